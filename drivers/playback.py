@@ -50,13 +50,14 @@ class Playback:
     uncertainty: float = 0.0
     next_due: float = field(default=math.inf, init=False)
     """Time of the next end of `valid_for`, or start of a set that waits [s]; infinite: none."""
-    _playing: list[tuple[Voice, ...]] = field(init=False)
+    all_voices: list[tuple[Voice, ...]] = field(init=False)
+    """Voices by channel, the oldest first."""
     _layers: dict[int, _Layer] = field(default_factory=dict)
     _changes_at: float = math.inf  # s; before, advancing changes nothing
 
     def __post_init__(self) -> None:
         """Start silent."""
-        self._playing = [()] * self.channels
+        self.all_voices = [()] * self.channels
 
     def commit(self, layers: Sequence[LayerSet], token: int, time: float) -> None:
         """Play a set from a time on; what has a new tone counts its phase from there."""
@@ -76,9 +77,9 @@ class Playback:
         """Fade all layers along a ramp [s], without endings; nothing waits any longer."""
         self.advance(time)
         self._layers.clear()
-        self._playing = [
+        self.all_voices = [
             tuple(voice.faded(time, ramp, self.uncertainty) for voice in voices)
-            for voices in self._playing
+            for voices in self.all_voices
         ]
         self._note_changes()
 
@@ -96,20 +97,20 @@ class Playback:
             else:
                 self._end(number, at)
         faded = time - self.uncertainty
-        for channel, voices in enumerate(self._playing):
+        for channel, voices in enumerate(self.all_voices):
             kept = []
             for voice in voices:
                 if voice.transition.last or voice.transition.end > faded:
                     kept.append(voice)
             if len(kept) < len(voices):
-                self._playing[channel] = tuple(kept)
+                self.all_voices[channel] = tuple(kept)
         self._note_changes()
 
     def _note_changes(self) -> None:
         """Note when a voice has faded, or a layer ends or starts, next."""
         due = self._next_due()
         first = self.next_due = math.inf if due is None else due[0]
-        for voices in self._playing:
+        for voices in self.all_voices:
             for voice in voices:
                 if not voice.transition.last and voice.transition.end < first:
                     first = voice.transition.end
@@ -121,21 +122,21 @@ class Playback:
         For bounds, where a set may have come before that or after.
         """
         ramp = self.ramp_of(layer)
-        for channel, voices in enumerate(self._playing):
+        for channel, voices in enumerate(self.all_voices):
             ends = [
                 each.ended(time, ramp, self.uncertainty)
                 for each in voices
                 if each.layer == layer and not each.has_ended
             ]
-            self._playing[channel] = (*voices, *ends)
+            self.all_voices[channel] = (*voices, *ends)
 
     def correct(self, one: LayerSet, token: int) -> None:
         """Have a layer lead to what an amplifier says it plays of the set with this token."""
         if one.layer not in self._layers or self._layers[one.layer].token != token:
             return
         commands = {command.channel: command for command in one.commands}
-        for channel, voices in enumerate(self._playing):
-            self._playing[channel] = tuple(
+        for channel, voices in enumerate(self.all_voices):
+            self.all_voices[channel] = tuple(
                 voice
                 if voice.layer != one.layer or voice.has_ended
                 else voice.corrected(commands.get(channel))
@@ -146,22 +147,17 @@ class Playback:
     def scale(self, time: float, factor: float, ramp: float) -> None:
         """Take all tones that last to a factor of their level along a ramp [s], endings too."""
         self.advance(time)
-        self._playing = [
+        self.all_voices = [
             tuple(
                 voice if voice.has_ended else voice.scaled(time, factor, ramp) for voice in voices
             )
-            for voices in self._playing
+            for voices in self.all_voices
         ]
         self._note_changes()
 
-    @property
-    def all_voices(self) -> Sequence[tuple[Voice, ...]]:
-        """Voices by channel, the oldest first."""
-        return self._playing
-
     def voices_of(self, channel: int) -> tuple[Voice, ...]:
         """Return the voices of a channel, the oldest first."""
-        return self._playing[channel]
+        return self.all_voices[channel]
 
     def playing(self, layer: int) -> LayerSet:
         """Return the set to which the voices of a layer lead, without envelopes; empty: silent."""
@@ -172,7 +168,7 @@ class Playback:
                 _LEVEL.to_wire(abs(voice.transition.last)),
                 _PHASE.to_wire(math.degrees(cmath.phase(voice.transition.last))),
             )
-            for channel, voices in enumerate(self._playing)
+            for channel, voices in enumerate(self.all_voices)
             for voice in voices
             if voice.layer == layer and not voice.has_ended
         )
@@ -182,7 +178,7 @@ class Playback:
     def level(self, channel: int, time: float) -> float:
         """Return the largest amplitude of a channel; voices of one frequency interfere."""
         sums: dict[float, complex] = {}
-        for voice in self._playing[channel]:
+        for voice in self.all_voices[channel]:
             turned = cmath.rect(1.0, -2 * math.pi * voice.frequency * voice.origin)
             amplitude = voice.transition.at(time) * turned
             sums[voice.frequency] = sums.get(voice.frequency, 0j) + amplitude
@@ -190,17 +186,17 @@ class Playback:
 
     def settled(self, channel: int) -> float:
         """Return the sum of the amplitudes to which the voices of a channel lead."""
-        return sum(abs(voice.transition.last) for voice in self._playing[channel])
+        return sum(abs(voice.transition.last) for voice in self.all_voices[channel])
 
     def peak(self, channel: int, time: float) -> float:
         """Return a bound of the amplitude from a time on: all voices at their largest at once."""
-        return sum(voice.transition.peak(time) for voice in self._playing[channel])
+        return sum(voice.transition.peak(time) for voice in self.all_voices[channel])
 
     @property
     def tokens(self) -> Mapping[int, int]:
         """Token of each layer that plays."""
         lasting: dict[int, int] = {}
-        for voices in self._playing:
+        for voices in self.all_voices:
             for voice in voices:
                 if not voice.has_ended:
                     lasting[voice.layer] = self._layers[voice.layer].token
@@ -214,7 +210,7 @@ class Playback:
     @property
     def silent_from(self) -> float:
         """Time from which every channel is silent [s]; infinite while a tone lasts."""
-        ends = [voice.silent_from for voices in self._playing for voice in voices]
+        ends = [voice.silent_from for voices in self.all_voices for voice in voices]
         waits = any(layer.waiting is not None for layer in self._layers.values())
         return math.inf if waits else max(ends, default=-math.inf)
 
@@ -230,14 +226,14 @@ class Playback:
     @property
     def ends_by(self) -> float:
         """Latest time at which all is silent by itself [s]; infinite without `valid_for`."""
-        latest = [voice.silent_from for voices in self._playing for voice in voices]
+        latest = [voice.silent_from for voices in self.all_voices for voice in voices]
         ends = [end for end in latest if end < math.inf]
         for number, layer in self._layers.items():
             if layer.waiting is not None:
                 return math.inf
             fades = [
                 voice.ended(layer.ends, layer.ramp / _PER_RAMP).transition.end
-                for voices in self._playing
+                for voices in self.all_voices
                 for voice in voices
                 if voice.layer == number and not voice.has_ended and layer.ends < math.inf
             ]
@@ -248,7 +244,7 @@ class Playback:
         """Return when the fades that go on at a time have ended [s], or that time."""
         ends = [
             voice.transition.end
-            for voices in self._playing
+            for voices in self.all_voices
             for voice in voices
             if voice.transition.last == 0
         ]
@@ -256,7 +252,7 @@ class Playback:
 
     def is_settled(self, time: float) -> bool:
         """Whether nothing changes from a time on [s] but by the ends of layers."""
-        for voices in self._playing:
+        for voices in self.all_voices:
             for voice in voices:
                 if voice.transition.end > time:
                     return False
@@ -273,7 +269,7 @@ class Playback:
     def _onsets_end(self, layer: int, time: float) -> float:
         ends = (
             voice.transition.end
-            for voices in self._playing
+            for voices in self.all_voices
             for voice in voices
             if voice.layer == layer and not voice.has_ended and voice.transition.knots
         )
@@ -282,12 +278,12 @@ class Playback:
     def _end(self, layer: int, time: float) -> None:
         """Let a layer fall silent by its endings."""
         ramp = self._layers.pop(layer).ramp / _PER_RAMP
-        self._playing = [
+        self.all_voices = [
             tuple(
                 each.ended(time, ramp, self.uncertainty) if each.layer == layer else each
                 for each in voices
             )
-            for voices in self._playing
+            for voices in self.all_voices
         ]
 
     def _start(self, one: LayerSet, token: int, time: float) -> None:
@@ -295,13 +291,13 @@ class Playback:
         for command in one.commands:
             commands[command.channel] = command
         ramp = one.ramp / _PER_RAMP
-        for channel, voices in enumerate(self._playing):
+        for channel, voices in enumerate(self.all_voices):
             if voices or channel in commands:
                 of_channel = commands.get(channel)
                 after = voices_after(voices, one.layer, of_channel, time, ramp, self.uncertainty)
                 if len(after) > self.voices:
                     after = cut_to(after, time, self.voices, self.slew)
-                self._playing[channel] = tuple(after)
+                self.all_voices[channel] = tuple(after)
         if not commands:
             self._layers.pop(one.layer, None)
             return

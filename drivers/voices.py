@@ -104,7 +104,11 @@ def voices_after(
         else:
             after.append(voice.ended(time, ramp, uncertainty))
     if is_new and command is not None:
-        transition = towards(command, time, ramp, 0j)
+        if command.onset is None:  # nearly always
+            last = amplitude_of(command.level, command.phase)
+            transition = Transition(time, ramp, 0j, last, time + ramp)
+        else:
+            transition = towards(command, time, ramp, 0j)
         frequency = command.frequency / _PER_HERTZ
         after.append(Voice(layer, frequency, time, transition, False, command.ending))
     return after

@@ -211,13 +211,13 @@ class Amplifier(Dialogue):
         self, token: int, layers: Sequence[Layer], cuts: list[Values], *, now: bool
     ) -> Staged:
         """Have the ledger admit a set, and cut it into parts; raises CommandRefused."""
-        moment, delay = clock.now(), self._commit_delay
+        moment, delay = self._time(), self._commit_delay
         admitted = self.ledger.admit(layers, moment, delay=delay)
         stream = pack_layers(admitted)
         if len(stream) > self.capabilities["set_words"]:
             limit = self.capabilities["set_words"]
             raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
-        cuts[:] = parts(stream, session=self.session, token=token, now=now)
+        cuts += parts(stream, session=self.session, token=token, now=now)
         staged = self._admitted = Staged(token, admitted, is_exact=True, until=moment + delay)
         return staged
 

@@ -225,11 +225,13 @@ def plain_bounds(
     Between the two they are convex, and so are sums of their squares, so that `worst` is at one of
     the ends. None where envelopes, several ramps or ends of layers make it less plain.
     """
-    ramp = layers[0].ramp
+    ramp, may_end = layers[0].ramp, playback.next_due <= until
+    if playback.next_due < math.inf and playback.waiting:
+        return None
     named: list[int] = []
     after = [0.0] * playback.channels
     for one in layers:
-        if one.ramp != ramp or one.after or playback.end_of(one.layer) <= until:
+        if one.ramp != ramp or one.after or (may_end and playback.end_of(one.layer) <= until):
             return None
         if not one.renew:
             named.append(one.layer)
@@ -237,8 +239,6 @@ def plain_bounds(
             if command.onset is not None or command.ending is not None:
                 return None
             after[command.channel] += command.level / _LEVEL.per_unit
-    if playback.waiting:
-        return None
     before = [0.0] * playback.channels
     for channel, voices in enumerate(playback.all_voices):
         for voice in voices:

@@ -53,11 +53,19 @@ def _level_problem(status: Values, ledger: Ledger, sent_at: float, now: float) -
     if len(status["levels"]) != playback.channels:
         return f"levels must be {playback.channels}, got {len(status['levels'])}"
     tolerance = _STEPS * max(ledger.capabilities["level_step"], 1)
+    is_steady = playback.next_due - 2 * ledger.lag > now
     for channel, level in enumerate(status["levels"]):
-        highest, is_settled = 0.0, playback.next_due - 2 * ledger.lag > now
-        for voice in playback.voices_of(channel):
-            highest += voice.transition.peak(late)
-            is_settled = is_settled and voice.transition.end <= late
+        highest, is_settled = 0.0, is_steady
+        for voice in playback.all_voices[channel]:
+            transition = voice.transition
+            if transition.end <= late:
+                highest += abs(transition.last)
+                continue
+            is_settled = False
+            if transition.knots:
+                highest += transition.peak(late)
+            else:
+                highest += max(abs(transition.first), abs(transition.last))
         high = round(min(highest, 1.0) * _LEVEL.per_unit)
         low = round(min(playback.level(channel, now), 1.0) * _LEVEL.per_unit) if is_settled else 0
         if not low - tolerance <= level <= high + tolerance:

@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers import clock
 from drivers.errors import CommandError, CommandRefused, LinkDegraded, LinkError, Preempted
 from drivers.host.comparison import MAX_CONTRADICTIONS, problem_of
 from drivers.host.feeding import Feeding
@@ -63,6 +62,7 @@ class Dialogue:
         self.listeners: list[Callable[[Values], None]] = []
         self.silences = 0
         """Stops and disarms that were sent to it."""
+        self._time = line.time
         self._ledger: Ledger | None = None
         self._admitted: Staged | None = None
         self._contradictions = 0
@@ -101,25 +101,25 @@ class Dialogue:
             self.silences += name in ("Stop", "Disarm")
             if name == "Silence":
                 self.played_at = now
-        elif admitted is not None and values.get("token") == admitted.token:
+        elif admitted is not None and values.get("token") == admitted.token and self._ledger:
             is_last = name == "Set" and values["now"] and values["index"] == values["parts"] - 1
             if name == "Commit" or is_last:
                 self.played_at = now
-                self.ledger.sent(admitted.token, admitted.layers, now)
+                self._ledger.sent(admitted.token, admitted.layers, now)
 
     def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
         """Note the reply to a request that was sent at a time [s].
 
         Raises CommandRefused once its statuses contradict what was sent, twice in a row.
         """
-        now = clock.now()
+        now = self._time()
         self.silence_cause = None
         self.round_trip = now - sent_at
         message = MESSAGES.get(name)
         if message is None:
             return
         if message.feeds:
-            self.feeding.confirm(sent_at, now)
+            self.feeding.since, self.feeding.confirmed_at = sent_at, now
         if message.reply is _STATUS:
             self._note_status(name, values, reply, sent_at, now)
         elif name == "Set" and reply["played"]:
@@ -143,7 +143,7 @@ class Dialogue:
 
     def note_other_host(self) -> None:
         """Note that another host drives it: it must feed the watchdog within its longest time."""
-        self._other_host_at = clock.now()
+        self._other_host_at = self._time()
 
     def note_several(self) -> None:
         """Note that a second amplifier has replied at its address."""
@@ -151,14 +151,15 @@ class Dialogue:
 
     def check_other_host(self) -> None:
         """Raise LinkError if another host drives it."""
-        if clock.now() - self._other_host_at <= _WATCHDOG.high:
+        if self._time() - self._other_host_at <= _WATCHDOG.high:
             raise self._driven_by_another()
 
     def check_request(self, name: str) -> None:
         """Raise LinkError for what plays or feeds, while degraded or beside another host."""
         if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
             return
-        self.check_other_host()
+        if self._other_host_at > -math.inf:
+            self.check_other_host()
         if self.silence_cause is not None:
             raise LinkDegraded(
                 f"{self.silence_cause}. The amplifier may play its last set until its watchdog has "
@@ -170,15 +171,16 @@ class Dialogue:
         admitted = self._admitted
         if admitted is None or admitted.token != token:
             raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
-        if clock.now() > admitted.until:
+        if (now := self._time()) > admitted.until:
             raise CommandRefused(
-                f"amplifier {self.name}: set {token} must be committed by {admitted.until:.3f} s, "
-                f"got {clock.now():.3f} s; the wire is too slow or too busy"
+                f"amplifier {self.name}: set {token} must be committed {now - admitted.until:.3g} "
+                "s earlier; the wire is too slow or too busy"
             )
 
     def _confirm(self, token: int, now: float) -> None:
         """Note that the amplifier plays the set with this token, as it says."""
-        self.ledger.resolve(token, now)
+        if self._ledger is not None:
+            self._ledger.resolve(token, now)
         if self._admitted is not None and self._admitted.token == token:
             self._admitted = None
 
@@ -186,8 +188,10 @@ class Dialogue:
         self, name: str, values: Values, status: Values, sent_at: float, now: float
     ) -> None:
         """Note a status; raises CommandRefused once it contradicts what was sent twice."""
-        if self.latch is None or is_newer_token(status["latch"], self.latch):
-            self.latch = status["latch"]
+        if (latch := status["latch"]) != self.latch and (
+            self.latch is None or is_newer_token(latch, self.latch)
+        ):
+            self.latch = latch
         self.status, self.status_at = status, now
         if self._ledger is None:
             return

@@ -24,10 +24,6 @@ class Feeding:
     since: float = -math.inf
     confirmed_at: float = -math.inf
 
-    def confirm(self, sent_at: float, now: float) -> None:
-        """Note the reply at a time [s] to a request that feeds, sent at another."""
-        self.since, self.confirmed_at = sent_at, now
-
     @property
     def latest(self) -> float:
         """When the watchdog may have been fed last [s].

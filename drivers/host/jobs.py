@@ -4,7 +4,7 @@ Times [s] are of the event loop's clock.
 """
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol
@@ -125,36 +125,29 @@ class JobQueue:
     """Jobs that wait for one line."""
 
     def __init__(self) -> None:
-        self._jobs: list[Job] = []
+        self.jobs: list[Job] = []
+        """In the order in which they were queued."""
         self._number = 0
-
-    def __len__(self) -> int:
-        """How many wait."""
-        return len(self._jobs)
-
-    def __iter__(self) -> Iterator[Job]:
-        """All that wait now."""
-        return iter([*self._jobs])
 
     def add(self, job: Job) -> None:
         """Queue a job, behind those of its priority."""
         self._number += 1
         job.number = self._number
-        self._jobs.append(job)
+        self.jobs.append(job)
 
     def remove(self, job: Job) -> None:
         """Take a job out, if it waits."""
-        if job in self._jobs:
-            self._jobs.remove(job)
+        if job in self.jobs:
+            self.jobs.remove(job)
 
     def next(self, now: float) -> Job | None:
         """Return the job whose turn it is; None while all pause, or a stop does."""
-        if len(self._jobs) == 1:
-            (first,) = self._jobs
+        if len(self.jobs) == 1:
+            (first,) = self.jobs
         else:
-            first = min(self._jobs, key=lambda job: job.rank(now))
+            first = min(self.jobs, key=lambda job: job.rank(now))
             if first.not_before > now and not first.priority.is_stop_class:
-                ready = [job for job in self._jobs if job.not_before <= now]
+                ready = [job for job in self.jobs if job.not_before <= now]
                 return min(ready, key=lambda job: job.rank(now), default=None)
         return first if first.not_before <= now else None
 
@@ -162,7 +155,7 @@ class JobQueue:
         """Return the jobs that a request for an amplifier, None for all, makes obsolete."""
         obsolete = _SUPERSEDED.get(priority, ())
         return [
-            job for job in self._jobs if job.priority in obsolete and member in (job.member, None)
+            job for job in self.jobs if job.priority in obsolete and member in (job.member, None)
         ]
 
     def supersedes(self, job: Job) -> bool:
@@ -170,10 +163,10 @@ class JobQueue:
         return any(
             other.member in (job.member, None)
             and job.priority in _SUPERSEDED.get(other.priority, ())
-            for other in self._jobs
+            for other in self.jobs
         )
 
     @property
-    def next_due(self) -> float | None:
-        """When the first of those that pause is due [s]; None if none pauses."""
-        return min((job.not_before for job in self._jobs if job.not_before), default=None)
+    def next_due(self) -> float:
+        """When the first of those that pause is due [s]; 0 if none pauses."""
+        return min((job.not_before for job in self.jobs if job.not_before), default=0.0)

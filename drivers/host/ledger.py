@@ -89,7 +89,7 @@ class Ledger:
 
         Again, where its commit is repeated: it may have played since the first time.
         """
-        if self.doubt == token:
+        if self._doubt is not None and self._doubt[0] == token:
             return
         before: Vibration | None = None
         if _is_vibration(layers):

@@ -56,6 +56,8 @@ class Line:
         self._current: Job | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._loop = asyncio.get_running_loop()
+        self.time = self._loop.time
+        """The clock of the line [s]."""
         self._is_pumping = False
 
     def submit(
@@ -83,6 +85,10 @@ class Line:
             future.add_done_callback(partial(_trace, job))
         if self.loss is not None:
             self._fail(job, LinkError(self.loss))
+            return future
+        if self._current is None and not (self._queue.jobs or self._is_pumping or start):
+            self._start(job)
+            self._schedule()
             return future
         for queued in self._queue.superseded_by(priority, member):
             self._fail(queued, Preempted(SUPERSEDED))
@@ -113,7 +119,8 @@ class Line:
                 continue
             self._current = None
             self._end(job, arrival)
-        self.pump()
+        if self._queue.jobs:
+            self.pump()
 
     def _end(self, job: Job, arrival: Reply | Nak | Broken) -> None:
         """End the request that was on the line by what came back."""
@@ -139,7 +146,7 @@ class Line:
         """Fail every request: the port is lost, or closed."""
         self.loss = cause
         current, self._current = self._current, None
-        for job in (*([] if current is None else [current]), *self._queue):
+        for job in (*([] if current is None else [current]), *self._queue.jobs):
             self._fail(job, LinkError(cause))
         if self._timer is not None:
             self._timer.cancel()
@@ -151,7 +158,7 @@ class Line:
             return
         self._is_pumping = True
         try:
-            while self.loss is None and self._current is None and self._queue:
+            while self.loss is None and self._current is None and self._queue.jobs:
                 job = self._queue.next(self._loop.time())
                 if job is None or (job.start is not None and not self._may_start(job)):
                     break
@@ -186,6 +193,8 @@ class Line:
                 return
             job.member.check_request(job.name)
             longer = self._write(job.member.address, job.name, job.values, now)
+            if self.loss is not None:  # by what the port did
+                raise LinkError(self.loss)
             job.due = now + longer + job.timeout
             if longer and job.attempts == ATTEMPTS:
                 job.attempts -= 1  # a slow wire: as long as on others until it counts as degraded
@@ -247,7 +256,7 @@ class Line:
         current = self._current
         if current is None or current.priority.is_stop_class:
             return
-        waiting = [job.priority for job in self._queue if job.priority < current.priority]
+        waiting = [job.priority for job in self._queue.jobs if job.priority < current.priority]
         if current.priority is Priority.READING and min(waiting, default=8) <= Priority.SET:
             current.due = self._loop.time()
         elif min(waiting, default=8) <= Priority.SILENCE:
@@ -255,8 +264,9 @@ class Line:
 
     def _schedule(self) -> None:
         """Have the timer look again by the next time that matters; it is never cancelled."""
-        due = self._queue.next_due if self._current is None else self._current.due
-        if due is None:
+        if self._current is not None:
+            due = self._current.due
+        elif not self._queue.jobs or (due := self._queue.next_due) <= 0.0:
             return
         if self._timer is None or self._timer.when() > due:
             if self._timer is not None:
@@ -286,7 +296,7 @@ class Line:
         self.pump()
 
     def _not_answered(self, job: Job) -> None:
-        preempting = any(other.priority.is_stop_class for other in self._queue)
+        preempting = any(other.priority.is_stop_class for other in self._queue.jobs)
         if preempting and not job.priority.is_stop_class:
             job.attempts += 1
             self._repeat(job)

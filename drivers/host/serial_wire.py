@@ -29,6 +29,8 @@ from drivers.protocol.table import (
 from drivers.statistics import WireCounters
 
 _BITS = 10  # of a byte, with start and stop
+_LONGEST = frame_length(2 * MAX_WORDS)  # bytes
+_IDENTITY = frame_length(140)
 
 
 class SerialWire:
@@ -37,7 +39,7 @@ class SerialWire:
     def __init__(self, baud: int, *, sequence: int) -> None:
         self.counters = WireCounters()
         self.delay = 0.0 if baud else NETWORK_DELAY
-        self._baud = baud
+        self._byte_time = _BITS / baud if baud else 0.0
         self._sequence = sequence
         self._pending: Frame | None = None
         self._replied: Frame | None = None  # the last reply
@@ -58,8 +60,11 @@ class SerialWire:
 
     def received(self, data: bytes) -> list[Arrival]:
         """Return what these bytes complete."""
-        arrivals = [self._arrival(frame) for frame in self._reader.feed(data)]
-        return [arrival for arrival in arrivals if arrival is not None]
+        arrivals: list[Arrival] = []
+        for frame in self._reader.feed(data):
+            if (arrival := self._arrival(frame)) is not None:
+                arrivals.append(arrival)
+        return arrivals
 
     def withdraw(self) -> None:
         """Take the request off the wire: its reply will be unexpected."""
@@ -67,14 +72,11 @@ class SerialWire:
 
     def transit(self, words: int) -> float:
         """Return how long a request of so many words takes to arrive [s]."""
-        return _BITS * frame_length(2 * words) / self._baud if self._baud else 0.0
+        return self._byte_time * frame_length(2 * words)
 
     def round_trip(self, name: str, length: int) -> float:
         """Return how long a request of this many bytes and its longest reply take [s]."""
-        if not self._baud:
-            return 0.0
-        reply_bytes = 2 * MAX_WORDS if name != "Hello" else 140
-        return _BITS * (length + frame_length(reply_bytes)) / self._baud
+        return self._byte_time * (length + (_IDENTITY if name == "Hello" else _LONGEST))
 
     def _arrival(self, frame: Frame) -> Arrival | None:
         self.counters.frames_in += 1
@@ -90,7 +92,12 @@ class SerialWire:
             return Several(frame.address) if self._is_second(frame) else None
         self._pending, self._replied = None, frame
         try:
-            return _reply(frame, pending)
+            if frame.kind != pending.kind | REPLY or pending.version == NEUTRAL:
+                return _special_reply(frame, pending)
+            if frame.version != pending.version:
+                return Broken(f"version of the reply must be {VERSION}, got {frame.version}")
+            record = BY_NUMBER[pending.kind].reply
+            return Reply(record.unpack(unpack_words(frame.payload), is_strict=False))
         except Refusal as refusal:
             return Broken(str(refusal))
 
@@ -114,15 +121,12 @@ class SerialWire:
         self.counters.invalid_frames += 1
 
 
-def _reply(frame: Frame, request: Frame) -> Arrival:
-    """Read the reply to a request; raises Refusal."""
+def _special_reply(frame: Frame, request: Frame) -> Arrival:
+    """Read a refusal, the reply to Hello, or what is none; raises Refusal."""
     if frame.kind == NAK | REPLY:
         return read_nak(unpack_words(frame.payload))
     if frame.kind != request.kind | REPLY:
         return Broken(f"type of the reply must be {request.type}, got {frame.type}")
-    if frame.version != request.version:
-        return Broken(f"version of the reply must be {request.version}, got {frame.version}")
-    if request.version == NEUTRAL:
-        return Reply(unpack_identity(frame.payload))
-    record = BY_NUMBER[request.kind].reply
-    return Reply(record.unpack(unpack_words(frame.payload), is_strict=False))
+    if frame.version != NEUTRAL:
+        return Broken(f"version of the reply must be {NEUTRAL}, got {frame.version}")
+    return Reply(unpack_identity(frame.payload))

@@ -7,7 +7,7 @@ what follows their fields is ignored.
 """
 
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, Protocol
@@ -265,45 +265,61 @@ class Rest:
 
 
 class Run:
-    """Numbers that follow each other, read and written in one loop: the codec's hot path."""
+    """Numbers and shared words that follow each other, in one loop: the codec's hot path."""
 
-    def __init__(self, numbers: Sequence[Number]) -> None:
-        self.names = tuple(number.name for number in numbers)
-        self._numbers = tuple(
-            (
-                *(number.name, number.quantity.minimum, number.quantity.maximum),
-                *(number.quantity.wire == "u32", number),
-            )
-            for number in numbers
-        )
+    def __init__(self, fields: Sequence[Number | Bits]) -> None:
+        self.names = tuple(name for field in fields for name in field.names)
+        self._fields = tuple(map(_parts_of, fields))
 
     def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
-        """Append the integers; ValueError for one out of range."""
-        for name, low, high, is_long, number in self._numbers:
-            value = values[name]
-            if not low <= value <= high:
-                number.pack(values, words)  # raises
-            if is_long:
-                words.append(value >> 16)
-            words.append(value % WORD)
+        """Append the words; ValueError for a value out of range, KeyError for no number."""
+        for _, parts, is_number in self._fields:
+            word = 0
+            for name, low, high, bits in parts:
+                value = values[name] if is_number else values.get(name, 0)
+                if not low <= value <= high:
+                    raise ValueError(f"{name} must be {low} to {high}, got {value}")
+                word = word << bits | value % (1 << bits)
+            words.append(word)
 
     def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
-        """Read the integers; raises Refusal for one out of range."""
-        for name, low, high, is_long, number in self._numbers:
-            value = words[at]
-            if is_long or low < 0 or not low <= value <= high:
-                at = number.unpack(words, at, values)
+        """Read the words; raises Refusal for one out of range."""
+        for field, parts, is_number in self._fields:
+            word = words[at]
+            name, low, high, _ = parts[0]
+            if not is_number:
+                for name, _, high, bits in reversed(parts):
+                    values[name] = word & high
+                    word >>= bits
+                if word:
+                    raise Refusal(f"unused bits beside {parts[0][0]} must be 0")
+            elif 0 <= low <= word <= high:
+                values[name] = word
             else:
-                values[name] = value
-                at += 1
+                field.unpack(words, at, values)
+            at += 1
         return at
 
 
+def _parts_of(
+    field: Number | Bits,
+) -> tuple[Number | Bits, tuple[tuple[str, int, int, int], ...], bool]:
+    """Return name, least, greatest and bits of each part of a word, and whether it is a number."""
+    if isinstance(field, Bits):
+        return field, tuple((name, 0, (1 << bits) - 1, bits) for name, bits in field.parts), False
+    quantity = field.quantity
+    return field, ((field.name, quantity.minimum, quantity.maximum, 16),), True
+
+
+def _is_word(field: Field) -> bool:
+    return isinstance(field, Bits) or (isinstance(field, Number) and field.quantity.wire != "u32")
+
+
 def _in_runs(fields: Sequence[Field]) -> Iterator[Field]:
-    """Yield fields, with numbers that follow each other as runs."""
-    for is_number, several in groupby(fields, lambda field: isinstance(field, Number)):
-        if is_number:
-            yield Run([field for field in several if isinstance(field, Number)])
+    """Yield fields, with single words that follow each other as runs."""
+    for is_word, several in groupby(fields, _is_word):
+        if is_word:
+            yield Run([field for field in several if isinstance(field, Number | Bits)])
         else:
             yield from several
 
@@ -311,13 +327,16 @@ def _in_runs(fields: Sequence[Field]) -> Iterator[Field]:
 class Record:
     """Fields that follow each other in words."""
 
+    append: Callable[[Mapping[str, Any], list[int]], None]
+    """Append the words of values; ValueError for one out of range, KeyError for none."""
+
     def __init__(self, *fields: Field) -> None:
         self.fields = fields
         self._compiled: tuple[Field, ...] = tuple(_in_runs(fields))
         self.names = tuple(name for field in fields for name in field.names)
+        self.append = self._compiled[0].pack if len(self._compiled) == 1 else self._append_all
 
-    def append(self, values: Mapping[str, Any], words: list[int]) -> None:
-        """Append the words of values; ValueError for one out of range, KeyError for none."""
+    def _append_all(self, values: Mapping[str, Any], words: list[int]) -> None:
         for field in self._compiled:
             field.pack(values, words)
 

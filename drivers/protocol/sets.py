@@ -4,7 +4,7 @@ All numbers are integers of the wire. A stream has the layers that a set changes
 other; a part is the values of one Set message. The far end collects parts in an `Assembly`.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from drivers.protocol.records import Refusal, Values
@@ -130,16 +130,18 @@ def _envelope(words: Sequence[int], at: int) -> tuple[Envelope, int]:
     return Envelope(head["step"], tuple(knots)), at
 
 
-def parts(stream: Sequence[int], *, session: int, token: int, now: bool) -> Iterator[Values]:
-    """Yield the Set messages of a stream; now: it plays when it is complete."""
+def parts(stream: Sequence[int], *, session: int, token: int, now: bool) -> list[Values]:
+    """Return the Set messages of a stream; now: it plays when it is complete."""
     cuts = range(0, max(len(stream), 1), _PART_WORDS)
     if len(cuts) > MAX_PARTS:
         raise ValueError(f"a set must have at most {MAX_PARTS} parts, got {len(cuts)}")
-    for index, at in enumerate(cuts):
-        yield {
+    return [
+        {
             **{"session": session, "token": token, "index": index, "parts": len(cuts)},
             **{"now": int(now), "stream": list(stream[at : at + _PART_WORDS])},
         }
+        for index, at in enumerate(cuts)
+    ]
 
 
 @dataclass

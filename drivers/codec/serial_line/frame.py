@@ -96,10 +96,13 @@ class FrameReader:
         frames = []
         *ended, rest = bytes(data).split(b"\0")
         for piece in ended:
-            if not (piece or self._stuffed or self._skipping):
+            if self._stuffed or self._skipping or len(piece) > _STUFFED_MAX:
+                self._append(piece)
+                frame = self._finish()
+            elif piece:  # nearly always
+                frame = self._decoded(piece)
+            else:
                 continue  # a leading zero
-            self._append(piece)
-            frame = self._finish()
             if frame is not None:
                 frames.append(frame)
         if rest:
@@ -122,26 +125,22 @@ class FrameReader:
         skipped, self._skipping = self._skipping, False
         if skipped or not stuffed:
             return None
-        frame = _decode_frame(stuffed)
-        if frame is None:
+        return self._decoded(stuffed)
+
+    def _decoded(self, stuffed: bytes) -> Frame | None:
+        """Decode a frame without its delimiters; None if it is damaged."""
+        try:
+            content = cobs.decode(stuffed)
+        except cobs.DecodeError:
+            content = b""
+        body, crc = content[: -_CRC.size], content[-_CRC.size :]
+        if len(content) < _OVERHEAD or _CRC.unpack(crc) != (zlib.crc32(body),):
             self._count_invalid(stuffed)
-        else:
-            self.counters.good += 1
-        return frame
+            return None
+        self.counters.good += 1
+        kind, version, address, sequence = _HEADER.unpack_from(body)
+        return Frame(kind, address, sequence, body[_HEADER.size :], version)
 
     def _count_invalid(self, piece: bytes) -> None:
         self.counters.invalid_frames += 1
         self._on_invalid(piece)
-
-
-def _decode_frame(stuffed: bytes) -> Frame | None:
-    """Decode a frame without its delimiters; None if it is damaged."""
-    try:
-        content = cobs.decode(stuffed)
-    except cobs.DecodeError:
-        return None
-    body, crc = content[: -_CRC.size], content[-_CRC.size :]
-    if len(content) < _OVERHEAD or _CRC.unpack(crc) != (zlib.crc32(body),):
-        return None
-    kind, version, address, sequence = _HEADER.unpack_from(body)
-    return Frame(kind, address, sequence, payload=body[_HEADER.size :], version=version)

@@ -25,7 +25,7 @@ REQUESTS: list[tuple[str, Values]] = [
     *(("Stop", {"ramp": 5}), ("Clear", {"latch": 1}), ("Disarm", {"ramp": 5})),
     *(("Commit", {"session": 9, "token": 7}), ("Silence", {"session": 9, "ramp": 5})),
     *(("GetAchieved", {"layer": 0}), ("GetReading", {"first": 0})),
-    ("Set", next(parts(pack_layers(LAYERS), session=9, token=7, now=True))),
+    ("Set", parts(pack_layers(LAYERS), session=9, token=7, now=True)[0]),
     *(("Set", part) for part in CUT),
 ]
 

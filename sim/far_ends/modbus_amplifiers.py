@@ -29,6 +29,7 @@ from sim.far_ends.modbus.pdu import (
 FRAME_TIMEOUT = 0.02
 """Longest pause [s] within an RTU frame: less than the 30 ms after which a host repeats it."""
 
+_MARGIN = 0.001  # s; behind the end of a pause, which must be exceeded
 _BOX = 256  # registers of a message
 _REPLY = 128  # offset of its reply
 _REPLY_HEAD = 2  # registers: tag, result
@@ -61,7 +62,18 @@ class ModbusAmplifiers:
         """Take bytes from the host at a time [s]."""
         self._take(self._reader.feed(data, now), now)
 
-    def pause(self, now: float) -> None:
+    def of_connection(self, send: Callable[[bytes], None]) -> "ModbusAmplifiers":
+        """Return the same units for another connection; send: see above."""
+        other = ModbusAmplifiers({}, send, is_rtu=self._is_rtu)
+        other._units = self._units
+        return other
+
+    @property
+    def next_event(self) -> float:
+        """Time by which silence has ended a frame that is not whole [s]; infinite without one."""
+        return self._reader.gives_up_at + _MARGIN
+
+    def tick(self, now: float) -> None:
         """Take the silence of the line until a time [s], which ends a frame that is not whole."""
         self._take(self._reader.pause(now), now)
 

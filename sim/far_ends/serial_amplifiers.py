@@ -3,6 +3,7 @@
 On a shared line amplifiers have one address each, and send no events.
 """
 
+import math
 from collections.abc import Callable, Mapping
 
 from drivers.codec.serial_line.frame import NEUTRAL, REPLY, Frame, FrameReader, encode_frame
@@ -39,6 +40,11 @@ class SerialAmplifiers:
         self._heard = [*amplifiers.values()] if len(amplifiers) == 1 else []
         for amplifier in self._heard:
             amplifier.listeners.append(self._send_event)
+
+    next_event = math.inf
+
+    def tick(self, now: float) -> None:
+        """Do nothing: nothing is due by itself."""
 
     def close(self) -> None:
         """Send no more events."""

@@ -87,11 +87,10 @@ def test_fault_of_an_amplifier_ends_its_tone(
             await rig.group.arm(watchdog=0.25 if fault == "WATCHDOG" else 2.0)
             await rig.group.apply({"main": [layer((0, 110.0, 1.0))]})
             await rig.beat_until(clock.now() + 0.1)
-            assert rig.bench.amplifiers["main"].summary(clock.now()).levels[0] == 1.0
+            assert rig.levels("main")[0] == 1.0
             rig.devices["main"].inject_fault(FaultWindow(kind, lasts=0.5))
             await asyncio.sleep(0.3)
-            rig.bench.advance(clock.now())
-            assert not any(rig.bench.amplifiers["main"].summary(clock.now()).levels)
+            assert not any(rig.levels("main"))
             with pytest.raises((CommandRefused, LinkError)):
                 await rig.group.beat()
             assert not rig.group.is_armed
@@ -112,10 +111,10 @@ async def test_hot_amplifier_is_derated_and_stopped(coarse_rig: Rig) -> None:
         await rig.beat_until(clock.now() + 0.1)
         rig.devices["main"].inject_fault(FaultWindow("over_temperature", lasts=1.0))
         await asyncio.sleep(0.05)
-        assert rig.bench.amplifiers["main"].summary(clock.now()).levels[0] == pytest.approx(0.4)
+        assert rig.levels("main")[0] == pytest.approx(0.4)
         with pytest.raises(CommandRefused, match="level of channel 0 must be 8000"):
             await rig.beat_until(clock.now() + 0.2)
-        assert not any(rig.bench.amplifiers["main"].summary(clock.now()).levels)
+        assert not any(rig.levels("main"))
 
 
 @in_virtual_time
@@ -131,7 +130,7 @@ async def test_unplugged_line_is_lost_and_opens_again_once_plugged_in(coarse_rig
         with pytest.raises(LinkError, match="unplugged"):
             memory_line([device], "main")
         await asyncio.sleep(1.01)
-        assert not any(rig.bench.amplifiers["main"].summary(clock.now()).levels)
+        assert not any(rig.levels("main"))
         line = memory_line([device], "main")
         host = Host(line, device.address, LIMITS, name="main")
         await host.open()
@@ -146,7 +145,7 @@ async def test_lost_frames_are_asked_again(coarse_rig: Rig) -> None:
         await rig.group.apply({"main": [layer((0, 110.0, 1.0))]})
         rig.devices["main"].inject_fault(FaultWindow("drop", share=0.1))
         await rig.beat_until(clock.now() + 2.0)
-        assert rig.bench.amplifiers["main"].summary(clock.now()).levels[0] == 1.0
+        assert rig.levels("main")[0] == 1.0
         assert rig.group.amplifiers["main"].statistics.retries > 0
 
 

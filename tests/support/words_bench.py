@@ -1,21 +1,25 @@
-"""A simulated rig of protocol 3 in this process, and a host's group on it."""
+"""A simulated rig of protocol 3 in this process or on wires, and a host's group on it."""
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 from drivers import clock
 from drivers.contents import Layer, Tone
+from drivers.errors import LinkError
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from drivers.host.line import Line
 from drivers.host.serial_wire import SerialWire
+from drivers.opening import Lines
 from model.rig.rig import Rig
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
+from sim.far_ends.wires import Wire, open_wire
 from sim.faults.fault_window import Faults
 from sim.memory_line import MemoryPort
 
@@ -23,13 +27,35 @@ LIMITS = GuardLimits(20.0, 1000.0, 1.0)
 
 
 @dataclass
-class RigInMemory:
-    """The bench, its devices, and the group of their hosts, each on a line of its own."""
+class HostedRig:
+    """The bench, its devices, and the group of their hosts; urls: on real wires, by name."""
 
     bench: Bench
     devices: Mapping[str, AmplifierDevice]
     group: Group
-    lines: dict[str, Line] = field(default_factory=dict)
+    urls: Mapping[str, str] = field(default_factory=dict)
+    opened: Lines = field(default_factory=Lines)
+
+    @property
+    def lines(self) -> Mapping[str, Line]:
+        """The line of each amplifier."""
+        return {name: each.line for name, each in self.group.amplifiers.items()}
+
+    def levels(self, name: str) -> tuple[float, ...]:
+        """What the channels of an amplifier play now."""
+        self.bench.advance(clock.now())
+        return self.bench.amplifiers[name].summary(self.bench.time).levels
+
+    async def reopen(self, *, within: float) -> None:
+        """Close the lines, and open them again once they are there, within so many seconds."""
+        await self.opened.close()
+        async with asyncio.timeout(within):
+            while True:
+                with contextlib.suppress(LinkError):
+                    self.group = await _opened_group(self.opened, self.urls)
+                    return
+                await self.opened.close()
+                await asyncio.sleep(0.05)
 
     async def beat_until(self, time: float) -> None:
         """Feed the watchdogs until a time [s]."""
@@ -38,9 +64,10 @@ class RigInMemory:
             await self.group.beat()
 
 
-def devices_of(bench: Bench) -> dict[str, AmplifierDevice]:
-    """A device for each amplifier, at addresses 1, 2, ..., without faults as yet."""
-    return {
+def make_bench(rig: Rig) -> tuple[Bench, dict[str, AmplifierDevice]]:
+    """A bench, and a device for each amplifier at addresses 1, 2, ..., without faults as yet."""
+    bench = Bench(rig, now=clock.now(), make_amplifier=Amplifier)
+    return bench, {
         name: AmplifierDevice(bench, name, address=number, faults=Faults(begin=clock.now()))
         for number, name in enumerate(bench.amplifiers, 1)
     }
@@ -55,22 +82,46 @@ def memory_line(devices: Sequence[AmplifierDevice], name: str) -> Line:
 
 
 @asynccontextmanager
-async def rig_in_memory(rig: Rig) -> AsyncIterator[RigInMemory]:
-    """The amplifiers of a rig, identified and disarmed."""
-    bench = Bench(rig, now=clock.now(), make_amplifier=Amplifier)
-    devices = devices_of(bench)
-    lines = {name: memory_line([device], name) for name, device in devices.items()}
-    group = Group(
-        {name: Host(each, devices[name].address, LIMITS, name=name) for name, each in lines.items()}
-    )
+async def rig_in_memory(rig: Rig) -> AsyncIterator[HostedRig]:
+    """The amplifiers of a rig, each on a line of its own, identified and disarmed."""
+    bench, devices = make_bench(rig)
+    hosts = {
+        name: Host(memory_line([each], name), each.address, LIMITS, name=name)
+        for name, each in devices.items()
+    }
+    group = Group(hosts)
     await group.open()
     try:
-        yield RigInMemory(bench, devices, group, lines)
+        yield HostedRig(bench, devices, group)
     finally:
         for name, device in devices.items():
             device.close()
-            if lines[name].loss is None:
-                lines[name].lose("closed")
+            if hosts[name].line.loss is None:
+                hosts[name].line.lose("closed")
+
+
+@asynccontextmanager
+async def rig_on_wire(rig: Rig, wire: Wire) -> AsyncIterator[HostedRig]:
+    """The amplifiers of a rig on a wire, identified and disarmed."""
+    bench, devices = make_bench(rig)
+    async with open_wire(wire, list(devices.values())) as urls:
+        opened = Lines()
+        try:
+            group = await _opened_group(opened, urls)
+            yield HostedRig(bench, devices, group, urls, opened)
+        finally:
+            await opened.close()
+            for device in devices.values():
+                device.close()
+
+
+async def _opened_group(lines: Lines, urls: Mapping[str, str]) -> Group:
+    """A group of the amplifiers at these URLs, identified and disarmed."""
+    group = Group(
+        {name: await lines.amplifier(url, LIMITS, name=name) for name, url in urls.items()}
+    )
+    await group.open()
+    return group
 
 
 def layer(*tones: tuple[int, float, float], number: int = 0, ramp: float = 0.02) -> Layer:

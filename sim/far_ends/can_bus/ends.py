@@ -5,26 +5,35 @@ import contextlib
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 
+from drivers import clock
+from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from drivers.protocol.definition import PROTOCOL
+from sim.bench.amplifier_device import AmplifierDevice
+from sim.bench.faulted_device import FaultedDevice
 from sim.bench.simulated_device import SimulatedDevice
+from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from sim.far_ends.can_bus.bus import CanBus, Stub
 from sim.far_ends.can_bus.node import CanNode
 from sim.far_ends.can_bus.slcan_adapter import SlcanEnd
 from sim.far_ends.can_bus.socketcand_server import BUS_NAME, SocketcandEnd
+from sim.transport.far_end import Served
 
 _BITRATE: int = PROTOCOL.canopen["bitrate"]
 _PER_NODE: int = PROTOCOL.canopen["channels_per_node"]
 
 
 @asynccontextmanager
-async def nodes_on(
-    bus: CanBus, devices: Sequence[SimulatedDevice]
-) -> AsyncIterator[dict[str, int]]:
+async def nodes_on(bus: CanBus, devices: Sequence[FaultedDevice]) -> AsyncIterator[dict[str, int]]:
     """Put amplifiers on a bus; yields the node of each by name."""
     with contextlib.ExitStack() as stack:
         numbers = {}
         number = 1
         for device in devices:
+            if isinstance(device, AmplifierDevice):
+                numbers[device.name] = device.address
+                stack.enter_context(_amplifier_on(bus, device))
+            if not isinstance(device, SimulatedDevice):
+                continue
             numbers[device.name] = number
             stack.enter_context(_node_on(bus, device, number))
             number += -(-device.capabilities.channels // _PER_NODE)
@@ -33,7 +42,7 @@ async def nodes_on(
 
 @asynccontextmanager
 async def socketcand(
-    devices: Sequence[SimulatedDevice], *, port: int = 0, bitrate: int | None = None
+    devices: Sequence[FaultedDevice], *, port: int = 0, bitrate: int | None = None
 ) -> AsyncIterator[Mapping[str, str]]:
     """Serve amplifiers on one bus by socketcand; yields their URLs by name."""
     bus = CanBus(bitrate)
@@ -64,7 +73,7 @@ async def socketcand(
 
 @asynccontextmanager
 async def slcan(
-    devices: Sequence[SimulatedDevice], *, bitrate: int | None = None, unpluggable: bool = False
+    devices: Sequence[FaultedDevice], *, bitrate: int | None = None, unpluggable: bool = False
 ) -> AsyncIterator[Mapping[str, str]]:
     """Serve amplifiers on one bus behind a serial adapter; yields their URLs by name."""
     bus = CanBus(bitrate)
@@ -78,6 +87,30 @@ async def slcan(
             name: f"can+slcan://{end.path}?bitrate={bitrate or _BITRATE}#{node}"
             for name, node in nodes.items()
         }
+
+
+@contextlib.contextmanager
+def _amplifier_on(bus: CanBus, device: AmplifierDevice) -> Iterator[None]:
+    """Put an amplifier of protocol 3 on a bus, at the node of its number."""
+
+    def send(frames: bytes) -> None:
+        for frame in unpack_frames(frames):
+            stub.send(frame)
+
+    def boot() -> None:
+        end.start(clock.now())
+        served.schedule()
+
+    stub = Stub(bus, lambda frame: served.receive(pack_frames([frame])), faults=device.faults)
+    end = CanAmplifiers({device.address: device}, send)
+    served = Served(end, bus.time.now)
+    device.on_boot(boot)
+    boot()
+    try:
+        yield
+    finally:
+        served.close()
+        stub.close()
 
 
 @contextlib.contextmanager

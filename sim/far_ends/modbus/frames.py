@@ -3,6 +3,7 @@
 Written without code of the host's side. A long pause ends a frame.
 """
 
+import math
 import struct
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -71,6 +72,11 @@ class Reader(ABC):
     def has_partial_frame(self) -> bool:
         """Whether part of a frame is buffered."""
         return bool(self._buffer)
+
+    @property
+    def gives_up_at(self) -> float:
+        """Time after which `pause` discards a partial frame [s]; infinite without one."""
+        return self._last + self.timeout if self._buffer else math.inf
 
     def feed(self, data: bytes, now: float) -> list[RequestAdu]:
         """The requests that these bytes complete, in order."""

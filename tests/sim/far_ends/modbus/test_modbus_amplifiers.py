@@ -32,7 +32,7 @@ class Port:
         self.sent.clear()
         body = bytes([unit]) + pdu
         self.end.receive(body + struct.pack("<H", crc(body)), self.now)
-        self.end.pause(self.now + 2 * FRAME_TIMEOUT)
+        self.end.tick(self.now + 2 * FRAME_TIMEOUT)
         return self.sent[0][1:-2] if self.sent else None
 
     def write(self, address: int, *registers: int, unit: int = 1) -> bytes | None:

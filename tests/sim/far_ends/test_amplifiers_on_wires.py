@@ -1,0 +1,228 @@
+"""Amplifiers of protocol 3 on every wire: what a finger feels, faults, shared lines, time."""
+
+import asyncio
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivers import clock
+from drivers.errors import CommandRefused, LinkError
+from drivers.protocol.table import FAULTS, STATES
+from memory_machine import live_in_memory
+from model.fem.assembly import assemble
+from model.fem.harmonic import direct_acceleration
+from model.finger.fingertip import fingertip_points
+from model.rig.rig import Rig
+from model.structure.fingertip import Fingertip, FingertipLoad
+from plate_in_time import apart
+from sim.far_ends.wires import Wire
+from sim.faults.fault_window import FaultKind, FaultWindow
+from virtual_loop import in_virtual_time
+from wires import SHARED_WIRES, WIRES, on_two_amplifiers
+from words_bench import layer, rig_on_wire
+
+SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcand": 500_000}
+
+
+@pytest.fixture(params=WIRES)
+def wire(request: pytest.FixtureRequest) -> Wire:
+    """Each wire, in its own time where it has one."""
+    found = WIRES[request.param]
+    return replace(found, speed=SPEEDS.get(found.kind))
+
+
+@in_virtual_time
+async def test_finger_feels_over_every_wire_what_the_model_says(
+    coarse_rig: Rig, wire: Wire
+) -> None:
+    """Layers on two amplifiers of a group, against the sparse direct solve: 1 %."""
+    live_in_memory()
+    at = (0.08, 0.06)
+    async with rig_on_wire(on_two_amplifiers(coarse_rig), replace(wire, shared=True)) as rig:
+        rig.bench.place_fingers({"a": at}, now=clock.now())
+        await rig.group.arm()
+        await rig.group.apply(
+            {
+                "east": [layer((0, 110.0, 1.0)), layer((1, 110.0, 0.5), number=3)],
+                "west": [layer((1, 230.0, 0.7), number=1)],
+            }
+        )
+        starts = {
+            voice.origin
+            for one in rig.bench.amplifiers.values()
+            for output in one.outputs
+            for voice in output
+        }
+        await rig.beat_until(clock.now() + 4.0)
+        end = clock.now()
+        rig.bench.advance(end)
+        felt = rig.bench.felt(end - 0.5, end)["a"]
+        stopped = await rig.group.stop()
+        assert all(each.is_confirmed for each in stopped.values())
+        assert not any((*rig.levels("east"), *rig.levels("west")))
+    assert max(starts) - min(starts) < 0.001
+    unit = direct_acceleration(
+        assemble(coarse_rig.plate, coarse_rig.mesh),
+        coarse_rig.eras,
+        np.array([110.0, 230.0]),
+        fingertip_points(*at, coarse_rig.plate),
+        loads=[FingertipLoad(*at, Fingertip())],
+    )
+    # ERAs 0 and 2 start with one layer of east: their phases differ by nothing.
+    expected = np.abs([unit[0, 0] + 0.5 * unit[0, 2], 0.7 * unit[1, 3]])
+    assert felt.frequencies == (110.0, 230.0)
+    assert apart(felt.amplitude, expected) < 0.01
+
+
+@in_virtual_time
+async def test_broadcast_commit_starts_all_at_one_moment(coarse_rig: Rig, wire: Wire) -> None:
+    """On one line by their own clocks, however much either has sent before; not over TCP."""
+    live_in_memory()
+    rig_of_two = on_two_amplifiers(coarse_rig)
+    async with rig_on_wire(rig_of_two, replace(wire, shared=True)) as rig:
+        await rig.group.arm()
+        for number in range(1, 4):
+            for _ in range(number):
+                await rig.group.amplifiers["east"].read_status()
+            played = [layer((0, 100.0 + number, 0.1 * number))]
+            await rig.group.apply({"east": played, "west": played})
+            origins = [one.outputs[0][-1].origin for one in rig.bench.amplifiers.values()]
+            apart_by = 0.001 if wire.kind == "modbus-tcp" else 0.0
+            assert abs(origins[0] - origins[1]) <= apart_by
+        await rig.group.disarm()
+
+
+@pytest.mark.parametrize(
+    ("kind", "fault"),
+    [
+        ("over_voltage", "OVER_VOLTAGE"),
+        ("over_temperature", "OVER_TEMPERATURE"),
+        ("interlock", "INTERLOCK"),
+        ("hang", "WATCHDOG"),
+        ("nak_storm", "WATCHDOG"),
+        ("reboot", "NONE"),
+        ("unplug", "WATCHDOG"),
+    ],
+)
+def test_fault_silences_and_its_amplifier_is_found_again(
+    coarse_rig: Rig, wire: Wire, kind: FaultKind, fault: str
+) -> None:
+    """A second of it: silent in time; the host stops, and finds what has happened afterwards."""
+
+    @in_virtual_time
+    async def run() -> None:
+        live_in_memory()
+        async with rig_on_wire(coarse_rig, wire) as rig:
+            await rig.group.arm()
+            await rig.group.apply({"main": [layer((0, 110.0, 1.0))]})
+            await rig.beat_until(clock.now() + 0.2)
+            assert rig.levels("main")[0] == 1.0
+            rig.devices["main"].inject_fault(FaultWindow(kind, lasts=1.0))
+            with pytest.raises((CommandRefused, LinkError)):
+                await rig.beat_until(clock.now() + 0.9)
+            assert not rig.group.is_armed
+            await asyncio.sleep(0.3)
+            assert not any(rig.levels("main"))
+            await asyncio.sleep(1.0)
+            await rig.reopen(within=5.0)
+            status = rig.group.amplifiers["main"].status
+            assert status is not None
+            assert status["fault"] == FAULTS[fault]
+            allowed = ["FAULT", "QUICK_STOP_ACTIVE", *(["SWITCH_ON_DISABLED"] * (kind == "reboot"))]
+            assert status["state"] in [STATES[each] for each in allowed]
+            await rig.group.clear()
+            await rig.group.arm()
+            await rig.group.apply({"main": [layer((0, 110.0, 0.5))]})
+            await rig.group.disarm()
+
+    run()
+
+
+@pytest.mark.parametrize("kind", ["drop", "corrupt", "truncate", "duplicate", "delay"])
+def test_damaged_frames_are_sent_again(coarse_rig: Rig, wire: Wire, kind: FaultKind) -> None:
+    """One in twenty each way for two seconds: the tone lasts, and its changes are played.
+
+    On CAN, where a request is several frames, one in a hundred and sixty.
+    """
+
+    @in_virtual_time
+    async def run() -> None:
+        live_in_memory()
+        async with rig_on_wire(coarse_rig, wire) as rig:
+            await rig.group.arm(watchdog=2.0)
+            share = 0.05 / (8 if wire.kind in ("slcan", "socketcand") else 1)
+            rig.devices["main"].inject_fault(FaultWindow(kind, share=share, delay=0.005))
+            for number in range(20):
+                level = 0.5 + 0.02 * number
+                await rig.group.apply({"main": [layer((0, 110.0, level))]})
+                await rig.beat_until(clock.now() + 0.1)
+                assert rig.levels("main")[0] == pytest.approx(level)
+
+    run()
+
+
+@pytest.mark.parametrize("name", SHARED_WIRES)
+@in_virtual_time
+async def test_hung_amplifier_of_a_line_leaves_the_other_to_be_stopped(
+    coarse_rig: Rig, name: str
+) -> None:
+    """East hangs: west is silent within 50 ms of the stop, east by its watchdog."""
+    live_in_memory()
+    async with rig_on_wire(on_two_amplifiers(coarse_rig), SHARED_WIRES[name]) as rig:
+        await rig.group.arm()
+        played = [layer((0, 110.0, 0.5))]
+        await rig.group.apply({"east": played, "west": played})
+        rig.devices["east"].inject_fault(FaultWindow("hang"))
+        begin = clock.now()
+        stopping = asyncio.create_task(rig.group.stop())
+        await asyncio.sleep(0.05)
+        assert not any(rig.levels("west"))
+        assert rig.levels("east")[0] == 0.5
+        stopped = await stopping
+        assert stopped["west"].is_confirmed
+        assert not stopped["east"].is_confirmed
+        await asyncio.sleep(begin + 0.3 - clock.now())
+        assert not any(rig.levels("east"))
+        assert stopped["east"].may_play_until > begin
+
+
+@pytest.mark.parametrize(("kind", "bits"), [("serial", 10), ("modbus-rtu", 11)])
+@in_virtual_time
+async def test_frames_take_their_time_on_a_slow_line(coarse_rig: Rig, kind: str, bits: int) -> None:
+    """At 9600 bit/s a status of an amplifier of four channels takes as long as its bytes do.
+
+    Request and reply have 19 words and 8 to 9 bytes more each way on a serial line.
+    """
+    live_in_memory()
+    async with rig_on_wire(coarse_rig, Wire(kind, speed=9600)) as rig:
+        main = rig.group.amplifiers["main"]
+        begin = clock.now()
+        await main.read_status()
+        words = 9 + 4 + 8  # of a status: numbers, levels, tokens
+        least = 2 * words * bits / 9600
+        assert least < clock.now() - begin < 2 * least + 0.02
+
+
+async def test_real_ports_are_unplugged_and_plugged_in(coarse_rig: Rig, wire: Wire) -> None:
+    """Real pseudo-terminals and TCP: a tone, the lost line, the watchdog, and a tone once more."""
+    async with rig_on_wire(coarse_rig, wire) as rig:
+        await rig.group.arm(watchdog=0.5)
+        await rig.group.apply({"main": [layer((0, 110.0, 0.5), ramp=0.0)]})
+        assert rig.levels("main")[0] == 0.5
+        rig.devices["main"].inject_fault(FaultWindow("unplug"))
+        with pytest.raises(LinkError):
+            await rig.beat_until(clock.now() + 5.0)
+        await asyncio.sleep(0.6)
+        assert not any(rig.levels("main"))
+        rig.devices["main"].recover()
+        await rig.reopen(within=10.0)
+        status = rig.group.amplifiers["main"].status
+        assert status is not None
+        assert status["fault"] == FAULTS["WATCHDOG"]
+        await rig.group.clear()
+        await rig.group.arm(watchdog=2.0)
+        await rig.group.apply({"main": [layer((1, 110.0, 0.25), ramp=0.0)]})
+        assert rig.levels("main")[:2] == (0.0, 0.25)
+        stopped = await rig.group.stop()
+        assert stopped["main"].is_confirmed

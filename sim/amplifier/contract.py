@@ -255,8 +255,9 @@ class Amplifier:
         return AmplifierSummary(self.state, self.fault, self._intake.committed, is_on, levels)
 
     def _levels(self, now: float) -> tuple[tuple[float, ...], bool]:
-        """Return the level of each channel, and whether high voltage is on."""
-        levels = tuple([min(self.playback.level(each, now), 1.0) for each in self._channels])
+        """Return the level of each channel, to its step, and whether high voltage is on."""
+        level = _Q["level"].quantise
+        levels = tuple([level(min(self.playback.level(each, now), 1.0)) for each in self._channels])
         return levels, self.state in ("SWITCHED_ON", _ENABLED) or any(levels)
 
     def trip(self, fault: str, moment: float, *, channel: int | None = None) -> None:

@@ -55,6 +55,8 @@ class Dialogue:
         """Of the last request that was answered [s]."""
         self.played_at = -math.inf
         """When [s] a set or silence was sent last."""
+        self.committed = 0
+        """Token of the set that it committed last, 0 for none since it was armed."""
         self.feeding = Feeding(line.wire.delay)
         self.counts = RequestCounts()
         self.silence_cause: str | None = None
@@ -179,6 +181,7 @@ class Dialogue:
 
     def _confirm(self, token: int, now: float) -> None:
         """Note that the amplifier plays the set with this token, as it says."""
+        self.committed = token
         if self._ledger is not None:
             self._ledger.resolve(token, now)
         if self._admitted is not None and self._admitted.token == token:

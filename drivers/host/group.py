@@ -14,6 +14,7 @@ from drivers.host.dialogue import Staged
 from drivers.host.jobs import Priority
 from drivers.host.joint_start import JointStart
 from drivers.host.line import Line
+from drivers.host.token_gaps import INTERVAL, close_gaps
 from drivers.protocol.records import Values
 from drivers.protocol.table import QUANTITIES, STATES
 from drivers.protocol.tokens import token_after
@@ -86,6 +87,8 @@ class Group:
         """
         self._check_armed()
         before = self._silences
+        if self._token % INTERVAL == 0:
+            self._token = await close_gaps(self.amplifiers.values(), self._token)
         self._token = token = token_after(self._token)
         is_silent = all(map(is_silence, layers.values()))
         is_committing = is_silent

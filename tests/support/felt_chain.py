@@ -16,7 +16,7 @@ from urllib.parse import quote
 
 import pytest
 
-import sim.backend
+import sim.shared_rig
 from controller.api.client_protocol import Notification
 from controller.daemon.api_views import PlateView
 from controller.effects.layout import SurfaceLayout, default_effects
@@ -87,7 +87,7 @@ class Chain:
     def play(self, stream: Stream) -> Played:
         """Play a stream from arming to closing."""
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sim.backend, "control_socket", self._keep_context)
+            patch.setattr(sim.shared_rig, "control_socket", self._keep_context)
             return run_virtual(self._play(stream), rng=random.Random(1), seen=self._seen)
 
     async def ask(self, op: str, **request: Any) -> dict[str, Any]:

@@ -1,0 +1,299 @@
+"""Amplifiers and lines that lie, on every kind of wire: refused or counted, and stop says the truth.
+
+Words of replies are altered by their place in the page of the protocol (docs/decisions/0061), not
+by the table that reads them.
+"""
+
+import asyncio
+import random
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.segments import PACKED, pack_frames
+from drivers.contents import Layer, Tone
+from drivers.errors import DriverError
+from drivers.host.group import Group
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.table import MESSAGES
+from sim.far_ends import serial_amplifiers
+from virtual_loop import run_virtual
+from words_line import KINDS, Alter, MemoryLine, unaltered
+
+LOUD = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
+STATUS = {
+    **{"state": (0, 255), "latch": (3, 0), "watchdog_left": (4, 65535), "temperature": (5, 32767)},
+    **{"channels": (8, 200 << 8 | 8), "no channels": (8, 8), "levels": (9, 65535)},
+}
+"""Word and value of what each status says."""
+CAPABILITIES = {
+    **{"channels": (0, 255), "no channels": (0, 0), "layers": (1, 0), "voices": (2, 0)},
+    **{"set_words": (3, 0), "knots": (4, 255), "frequency_step": (8, 0), "level_step": (10, 0)},
+    **{"phase_step": (11, 0), "ramp_max": (12, 65535), "watchdog_max": (15, 65535)},
+    **{"frequency_min is above": (6, 65535), "level_max": (9, 65535), "level 0": (10, 10001)},
+    **{"watchdog_min": (14, 2001), "envelope_step_min": (16, 1001), "limits": (18, 30000)},
+}
+
+
+@pytest.fixture(params=KINDS)
+def wire(request: pytest.FixtureRequest) -> str:
+    """Every kind of wire."""
+    return str(request.param)
+
+
+@pytest.fixture
+def altered(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, int, int], None]:
+    """A function that has all replies of a record say a value in a word."""
+
+    def alter(name: str, at: int, value: int) -> None:
+        record = MESSAGES[name].reply
+        pack = record.pack
+
+        def lying(values: Values) -> list[int]:
+            words = pack(values)
+            words[at] = value
+            return words
+
+        monkeypatch.setattr(record, "pack", lying)
+
+    return alter
+
+
+async def armed(wire: str) -> tuple[Group, MemoryLine]:
+    """A group of one amplifier, armed."""
+    end = MemoryLine(wire, "a")
+    group = Group(end.hosts, draw=random.Random(3).randint)
+    await group.open()
+    await group.arm()
+    return group, end
+
+
+async def stops_truthfully(group: Group, end: MemoryLine) -> None:
+    """Stop: silent where that is confirmed, else from the moment on that is said."""
+    stopped = (await group.stop())["a"]
+    if not stopped.is_confirmed:
+        assert stopped.cause
+        await asyncio.sleep(max(stopped.may_play_until - end.loop.time(), 0.0))
+    assert end.levels("a") == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("lie", CAPABILITIES)
+def test_capabilities_that_cannot_be_are_refused(
+    wire: str, lie: str, altered: Callable[[str, int, int], None]
+) -> None:
+    """It is not opened, and nothing but questions was sent; one message says why."""
+    altered("GetCaps", *CAPABILITIES[lie])
+
+    async def run() -> None:
+        end = MemoryLine(wire, "a")
+        with pytest.raises(DriverError, match=r"must|too short|limits"):
+            await end.hosts["a"].open()
+        assert {each for _, each in end.sent} <= {"1:1", "1:2"}
+
+    run_virtual(run())
+
+
+@pytest.mark.parametrize("lie", STATUS)
+def test_status_that_cannot_be_ends_in_silence(
+    wire: str, lie: str, altered: Callable[[str, int, int], None]
+) -> None:
+    """Two beats at most; a stop that cannot be read is not confirmed."""
+
+    async def run() -> None:
+        group, end = await armed(wire)
+        await group.apply({"a": [LOUD]})
+        await asyncio.sleep(0.01)
+        altered("GetStatus", *STATUS[lie])
+        if lie != "latch":
+            with pytest.raises(DriverError):
+                for _ in range(2):
+                    await group.beat()
+                    await asyncio.sleep(0.03)
+            assert not group.is_armed
+        stopped = (await group.stop())["a"]
+        assert not stopped.is_confirmed
+        await stops_truthfully(group, end)
+
+    run_virtual(run())
+
+
+@pytest.mark.parametrize("text", ["vendor\n", "a\x1b[2J"])
+def test_name_with_control_characters_is_refused(wire: str, text: str) -> None:
+    """It could rewrite a terminal."""
+
+    async def run() -> None:
+        end = MemoryLine(wire, "a")
+        end.far["a"].identity["vendor"] = text
+        with pytest.raises(DriverError, match="control characters"):
+            await end.hosts["a"].open()
+
+    run_virtual(run())
+
+
+def ignored(name: str, values: Values) -> Values | None:
+    """A reply as if it had been carried out: the status."""
+    return None
+
+
+def refused(name: str, values: Values) -> Values | None:
+    """A refusal."""
+    raise Refusal("not now", "WRONG_STATE")
+
+
+@pytest.mark.parametrize("reply", [ignored, refused])
+def test_stop_that_is_not_carried_out_is_not_confirmed_while_it_plays(
+    wire: str, reply: Callable[[str, Values], Values | None]
+) -> None:
+    """Stop and Disarm are ignored or refused: it plays until its watchdog has passed."""
+
+    async def run() -> None:
+        group, end = await armed(wire)
+        await group.apply({"a": [LOUD]})
+        far = end.far["a"]
+        handle = far.handle
+
+        def lying(name: str, values: Values, now: float) -> Values:
+            if name in ("Stop", "Disarm"):
+                return reply(name, values) or handle("GetStatus", {}, now)
+            return handle(name, values, now)
+
+        far.handle = lying  # type: ignore[method-assign]
+        began = end.loop.time()
+        stopping = asyncio.ensure_future(group.stop())
+        await asyncio.sleep(0.24)
+        assert end.levels("a") == [0.5, 0.0]
+        assert not stopping.done()
+        await stopping
+        assert end.loop.time() - began < 1.0
+        await stops_truthfully(group, end)
+
+    run_virtual(run())
+
+
+def late(kind: str) -> Alter:
+    """Everything comes 40 ms late."""
+    return lambda name, data: [(0.04, data)]
+
+
+def byte_by_byte(kind: str) -> Alter:
+    """Byte by byte, or frame by frame on CAN, 20 us apart."""
+    size = PACKED if kind == "can" else 1
+
+    def alter(name: str, data: bytes) -> list[tuple[float, bytes]]:
+        cuts = range(0, len(data), size)
+        return [(0.0002 + 2e-5 * n, data[at : at + size]) for n, at in enumerate(cuts)]
+
+    return alter
+
+
+def with_copies(kind: str) -> Alter:
+    """Growing copies of all replies before."""
+    before: list[bytes] = []
+
+    def alter(name: str, data: bytes) -> list[tuple[float, bytes]]:
+        before.append(data)
+        return [(0.0002, b"".join(before[-20:-1])), (0.0003, data)]
+
+    return alter
+
+
+def every_second(damage: Callable[[bytes], bytes]) -> Callable[[str], Alter]:
+    """Every second reply is damaged."""
+
+    def make(kind: str) -> Alter:
+        count = 0
+
+        def alter(name: str, data: bytes) -> list[tuple[float, bytes]]:
+            nonlocal count
+            count += 1
+            return [(0.0002, damage(data) if count % 2 else data)]
+
+        return alter
+
+    return make
+
+
+def with_noise(noise: Callable[[str, random.Random], bytes]) -> Callable[[str], Alter]:
+    """Noise before every reply."""
+
+    def make(kind: str) -> Alter:
+        chance = random.Random(4)
+        return lambda name, data: [(0.0001, noise(kind, chance)), (0.0002, data)]
+
+    return make
+
+
+def random_bytes(kind: str, chance: random.Random) -> bytes:
+    """Bytes, or frames on CAN, of other devices."""
+    if kind != "can":
+        return chance.randbytes(40)
+    return pack_frames([CanFrame(chance.randrange(0x300, 0x500), chance.randbytes(8))] * 20)
+
+
+def events(kind: str, chance: random.Random) -> bytes:
+    """Events of the amplifier, where the wire has some, each whole."""
+    words = (5).to_bytes(2, "little") + bytes(2) + (255).to_bytes(2, "little") + bytes(2)
+    if kind == "can":
+        frames = [bytes((0, 0, 30, 4)) + words[:4], bytes((0, 1)) + words[4:] + bytes(2)]
+        return pack_frames([CanFrame(0x181, each) for each in frames] * 50)
+    if kind == "serial":
+        return serial_amplifiers.encode_frame(serial_amplifiers.Frame(30, 1, 0, words, 3)) * 50
+    return b""
+
+
+WIRE_LIES: dict[str, Callable[[str], Alter]] = {
+    "late by 40 ms": late,
+    "byte by byte": byte_by_byte,
+    "with copies of old replies": with_copies,
+    "doubled": lambda kind: lambda name, data: [(0.0002, data), (0.0003, data)],
+    "every second damaged": every_second(lambda data: data[:-2] + bytes((data[-2] ^ 64, data[-1]))),
+    "every second cut": every_second(lambda data: data[: len(data) * 2 // 3 // PACKED * PACKED]),
+    "after random bytes": with_noise(random_bytes),
+    "after 4000 bytes without an end": with_noise(
+        lambda kind, chance: b"" if kind == "can" else b"\x01" * 4000
+    ),
+    "after events": with_noise(events),
+    "half open": lambda kind: lambda name, data: [],
+}
+
+
+def lies_of(kind: str) -> Iterator[str]:
+    """Lies that a kind of wire can tell: TCP itself detects damage."""
+    for name in WIRE_LIES:
+        if not (kind == "tcp" and name == "every second damaged"):
+            yield name
+
+
+@pytest.mark.parametrize(("kind", "lie"), [(kind, lie) for kind in KINDS for lie in lies_of(kind)])
+def test_line_that_lies_has_no_effect_but_counts(kind: str, lie: str) -> None:
+    """Sets and beats succeed or stop it; the stop says the truth; afterwards all is as before."""
+
+    async def run() -> None:
+        group, end = await armed(kind)
+        await group.apply({"a": [LOUD]})
+        end.outward = WIRE_LIES[lie](kind)
+        try:
+            for level in (0.4, 0.3, 0.2):
+                await group.apply({"a": [Layer(0, (Tone(0, 100.0, level),), 0.001)]})
+                await asyncio.sleep(0.02)
+                assert end.levels("a") == [level, 0.0]
+                await group.beat()
+        except DriverError as error:
+            assert str(error)
+            assert not group.is_armed
+        await stops_truthfully(group, end)
+        end.outward = unaltered
+        await asyncio.sleep(0.3)
+        await group.open()
+        await group.clear()
+        await group.arm()
+        await group.apply({"a": [LOUD]})
+        assert (await group.stop())["a"].is_confirmed
+        counters = end.line.wire.counters
+        has_noise = lie not in ("byte by byte", "half open", "every second cut")
+        if has_noise and not (kind in ("tcp", "rtu") and lie == "after events"):
+            odd = counters.invalid_frames + counters.unexpected_frames + counters.events
+            assert odd > 0 or (kind == "can" and lie.startswith("after"))
+
+    run_virtual(run())

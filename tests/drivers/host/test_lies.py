@@ -1,10 +1,11 @@
-"""Amplifiers and lines that lie, on every kind of wire: refused or counted, and stop says the truth.
+"""Amplifiers and lines that lie, on every kind of wire: refused or counted; stops are truthful.
 
 Words of replies are altered by their place in the page of the protocol (docs/decisions/0061), not
 by the table that reads them.
 """
 
 import asyncio
+import contextlib
 import random
 from collections.abc import Callable, Iterator
 
@@ -32,7 +33,7 @@ CAPABILITIES = {
     **{"set_words": (3, 0), "knots": (4, 255), "frequency_step": (8, 0), "level_step": (10, 0)},
     **{"phase_step": (11, 0), "ramp_max": (12, 65535), "watchdog_max": (15, 65535)},
     **{"frequency_min is above": (6, 65535), "level_max": (9, 65535), "level 0": (10, 10001)},
-    **{"watchdog_min": (14, 2001), "envelope_step_min": (16, 1001), "limits": (18, 30000)},
+    **{"watchdog_min": (14, 2001), "envelope_step_max": (17, 5), "limits": (18, 30000)},
 }
 
 
@@ -106,10 +107,11 @@ def test_status_that_cannot_be_ends_in_silence(
         await asyncio.sleep(0.01)
         altered("GetStatus", *STATUS[lie])
         if lie != "latch":
+            with contextlib.suppress(DriverError):
+                await group.beat()
+            await asyncio.sleep(0.03)
             with pytest.raises(DriverError):
-                for _ in range(2):
-                    await group.beat()
-                    await asyncio.sleep(0.03)
+                await group.beat()
             assert not group.is_armed
         stopped = (await group.stop())["a"]
         assert not stopped.is_confirmed
@@ -279,9 +281,10 @@ def test_line_that_lies_has_no_effect_but_counts(kind: str, lie: str) -> None:
                 await asyncio.sleep(0.02)
                 assert end.levels("a") == [level, 0.0]
                 await group.beat()
-        except DriverError as error:
-            assert str(error)
-            assert not group.is_armed
+            has_failed = False
+        except DriverError:
+            has_failed = True
+        assert group.is_armed is not has_failed
         await stops_truthfully(group, end)
         end.outward = unaltered
         await asyncio.sleep(0.3)

@@ -16,7 +16,7 @@ import serial
 
 from drivers.errors import LinkError
 from sim.transport.pseudo_terminal import PseudoTerminal
-from sim.witness.decoded import Direction
+from sim.witness.capture import Direction
 from sim.witness.endpoint import WireEndpoint
 from sim.witness.witness import Witness
 

@@ -2,8 +2,9 @@
 
 import math
 
-from sim.witness.decoded import Reply, ReportViolation, Request
+from sim.witness.decoded import Reply, Request
 from sim.witness.quantities import LEVEL
+from sim.witness.violation import ReportViolation
 
 _FINE = 0.011  # Hz and degrees; one step of the wire
 

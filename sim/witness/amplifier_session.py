@@ -6,8 +6,9 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 
 from sim.witness.config import AmplifierConfig
-from sim.witness.decoded import ChannelCommand, ReportViolation, Request
+from sim.witness.decoded import ChannelCommand, Request
 from sim.witness.reference_amplifier import ReferenceAmplifier
+from sim.witness.violation import ReportViolation
 from sim.witness.voices import Voices
 
 _TOKENS_KEPT = 16  # of commits

@@ -10,12 +10,12 @@ from sim.witness import quantities as q
 from sim.witness.can_requests import ACTIONS, FILLING, PER_NODE, WITH_COMMANDS, CanRequests
 from sim.witness.can_text import CanFrame, SlcanText, SocketcandText
 from sim.witness.can_transfers import CanTransfers
+from sim.witness.capture import Direction
 from sim.witness.decoded import (
     SETS,
     BootUp,
     Damaged,
     DecodedFrame,
-    Direction,
     Message,
     Reply,
     Request,

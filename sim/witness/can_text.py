@@ -8,7 +8,7 @@ import re
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
-from sim.witness.decoded import Direction
+from sim.witness.capture import Direction
 
 LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 """Data lengths of CAN FD frames, by length code."""

@@ -9,11 +9,13 @@ TIME in seconds of any one clock; # begins a comment.
 import math
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 from model.errors import InputError
 from model.files.regular_file import regular_file
-from sim.witness.decoded import Direction
+
+Direction: TypeAlias = Literal["amplifier", "host"]
+"""Direction of transfer: toward the amplifier or the host."""
 
 
 class Piece(NamedTuple):

@@ -1,15 +1,9 @@
 """Decoded frames, the same for every kind of wire."""
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Literal, TypeAlias
-
-Direction: TypeAlias = Literal["amplifier", "host"]
-"""Direction of transfer: toward the amplifier or the host."""
-
-ReportViolation: TypeAlias = Callable[[str, float, str], None]
-"""Called with the rule, the time [s] and a sentence."""
+from typing import TypeAlias
 
 Data: TypeAlias = bytes
 

@@ -3,6 +3,7 @@
 import math
 
 from sim.witness.amplifier_session import AmplifierSession
+from sim.witness.capture import Direction
 from sim.witness.config import TimeLimits
 from sim.witness.decoded import (
     REPLY_TO_DAMAGED_FRAME,
@@ -11,7 +12,6 @@ from sim.witness.decoded import (
     BootUp,
     Damaged,
     Data,
-    Direction,
     Message,
     Reply,
     Request,

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sim.witness import quantities as q
+from sim.witness.capture import Direction
 from sim.witness.decoded import (
     REPLY_TO_DAMAGED_FRAME,
     ChannelCommand,
     Damaged,
     DecodedFrame,
-    Direction,
     EnvelopeLoad,
     Message,
     Reply,

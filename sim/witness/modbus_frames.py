@@ -4,7 +4,7 @@ import struct
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
-from sim.witness.decoded import Direction
+from sim.witness.capture import Direction
 
 _MIN_LENGTH, _MAX_LENGTH = 4, 256
 _PAUSE = 0.04  # s; a longer pause ends a partial frame

@@ -13,7 +13,6 @@ from sim.witness.decoded import (
     WATCHDOG_FEEDING,
     ChannelCommand,
     Reply,
-    ReportViolation,
     Request,
     RequestKind,
     Status,
@@ -21,6 +20,7 @@ from sim.witness.decoded import (
 from sim.witness.quantities import is_newer
 from sim.witness.reference_outputs import ReferenceOutputs
 from sim.witness.reports import Faults, Interval, fault_list_problem
+from sim.witness.violation import ReportViolation
 from sim.witness.watchdog import Watchdog
 
 SILENCING_RAMP = 0.005  # s; along which the watchdog and faults silence

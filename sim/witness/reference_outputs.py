@@ -4,8 +4,9 @@ import math
 from collections.abc import Mapping, Sequence
 
 from sim.witness.config import AmplifierConfig
-from sim.witness.decoded import ChannelCommand, EnvelopeLoad, ReportViolation, Request
+from sim.witness.decoded import ChannelCommand, EnvelopeLoad, Request
 from sim.witness.fade import Fade
+from sim.witness.violation import ReportViolation
 
 LEVEL = 0.002
 """Tolerance of levels, in full strokes: rounding, and the last step of a fade."""

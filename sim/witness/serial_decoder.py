@@ -6,13 +6,13 @@ from collections import deque
 from dataclasses import replace
 
 from sim.witness import quantities as q
+from sim.witness.capture import Direction
 from sim.witness.decoded import (
     REPLY_TO_DAMAGED_FRAME,
     SETS,
     ChannelCommand,
     Damaged,
     DecodedFrame,
-    Direction,
     EnvelopeLoad,
     Message,
     Reply,

@@ -1,9 +1,14 @@
 """Violations of rules, each with the frames around it."""
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
-from sim.witness.decoded import Direction
+from sim.witness.capture import Direction
+
+ReportViolation: TypeAlias = Callable[[str, float, str], None]
+"""Called with the rule, the time [s] and a sentence."""
 
 _FRAMES_BEFORE, _FRAMES_AFTER = 6, 3
 _MAX_VIOLATIONS = 200

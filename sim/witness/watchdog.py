@@ -2,7 +2,7 @@
 
 import math
 
-from sim.witness.decoded import ReportViolation
+from sim.witness.violation import ReportViolation
 
 _LEFT = 0.011  # s; tolerance of the reported time left, as that of a host
 

@@ -7,7 +7,8 @@ from typing import Protocol
 
 from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.can_decoder import CanDecoder
-from sim.witness.decoded import Data, DecodedFrame, Direction
+from sim.witness.capture import Direction
+from sim.witness.decoded import Data, DecodedFrame
 from sim.witness.modbus_decoder import ModbusDecoder
 from sim.witness.serial_decoder import SerialDecoder
 

@@ -5,8 +5,9 @@ from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from typing import Any, Literal
 
 from sim.witness.amplifier_session import AmplifierSession
+from sim.witness.capture import Direction
 from sim.witness.config import WitnessConfig, parse_config
-from sim.witness.decoded import STATE_CHANGING, Damaged, Data, Direction, Request
+from sim.witness.decoded import STATE_CHANGING, Damaged, Data, Request
 from sim.witness.delays import Delays
 from sim.witness.exchanges import Exchanges
 from sim.witness.host_rules import HostRules

@@ -11,11 +11,11 @@ from cobs import cobs
 
 from sim.witness.can_decoder import CanDecoder
 from sim.witness.can_text import CanFrame, SlcanText, SocketcandText
+from sim.witness.capture import Direction
 from sim.witness.decoded import (
     BootUp,
     ChannelCommand,
     Damaged,
-    Direction,
     Message,
     Reply,
     Request,

@@ -50,11 +50,15 @@ class TimeLimits(_Section):
 
 
 class AmplifierConfig(_Section):
-    """An amplifier: its wire, its address, unit or node there, and the limits of its channels."""
+    """An amplifier: its wire, its address, unit or node there, and the limits of its channels.
+
+    power: limit of the sum of their squared levels.
+    """
 
     wire: str
     address: int = 1
     channels: Annotated[dict[int, ChannelLimits], Field(min_length=1, strict=False)]
+    power: float = float("inf")
 
 
 class WitnessConfig(_Section):

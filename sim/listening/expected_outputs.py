@@ -1,0 +1,284 @@
+"""What the channels of an amplifier must play: `drivers.playback`, with what is not known of it.
+
+A commit came at some time between its request and its reply. The playback has it in the middle;
+every transition has a radius beside, by which its amplitude may differ meanwhile.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+
+from drivers.playback import Playback, Transition, Voice
+from drivers.protocol.sets import LayerSet
+from drivers.protocol.table import QUANTITIES
+from sim.witness.violation import ReportViolation
+
+LEVEL = 0.002
+"""Tolerance of levels, in full levels: rounding, and the last step of a fade."""
+CHANNELS, LAYERS = QUANTITIES["channel_count"].maximum, QUANTITIES["layer_count"].maximum
+_RAMP, _STEP = QUANTITIES["ramp"], QUANTITIES["envelope_step"]
+_FINE = 0.026  # Hz; half a step of the wire
+_MAX_ENDING = 3.3  # s; 32 knots, 0.1 s apart
+_FRACTIONS = 16  # of a transition at which sums are looked at
+Interval = tuple[float, float]
+
+
+class ExpectedOutputs:
+    """The channels of one amplifier by name; times [s].
+
+    voices: of a channel, as the amplifier states them; cause: of what plays, for messages; is_warm:
+    it may derate.
+    """
+
+    def __init__(self, name: str, *, slack: float, report: ReportViolation) -> None:
+        self.voices = QUANTITIES["voices"].minimum
+        self.cause = "nothing"
+        self.is_warm = False
+        self._name = name
+        self._slack = slack
+        self._report = report
+        # Levels that sensors measured too low, which an unreported fault would explain.
+        self._suspicions: list[tuple[str, float, str]] = []
+        self.settle("nothing")
+
+    def settle(self, cause: str) -> None:
+        """Treat all channels as silent, their fades over."""
+        self.playback = Playback(CHANNELS, self.voices)
+        self.cause = cause
+        self.is_exact = True
+        self._half = [0.0] * LAYERS  # s; by which what a layer plays may be earlier or later
+        self._marks: dict[int, tuple[Transition, float, float]] = {}  # half a time, radius at first
+        self._unknown = [-math.inf] * LAYERS  # until when what a layer plays is not known [s]
+        self._before: Mapping[int, float] = {}  # levels of channels before the last commit
+        self._last_due = -math.inf
+        self._uncertain_until = -math.inf  # fades may have been cut short
+
+    def forget(self) -> None:
+        """Treat what plays as unknown."""
+        self.settle("what was not heard")
+        self._unknown = [math.inf] * LAYERS
+
+    # what happens
+
+    def advance(self, time: float) -> None:
+        """End layers whose `valid_for` has passed, and start what waits."""
+        while self.playback.next_due <= time:
+            due = self._last_due = self.playback.next_due
+            before = self._voices()
+            self.playback.advance(due)
+            half = max(self._half)
+            self._mark(before, (due - half, due + half), half)
+        self.playback.advance(time)
+
+    def play(self, layers: Sequence[LayerSet], token: int, when: Interval, *, exact: bool) -> None:
+        """Play a set from some time between two on."""
+        begin, end = when
+        middle, half = (begin + end) / 2, (end - begin) / 2
+        self.advance(begin - self._slack)
+        self._before = {
+            channel: self.playback.settled(channel) for channel in range(self.playback.channels)
+        }
+        for one in layers:
+            number, ends = one.layer, self.playback.end_of(one.layer)
+            is_ending = begin - self._half[number] <= ends <= end + self._half[number]
+            if is_ending and (one.renew or any(each.keep_phase for each in one.commands)):
+                self._unknown[number] = math.inf
+            elif not one.renew and not one.after:
+                fade = middle + half + _MAX_ENDING + _RAMP.from_wire(one.ramp)
+                self._unknown[number] = min(self._unknown[number], fade)
+            self._half[number] = max(half, self._half[number] if one.after else 0.0)
+        voices = self._voices()
+        self.playback.commit(layers, token, middle)
+        self._mark(voices, when, half)
+        self.cause, self.is_exact = "a set", exact and self.is_exact
+        for each in self.playback.all_voices:
+            fades = [voice.silent_from for voice in each if voice.has_ended]
+            if len(each) > self.voices and fades:
+                self._uncertain_until = max(self._uncertain_until, *fades)
+
+    def note_silent(self, tokens: Sequence[int], time: float) -> None:
+        """Note the layers that play nothing by a status at a time; they may still fade."""
+        for layer, until in enumerate(self._unknown):
+            if until == math.inf and (layer >= len(tokens) or not tokens[layer]):
+                self._unknown[layer] = time + _MAX_ENDING + _RAMP.high
+
+    def silence(self, when: Interval, ramp: float, cause: str) -> None:
+        """Silence all channels along a ramp [s], from some time between two on."""
+        begin, end = when
+        self.advance(begin - self._slack)
+        voices = self._voices()
+        self.playback.silence((begin + end) / 2, ramp)
+        self._mark(voices, when, (end - begin) / 2)
+        self._unknown = [min(until, end + ramp) for until in self._unknown]
+        self.cause = cause
+
+    def _voices(self) -> list[tuple[Voice, ...]]:
+        return [*self.playback.all_voices]
+
+    def _mark(self, before: Sequence[Sequence[Voice]], when: Interval, half: float) -> None:
+        """Note the radius of every transition that is new."""
+        marks: dict[int, tuple[Transition, float, float]] = {}
+        for were, voices in zip(before, self.playback.all_voices, strict=True):
+            known = {(each.layer, each.frequency, each.origin): each.transition for each in were}
+            for voice in voices:
+                way = voice.transition
+                last = known.get((voice.layer, voice.frequency, voice.origin))
+                if id(way) in self._marks:
+                    marks[id(way)] = self._marks[id(way)]
+                else:
+                    radius = 0.0 if last is None else self._radius(last, *when)
+                    marks[id(way)] = (way, half, radius)
+        self._marks = marks
+
+    def _radius(self, way: Transition, begin: float, end: float) -> float:
+        """Return by how much an amplitude may differ from that in the middle of an interval."""
+        _, half, radius = self._marks.get(id(way), (way, 0.0, 0.0))
+        center = way.at((begin + end) / 2)
+        since, until = begin - half, end + half
+        moments = (way.start + way.step * (index + 1) for index in range(len(way.knots)))
+        between = [knot for at, knot in zip(moments, way.knots, strict=True) if since < at < until]
+        reach = max(abs(each - center) for each in (way.at(since), *between, way.at(until)))
+        return reach + (radius if since < way.end else 0.0)
+
+    @property
+    def lag(self) -> float:
+        """Longest time by which a transition under way may be earlier or later [s]."""
+        halves = [half for _, half, _ in self._marks.values()]
+        return max(*self._half, *halves, 0.0) + self._slack
+
+    # what is reported
+
+    def is_quiet(self, begin: float, end: float) -> bool:
+        """Whether no layer ends or starts by itself near two times, and all of them are known."""
+        half = self.lag
+        is_known = all(until < begin for until in self._unknown)
+        is_due = self.playback.next_due <= end + half or self._last_due >= begin - half
+        return is_known and not is_due
+
+    def bounds(self, channel: int, begin: float, end: float) -> Interval:
+        """Return the least and the largest level of a channel between two times."""
+        low = high = 0.0
+        by_frequency: dict[float, dict[float, tuple[complex, float]]] = {}
+        for voice in self.playback.voices_of(channel):
+            group = by_frequency.setdefault(voice.frequency, {})
+            center, radius = group.get(voice.origin, (0j, 0.0))
+            way = voice.transition
+            center += way.at((begin + end) / 2)
+            group[voice.origin] = center, radius + self._radius(way, begin, end)
+        for group in by_frequency.values():
+            highs = [abs(center) + radius for center, radius in group.values()]
+            lows = [abs(center) - radius for center, radius in group.values()]
+            # Tones of one frequency that began at different times may cancel.
+            low += max(
+                0.0, *(one - (sum(highs) - own) for one, own in zip(lows, highs, strict=True))
+            )
+            high += sum(highs)
+        if begin <= self._uncertain_until:
+            low = 0.0
+        return min(low, 1.0), min(high, 1.0)
+
+    def check_levels(
+        self, levels: Sequence[float], begin: float, end: float, *, may_be_off: bool,
+        of_sensor: bool = False,
+    ) -> None:  # fmt: skip
+        """Report levels that are impossible at every time between two.
+
+        may_be_off: whether the watchdog may have expired; of_sensor: levels that are too low wait
+        for `resolve_suspicions`.
+        """
+        self.advance(begin - self.lag)
+        if not self.is_quiet(begin, end):
+            return
+        begin, end = begin - self._slack, end + self._slack
+        for channel, level in enumerate(levels):
+            low, high = self.bounds(channel, begin, end)
+            is_low = level < low - LEVEL
+            if not (level > high + LEVEL or is_low):
+                continue
+            if is_low and (self.is_warm or may_be_off or not self.is_exact):
+                continue
+            wrong = f"at least {low:.4f}" if is_low else f"at most {high:.4f}"
+            is_settled = self.playback.is_settled(begin - self.lag)
+            found = (
+                self._rule_of_level(channel, level, is_settled=is_settled),
+                end,
+                f"channel {channel} of {self._name}: level must be {wrong}, got {level:.4f} "
+                f"{'' if is_settled else 'fading '}after {self.cause}",
+            )
+            if is_low and of_sensor:
+                self._suspicions.append(found)
+            else:
+                self._report(*found)
+
+    def _rule_of_level(self, channel: int, level: float, *, is_settled: bool) -> str:
+        if self.cause == "the watchdog":
+            return "watchdog"
+        if not is_settled:
+            return "ramp"
+        if self.cause != "a set":
+            return "silent"
+        return "commit" if abs(level - self._before.get(channel, 0.0)) < LEVEL else "plays"
+
+    def resolve_suspicions(self, *, is_enabled: bool) -> None:
+        """Report suspicions, unless a fault explains them."""
+        for suspicion in self._suspicions if is_enabled else ():
+            self._report(*suspicion)
+        self._suspicions.clear()
+
+    def check_frequencies(self, measured: Mapping[int, float], time: float) -> None:
+        """Compare the frequency [Hz] that a channel vibrates with, where it must have settled."""
+        self.advance(time - self.lag)
+        if not self.is_quiet(time, time):
+            return
+        for channel, frequency in measured.items():
+            voices = self.playback.voices_of(channel)
+            lasting = sorted({each.frequency for each in voices if not each.has_ended})
+            is_settled = all(each.transition.end < time - self.lag for each in voices)
+            if lasting and is_settled and all(abs(each - frequency) > _FINE for each in lasting):
+                expected = " or ".join(f"{each:g}" for each in lasting)
+                what = f"channel {channel} of {self._name} vibrates at {frequency:g} Hz, commanded "
+                self._report("plays", time, f"{what}{expected} Hz")
+
+    def check_tokens(self, tokens: Sequence[int], begin: float, end: float) -> None:
+        """Compare the token of each layer."""
+        self.advance(begin - self.lag)
+        if not self.is_quiet(begin, end):
+            return
+        expected = self.playback.tokens
+        for layer, token in enumerate(tokens):
+            if token != expected.get(layer, 0):
+                what = f"{self._name} reports token {token} of layer {layer}, expected "
+                self._report("token", end, f"{what}{expected.get(layer, 0)}")
+
+    def sums(self, time: float) -> tuple[Mapping[int, float], float, Mapping[int, float]]:
+        """Return what follows from a time on: largest levels and steepest rises, and power.
+
+        By channel, in full levels and full levels/s; looked at along the transitions under way.
+        """
+        times = {time}
+        for voices in self.playback.all_voices:
+            for voice in voices:
+                way = voice.transition
+                count = max(_FRACTIONS, len(way.knots) + 1)
+                times.update(
+                    way.start + (way.end - way.start) * part / count for part in range(count + 1)
+                )
+        moments = sorted({round(at, 6) for at in times if at >= time})  # no sums of floats
+        levels: dict[int, list[float]] = {
+            channel: [sum(abs(each.transition.at(at)) for each in voices) for at in moments]
+            for channel, voices in enumerate(self.playback.all_voices)
+            if voices
+        }
+        power = max(
+            (sum(v * v for v in row) for row in zip(*levels.values(), strict=True)), default=0.0
+        )
+        rises = {
+            channel: max(
+                (
+                    (row[i + 1] - row[i]) / (moments[i + 1] - moments[i])
+                    for i in range(len(moments) - 1)
+                ),
+                default=0.0,
+            )
+            for channel, row in levels.items()
+        }
+        return {channel: max(row) for channel, row in levels.items()}, power, rises

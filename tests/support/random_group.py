@@ -1,0 +1,148 @@
+"""Random days of a group of amplifiers of protocol 3: layers, stops, faults, lost frames."""
+
+import asyncio
+import contextlib
+import random
+from collections.abc import Sequence
+
+from drivers.contents import Layer, Shape, Tone
+from drivers.errors import CommandRefused, LinkError, Preempted
+from drivers.host.group import Group
+from drivers.host.line import Priority
+from listened_line import ListenedLine
+
+_CHANNELS, _LAYERS = 2, 4
+_BEAT = 0.05  # s
+_FAILURES = (CommandRefused, LinkError, Preempted)
+
+
+class RandomGroup:
+    """A group on lines, and a random generator of what is done with it.
+
+    is_lossy: frames are lost and doubled on their way.
+    """
+
+    def __init__(self, lines: Sequence[ListenedLine], seed: int, *, is_lossy: bool) -> None:
+        self.rng = random.Random(seed)
+        self.lines = lines
+        hosts = {name: host for line in lines for name, host in line.hosts.items()}
+        self.group = Group(hosts, draw=self.rng.randint)
+        self.is_beating = True
+        if is_lossy:
+            for line in lines:
+                line.inward = line.outward = self._alter
+
+    async def run(self, steps: int) -> None:
+        """Open and arm the group, take so many steps, and disarm."""
+        background = [asyncio.ensure_future(line.keep_sensing()) for line in self.lines]
+        background.append(asyncio.ensure_future(self._keep_beating()))
+        try:
+            await self._opened()
+            for _ in range(steps):
+                with contextlib.suppress(*_FAILURES):
+                    await self._step()
+                await asyncio.sleep(self.rng.choice((0.0, 0.001, 0.01, 0.04, 0.2)))
+            with contextlib.suppress(*_FAILURES):
+                await self.group.disarm()
+            await asyncio.sleep(0.1)
+        finally:
+            for each in background:
+                each.cancel()
+            await asyncio.gather(*background, return_exceptions=True)
+
+    async def _opened(self) -> None:
+        for _ in range(20):
+            with contextlib.suppress(*_FAILURES):
+                await self.group.open()
+                return
+        raise AssertionError("the group must open")
+
+    async def _step(self) -> None:
+        if not self.group.is_armed and self.rng.random() < 0.8:
+            await self.group.clear()
+            await self.group.arm(self.rng.choice((0.25, 0.5)))
+            return
+        chosen = self.rng.random()
+        names = [*self.group.amplifiers]
+        host = self.group.amplifiers[self.rng.choice(names)]
+        if chosen < 0.6:
+            layers = {name: self._layers() for name in names}
+            await self.group.apply(layers)
+        elif chosen < 0.7:
+            await host._request("GetAchieved", {"layer": self._number()}, Priority.OTHER)
+        elif chosen < 0.75:
+            await host._request("GetFaults", {}, Priority.OTHER)
+        elif chosen < 0.8:
+            await self.group.silence(self._ramp())
+        elif chosen < 0.84:
+            await self.group.disarm()
+        elif chosen < 0.9:
+            await self.group.stop()
+        elif chosen < 0.93:
+            self._stall(is_stalled=True)
+            await asyncio.sleep(0.6)
+            self._stall(is_stalled=False)
+        elif chosen < 0.96:
+            line = self.rng.choice(self.lines)
+            far = self.rng.choice([*line.far.values()])
+            far.tick(line.loop.time())
+            far.trip(self.rng.choice(("ARC", "CHANNEL")), line.loop.time(), channel=1)
+        else:
+            await host.read_status()
+
+    def _stall(self, *, is_stalled: bool) -> None:
+        self.is_beating = not is_stalled
+        for line in self.lines:
+            line.witness.set_stalled(line.loop.time(), is_stalled)
+
+    def _number(self) -> int:
+        return self.rng.randrange(_LAYERS)
+
+    def _ramp(self) -> float:
+        return self.rng.choice((0.0, 0.005, 0.01, 0.03))
+
+    def _layers(self) -> list[Layer]:
+        numbers = self.rng.sample(range(_LAYERS), self.rng.choice((1, 1, 1, 2)))
+        return [self._layer(number) for number in numbers]
+
+    def _layer(self, number: int) -> Layer:
+        kind = self.rng.random()
+        valid_for = self.rng.choice((0.0, 0.0, 0.05, 0.3))
+        if kind < 0.15:
+            return Layer(number, (), self._ramp())
+        if kind < 0.25:
+            return Layer(number, (), self._ramp(), valid_for, renew=True)
+        channels = self.rng.sample(range(_CHANNELS), self.rng.choice((1, 2)))
+        tones = tuple(self._tone(channel, number) for channel in channels)
+        return Layer(number, tones, self._ramp(), valid_for, after=self.rng.random() < 0.15)
+
+    def _tone(self, channel: int, number: int) -> Tone:
+        rng = self.rng
+        shapes = [self._shape() if rng.random() < 0.3 else None for _ in range(2)]
+        return Tone(
+            *(channel, rng.choice((100.0, 100.0, 150.0 + number)), rng.choice((0.0, 0.1, 0.2))),
+            rng.uniform(-180, 179),
+            keep_phase=rng.random() < 0.4,
+            skip_ending=rng.random() < 0.3,
+            onset=shapes[0],
+            ending=shapes[1],
+        )
+
+    def _shape(self) -> Shape:
+        count = self.rng.choice((0, 1, 4))
+        step = self.rng.choice((0.001, 0.004, 0.02))
+        return Shape(step, tuple(0.2 * self.rng.random() + 0j for _ in range(count)))
+
+    async def _keep_beating(self) -> None:
+        while True:
+            await asyncio.sleep(_BEAT)
+            if self.group.is_armed and self.is_beating:
+                with contextlib.suppress(*_FAILURES):
+                    await self.group.beat()
+
+    def _alter(self, name: str, data: bytes) -> list[tuple[float, bytes]]:
+        chosen = self.rng.random()
+        if chosen < 0.03:
+            return []
+        delays = [0.0002, 0.0015] if chosen < 0.06 else [0.0002]
+        return [(delay, data) for delay in delays]

@@ -15,9 +15,9 @@ from sim.listening.decoded import (
     Reply,
     Request,
 )
-from sim.listening.expected_amplifier import Sent
 from sim.listening.host_rules import HostRules
 from sim.listening.set_rules import check_sums
+from sim.listening.unanswered import Sent
 from sim.listening.watched_wire import Pending, WatchedWire
 from sim.witness.capture import Direction
 from sim.witness.config import TimeLimits
@@ -89,7 +89,7 @@ class Exchanges:
         for session in _addressed(wire, message.address):
             if not is_copy:
                 self._host.check_request(wire, session, time, sent)
-            if message.key is not None:
+            if message.key is not None and (not is_copy or message.name == HELLO):
                 wire.pending[message.key] = Pending(session, sent, time, begun)
             if not message.problem:
                 session.amplifier.sent(sent)

@@ -6,57 +6,40 @@ carried out: the next status says so.
 """
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 from drivers.protocol.definition import is_newer_token
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import (
-    FAULTS,
     MESSAGES,
     QUANTITIES,
     REACTION,
     STAGED_LIFE,
-    STATES,
     STATUS_FLAGS,
 )
 from sim.listening.decoded import CHANGING, FEEDING, STATUS_RECORD, Request
-from sim.listening.expected_outputs import ExpectedOutputs, Interval
-from sim.listening.set_replies import SetReplies, achieved_problem
+from sim.listening.expected_outputs import Interval
+from sim.listening.expected_state import (
+    DISABLED,
+    FAULT,
+    NAMES,
+    OFF,
+    REACTING,
+    SILENCING_RAMP,
+    STOPPED,
+    SWITCHED_ON,
+    ExpectedState,
+)
+from sim.listening.set_replies import achieved_problem
+from sim.listening.unanswered import ENABLED, LATCHED, Sent, is_carried_out
 from sim.witness.config import TimeLimits
-from sim.witness.reports import fault_list_problem
 from sim.witness.violation import ReportViolation
-from sim.witness.watchdog import Watchdog
 
-SILENCING_RAMP = 0.005  # s; along which the watchdog and faults silence
 _WARM = QUANTITIES["temperature"].to_wire(60.0)  # from here on an amplifier may derate
-_ENABLED, _STOPPED = STATES["OPERATION_ENABLED"], STATES["QUICK_STOP_ACTIVE"]
-_REACTING, _FAULT = STATES["FAULT_REACTION_ACTIVE"], STATES["FAULT"]
-_DISABLED, _SWITCHED_ON = STATES["SWITCH_ON_DISABLED"], STATES["SWITCHED_ON"]
-_OFF = (STATES["NOT_READY"], _DISABLED, STATES["READY_TO_SWITCH_ON"])
-LATCHED = (_STOPPED, _REACTING, _FAULT)
-"""States that a stop or a fault leads to, until it is cleared."""
-_SPONTANEOUS = {
-    _SWITCHED_ON: (_SWITCHED_ON, _DISABLED),
-    _REACTING: (_REACTING, _FAULT),
-    **dict.fromkeys(_OFF, _OFF),
-}
-"""States that an amplifier may enter from a state without a request."""
-NAMES = {number: name for name, number in STATES.items()}
 
 
-@dataclass(frozen=True, slots=True)
-class Sent:
-    """A request as it was sent: in which order, when its first byte passed [s], its reply's key."""
-
-    number: int
-    begun: float
-    request: Request
-    key: Hashable = None
-
-
-class ExpectedAmplifier:
+class ExpectedAmplifier(ExpectedState):
     """The expected state of one amplifier by name; None while it is unknown.
 
     report_always: for violations that no fault of the wire excuses; report: for all others.
@@ -70,40 +53,16 @@ class ExpectedAmplifier:
         report: ReportViolation,
         report_always: ReportViolation,
     ) -> None:
-        self._name = name
-        self._report = report
+        super().__init__(name, slack=times.slack, report=report)
         self._report_always = report_always
-        self._slack = times.slack
-        self.state: int | None = None
-        self.is_answered = True  # it has told its state in a reply
-        self.last_fault = -math.inf  # when it was seen to enter a fault
-        self.watchdog = Watchdog(name, slack=times.slack, report=report)
-        self.outputs = ExpectedOutputs(name, slack=times.slack, report=report)
-        self.sets = SetReplies(name, report=report)
         self.capabilities: Values = {}
-        self._fault = 0
-        self._is_reported = True  # it has told this state
-        self._fault_since: Interval | None = None  # when the present one came, if known
-        self._last_status = -math.inf
         self._token: int | None = None
-        self._latch: int | None = None
         self._session: int | None = None
-        self._unanswered: list[Sent] = []  # and perhaps carried out
 
     @property
     def token(self) -> int | None:
         """Token of the set committed last, 0 for none."""
         return self._token
-
-    @property
-    def is_enabled(self) -> bool:
-        """Whether it is armed, as far as is known."""
-        return self.state == _ENABLED
-
-    @property
-    def is_in_fault(self) -> bool:
-        """Whether it is in a fault, or reacting to one."""
-        return self.state in (_REACTING, _FAULT)
 
     def forget_state(self) -> None:
         """Treat the state as unknown until the next status."""
@@ -117,7 +76,7 @@ class ExpectedAmplifier:
     def restarted(self, time: float) -> None:
         """Note a restart: disarmed and silent."""
         self.forget_state()
-        self.state, self._token = _DISABLED, 0
+        self.state, self._token = DISABLED, 0
         self.outputs.settle("a restart")
         self._last_status = time
 
@@ -128,14 +87,6 @@ class ExpectedAmplifier:
         if self.outputs.cause in ("nothing", "a restart"):
             self.outputs.settle(self.outputs.cause)
 
-    def advance(self, time: float) -> None:
-        """Apply what must have happened without a request until now."""
-        if self.state == _ENABLED and self.watchdog.has_expired(time) and not self._unanswered:
-            self._silence(self.watchdog.expiry, SILENCING_RAMP, "the watchdog")
-            self.state, self._fault, self._is_reported = _REACTING, FAULTS["WATCHDOG"], False
-            self.is_answered = False
-            self.last_fault, self._fault_since = time, self.watchdog.expiry
-
     # requests
 
     def sent(self, sent: Sent) -> None:
@@ -143,11 +94,11 @@ class ExpectedAmplifier:
         if sent.request.name in FEEDING:
             self.watchdog.may_feed(sent.begun + REACTION)
         if sent.request.name in CHANGING:
-            self._unanswered.append(sent)
+            self._unanswered.add(sent)
 
     def answered(self, sent: Sent) -> None:
         """Note that a request has its reply: a refusal, or what `granted` is given."""
-        self._unanswered = [each for each in self._unanswered if each.number != sent.number]
+        self._unanswered.remove(sent)
 
     def granted(self, sent: Sent, values: Values, begin: float, end: float) -> None:
         """Apply a request carried out between two times, and compare its reply."""
@@ -158,7 +109,7 @@ class ExpectedAmplifier:
         if status is not None:
             self._resolve(sent.number, status, end)
         self._check_allowed(request, end)
-        is_late = status is not None and status["state"] in (_REACTING, _FAULT)
+        is_late = status is not None and status["state"] in (REACTING, FAULT)
         if request.name in FEEDING and not is_late:  # else it may have expired before
             self.watchdog.feed((begin, end))
         if request.name == "Set":
@@ -178,24 +129,22 @@ class ExpectedAmplifier:
         if request.name in ("Stop", "Disarm"):
             self._report("stop", time, f"{self._name} refused {request.name}")
         token = request.values.get("token")
-        is_held = self.state == _ENABLED and request.values.get("session") == self._session
+        is_held = self.state == ENABLED and request.values.get("session") == self._session
         if request.name == "Commit" and is_held and self.sets.is_staged(token, time + REACTION):
             self._report("commit", time, f"{self._name} refused to commit set {token}, staged")
 
     def _resolve(self, number: int, status: Values, end: float) -> None:
         """Apply earlier requests without a reply that were carried out by a status."""
-        earlier = [each for each in self._unanswered if each.number < number]
-        self._unanswered = [each for each in self._unanswered if each.number >= number]
-        for each in earlier if self.state is not None else ():
-            name, is_broadcast = each.request.name, each.key is None
-            until = min(end, each.begun + REACTION) if is_broadcast else end
-            if _is_carried_out(each.request, status):
-                self._apply(each.request, (each.begun, max(until, each.begun)), status)
-            elif is_broadcast and name == "Stop":
+        for each in self._unanswered.take_before(number) if self.state is not None else ():
+            name, begun = each.request.name, each.begun
+            if is_carried_out(each.request, status):
+                until = min(end, begun + REACTION) if each.is_broadcast else end
+                self._apply(each.request, (begun, max(until, begun)), status)
+            elif each.is_broadcast and name == "Stop":
                 self._report("stop", end, f"{self._name} did not obey a broadcast Stop")
-            elif is_broadcast and name == "Commit":
+            elif each.is_broadcast and name == "Commit":
                 token = each.request.values["token"]
-                if self.sets.is_staged(token, each.begun + REACTION):
+                if self.sets.is_staged(token, begun + REACTION):
                     what = f"{self._name} did not obey a broadcast Commit of set {token}"
                     self._report("commit", end, what)
 
@@ -204,10 +153,10 @@ class ExpectedAmplifier:
         values = request.values
         match request.name:
             case "Arm":
-                if self.state != _ENABLED:
+                if self.state != ENABLED:
                     self._silence(when, SILENCING_RAMP, "Arm")
                     self._token = 0
-                self.state, self._fault, self._session = _ENABLED, 0, values["session"]
+                self.state, self._fault, self._session = ENABLED, 0, values["session"]
                 self._is_reported = True
                 self.watchdog.time = QUANTITIES["watchdog"].from_wire(values["watchdog"])
                 self.watchdog.feed(when)
@@ -228,14 +177,14 @@ class ExpectedAmplifier:
         """Only the session that is held plays and feeds; nothing plays unless armed."""
         name, session = request.name, request.values.get("session")
         known = None not in (self._session, session)
-        if name in FEEDING and self.state == _ENABLED and known and session != self._session:
+        if name in FEEDING and self.state == ENABLED and known and session != self._session:
             what = f"{self._name} accepted {name} of session {session}, held by {self._session}"
             self._report("session", end, what)
         before, token = self._token, request.values.get("token", 0)
         if before and token not in (0, before) and not is_newer_token(token, before):
             what = f"{self._name} accepted {name} of set {token} after set {before}"
             self._report_always("token", end, what)
-        if name in ("Set", "Commit", "Silence") and self.state not in (None, _ENABLED):
+        if name in ("Set", "Commit", "Silence") and self.state not in (None, ENABLED):
             rule = "enabled" if self._is_reported else "watchdog"
             self._report(rule, end, f"{self._name} accepted {name} in {self._state_name()}")
         if name == "Arm" and self.state in LATCHED and self._is_reported:
@@ -247,21 +196,21 @@ class ExpectedAmplifier:
         if request.name == "Stop":
             if self.state is None:  # it may have been in a fault before
                 self.watchdog.feed((-math.inf, when[1]))
-            self.state = self.state if self.state in (_REACTING, _FAULT) else _STOPPED
-        elif self.state == _ENABLED:
-            self.state = _SWITCHED_ON
+            self.state = self.state if self.state in (REACTING, FAULT) else STOPPED
+        elif self.state == ENABLED:
+            self.state = SWITCHED_ON
 
     def _cleared(self, latch: int, status: Values, when: Interval) -> None:
         """Apply Clear, which leaves the state as it is while the cause lasts."""
-        if status["state"] not in _OFF:
+        if status["state"] not in OFF:
             return
         if self._latch not in (None, latch):
             what = f"{self._name} was cleared by latch {latch}, must be {self._latch}"
             self._report("latched", when[1], what)
         # The Event that ends the reaction is not heard while other requests are pending.
-        is_reacting = self.state == _REACTING and when[0] <= self._last_status + SILENCING_RAMP
+        is_reacting = self.state == REACTING and when[0] <= self._last_status + SILENCING_RAMP
         if not (is_reacting and self._is_reported):
-            self.state, self._fault = _DISABLED, 0
+            self.state, self._fault = DISABLED, 0
             self.outputs.cause = "Clear"
 
     def _take(self, part: Values, reply: Values, when: Interval) -> None:
@@ -311,14 +260,14 @@ class ExpectedAmplifier:
             self._report("token", end, what)
         self._token = status["token"]
         self._check_left(status["watchdog_left"], state, begin, end)
-        may_be_off = self.state == _ENABLED and self.watchdog.may_have_expired(end)
+        may_be_off = self.state == ENABLED and self.watchdog.may_have_expired(end)
         levels = [QUANTITIES["level"].from_wire(level) for level in status["levels"]]
         self.outputs.check_levels(levels, begin, end, may_be_off=may_be_off)
-        if not may_be_off and state == _ENABLED:
+        if not may_be_off and state == ENABLED:
             self.outputs.check_tokens(status["tokens"], begin, end)
         self.outputs.note_silent(status["tokens"], end)
         is_on = bool(status["flags"] >> STATUS_FLAGS["high_voltage"] & 1)
-        must = {_ENABLED: True, _FAULT: False}.get(state, False if state in _OFF else None)
+        must = {ENABLED: True, FAULT: False}.get(state, False if state in OFF else None)
         if must is not None and must != is_on:
             what = f"{self._name} reports high voltage {'on' if is_on else 'off'} in {NAMES[state]}"
             self._report("high_voltage", end, what)
@@ -341,127 +290,23 @@ class ExpectedAmplifier:
         self.advance(time)
         if self._unanswered:
             return
-        may_be_off = self.state == _ENABLED and self.watchdog.may_have_expired(time)
+        may_be_off = self.state == ENABLED and self.watchdog.may_have_expired(time)
         of_sensor = self.is_enabled
         self.outputs.check_levels(levels, time, time, may_be_off=may_be_off, of_sensor=of_sensor)
         self.outputs.check_frequencies(frequencies, time)
 
-    def _note_state(self, now: int, fault: int, end: float) -> None:
-        """Compare a state and a fault with those expected, and go on with them."""
-        here = self.state
-        if here is None:
-            self._adopt(now, fault, end)
-            return
-        if now in (_REACTING, _FAULT) and here not in (*_OFF, _REACTING, _FAULT):
-            self.last_fault = end
-            self._check_trip(now, fault, end)
-        elif now not in _SPONTANEOUS.get(here, (here,)):
-            self._report(self._rule_against(now), end, self._state_problem(now))
-        elif self._is_reported and self._fault and fault != self._fault and now in LATCHED:
-            what = f"{self._name} reports fault {fault} instead of {self._fault}"
-            self._report("latched", end, what)
-        self._fault = fault if now in (_REACTING, _FAULT) else 0
-        self.outputs.resolve_suspicions(is_enabled=now not in (_REACTING, _FAULT))
-        self.state, self._is_reported = now, True
-
-    def _adopt(self, state: int, fault: int, time: float) -> None:
-        """Adopt a reported state where it is unknown."""
-        self.state, self._fault, self._is_reported = state, fault, True
-        self._fault_since = None
-        if state in (*_OFF, _FAULT):
-            self.outputs.settle(NAMES[state])
-        elif state == _ENABLED:
-            self.watchdog.feed((-math.inf, time))
-
-    def _check_trip(self, state: int, fault: int, end: float) -> None:
-        """Check a transition into a fault: the watchdog not before its time."""
-        since = (min(self._last_status, end), end)
-        if fault == FAULTS["WATCHDOG"]:
-            self.watchdog.check_trip(end)
-            since = (min(max(self.watchdog.expiry[0], self._last_status), end), end)
-        elif fault == FAULTS["NONE"]:
-            self._report("state", end, f"{self._name} is in {NAMES[state]} without a fault")
-        self._fault_since = since if since[0] > -math.inf else None
-        self._silence((max(since[0], end - 2.0), end), SILENCING_RAMP, "a fault")
-
-    def _note_latch(self, latch: int, state: int, end: float, *, after: str) -> None:
-        """Compare the latch: newer after each stop and fault, else as it was."""
-        before, self._latch = self._latch, latch
-        if before is None:
-            return
-        is_newer = latch > 0 and is_newer_token(latch, before)
-        if after == "Stop" and not is_newer:
-            what = f"{self._name} reports latch {latch} after Stop, must be newer than {before}"
-            self._report("latched", end, what)
-        elif latch != before and not (is_newer and state in LATCHED):
-            what = f"{self._name} reports latch {latch} in {NAMES[state]}, must be {before}"
-            self._report("latched", end, what)
-
-    def _rule_against(self, now: int) -> str:
-        if not self._is_reported:
-            return "watchdog" if now == _ENABLED else "latched"
-        if now == _ENABLED:
-            return "armed"
-        return "latched" if self.state in LATCHED else "state"
-
-    def _state_problem(self, now: int) -> str:
-        if not self._is_reported and now == _ENABLED:
-            return f"{self._name} is still enabled: {self.watchdog}"
-        return f"{self._name} must be in {self._state_name()}, got {NAMES[now]}"
-
-    def _check_left(self, left: int, state: int, begin: float, end: float) -> None:
-        if state == _ENABLED:
-            seconds = QUANTITIES["watchdog_left"].from_wire(left)
-            self.watchdog.check_left(seconds, begin, end)
-        elif state in _OFF and left:
-            self._report("watchdog", end, f"{self._name}: watchdog runs while disarmed")
-
-    def _check_faults(self, values: Values, begin: float, end: float) -> None:
-        faults = [(each["fault"], each["age"] / 1000) for each in values["faults"]]
-        is_known = self.is_in_fault and self._is_reported and not self._unanswered
-        problem = fault_list_problem(
-            tuple(faults),
-            (begin - self._slack, end + self._slack),
-            present=self._fault if is_known else 0,
-            since=self._fault_since,
-        )
-        if problem is not None:
-            self._report("faults", end, f"{self._name} {problem}")
-
     def _check_achieved(self, layer: int, reply: Values, begin: float, end: float) -> None:
         self.outputs.advance(begin - self.outputs.lag)
-        if self._unanswered or self.state != _ENABLED or not self.outputs.is_quiet(begin, end):
+        if self._unanswered or self.state != ENABLED or not self.outputs.is_quiet(begin, end):
             return
         outputs = self.outputs
         expected, token = outputs.playback.playing(layer), outputs.playback.tokens.get(layer, 0)
         can_scale = outputs.is_warm or not outputs.is_exact
         found = achieved_problem(expected, token, reply, can_scale=can_scale)
-        if found is not None:
-            self._report(found[0], end, f"{self._name}: layer {layer}: {found[1]}")
-
-    def _silence(self, when: Interval, ramp: float, cause: str) -> None:
-        self.sets.drop()
-        self.outputs.silence((max(when[0], -1e9), when[1]), ramp, cause)
-
-    def _state_name(self) -> str:
-        return NAMES[self.state] if self.state is not None else "an unknown state"
-
-
-def _is_carried_out(request: Request, status: Values) -> bool:
-    """Whether a later status shows that a request was carried out."""
-    match request.name:
-        case "Commit":
-            return bool(status["token"] == request.values["token"])
-        case "Set":
-            is_played = status["token"] == request.values["token"]
-            return bool(is_played and request.values["now"])
-        case "Stop":
-            return status["state"] in LATCHED
-        case "Disarm":
-            return bool(status["state"] != _ENABLED)
-        case "Arm":
-            return bool(status["state"] == _ENABLED)
-        case "Silence":
-            return not any(status["tokens"])
-        case _:
-            return request.name == "Clear"
+        if found is None:
+            return
+        violation = found[0], end, f"{self._name}: layer {layer}: {found[1]}"
+        if reply["commands"]:
+            self._report(*violation)
+        else:
+            outputs.suspect(*violation)

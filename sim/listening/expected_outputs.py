@@ -36,7 +36,7 @@ class ExpectedOutputs:
         self._name = name
         self._slack = slack
         self._report = report
-        # Levels that sensors measured too low, which an unreported fault would explain.
+        # Silence where there must be none, which an unreported fault would explain.
         self._suspicions: list[tuple[str, float, str]] = []
         self.settle("nothing")
 
@@ -49,6 +49,7 @@ class ExpectedOutputs:
         self._marks: dict[int, tuple[Transition, float, float]] = {}  # half a time, radius at first
         self._unknown = [-math.inf] * LAYERS  # until when what a layer plays is not known [s]
         self._before: Mapping[int, float] = {}  # levels of channels before the last commit
+        self._ghosts: list[tuple[int, Transition, float]] = []  # of voices that may still fade
         self._last_due = -math.inf
         self._uncertain_until = -math.inf  # fades may have been cut short
 
@@ -73,7 +74,7 @@ class ExpectedOutputs:
         """Play a set from some time between two on."""
         begin, end = when
         middle, half = (begin + end) / 2, (end - begin) / 2
-        self.advance(begin - self._slack)
+        self.advance(begin - self.lag)
         self._before = {
             channel: self.playback.settled(channel) for channel in range(self.playback.channels)
         }
@@ -104,7 +105,7 @@ class ExpectedOutputs:
     def silence(self, when: Interval, ramp: float, cause: str) -> None:
         """Silence all channels along a ramp [s], from some time between two on."""
         begin, end = when
-        self.advance(begin - self._slack)
+        self.advance(begin - self.lag)
         voices = self._voices()
         self.playback.silence((begin + end) / 2, ramp)
         self._mark(voices, when, (end - begin) / 2)
@@ -117,7 +118,9 @@ class ExpectedOutputs:
     def _mark(self, before: Sequence[Sequence[Voice]], when: Interval, half: float) -> None:
         """Note the radius of every transition that is new."""
         marks: dict[int, tuple[Transition, float, float]] = {}
-        for were, voices in zip(before, self.playback.all_voices, strict=True):
+        self._ghosts = [each for each in self._ghosts if each[1].end + each[2] > when[0]]
+        for channel, were in enumerate(before):
+            voices = self.playback.voices_of(channel)
             known = {(each.layer, each.frequency, each.origin): each.transition for each in were}
             for voice in voices:
                 way = voice.transition
@@ -127,6 +130,11 @@ class ExpectedOutputs:
                 else:
                     radius = 0.0 if last is None else self._radius(last, *when)
                     marks[id(way)] = (way, half, radius)
+            left = known.keys() - {(each.layer, each.frequency, each.origin) for each in voices}
+            for way in (known[each] for each in left):
+                late = self._marks.get(id(way), (way, 0.0, 0.0))[1]
+                if way.end + late > when[0]:
+                    self._ghosts.append((channel, way, late))
         self._marks = marks
 
     def _radius(self, way: Transition, begin: float, end: float) -> float:
@@ -152,7 +160,12 @@ class ExpectedOutputs:
         half = self.lag
         is_known = all(until < begin for until in self._unknown)
         is_due = self.playback.next_due <= end + half or self._last_due >= begin - half
-        return is_known and not is_due
+        vanish = any(  # onsets that lead to silence
+            not voice.has_ended and begin - half <= voice.silent_from <= end + half
+            for voices in self.playback.all_voices
+            for voice in voices
+        )
+        return is_known and not is_due and not vanish
 
     def bounds(self, channel: int, begin: float, end: float) -> Interval:
         """Return the least and the largest level of a channel between two times."""
@@ -172,6 +185,9 @@ class ExpectedOutputs:
                 0.0, *(one - (sum(highs) - own) for one, own in zip(lows, highs, strict=True))
             )
             high += sum(highs)
+        for at, way, late in self._ghosts:
+            if at == channel and way.end + late > begin:
+                low, high = 0.0, high + abs(way.at(begin - late))
         if begin <= self._uncertain_until:
             low = 0.0
         return min(low, 1.0), min(high, 1.0)
@@ -205,7 +221,7 @@ class ExpectedOutputs:
                 f"{'' if is_settled else 'fading '}after {self.cause}",
             )
             if is_low and of_sensor:
-                self._suspicions.append(found)
+                self.suspect(*found)
             else:
                 self._report(*found)
 
@@ -217,6 +233,10 @@ class ExpectedOutputs:
         if self.cause != "a set":
             return "silent"
         return "commit" if abs(level - self._before.get(channel, 0.0)) < LEVEL else "plays"
+
+    def suspect(self, rule: str, time: float, sentence: str) -> None:
+        """Note a violation that is none if the amplifier has a fault, as its next status says."""
+        self._suspicions.append((rule, time, sentence))
 
     def resolve_suspicions(self, *, is_enabled: bool) -> None:
         """Report suspicions, unless a fault explains them."""

@@ -11,8 +11,8 @@ from drivers.protocol.table import QUANTITIES
 from sim.listening.amplifier_session import AmplifierSession, is_vibrating
 from sim.listening.deadlines import Deadlines, KnownInputs
 from sim.listening.decoded import A_READ, BROADCAST, FEEDING, HELLO, Request
-from sim.listening.expected_amplifier import LATCHED, Sent
 from sim.listening.set_rules import ExpectedSets, check_expected, check_set
+from sim.listening.unanswered import LATCHED, Sent
 from sim.listening.watched_wire import WatchedWire
 from sim.witness.config import TimeLimits
 from sim.witness.delays import Delays
@@ -119,7 +119,8 @@ class HostRules:
         if request.name == HELLO:
             session.is_identified = True
         elif request.name == "Arm":
-            if session.is_stopped:
+            was_stopped, session.is_stopped = session.is_stopped, False
+            if was_stopped and not session.is_disturbed(time):
                 what = f"{session.name} armed before its stop was cleared"
                 session.report("stop", time, what)
             session.armed_at = session.last_feed = time
@@ -140,6 +141,8 @@ class HostRules:
         request = sent.request
         if request.name in _SILENCING or is_silent:
             wire.preempted_at = sent.begun
+            return
+        if wire.is_disturbed(sent.begun):
             return
         # A last lift preempts too, even if a finger has come since.
         preempted = max(wire.preempted_at, self._inputs.last_lift)
@@ -173,7 +176,8 @@ class HostRules:
     def _check_feeding(self, session: AmplifierSession, time: float, request: Request) -> None:
         """Nothing feeds while the loop stalls, after a stop, beside another host's session."""
         name, since = request.name, self._inputs.stalled_since
-        if since is not None and time > since + self._times.slack and name != "Silence":
+        is_late = since is not None and time > since + self._times.slack
+        if is_late and name != "Silence" and not session.is_disturbed(time):
             what = f"control loop stalled since {since:.4f} s, but {name} feeds the watchdog of "
             session.report("heartbeat", time, f"{what}{session.name}")
         if session.is_stopped and name not in ("Arm", "Silence"):
@@ -209,7 +213,11 @@ class HostRules:
 
     def _check_justified(self, session: AmplifierSession, time: float) -> None:
         """Vibration needs an enabled amplifier and a contact."""
-        if not session.is_stopped and self._is_known_disabled(session):
+        # A set that waits in a queue may still go out with the reply that says so.
+        is_known = time > session.amplifier.reported_at + _IN_FLIGHT and not session.is_disturbed(
+            time
+        )
+        if is_known and not session.is_stopped and self._is_known_disabled(session):
             session.report("enabled", time, f"vibration commanded while disabled: {session.name}")
         is_touched = self._inputs.contacts is None or self._inputs.contacts
         last_lift = self._inputs.last_lift

@@ -9,9 +9,9 @@ from typing import Protocol
 from sim.listening.amplifier_session import AmplifierSession
 from sim.listening.can_decoder import CanDecoder
 from sim.listening.decoded import DecodedFrame
-from sim.listening.expected_amplifier import Sent
 from sim.listening.modbus_decoder import ModbusDecoder
 from sim.listening.serial_decoder import SerialDecoder
+from sim.listening.unanswered import Sent
 from sim.witness.capture import Direction
 
 _RECOVERY = 0.5  # s; after a fault a wire counts as disturbed for so long

@@ -21,7 +21,7 @@ def witness_of(
     times_s: Mapping[str, float] | None = None,
     **limits: Any,
 ) -> Witness:
-    """Return a witness of lines, each of a kind and with amplifiers 1, 2, ...; limits: of channels."""
+    """Return a witness of lines, each a kind and its amplifiers 1, 2, ...; limits: of channels."""
     limits = {"frequency_hz": [20, 1000], "level": 1.0} | limits
     return Witness(
         {
@@ -52,7 +52,7 @@ class ListenedLine(MemoryLine):
         at_host: bool = False,
     ) -> None:
         self.witness = witness
-        self._name = name
+        self.name = name
         self._kind = kind
         self._at_host = at_host
         super().__init__(kind, *names, channels=channels)
@@ -85,10 +85,10 @@ class ListenedLine(MemoryLine):
         """Let the witness hear bytes, frames of a bus as the text of an adapter."""
         if self._kind == "can":
             data = b"".join(map(slcan_line, unpack_frames(data)))
-        self.witness.record_bytes(self._name, direction, self.loop.time(), data)
+        self.witness.record_bytes(self.name, direction, self.loop.time(), data)
 
     async def keep_sensing(self) -> None:
-        """Let the amplifiers run, and the witness measure what they play, every millisecond."""
+        """Let the amplifiers run, and the witness measure what they play, every 2 ms."""
         while True:
             now = self.loop.time()
             for name, far in self.far.items():
@@ -96,4 +96,4 @@ class ListenedLine(MemoryLine):
                 channels = range(far.playback.channels)
                 levels = [min(far.playback.level(channel, now), 1.0) for channel in channels]
                 self.witness.levels(now, name, levels)
-            await asyncio.sleep(0.001)
+            await asyncio.sleep(0.002)

@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from drivers.contents import Layer, Shape, Tone
 from drivers.errors import CommandRefused, LinkError, Preempted
 from drivers.host.group import Group
-from drivers.host.line import Priority
+from drivers.host.jobs import Priority
+from drivers.protocol.table import STATES
 from listened_line import ListenedLine
+from words_line import unaltered
 
 _CHANNELS, _LAYERS = 2, 4
 _BEAT = 0.05  # s
@@ -17,28 +19,33 @@ _FAILURES = (CommandRefused, LinkError, Preempted)
 
 
 class RandomGroup:
-    """A group on lines, and a random generator of what is done with it.
+    """A group on lines, and a random generator of what is done with it."""
 
-    is_lossy: frames are lost and doubled on their way.
-    """
-
-    def __init__(self, lines: Sequence[ListenedLine], seed: int, *, is_lossy: bool) -> None:
+    def __init__(self, lines: Sequence[ListenedLine], seed: int) -> None:
         self.rng = random.Random(seed)
         self.lines = lines
         hosts = {name: host for line in lines for name, host in line.hosts.items()}
         self.group = Group(hosts, draw=self.rng.randint)
         self.is_beating = True
-        if is_lossy:
-            for line in lines:
-                line.inward = line.outward = self._alter
 
-    async def run(self, steps: int) -> None:
-        """Open and arm the group, take so many steps, and disarm."""
+    def disturb(self, *, is_on: bool) -> None:
+        """Lose and double frames on their way from now on, or no longer; the witness is told."""
+        for line in self.lines:
+            line.witness.faults(line.loop.time(), line.name, are_on=is_on)
+            line.inward = line.outward = self._alter if is_on else unaltered
+
+    async def run(self, steps: int, *, lossy_steps: int = 0) -> None:
+        """Open and arm the group, take so many steps, the first lossy, and disarm."""
         background = [asyncio.ensure_future(line.keep_sensing()) for line in self.lines]
         background.append(asyncio.ensure_future(self._keep_beating()))
         try:
             await self._opened()
-            for _ in range(steps):
+            for step in range(steps):
+                if step == 0 and lossy_steps:
+                    self.disturb(is_on=True)
+                elif step == lossy_steps and lossy_steps:
+                    self.disturb(is_on=False)
+                    await asyncio.sleep(0.6)
                 with contextlib.suppress(*_FAILURES):
                     await self._step()
                 await asyncio.sleep(self.rng.choice((0.0, 0.001, 0.01, 0.04, 0.2)))
@@ -88,7 +95,9 @@ class RandomGroup:
             far.tick(line.loop.time())
             far.trip(self.rng.choice(("ARC", "CHANNEL")), line.loop.time(), channel=1)
         else:
-            await host.read_status()
+            status = await host.read_status()
+            if self.group.is_armed and status["state"] != STATES["OPERATION_ENABLED"]:
+                await self.group.stop()
 
     def _stall(self, *, is_stalled: bool) -> None:
         self.is_beating = not is_stalled

@@ -35,9 +35,15 @@ class Lines:
         self._changing: dict[str, asyncio.Lock] = {}  # held while a line is opened
 
     async def amplifier(
-        self, url: str, limits: GuardLimits, *, name: str, serial_number: str | None = None
+        self,
+        url: str,
+        limits: GuardLimits,
+        *,
+        name: str,
+        serial_number: str | None = None,
+        is_output: bool | None = False,
     ) -> Amplifier:
-        """Return the amplifier of a URL, its line open, nothing sent.
+        """Return the amplifier of a URL, its line open, nothing sent; see `Amplifier`.
 
         A line that was lost is opened anew; amplifiers of the lost one stay lost. Raises
         CommandError for a URL that is none, LinkError for a line that cannot be opened, or an
@@ -61,7 +67,12 @@ class Lines:
         if address.number in opened.line.members:
             raise LinkError(f"address {address.number} on {address.line} must be used once")
         return Amplifier(
-            opened.line, address.number, limits, name=name, serial_number=serial_number
+            opened.line,
+            address.number,
+            limits,
+            name=name,
+            serial_number=serial_number,
+            is_output=is_output,
         )
 
     async def close(self) -> None:

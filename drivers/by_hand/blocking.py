@@ -138,7 +138,8 @@ class BlockingAmplifier:
     async def _open(self) -> tuple[Lines, Amplifier]:
         lines = Lines()
         try:
-            amplifier = await lines.amplifier(self._url, self._limits, name=self._url)
+            url = self._url
+            amplifier = await lines.amplifier(url, self._limits, name=url, is_output=None)
             await amplifier.open()
         except BaseException:
             await lines.close()

@@ -27,7 +27,9 @@ async def reached(
     """Open the line of an amplifier while the context lasts; nothing is sent."""
     lines = Lines()
     try:
-        yield await lines.amplifier(url, limits, name=url, serial_number=serial_number)
+        yield await lines.amplifier(
+            url, limits, name=url, serial_number=serial_number, is_output=None
+        )
     finally:
         await lines.close()
 

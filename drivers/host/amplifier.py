@@ -63,7 +63,8 @@ class Amplifier(Dialogue):
     """An amplifier on a line that is open.
 
     limits: configured. serial_number: the expected one, None for any. is_output: what the rig says
-    of full level: the output of a linear amplifier, else the motion of a stiff source.
+    of full level: the output of a linear amplifier, else the motion of a stiff source; None for
+    either.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class Amplifier(Dialogue):
         *,
         name: str,
         serial_number: str | None = None,
-        is_output: bool = False,
+        is_output: bool | None = False,
     ) -> None:
         super().__init__(line, address, name)
         self.limits, self._serial_number = limits, serial_number
@@ -149,12 +150,12 @@ class Amplifier(Dialogue):
                     f"amplifier {self.name}: {name}_min must be at most {name}_max, got {low} and "
                     f"{high}"
                 )
-        is_output = bool(can["features"] >> FEATURES["output"] & 1)
-        if is_output is not self._is_output:
+        expected, is_output = self._is_output, bool(can["features"] >> FEATURES["output"] & 1)
+        if expected is not None and is_output is not expected:
             raise LinkError(
-                f"amplifier {self.name}: full level must be {_FULL_LEVEL[self._is_output]} as in "
-                f"the rig file, got {_FULL_LEVEL[is_output]}; correct the rig file, or connect "
-                "another amplifier"
+                f"amplifier {self.name}: full level must be {_FULL_LEVEL[expected]} as in the rig "
+                f"file, got {_FULL_LEVEL[is_output]}; correct the rig file, or connect another "
+                "amplifier"
             )
 
     async def arm(self, session: int, watchdog: float = WATCHDOG) -> Values:

@@ -1,6 +1,7 @@
 """Simulated amplifiers of protocol 3 on real wires: terminals, TCP, CAN servers and adapters."""
 
 import asyncio
+import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
@@ -146,10 +147,13 @@ async def _socketcand(count: int) -> AsyncIterator[FarSide]:
 
 
 @asynccontextmanager
-async def _python_can(count: int, interface: str, channel: str) -> AsyncIterator[FarSide]:
+async def _python_can(
+    count: int, interface: str, channel: str, **options: int
+) -> AsyncIterator[FarSide]:
     """Serve amplifiers on a bus of python-can, which a thread reads."""
     loop, amplifiers = asyncio.get_running_loop(), _amplifiers(count)
-    adapter = can.Bus(interface=interface, channel=channel)
+    adapter = can.Bus(interface=interface, channel=channel, **options)
+    query = "".join(f"?{name}={value}" for name, value in options.items())
     ending = threading.Event()
     sent: set[tuple[int, bytes]] = set()  # some interfaces return what was sent
 
@@ -174,11 +178,20 @@ async def _python_can(count: int, interface: str, channel: str) -> AsyncIterator
     thread = threading.Thread(target=read)
     thread.start()
     try:
-        yield FarSide(amplifiers, lambda node: f"can+python-can://{interface}/{channel}#{node}")
+        yield FarSide(
+            amplifiers, lambda node: f"can+python-can://{interface}/{channel}{query}#{node}"
+        )
     finally:
         ending.set()
         thread.join()
         adapter.shutdown()
+
+
+def _free_port() -> int:
+    """Return a UDP port that nobody has, so that tests of other processes are not on the bus."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        return int(probe.getsockname()[1])
 
 
 WORD_WIRES: Mapping[str, Callable[[int], Any]] = {
@@ -204,7 +217,7 @@ WORD_WIRES: Mapping[str, Callable[[int], Any]] = {
     "can+socketcand": _socketcand,
     "can+python-can virtual": lambda count: _python_can(count, "virtual", "plate"),
     "can+python-can udp_multicast": lambda count: _python_can(
-        count, "udp_multicast", "239.74.163.2"
+        count, "udp_multicast", "239.74.163.2", port=_free_port()
     ),
 }
 """Wires by their names: called with the number of amplifiers, at numbers from 1 on."""

@@ -13,6 +13,7 @@ from drivers.by_hand.discovery import identify_all
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
 from drivers.opening import Lines
+from drivers.protocol.table import FEATURES
 from drivers.trace import tracing
 from registry.limits import GuardLimits
 from word_wires import WORD_WIRES, FarSide
@@ -25,7 +26,7 @@ ADDRESSED = [wire for wire in WORD_WIRES if wire not in ("serial+tcp", "modbus+t
 async def leave_playing(far: FarSide, number: int = 1) -> None:
     """Play at half level, as a host that then ends without a word."""
     lines = Lines()
-    amplifier = await lines.amplifier(far.url(number), LIMITS, name="a")
+    amplifier = await lines.amplifier(far.url(number), LIMITS, name="a", is_output=None)
     await amplifier.open()
     await amplifier.arm(77, 2.0)
     await amplifier.stage(5, [Layer(0, (Tone(0, 100.0, 0.5),), 0.0)], now=True)
@@ -87,8 +88,12 @@ async def test_identity_has_units_and_the_limits_of_the_wire() -> None:
 
 @pytest.mark.parametrize("wire", WORD_WIRES)
 async def test_status_of_what_plays_and_clear_of_a_stop(wire: str) -> None:
-    """Looking changes nothing; after a stop Clear leaves it disarmed."""
+    """Looking changes nothing; after a stop Clear leaves it disarmed.
+
+    What full level means is the rig's business.
+    """
     async with WORD_WIRES[wire](2) as far:
+        far.amplifiers[2].capabilities["features"] |= 1 << FEATURES["output"]
         await leave_playing(far, 2)
         rows = await actions.status(far.url(2))
         assert (rows["state"], rows["levels"], rows["token"]) == ("OPERATION_ENABLED", [0.5], 5)

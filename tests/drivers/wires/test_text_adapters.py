@@ -1,0 +1,121 @@
+"""CAN adapters that speak text, as they open: socketcand's greeting, slcan's commands."""
+
+import asyncio
+import os
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+
+import pytest
+
+from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.segments import pack_frames, unpack_frames
+from drivers.errors import LinkError
+from drivers.wires import socketcand
+from drivers.wires.known import address_of
+from drivers.wires.text_port import TextPort
+
+FRAME = CanFrame(0x185, bytes.fromhex("0102030405060708"))
+ELEMENT = b"< frame 185 1.000000 0102030405060708 >"
+
+
+@asynccontextmanager
+async def server(*replies: bytes) -> AsyncIterator[str]:
+    """A server that greets with the first text, and replies to each element with the next.
+
+    Its URL, of node 5. After the last text it closes the connection if that is empty.
+    """
+
+    ended = asyncio.Event()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with suppress(EOFError, ConnectionError):
+            for reply in replies:
+                writer.write(reply)
+                if reply:
+                    await reader.readuntil(b">")
+            if replies[-1]:
+                await reader.read()
+        writer.close()
+        ended.set()
+
+    listening = await asyncio.start_server(serve, "127.0.0.1", 0)
+    try:
+        yield f"can+socketcand://127.0.0.1:{listening.sockets[0].getsockname()[1]}/can0#5"
+    finally:
+        listening.close()
+        await ended.wait()
+        await asyncio.sleep(0)  # the connection ends
+
+
+async def open_port(url: str, on_data: Callable[[bytes], None]) -> None:
+    """Open a URL's port, and close it once it has handed something over."""
+    done = asyncio.Event()
+
+    def received(data: bytes) -> None:
+        on_data(data)
+        done.set()
+
+    port = await address_of(url).open_port(received, lambda cause: done.set())
+    await done.wait()
+    port.close()
+    await port.wait_closed()
+
+
+async def test_frames_amid_the_greeting_do_not_disturb_it() -> None:
+    """A bus on which others speak; a frame that follows the last reply at once is handed over."""
+    heard: list[CanFrame] = []
+    greeting = (b"< hi >", ELEMENT + b"< ok >", ELEMENT + b"< ok >" + ELEMENT)
+    async with server(*greeting) as url:
+        await open_port(url, lambda data: heard.extend(unpack_frames(data)))
+    assert heard == [FRAME]
+
+
+@pytest.mark.parametrize(
+    ("replies", "problem"),
+    [
+        ((b"< error no such bus >",), "no such bus"),
+        ((b"< hi >", b"< error could not open bus >"), "could not open"),
+        ((b"< hi >", b""), "was lost"),
+        ((b"nonsense",), "no reply within"),
+    ],
+)
+async def test_server_that_does_not_open_the_bus_is_told(
+    replies: tuple[bytes, ...], problem: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An error, a closed connection, or no reply at all: with the remedy."""
+    monkeypatch.setattr(socketcand, "_GREETING_TIMEOUT", 0.2)
+    async with server(*replies) as url:
+        with pytest.raises(LinkError, match=rf"(?s){problem}.*check address and port"):
+            await open_port(url, lambda data: None)
+
+
+async def test_slcan_is_closed_then_opened_at_its_bit_rate_and_closed_at_the_end() -> None:
+    """LAWICEL's commands: C, S5 for 250 kbit/s, O; a frame as t with its bytes in hexadecimal."""
+    master, slave = os.openpty()
+    try:
+        url = f"can+slcan://{os.ttyname(slave)}?bitrate=250000#5"
+        port = await address_of(url).open_port(lambda data: None, lambda cause: None)
+        port.write(pack_frames([FRAME]))
+        port.close()
+        text = os.read(master, 100)
+        await port.wait_closed()
+    finally:
+        os.close(master)
+        os.close(slave)
+    assert text == b"\rC\rS5\rO\rt18580102030405060708\r\rC\r"
+
+
+async def test_line_that_was_cut_off_is_ended_before_the_next_frame() -> None:
+    """A port that has not taken all drops the rest of a line: a CR of its own ends that."""
+
+    class Blocked:
+        is_blocked = True
+        written = b""
+
+        def write(self, data: bytes) -> None:
+            self.written += data
+
+    port = TextPort(iter, lambda frame: b"t1850\r", lambda data: None)  # type: ignore[arg-type]
+    port.below = below = Blocked()  # type: ignore[assignment]
+    port.write(pack_frames([FRAME]))
+    assert below.written == b"\rt1850\r"

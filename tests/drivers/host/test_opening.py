@@ -1,6 +1,8 @@
 """Amplifiers of protocol 3 by their URLs, on real terminals, TCP connections and CAN adapters."""
 
 import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 import pytest
 
@@ -16,6 +18,16 @@ LIMITS = GuardLimits(20.0, 1000.0, 1.0)
 CUT = [name for name in WORD_WIRES if "python-can" not in name]
 
 
+@asynccontextmanager
+async def opened_lines() -> AsyncIterator[Lines]:
+    """Lines that are closed at the end."""
+    lines = Lines()
+    try:
+        yield lines
+    finally:
+        await lines.close()
+
+
 async def read_for_ever(amplifier: Amplifier) -> None:
     """Read the status until an error, for five seconds at most."""
     async with asyncio.timeout(5.0):
@@ -27,8 +39,7 @@ async def read_for_ever(amplifier: Amplifier) -> None:
 @pytest.mark.parametrize("wire", WORD_WIRES)
 async def test_group_plays_over_a_wire_and_stops(wire: str) -> None:
     """Two amplifiers on one line: 0.5 on both after one commit, silent after the stop."""
-    async with WORD_WIRES[wire](2) as far:
-        lines = Lines()
+    async with WORD_WIRES[wire](2) as far, opened_lines() as lines:
         amplifiers = {
             str(number): await lines.amplifier(far.url(number), LIMITS, name=str(number))
             for number in far.amplifiers
@@ -45,15 +56,13 @@ async def test_group_plays_over_a_wire_and_stops(wire: str) -> None:
         stopped = await group.stop()
         assert all(each.is_confirmed for each in stopped.values())
         assert [far.level(number) for number in far.amplifiers] == [0.0, 0.0]
-        await lines.close()
 
 
 @pytest.mark.real_time
 @pytest.mark.parametrize("wire", CUT)
 async def test_cut_line_is_lost_once_and_opened_again(wire: str) -> None:
     """Requests of both amplifiers fail with the same message, and those of a new line do not."""
-    async with WORD_WIRES[wire](2) as far:
-        lines = Lines()
+    async with WORD_WIRES[wire](2) as far, opened_lines() as lines:
         both = [
             await lines.amplifier(far.url(number), LIMITS, name="a") for number in far.amplifiers
         ]
@@ -74,15 +83,13 @@ async def test_cut_line_is_lost_once_and_opened_again(wire: str) -> None:
         else:
             with pytest.raises(LinkError, match=r"cannot be opened|refused"):
                 await lines.amplifier(far.url(1), LIMITS, name="a")
-        await lines.close()
 
 
 @pytest.mark.real_time
 @pytest.mark.parametrize("wire", WORD_WIRES)
 async def test_amplifier_that_does_not_reply_leaves_the_line(wire: str) -> None:
     """Nobody has the second address; the first one replies as before."""
-    async with WORD_WIRES[wire](1) as far:
-        lines = Lines()
+    async with WORD_WIRES[wire](1) as far, opened_lines() as lines:
         first, second = [
             await lines.amplifier(far.url(number), LIMITS, name="a") for number in (1, 2)
         ]
@@ -90,13 +97,11 @@ async def test_amplifier_that_does_not_reply_leaves_the_line(wire: str) -> None:
         with pytest.raises(LinkTimeout):
             await second.read_status()
         await first.read_status()
-        await lines.close()
 
 
 async def test_ports_are_for_one_program_alone() -> None:
     """A second host of the same terminal is refused, and a second user of the same address."""
-    async with WORD_WIRES["serial"](1) as far:
-        first, second = Lines(), Lines()
+    async with WORD_WIRES["serial"](1) as far, opened_lines() as first, opened_lines() as second:
         await first.amplifier(far.url(1), LIMITS, name="a")
         with pytest.raises(LinkError, match="in use by another program"):
             await second.amplifier(far.url(1), LIMITS, name="a")
@@ -104,7 +109,6 @@ async def test_ports_are_for_one_program_alone() -> None:
             await first.amplifier(far.url(1), LIMITS, name="b")
         with pytest.raises(LinkError, match="baud must be 921600"):
             await first.amplifier(far.url(2) + "&baud=115200", LIMITS, name="b")
-        await first.close()
 
 
 @pytest.mark.parametrize(

@@ -57,11 +57,12 @@ async def opened() -> AsyncIterator[tuple[BusPort, Adapter, list[str]]]:
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Let the event loop turn until a condition holds."""
-    while True:
-        if condition():
-            return
-        await asyncio.sleep(0)
+    """Let the event loop turn until a condition holds, for ten seconds at most."""
+    async with asyncio.timeout(10.0):
+        while True:
+            if condition():
+                return
+            await asyncio.sleep(0)
 
 
 async def test_long_set_is_sent_as_the_queue_takes_it() -> None:

@@ -84,8 +84,6 @@ class ExpectedAmplifier(ExpectedState):
         """Note its capabilities."""
         self.capabilities = capabilities
         self.outputs.voices = capabilities["voices"]
-        if self.outputs.cause in ("nothing", "a restart"):
-            self.outputs.settle(self.outputs.cause)
 
     # requests
 

@@ -7,9 +7,10 @@ every transition has a radius beside, by which its amplitude may differ meanwhil
 import math
 from collections.abc import Mapping, Sequence
 
-from drivers.playback import Playback, Transition, Voice
+from drivers.playback import Playback, Voice
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES
+from drivers.transition import Transition
 from sim.witness.violation import ReportViolation
 
 LEVEL = 0.002
@@ -42,7 +43,8 @@ class ExpectedOutputs:
 
     def settle(self, cause: str) -> None:
         """Treat all channels as silent, their fades over."""
-        self.playback = Playback(CHANNELS, self.voices)
+        # No fade is cut short in it, so that its levels are upper bounds.
+        self.playback = Playback(CHANNELS, QUANTITIES["voices"].maximum)
         self.cause = cause
         self.is_exact = True
         self._half = [0.0] * LAYERS  # s; by which what a layer plays may be earlier or later

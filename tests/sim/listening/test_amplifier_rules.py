@@ -1,0 +1,269 @@
+"""Each rule for amplifiers, found broken in a conversation written by hand.
+
+Expected rules are by docs/reference/witness.md; messages by docs/decisions/0061-protocol-3.md.
+"""
+
+from typing import Any
+
+import pytest
+
+import hand_written as hand
+from hand_written_talk import HALF, Broken, Talk, breaking
+
+BROKEN: Broken = {}
+breaks = breaking(BROKEN)
+
+
+@breaks("garbage")
+def _state_that_is_none() -> Talk:
+    return Talk().armed().says(9)
+
+
+@breaks("enabled")
+def _set_accepted_before_arm() -> Talk:
+    return Talk().identified().staged(5, hand.layer(0))
+
+
+@breaks("commit")
+def _staged_before_all_parts() -> Talk:
+    stream = hand.layer(0, hand.tone(0, 100, 0.5))
+    talk = Talk().armed()
+    return talk.exchange(hand.SET, hand.part(5, stream[:4], parts=2), hand.taken(5))
+
+
+@breaks("commit")
+def _played_before_its_commit() -> Talk:
+    words = hand.part(5, hand.layer(0))
+    return Talk().armed().exchange(hand.SET, words, hand.taken(5, staged=False, played=True))
+
+
+@breaks("commit")
+def _whole_and_not_staged() -> Talk:
+    words = hand.part(5, hand.layer(0))
+    return Talk().armed().exchange(hand.SET, words, hand.taken(5, staged=False))
+
+
+@breaks("commit")
+def _refused_though_staged() -> Talk:
+    return Talk().armed().staged(5, hand.layer(0)).refused(hand.COMMIT, (9, 5), 6)
+
+
+@breaks("commit")
+def _broadcast_commit_ignored() -> Talk:
+    talk = Talk().armed().staged(5, hand.layer(0, hand.tone(0, 100, 0.5)))
+    talk.sends(hand.COMMIT, (9, 5), address=0)
+    return talk.says(kind=hand.GET_STATUS)
+
+
+@breaks("commit")
+def _plays_as_before() -> Talk:
+    talk = Talk().armed().playing().staged(6, hand.layer(0, hand.tone(0, 100, 0.3)))
+    talk.committed(6, levels=(5000, 0), tokens=(6, 0, 0, 0)).rest(0.03)
+    return talk.says(**HALF | {"token": 6, "tokens": (6, 0, 0, 0)})
+
+
+@breaks("session")
+def _another_session_feeds() -> Talk:
+    return Talk().armed().exchange(hand.PING, (8,), hand.status())
+
+
+@breaks("token")
+def _reports_another_set() -> Talk:
+    return Talk().armed().playing().says(**HALF | {"token": 4})
+
+
+@breaks("token")
+def _reports_another_set_of_a_layer() -> Talk:
+    return Talk().armed().playing().says(**HALF | {"tokens": (0, 5, 0, 0)})
+
+
+@breaks("token")
+def _ended_by_itself_too_late() -> Talk:
+    talk = Talk().armed()
+    talk.staged(5, hand.layer(0, hand.tone(0, 100, 0.0005), valid_for=50))
+    return talk.committed(5, tokens=(5, 0, 0, 0)).rest(0.1).says(token=5, tokens=(5, 0, 0, 0))
+
+
+@breaks("token")
+def _commit_of_a_set_of_long_ago() -> Talk:
+    talk = Talk().armed().staged(5, hand.layer(0))
+    for _ in range(6):
+        talk.rest(0.2).says()
+    return talk.committed(5)
+
+
+@breaks("stop")
+def _stop_refused() -> Talk:
+    return Talk().armed().refused(hand.STOP, (5,), 7)
+
+
+@breaks("stop")
+def _broadcast_stop_ignored() -> Talk:
+    talk = Talk().armed()
+    talk.sends(hand.STOP, (5,), address=0)
+    return talk.says(kind=hand.GET_STATUS)
+
+
+@breaks("armed")
+def _arms_itself() -> Talk:
+    return Talk().identified().rest(0.1).says(kind=hand.GET_STATUS)
+
+
+@breaks("credit")
+def _reply_twice() -> Talk:
+    talk = Talk().armed().says()
+    talk.replies(hand.PING, hand.status())
+    return talk
+
+
+@breaks("credit")
+def _reply_of_another_set() -> Talk:
+    return Talk().armed().exchange(hand.SET, hand.part(5, hand.layer(0)), hand.taken(4))
+
+
+@breaks("answer")
+def _no_reply() -> Talk:
+    talk = Talk().armed()
+    talk.sends(hand.GET_STATUS)
+    return talk.rest(0.04)
+
+
+@breaks("watchdog")
+def _watchdog_too_early() -> Talk:
+    talk = Talk().armed().rest(0.2)
+    return talk.says(hand.FAULT, kind=hand.GET_STATUS, fault=hand.WATCHDOG, latch=1)
+
+
+@breaks("watchdog")
+def _no_watchdog() -> Talk:
+    return Talk().armed().rest(0.3).says(kind=hand.GET_STATUS, left=0)
+
+
+@breaks("watchdog")
+def _watchdog_left_of_before() -> Talk:
+    return Talk().armed().rest(0.05).says(kind=hand.GET_STATUS, left=250)
+
+
+@breaks("latched")
+def _stop_without_a_latch() -> Talk:
+    return Talk().armed().exchange(hand.STOP, (5,), hand.status(hand.STOPPED))
+
+
+@breaks("latched")
+def _latch_that_changes_by_itself() -> Talk:
+    return Talk().armed().says(latch=1)
+
+
+@breaks("latched")
+def _stop_ends_by_itself() -> Talk:
+    talk = Talk().armed().exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
+    return talk.rest(0.1).says(hand.SWITCHED_OFF, kind=hand.GET_STATUS, latch=1)
+
+
+@breaks("latched")
+def _cleared_by_another_latch() -> Talk:
+    talk = Talk().armed().exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
+    return talk.rest(0.1).exchange(hand.CLEAR, (7,), hand.status(hand.SWITCHED_OFF, latch=1))
+
+
+@breaks("latched")
+def _armed_in_a_fault() -> Talk:
+    talk = Talk().armed().says(hand.FAULT, fault=hand.ARC, latch=1)
+    return talk.exchange(hand.ARM, (8, 250), hand.status(latch=1))
+
+
+@breaks("state")
+def _switched_on_by_itself() -> Talk:
+    return Talk().armed().says(hand.SWITCHED_ON)
+
+
+@breaks("state")
+def _fault_without_a_cause() -> Talk:
+    return Talk().armed().says(hand.FAULT, latch=1)
+
+
+@breaks("ramp")
+def _without_a_ramp() -> Talk:
+    talk = Talk().armed().staged(5, hand.layer(0, hand.tone(0, 100, 0.5), ramp=100))
+    return talk.committed(5, levels=(5000, 0), tokens=(5, 0, 0, 0))
+
+
+@breaks("plays")
+def _another_level() -> Talk:
+    return Talk().armed().playing().says(**HALF | {"levels": (4000, 0)})
+
+
+@breaks("plays")
+def _another_frequency_in_achieved() -> Talk:
+    reply = [5, *hand.layer(0, hand.tone(0, 50, 0.5))]
+    return Talk().armed().playing().exchange(hand.GET_ACHIEVED, (0,), reply)
+
+
+@breaks("commit")
+def _another_channel_in_achieved() -> Talk:
+    reply = [5, *hand.layer(0, hand.tone(1, 100, 0.5))]
+    return Talk().armed().playing().exchange(hand.GET_ACHIEVED, (0,), reply)
+
+
+@breaks("plays")
+def _not_exact_without_a_reason() -> Talk:
+    words = hand.part(5, hand.layer(0, hand.tone(0, 100, 0.5)))
+    return Talk().armed().exchange(hand.SET, words, hand.taken(5, exact=False))
+
+
+@breaks("silent")
+def _plays_on_after_silence() -> Talk:
+    talk = Talk().armed().playing()
+    silent: dict[str, Any] = {"token": 5, "levels": (5000, 0)}
+    return talk.exchange(hand.SILENCE, (9, 10), hand.status(**silent)).rest(0.02).says(**silent)
+
+
+@breaks("constant")
+def _other_capabilities() -> Talk:
+    return Talk().armed().exchange(hand.GET_CAPS, (), hand.capabilities(layers=5))
+
+
+@breaks("faults")
+def _fault_not_listed() -> Talk:
+    talk = Talk().armed().says(hand.FAULT, fault=hand.ARC, latch=1)
+    return talk.exchange(hand.GET_FAULTS, (), (0,))
+
+
+@breaks("faults")
+def _fault_five_seconds_old() -> Talk:
+    talk = Talk().armed().says(hand.FAULT, fault=hand.ARC, latch=1)
+    return talk.exchange(hand.GET_FAULTS, (), (1, hand.ARC, 255, 0, 5000))
+
+
+@breaks("high_voltage")
+def _high_voltage_in_a_fault() -> Talk:
+    return Talk().armed().says(hand.FAULT, fault=hand.ARC, latch=1, high_voltage=True)
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_witness_finds_what_an_amplifier_breaks(name: str) -> None:
+    """The conversation breaks one rule, and no other."""
+    rule, talk = BROKEN[name]
+    assert {*talk().found} == {rule}
+
+
+def test_sound_conversation_breaks_no_rule() -> None:
+    """Armed, played in two layers, achieved, silenced, stopped, cleared, armed again, disarmed."""
+    talk = Talk().armed().playing()
+    talk.staged(6, hand.layer(1, hand.tone(1, 150, 0.3, 90.0), valid_for=200))
+    talk.committed(6, levels=(5000, 30), tokens=(5, 6, 0, 0)).rest(0.03)
+    both: dict[str, Any] = {"token": 6, "levels": (5000, 3000)}
+    talk.says(**both | {"tokens": (5, 6, 0, 0)})
+    achieved = [6, *hand.layer(1, hand.tone(1, 150, 0.3, 90.0), valid_for=200)]
+    talk.exchange(hand.GET_ACHIEVED, (1,), achieved)
+    talk.exchange(hand.SET, hand.part(7, hand.layer(1, valid_for=300, renew=True)), hand.taken(7))
+    talk.committed(7, levels=(5000, 3000), tokens=(5, 6, 0, 0))
+    talk.rest(0.2).says(**both | {"token": 7, "tokens": (5, 6, 0, 0)})
+    talk.rest(0.2).says(token=7, levels=(5000, 0), tokens=(5, 0, 0, 0))
+    talk.exchange(hand.SILENCE, (9, 5), hand.status(token=7, levels=(5000, 0)))
+    talk.rest(0.02).says(token=7)
+    talk.exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1, token=7))
+    talk.exchange(hand.CLEAR, (1,), hand.status(hand.SWITCHED_OFF, latch=1, token=7))
+    talk.exchange(hand.ARM, (10, 250), hand.status(latch=1))
+    talk.exchange(hand.DISARM, (50,), hand.status(hand.SWITCHED_OFF, latch=1))
+    assert talk.found == []

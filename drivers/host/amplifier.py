@@ -10,14 +10,14 @@ from drivers import clock
 from drivers.contents import Layer, is_silence
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout, Preempted
 from drivers.guard.budget import COMMIT_DELAY
-from drivers.host.comparison import name_of
+from drivers.host.comparison import achieved_problem, name_of
 from drivers.host.dialogue import Dialogue, Staged
+from drivers.host.identification import check_capabilities, check_identity
 from drivers.host.jobs import Priority
 from drivers.host.joint_start import JointStart
 from drivers.host.ledger import Ledger
 from drivers.host.line import ATTEMPTS, REPLY_TIMEOUT, Line
 from drivers.protocol.records import Values
-from drivers.protocol.serial_payload import speaks
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import (
     FAULTS,
@@ -25,7 +25,6 @@ from drivers.protocol.table import (
     MAX_WORDS,
     QUANTITIES,
     STATES,
-    VERSION,
 )
 from drivers.protocol.tokens import is_newer_token
 from registry.limits import GuardLimits
@@ -39,12 +38,11 @@ LISTENING = 0.3  # s; to an amplifier that is found armed
 SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
+_VOLTAGE, _CURRENT = QUANTITIES["channel_voltage"], QUANTITIES["channel_current"]
 _ENABLED = STATES["OPERATION_ENABLED"]
 _LATCHED = tuple(STATES[name] for name in ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT"))
 PART_BYTES = 2 * MAX_WORDS
 """Of the longest part of a set."""
-_POSITIVE = ("frequency_step", "level_step", "phase_step")
-_FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,9 +103,9 @@ class Amplifier(Dialogue):
             self._check_alone()
             raise
         self._check_alone()
-        self._check_identity(identity)
+        check_identity(identity, self.name, self._serial_number)
         can = await self._request("GetCaps", {}, Priority.OTHER, timeout=OPEN_TIMEOUT)
-        self._check_capabilities(can)
+        check_capabilities(can, self.name, is_output=self._is_output)
         if self._ledger is None:
             self._ledger = Ledger(self.limits, can)
         elif can != self.capabilities:
@@ -123,39 +121,6 @@ class Amplifier(Dialogue):
             raise LinkError(
                 f"amplifier {self.name}: several amplifiers reply at address {self.address} on "
                 f"{self.line.name}; give each its own: era amp address --serial-number"
-            )
-
-    def _check_identity(self, identity: Values) -> None:
-        if not speaks(identity, VERSION):
-            spoken = [str(version) for version in range(16) if speaks(identity, version)]
-            raise LinkError(
-                f"amplifier {self.name} speaks protocol {', '.join(spoken) or 'none'}, needs "
-                f"{VERSION}; update it"
-            )
-        serial = identity["serial_number"]
-        if self._serial_number not in (None, serial):
-            raise LinkError(
-                f"amplifier {self.name}: serial number must be {self._serial_number}, got {serial}"
-                "; connect the expected amplifier, or restart with this one"
-            )
-
-    def _check_capabilities(self, can: Values) -> None:
-        for name in _POSITIVE:
-            if not can[name] > 0:
-                raise LinkError(f"amplifier {self.name}: {name} must be above 0, got {can[name]}")
-        for name in ("watchdog", "envelope_step", "frequency"):
-            low, high = can[f"{name}_min"], can[f"{name}_max"]
-            if low > high:
-                raise LinkError(
-                    f"amplifier {self.name}: {name}_min must be at most {name}_max, got {low} and "
-                    f"{high}"
-                )
-        expected, is_output = self._is_output, bool(can["features"] >> FEATURES["output"] & 1)
-        if expected is not None and is_output is not expected:
-            raise LinkError(
-                f"amplifier {self.name}: full level must be {_FULL_LEVEL[expected]} as in the rig "
-                f"file, got {_FULL_LEVEL[is_output]}; correct the rig file, or connect another "
-                "amplifier"
             )
 
     async def arm(self, session: int, watchdog: float = WATCHDOG) -> Values:
@@ -244,13 +209,35 @@ class Amplifier(Dialogue):
         return max(COMMIT_DELAY, ATTEMPTS * waiting)
 
     async def read_achieved(self, one: LayerSet) -> LayerSet:
-        """Read what plays of a layer of the set that was committed last."""
+        """Read what plays of a layer of the set committed last; the ledger goes on with it.
+
+        Raises CommandRefused where it contradicts the set, and a status did so before.
+        """
         values = await self._request("GetAchieved", {"layer": one.layer}, Priority.SET)
         commands = tuple(
             Command(each["channel"], each["frequency"], each["level"], each["phase"])
             for each in values["commands"]
         )
-        return replace(one, commands=commands)
+        achieved = replace(one, commands=commands)
+        problem = achieved_problem(one, achieved, self.capabilities)
+        if problem is not None:
+            self.note_contradiction(problem, self._time())
+        else:
+            self.ledger.achieved(achieved, values["token"])
+        return achieved
+
+    async def read_measured(self) -> list[tuple[float, float]]:
+        """Read voltage [V] and current [A] of each channel; empty without the feature."""
+        if not self.capabilities["features"] >> FEATURES["electrical"] & 1:
+            return []
+        measured = await self._request("GetMeasured", {}, Priority.READING)
+        return [
+            (
+                _VOLTAGE.from_wire(each["channel_voltage"]),
+                _CURRENT.from_wire(each["channel_current"]),
+            )
+            for each in measured["channels"]
+        ]
 
     async def silence(self, ramp: float) -> Values:
         """Let all layers fall silent along a ramp [s]; it stays armed."""

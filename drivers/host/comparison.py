@@ -8,13 +8,17 @@ from collections.abc import Mapping
 from drivers.host.feeding import Feeding
 from drivers.host.ledger import Ledger
 from drivers.protocol.records import Values
-from drivers.protocol.table import QUANTITIES, STATES, STATUS_FLAGS
+from drivers.protocol.sets import LayerSet
+from drivers.protocol.table import FEATURES, QUANTITIES, STATES, STATUS_FLAGS
 
 MAX_CONTRADICTIONS = 2
 """Contradictions in a row that are a fault; a single one may be a moment between two sets."""
 
 _LEVEL, _LEFT = QUANTITIES["level"], QUANTITIES["watchdog_left"]
 _STEPS = 2
+_HALF_TURN = 180 * QUANTITIES["phase"].per_unit
+_MEASURING_ERROR = 0.002  # of full level, where an amplifier measures its levels
+_WEAK = 0.25  # largest measuring error, relative to a weak level
 
 
 def problem_of(
@@ -52,7 +56,9 @@ def _level_problem(status: Values, ledger: Ledger, sent_at: float, now: float) -
     playback, late = ledger.playback, sent_at - ledger.lag
     if len(status["levels"]) != playback.channels:
         return f"levels must be {playback.channels}, got {len(status['levels'])}"
-    tolerance = _STEPS * max(ledger.capabilities["level_step"], 1)
+    can = ledger.capabilities
+    tolerance = _STEPS * max(can["level_step"], 1)
+    is_measured = can["features"] >> FEATURES["levels_measured"] & 1
     is_steady = playback.next_due - 2 * ledger.lag > now
     for channel, level in enumerate(status["levels"]):
         highest, is_settled = 0.0, is_steady
@@ -68,8 +74,36 @@ def _level_problem(status: Values, ledger: Ledger, sent_at: float, now: float) -
                 highest += max(abs(transition.first), abs(transition.last))
         high = round(min(highest, 1.0) * _LEVEL.per_unit)
         low = round(min(playback.level(channel, now), 1.0) * _LEVEL.per_unit) if is_settled else 0
+        if is_measured:
+            error = round(_MEASURING_ERROR * _LEVEL.per_unit)
+            low, high = low - min(error, round(_WEAK * low)), high + min(error, round(_WEAK * high))
         if not low - tolerance <= level <= high + tolerance:
             return f"level of channel {channel} must be {low} to {high} (1e-4), got {level}"
+    return None
+
+
+def achieved_problem(sent: LayerSet, achieved: LayerSet, can: Values) -> str | None:
+    """Describe what a layer that plays contradicts; None if it is what was sent, to the steps.
+
+    can: values of the capabilities. Envelopes are not compared: an amplifier does not report them.
+    """
+    commands = {command.channel: command for command in sent.commands if command.level}
+    played = {command.channel: command for command in achieved.commands if command.level}
+    if commands.keys() != played.keys():
+        return f"channels of layer {sent.layer} must be {[*commands]}, got {[*played]}"
+    for channel, command in commands.items():
+        got = played[channel]
+        turn = (got.phase - command.phase + _HALF_TURN) % (2 * _HALF_TURN) - _HALF_TURN
+        for name, difference in (
+            ("frequency", got.frequency - command.frequency),
+            ("level", got.level - command.level),
+            ("phase", turn),
+        ):
+            if abs(difference) > (can[f"{name}_step"] + 1) / 2:
+                return (
+                    f"{name} achieved on channel {channel} in layer {sent.layer} must be "
+                    f"{getattr(command, name)}, got {getattr(got, name)} (steps of the wire)"
+                )
     return None
 
 

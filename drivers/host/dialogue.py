@@ -208,14 +208,19 @@ class Dialogue:
         problem = problem_of(status, self._ledger, self.feeding, sent_at=sent_at, now=now, fed=fed)
         if problem is None:
             self._contradictions, self._contradicted_at = 0, -math.inf
-        elif now - self._contradicted_at >= _SAME_MOMENT:
-            self._contradictions, self._contradicted_at = self._contradictions + 1, now
-            if self._contradictions >= MAX_CONTRADICTIONS:
-                raise CommandRefused(
-                    f"amplifier {self.name} contradicts its requests: {problem}; look for a "
-                    "derated or broken channel, an exchanged cable or firmware, then clear and arm "
-                    "again"
-                )
+        else:
+            self.note_contradiction(problem, now)
+
+    def note_contradiction(self, problem: str, now: float) -> None:
+        """Count a contradiction at a time [s]; raises CommandRefused for the second in a row."""
+        if now - self._contradicted_at < _SAME_MOMENT:
+            return
+        self._contradictions, self._contradicted_at = self._contradictions + 1, now
+        if self._contradictions >= MAX_CONTRADICTIONS:
+            raise CommandRefused(
+                f"amplifier {self.name} contradicts its requests: {problem}; look for a derated or "
+                "broken channel, an exchanged cable or firmware, then clear and arm again"
+            )
 
     def _driven_by_another(self) -> LinkError:
         return LinkError(f"amplifier {self.name} is driven by another host; end that one first")

@@ -1,0 +1,119 @@
+"""What an amplifier says it plays, compared with what it was sent."""
+
+from dataclasses import replace
+
+import pytest
+
+from drivers.contents import Layer, Tone
+from drivers.errors import CommandRefused
+from drivers.host.comparison import achieved_problem
+from drivers.host.group import Group
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, LayerSet
+from sim.amplifier.contract import capabilities
+from virtual_loop import in_virtual_time
+from words_line import KINDS, MemoryLine
+
+SENT = LayerSet(2, 20, 0, (Command(0, 2000, 5000, 17_990), Command(1, 2000, 0, 0)))
+CAN = {**capabilities(2), "frequency_step": 3, "level_step": 5, "phase_step": 41}
+PLAYED = SENT.commands[0]
+SAME = [
+    *(PLAYED, replace(PLAYED, frequency=2002), replace(PLAYED, level=4997)),
+    replace(PLAYED, phase=-17_989),  # 21 steps beyond 179.9 degrees, across 180
+]
+OTHER = {
+    "frequency": [replace(PLAYED, frequency=2003)],
+    "level": [replace(PLAYED, level=4996)],
+    "phase": [replace(PLAYED, phase=-17_988)],
+    "channels": [],
+    "channels of": [PLAYED, Command(1, 2000, 1, 0)],
+}
+
+
+@pytest.mark.parametrize("played", SAME)
+def test_half_a_step_and_what_the_wire_rounds_is_no_contradiction(played: Command) -> None:
+    """Half of the steps of the amplifier and of the wire: 2, 3 and 21 steps of the wire."""
+    assert achieved_problem(SENT, replace(SENT, commands=(played,)), CAN) is None
+
+
+@pytest.mark.parametrize("name", OTHER)
+def test_more_than_that_is_one(name: str) -> None:
+    """Of frequency, level and phase, and channels that are missing or too many."""
+    problem = achieved_problem(SENT, replace(SENT, commands=tuple(OTHER[name])), CAN)
+    assert problem is not None
+    assert problem.startswith(name)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@in_virtual_time
+async def test_ledger_goes_on_with_what_was_achieved(kind: str) -> None:
+    """An amplifier of steps of 10 % plays 0.6 for 0.58: 0.41 beside it is refused, 0.4 plays."""
+    end = MemoryLine(kind, "a")
+    far, (host,) = end.far["a"], end.hosts.values()
+    far.capabilities = {**far.capabilities, "level_step": 1000}
+    group = Group(end.hosts, draw=lambda low, high: 77)
+    await group.open()
+    await group.arm()
+    commit = far.playback.commit
+
+    def rounded(layers: tuple[LayerSet, ...], token: int, time: float) -> None:
+        commands = [
+            tuple(replace(each, level=round(each.level, -3)) for each in layer.commands)
+            for layer in layers
+        ]
+        made = [replace(one, commands=each) for one, each in zip(layers, commands, strict=True)]
+        commit(made, token, time)
+
+    far.playback.commit = rounded  # type: ignore[method-assign]
+    staged = await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.58),), 0.001)]})
+    achieved = await host.read_achieved(staged["a"].layers[0])
+    assert achieved.commands[0].level == 6000
+    with pytest.raises(CommandRefused):
+        await group.apply({"a": [Layer(1, (Tone(0, 150.0, 0.41),), 0.001)]})
+    await group.apply({"a": [Layer(1, (Tone(0, 150.0, 0.4),), 0.001)]})
+
+
+@in_virtual_time
+async def test_levels_that_are_measured_have_an_error() -> None:
+    """0.002 of full level, a quarter at most: 0.5 measured as 0.498 agrees, as 0.497 does not.
+
+    The tolerance of two steps of 1e-4 comes on top.
+    """
+    end = MemoryLine("serial", "a")
+    far, (host,) = end.far["a"], end.hosts.values()
+    far.capabilities = {**far.capabilities, "features": far.capabilities["features"] | 1 << 2}
+    group = Group(end.hosts, draw=lambda low, high: 77)
+    await group.open()
+    await group.arm()
+    await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)]})
+    status = far.status
+
+    def measured(level: int) -> None:
+        far.status = lambda now: {**status(now), "levels": [level, 0]}  # type: ignore[method-assign]
+
+    for level, count in ((4978, 0), (4977, 1)):
+        measured(level)
+        end.loop.now += 0.02  # type: ignore[attr-defined]
+        await host.ping()
+        assert host._contradictions == count
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@in_virtual_time
+async def test_voltage_and_current_of_each_channel(kind: str) -> None:
+    """In volts and amperes; none without the feature."""
+    end = MemoryLine(kind, "a")
+    far, (host,) = end.far["a"], end.hosts.values()
+    values: Values = {
+        "count": 2,
+        "channels": [
+            {"channel_voltage": 12_345, "channel_current": 250},
+            {"channel_voltage": 0, "channel_current": 0},
+        ],
+    }
+    far._measured = lambda now: iter(values["channels"])  # type: ignore[method-assign]
+    await host.open()
+    assert await host.read_measured() == [(1234.5, 250e-6), (0.0, 0.0)]
+    far.capabilities = {**far.capabilities, "features": 0}
+    await host.open()
+    assert await host.read_measured() == []

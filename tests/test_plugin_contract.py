@@ -22,6 +22,9 @@ from controller.sources.tuio import TuioSource
 from drivers.backends.serial_line.backend import SerialBackend
 from drivers.errors import CommandError
 from drivers.registry import known_schemes, open_backend
+from drivers.wires.known import address_of
+from drivers.wires.known import known_schemes as known_wires
+from drivers.wires.serial_line import SerialAddress
 from model.errors import InputError
 from model.structure.materials import KNOWN_MATERIALS, known_material, material_names
 from registry.plugins import failure_text
@@ -122,6 +125,30 @@ KINDS = [
         "    async def close(self): pass\n"
         "    async def exchange(self, request, *, timeout): pass\n",
         use=lambda found: asyncio.run(found.open()),
+        ending="://",
+        rest="a:1",
+        error=CommandError,
+    ),
+    Kind(
+        "wires",
+        "wire",
+        "from era_haptics.plugins.wires import CommandError as Refused, WireAddress\n"
+        "class THING(WireAddress):\n"
+        f"{URL_CLASS}"
+        "    def exchange_time(self, words, reply): return 0.0\n"
+        "    def make_wire(self): pass\n"
+        "    async def open_port(self, on_data, on_loss): pass\n",
+        "a class derived from WireAddress",
+        address_of,
+        ("serial+tcp", SerialAddress),
+        known_wires,
+        fails="from era_haptics.plugins.wires import WireAddress\n"
+        "class THING(WireAddress):\n"
+        "    def __init__(self, url): pass\n"
+        "    def exchange_time(self, words, reply): return 0.0\n"
+        "    def make_wire(self): pass\n"
+        "    async def open_port(self, on_data, on_loss): raise KeyError('open')\n",
+        use=lambda found: asyncio.run(found.open_port(None, None)),
         ending="://",
         rest="a:1",
         error=CommandError,

@@ -1,31 +1,51 @@
-"""Drive the amplifiers of a bench, by requests that must not be refused."""
+"""Drive the amplifiers of a bench, of protocol 3, by requests that must not be refused."""
 
 from collections.abc import Collection
+from functools import partial
 
-from drivers.command import CommandSet, DriveCommand
-from drivers.protocol.messages import Apply, Arm, Nak, Ping, Request
+from drivers.contents import Tone
+from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
+from drivers.protocol.table import QUANTITIES
+from sim.amplifier.contract import Amplifier
 from sim.bench.bench import Bench
 
+SESSION = 9
+_Q = QUANTITIES
 
-def ask(bench: Bench, name: str, request: Request, now: float) -> None:
-    """Exchange a request with an amplifier at a time [s]."""
-    reply = bench.exchange(name, request, now=now)
-    assert not isinstance(reply, Nak), reply
+bench_of = partial(Bench, make_amplifier=Amplifier)
+"""A bench whose amplifiers speak protocol 3; see `Bench`."""
+
+
+def arm(bench: Bench, watchdog: float, *, now: float, name: str = "main") -> None:
+    """Arm an amplifier at a time [s], with a watchdog [s]."""
+    values = {"session": SESSION, "watchdog": _Q["watchdog"].to_wire(watchdog)}
+    bench.exchange(name, "Arm", values, now=now)
 
 
 def play(
     bench: Bench,
-    *commands: DriveCommand,
+    *tones: Tone,
     now: float,
     name: str = "main",
     token: int = 1,
     ramp: float = 0.0,
     watchdog: float | None = None,
 ) -> None:
-    """Apply a set at a time [s]; watchdog [s]: arm before, None where it is armed."""
+    """Play tones in layer 0 at a time [s]; watchdog [s]: arm before, None where it is armed."""
     if watchdog is not None:
-        ask(bench, name, Arm(watchdog), now)
-    ask(bench, name, Apply(CommandSet(token, commands, ramp, 0.0)), now)
+        arm(bench, watchdog, now=now, name=name)
+    commands = [
+        Command(
+            tone.channel,
+            _Q["frequency"].to_wire(tone.frequency),
+            _Q["level"].to_wire(tone.level),
+            _Q["phase"].to_wire(tone.phase),
+        )
+        for tone in tones
+    ]
+    layer = LayerSet(0, _Q["ramp"].to_wire(ramp), 0, tuple(commands))
+    for part in parts(pack_layers([layer]), session=SESSION, token=token, now=True):
+        bench.exchange(name, "Set", part, now=now)
 
 
 def keep_alive(
@@ -34,5 +54,5 @@ def keep_alive(
     """Advance to a time [s], with heartbeats to these amplifiers, None for all."""
     while (now := bench.time + every) < until:
         for name in names or bench.amplifiers:
-            ask(bench, name, Ping(), now)
+            bench.exchange(name, "Ping", {"session": SESSION}, now=now)
     bench.advance(until)

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bench_driving import ask, keep_alive
-from drivers.command import CommandSet, DriveCommand
-from drivers.protocol.messages import Apply, Arm, Stop
+from bench_driving import arm, bench_of, keep_alive, play
+from drivers.contents import Tone
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
@@ -18,7 +17,6 @@ from model.rig.uncertainty import Uncertainty
 from model.structure.fingertip import Fingertip
 from plate_in_time import lock_in
 from resting_fingers import FINGERTIP
-from sim.bench.bench import Bench
 from sim.plant.imperfections import (
     ChannelErrors,
     Imperfections,
@@ -44,20 +42,20 @@ def two_amplifiers(coarse_rig: Rig) -> Rig:
 def played(
     rig: Rig,
     imperfections: Imperfections,
-    commands: Mapping[str, tuple[DriveCommand, ...]],
+    commands: Mapping[str, tuple[Tone, ...]],
     *,
     until: float = 1.0,
     stop: float | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Times [s] and acceleration [m/s²] in the middle of a finger, commands coming at 0.01 s."""
-    bench = Bench(rig, now=0.0, imperfections=imperfections)
+    bench = bench_of(rig, now=0.0, imperfections=imperfections)
     bench.place_fingers({"a": AT}, now=0.0)
     for name, wanted in commands.items():
-        ask(bench, name, Arm(2.0), 0.0)
-        ask(bench, name, Apply(CommandSet(1, wanted, 0.02, 0.0)), 0.01)
+        arm(bench, 2.0, now=0.0, name=name)
+        play(bench, *wanted, now=0.01, name=name, ramp=0.02)
     if stop is not None:
         for name in commands:
-            ask(bench, name, Stop(0.01), stop)
+            bench.exchange(name, "Stop", {"ramp": 10}, now=stop)
     keep_alive(bench, until)
     (record,) = bench.fingers.felt(0.0, until).values()
     return record.times, record.accelerations[:, 0]
@@ -75,7 +73,7 @@ def test_imperfections_apply_gain_and_phase(two_amplifiers: Rig) -> None:
     shares: list[complex] = []
     for imperfections in (PERFECT, errors):
         for name, channel in (("left", 0), ("right", 1)):
-            drive = {name: (DriveCommand(channel, 110.0, 0.5),)}
+            drive = {name: (Tone(channel, 110.0, 0.5),)}
             times, samples = played(two_amplifiers, imperfections, drive, until=3.0)
             shares.append(phasor(times, samples, 110.0, since=2.5))
     assert shares[2] == pytest.approx(shares[0], rel=1e-9)
@@ -86,7 +84,7 @@ def test_imperfections_apply_gain_and_phase(two_amplifiers: Rig) -> None:
 @pytest.mark.parametrize("stop", [None, 0.4])
 def test_imperfections_latency_delays_the_motion(two_amplifiers: Rig, stop: float | None) -> None:
     """With 3 ms of latency the whole record, onset and stop, is the same 3 ms later."""
-    drive = {"left": (DriveCommand(0, 110.0, 0.5), DriveCommand(1, 171.0, 0.3, phase=40.0))}
+    drive = {"left": (Tone(0, 110.0, 0.5), Tone(1, 171.0, 0.3, phase=40.0))}
     _, prompt = played(two_amplifiers, PERFECT, drive, stop=stop)
     _, late = played(two_amplifiers, Imperfections(latency=0.003), drive, stop=stop)
     assert np.abs(prompt).max() > 1
@@ -96,7 +94,7 @@ def test_imperfections_latency_delays_the_motion(two_amplifiers: Rig, stop: floa
 
 def test_imperfections_skew_shifts_the_phase(two_amplifiers: Rig) -> None:
     """One amplifier 1 ms behind the other: at 110 Hz its share lags by 39.6 degrees."""
-    drive = {"right": (DriveCommand(0, 110.0, 0.5),)}
+    drive = {"right": (Tone(0, 110.0, 0.5),)}
     skewed = Imperfections(latency=0.002, skew={"right": 0.001, "left": -0.0005})
     shares = [
         phasor(*played(two_amplifiers, each, drive, until=3.0), 110.0, since=2.5)
@@ -111,12 +109,11 @@ def test_imperfections_latency_keeps_the_order_of_commands(two_amplifiers: Rig) 
     """Two sets within the latency: both are played, each as long as it was meant to be."""
     frequencies = []
     for latency in (0.0, 0.05):
-        bench = Bench(two_amplifiers, now=0.0, imperfections=Imperfections(latency=latency))
+        bench = bench_of(two_amplifiers, now=0.0, imperfections=Imperfections(latency=latency))
         bench.place_fingers({"a": AT}, now=0.0)
-        ask(bench, "left", Arm(2.0), 0.0)
+        arm(bench, 2.0, now=0.0, name="left")
         for token, (frequency, now) in enumerate([(110.0, 0.1), (170.0, 0.12)], start=1):
-            wanted = CommandSet(token, (DriveCommand(0, frequency, 0.5),), 0.0, 0.0)
-            ask(bench, "left", Apply(wanted), now)
+            play(bench, Tone(0, frequency, 0.5), now=now, name="left", token=token)
         bench.advance(0.4)
         windows = [(0.09, 0.0999), (0.1001, 0.1199), (0.1201, 0.15)]
         frequencies.append(
@@ -144,7 +141,7 @@ def test_noise_has_its_rms_while_a_channel_plays(two_amplifiers: Rig) -> None:
     assert np.std(motion) == pytest.approx(1e-6, rel=0.01)
 
     noisy = Imperfections({Channel("left", 0): ChannelErrors(noise=0.02)})
-    drive = {"left": (DriveCommand(0, 110.0, 0.2),)}
+    drive = {"left": (Tone(0, 110.0, 0.2),)}
     times, loud = played(two_amplifiers, noisy, drive, until=3.0, stop=1.5)
     _, again = played(two_amplifiers, noisy, drive, until=3.0, stop=1.5)
     _, clean = played(two_amplifiers, PERFECT, drive, until=3.0, stop=1.5)
@@ -153,8 +150,8 @@ def test_noise_has_its_rms_while_a_channel_plays(two_amplifiers: Rig) -> None:
     assert not hiss[times <= 0.01].any()
     assert hiss[(times > 0.5) & (times < 1.5)].std() > 0.1
     assert np.abs(hiss[times > 2.9]).max() < 1e-3 * np.abs(hiss).max()
-    _, other = played(two_amplifiers, noisy, {"left": (DriveCommand(1, 110.0, 0.2),)})
-    _, quiet = played(two_amplifiers, PERFECT, {"left": (DriveCommand(1, 110.0, 0.2),)})
+    _, other = played(two_amplifiers, noisy, {"left": (Tone(1, 110.0, 0.2),)})
+    _, quiet = played(two_amplifiers, PERFECT, {"left": (Tone(1, 110.0, 0.2),)})
     assert_allclose(other, quiet, rtol=0, atol=0)
 
 
@@ -243,7 +240,7 @@ def test_imperfections_of_the_plate_are_those_of_another_rig(coarse_rig: Rig) ->
             for era in coarse_rig.eras
         ),
     )
-    drive = {"main": (DriveCommand(0, 110.0, 0.5), DriveCommand(1, 110.0, 0.5))}
+    drive = {"main": (Tone(0, 110.0, 0.5), Tone(1, 110.0, 0.5))}
     _, found = played(coarse_rig, Imperfections(plate=errors), drive)
     _, expected = played(built, PERFECT, drive)
     assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
@@ -273,4 +270,4 @@ def test_imperfections_refuse_unknown_channels(two_amplifiers: Rig) -> None:
     with pytest.raises(InputError, match="channel 7 of amplifier left"):
         Imperfections({Channel("left", 7): ChannelErrors()}).check(two_amplifiers)
     with pytest.raises(InputError, match="middle"):
-        Bench(two_amplifiers, now=0.0, imperfections=Imperfections(skew={"middle": 0.001}))
+        bench_of(two_amplifiers, now=0.0, imperfections=Imperfections(skew={"middle": 0.001}))

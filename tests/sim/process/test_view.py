@@ -3,10 +3,9 @@
 import numpy as np
 from rich.console import Console
 
-from bench_driving import play
-from drivers.command import DriveCommand
+from bench_driving import bench_of, play
+from drivers.contents import Tone
 from model.rig.rig import Rig
-from sim.bench.bench import Bench
 from sim.control.context import SimulationContext
 from sim.process.view import PlateView, draw
 
@@ -26,7 +25,7 @@ def rows_of(text: str) -> list[str]:
 
 def test_view_shows_eras_fingers_and_peaks_in_place(coarse_rig: Rig) -> None:
     """y points upwards; peaks are darkest near the driven ERA; nothing at rest."""
-    bench = Bench(coarse_rig, now=0.0)
+    bench = bench_of(coarse_rig, now=0.0)
     context = SimulationContext(bench, urls={"main": "serial:///dev/pts/7?baud=921600"})
     plate = PlateView(bench)
     bench.probes.append(plate)
@@ -40,7 +39,7 @@ def test_view_shows_eras_fingers_and_peaks_in_place(coarse_rig: Rig) -> None:
     # 0.25 of 0.3048 m from the left, 0.05 of 0.2286 m from below.
     assert rows[-1 - int(0.05 / 0.2286 * len(rows))].index("O") == int(0.25 / 0.3048 * 28)
     assert set("".join(rows)) == {"E", "O", " "}
-    play(bench, DriveCommand(0, 40.0, 0.5), now=0.1, watchdog=2.0)
+    play(bench, Tone(0, 40.0, 0.5), now=0.1, watchdog=2.0)
     bench.advance(1.0)
     bench.advance(1.3)
     moving = shown(context, plate)

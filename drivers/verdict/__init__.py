@@ -1,0 +1,93 @@
+"""The contract of every amplifier of protocol 3, on whatever wire, as checks.
+
+Run against hardware by its URL, and by the project's tests over every wire in virtual time. Checks
+that only read come first; the others arm the amplifier and drive its channels.
+"""
+
+from collections.abc import Callable
+
+from drivers.verdict import (
+    arming,
+    can_frames,
+    layers,
+    modbus_frames,
+    reading,
+    serial_frames,
+    sets,
+    shapes,
+    silencing,
+    telling,
+    tokens,
+    voices,
+    watchdog,
+)
+from drivers.verdict.check import Check, CheckResult, Report, Result, run_checks
+from drivers.verdict.opening import opened
+from drivers.verdict.subject import LEVEL
+
+__all__ = ["CHECKS", "LEVEL", "Check", "CheckResult", "Report", "Result", "judge", "of_kind"]
+
+CHECKS: tuple[Check, ...] = (
+    *(reading.identity, reading.capabilities, reading.starts_disarmed, reading.replies_in_time),
+    *(reading.unknown_types, reading.reading_changes_nothing, reading.ages_and_temperature),
+    *(reading.hello_for_ever, telling.sensors, modbus_frames.areas, modbus_frames.pieces),
+    *(can_frames.objects, reading.lengths),
+    *(silencing.stop, silencing.stop_ramps, silencing.silence_never_later),
+    *(silencing.stop_ends_all, silencing.stops_are_numbered, silencing.clear_too_early),
+    *(silencing.disarm, silencing.silence),
+    *(arming.plays_nothing_disarmed, arming.arming, arming.watchdog_ranges, arming.arms_again),
+    *(arming.sessions, arming.arming_ends_fades),
+    *(watchdog.watchdog, watchdog.watchdog_unread, watchdog.watchdog_left, watchdog.what_feeds),
+    *(watchdog.what_does_not_feed, watchdog.trips_amid_other_requests),
+    *(watchdog.trips_amid_fades, watchdog.fault_list),
+    *(sets.every_channel, sets.levels_of_every_frequency, sets.achieved, sets.steps_as_stated),
+    *(sets.all_or_nothing, sets.accepts_its_ranges, sets.parts_of_sets, sets.longest_set),
+    sets.sets_expire,
+    *(tokens.stage_and_commit, tokens.repeats_change_nothing, tokens.tokens_wrap),
+    *(tokens.newer_sets_replace, tokens.committed_together),
+    *(layers.layers_add, layers.layers_play_on, layers.limited, layers.valid_for, layers.renew),
+    layers.after,
+    *(shapes.ramps, shapes.cross_fades, shapes.interrupted_ramps, shapes.kept_phase),
+    *(shapes.onsets, shapes.endings, shapes.endings_amid, shapes.extreme_envelopes),
+    *(shapes.phases, shapes.frequency, voices.voices, voices.voices_of_layers),
+    *(serial_frames.damaged_frames, serial_frames.doubled_frames, serial_frames.tolerated_frames),
+    *(modbus_frames.present_areas, modbus_frames.exceptions),
+    *(can_frames.numbers, can_frames.network_management, can_frames.heartbeats),
+    *(telling.events, telling.broadcasts, telling.measured, telling.readings, telling.addresses),
+)
+"""All checks, in their order of execution."""
+
+
+def of_kind(kind: str) -> list[tuple[int, Check]]:
+    """Return the checks of a kind of wire, each with its number."""
+    numbered = enumerate(CHECKS, 1)
+    return [(number, check) for number, check in numbered if not check.kinds or kind in check.kinds]
+
+
+async def judge(
+    url: str,
+    *,
+    drives: bool,
+    level: float = LEVEL,
+    on_result: Callable[[CheckResult], None] = lambda result: None,
+    before: Report | None = None,
+) -> Report:
+    """Check the amplifier at a URL, and leave it silent and disarmed.
+
+    drives: also what arms it and drives its channels, at this level of full level at most.
+    on_result: called with each result. before: report of checks that are not run again. Raises
+    CommandError for a URL that is none, LinkError for a line that cannot be opened or is lost.
+    """
+    results = () if before is None else before.results
+    known = {each.number for each in results}
+    async with opened(url) as client:
+        checks = of_kind(client.kind)
+        chosen = [
+            (number, check)
+            for number, check in checks
+            if number not in known and (drives or not check.drives)
+        ]
+        found = await run_checks(chosen, client, level=level, on_result=on_result)
+    results = (*results, *found)
+    driven = level if any(each.check.drives for each in results) else 0.0
+    return Report(url, driven, results, len(checks) - len(results))

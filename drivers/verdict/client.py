@@ -1,0 +1,166 @@
+"""A host below the host: one raw message at a time, and the times of all that is heard.
+
+A client of a kind of wire makes frames and reads them; nothing is repeated or given up by itself,
+and what was not asked for is kept, so that checks see it.
+"""
+
+import asyncio
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, Protocol
+
+from drivers import clock
+from drivers.errors import LinkError
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REFUSALS
+from drivers.verdict.findings import Violation
+
+REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
+QUIET = 0.03  # s; in which something that must not be replied to would be
+_CODES = {number: name for name, number in REFUSALS.items()}
+
+
+class Port(Protocol):
+    """An open port; what it receives goes to `Client.received`."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; raises LinkError."""
+
+
+class When(NamedTuple):
+    """An interval in which something happened [s]."""
+
+    earliest: float
+    latest: float
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A message of the amplifier: number of its request (0: an event), type, words."""
+
+    at: float
+    number: int
+    type: int
+    words: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What became of a request: code of a refusal, empty where it was carried out; its words.
+
+    channel: that a refusal names; when: between sending and the reply [s].
+    """
+
+    code: str
+    channel: int | None
+    words: tuple[int, ...]
+    when: When
+
+
+class Client(ABC):
+    """One amplifier at an address of a line.
+
+    heard: messages that no request was waiting for; events: those of type Event. reply_words: the
+    longest reply to each message by its number, where it is known. transit: time on the wire [s] of
+    a request and the longest reply. session: that was begun last. loss: why the line was
+    lost.
+    """
+
+    kind: ClassVar[str]
+    """Kind of wire: serial, rtu, tcp or can."""
+    broadcasts: ClassVar[bool] = True
+    """Whether one request can be for all."""
+    has_events: ClassVar[bool] = True
+    """Whether the wire carries messages that were not asked for."""
+    addresses: ClassVar[int] = 247
+    """The highest address."""
+
+    def __init__(self, port: Port, address: int) -> None:
+        self.port = port
+        self.address = address
+        self.heard: list[Heard] = []
+        self.events: list[Heard] = []
+        self.reply_words: dict[int, int] = {}
+        self.transit = 0.0
+        self.session = 0
+        self.loss: str | None = None
+        self._news = asyncio.Event()
+
+    @abstractmethod
+    def received(self, data: bytes) -> None:
+        """Take bytes from the port."""
+
+    @abstractmethod
+    async def hello(self) -> Values:
+        """Read the identity; raises Violation."""
+
+    @abstractmethod
+    async def exchange(self, number: int, words: Sequence[int]) -> Answer:
+        """Send a message and await its reply; raises Violation where none comes."""
+
+    @abstractmethod
+    def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
+        """Return the frames of a request; to: its address, 0 for all, None for this amplifier."""
+
+    @abstractmethod
+    def damaged(self, number: int, words: Sequence[int]) -> Mapping[str, bytes]:
+        """Return frames that must have no effect and no reply, by what is wrong with them."""
+
+    async def send(self, data: bytes, quiet: float = QUIET) -> list[Heard]:
+        """Send bytes; return what is heard until a time [s] has passed."""
+        self.heard.clear()
+        self.port.write(data)
+        await asyncio.sleep(quiet)
+        heard, self.heard = self.heard, []
+        return heard
+
+    def take(self, message: Heard, *, is_event: bool = False) -> None:
+        """Keep a message that was heard."""
+        (self.events if is_event else self.heard).append(message)
+        self._news.set()
+
+    async def next(
+        self, is_meant: Callable[[Heard], bool], timeout: float = REPLY_TIMEOUT
+    ) -> Heard | None:
+        """Return the first message that is meant, None if it does not come in time [s]."""
+        loop, due = asyncio.get_running_loop(), clock.now() + timeout
+        timer = loop.call_at(due, self._news.set)
+        try:
+            while True:
+                for message in self.heard:
+                    if is_meant(message):
+                        self.heard.remove(message)
+                        return message
+                if self.loss is not None:
+                    raise LinkError(self.loss)
+                if clock.now() >= due:
+                    return None
+                self._news.clear()
+                await self._news.wait()
+        finally:
+            timer.cancel()
+
+    def answer(self, sent: float, came: float, number: int, words: Sequence[int]) -> Answer:
+        """Make the answer of a reply that was carried out."""
+        return Answer("", None, tuple(words), When(sent, came))
+
+    def refusal(self, sent: float, came: float, number: int, words: Sequence[int]) -> Answer:
+        """Make the answer of a Nak; Violation where it names another request."""
+        try:
+            values = NAK_RECORD.unpack(words, is_strict=True)
+        except Refusal as error:
+            raise Violation("Nak", expected="three words", seen=str(error)) from None
+        if values["request"] != number:
+            raise Violation("request that a Nak names", expected=number, seen=values["request"])
+        channel = None if values["channel"] == NO_CHANNEL else values["channel"]
+        code = _CODES.get(values["code"], f"code {values['code']}")
+        return Answer(code, channel, (), When(sent, came))
+
+
+def expect_reply(found: Heard | None, number: int) -> Heard:
+    """Return a reply; Violation where there is none."""
+    if found is None:
+        seen = f"none within {REPLY_TIMEOUT:g} s"
+        raise Violation(f"reply to message {number}", expected="one", seen=seen)
+    return found

@@ -1,0 +1,197 @@
+"""A Modbus line, RTU or TCP, PDU by PDU: writes of messages, reads of their replies."""
+
+import asyncio
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from drivers import clock
+from drivers.protocol.records import Values
+from drivers.protocol.table import MAX_WORDS, MESSAGES
+from drivers.verdict.client import QUIET, Answer, Client, Heard, Port, expect_reply
+from drivers.verdict.findings import Violation, expect, expect_equal
+
+BOX, REPLY = 256, 128  # registers of a message, offset of its reply
+HEAD = 2  # registers of a reply before its words: tag, result
+IDENTITY, TEXT = 1065, 16  # first register, registers of a text
+WRITE, READ_HOLDING, READ = 16, 3, 4
+PRESENT = tuple(MESSAGES[name].number for name in ("GetCaps", "GetStatus", "GetFaults"))
+EXCEPTION = 0x80
+_HEADER = struct.Struct(">HHHB")  # transaction, protocol, length, unit
+_EXCEPTIONS = {1: "UNKNOWN_TYPE", 2: "UNKNOWN_TYPE", 3: "BAD_LENGTH"}
+
+
+@dataclass(frozen=True, slots=True)
+class Response(Heard):
+    """A response: its unit and PDU."""
+
+    unit: int
+    pdu: bytes
+
+
+class ModbusClient(Client):
+    """A line or a connection; number: of the last transaction and tag."""
+
+    has_events = False
+
+    def __init__(self, port: Port, address: int, *, is_rtu: bool, number: int = 0) -> None:
+        super().__init__(port, address)
+        self.is_rtu = is_rtu
+        self.number = number
+        self._buffer = b""
+
+    @property
+    def kind(self) -> str:  # type: ignore[override]
+        """Kind of wire."""
+        return "rtu" if self.is_rtu else "tcp"
+
+    @property
+    def broadcasts(self) -> bool:  # type: ignore[override]
+        """Whether one request can be for all: not over TCP."""
+        return self.is_rtu
+
+    def received(self, data: bytes) -> None:
+        """Take bytes from the port."""
+        self._buffer += data
+        while (found := self._next_rtu() if self.is_rtu else self._next_tcp()) is not None:
+            transaction, unit, pdu = found
+            self.take(Response(clock.now(), transaction, pdu[0], (), unit, pdu))
+
+    def _next_tcp(self) -> tuple[int, int, bytes] | None:
+        if len(self._buffer) < _HEADER.size:
+            return None
+        transaction, _, length, unit = _HEADER.unpack_from(self._buffer)
+        end = _HEADER.size - 1 + length
+        if len(self._buffer) < end:
+            return None
+        pdu, self._buffer = self._buffer[_HEADER.size : end], self._buffer[end:]
+        return transaction, unit, pdu
+
+    def _next_rtu(self) -> tuple[int, int, bytes] | None:
+        if len(self._buffer) < 5:
+            return None
+        unit, function, count = self._buffer[:3]
+        size = 5 if function & EXCEPTION else 5 + count if function in (3, 4) else 8
+        if len(self._buffer) < size:
+            return None
+        frame, self._buffer = self._buffer[:size], self._buffer[size:]
+        is_good = crc(frame[:-2]) == frame[-2:]
+        expect(is_good, "CRC of a response", expected=crc(frame[:-2]).hex(), seen=frame[-2:].hex())
+        return 0, unit, frame[1:-2]
+
+    def adu(self, pdu: bytes, *, unit: int | None = None) -> bytes:
+        """Return a PDU in a frame under the next transaction number."""
+        self.number = self.number % 0xFFFF + 1
+        unit = self.address if unit is None else unit
+        if not self.is_rtu:
+            return _HEADER.pack(self.number, 0, len(pdu) + 1, unit) + pdu
+        body = bytes([unit]) + pdu
+        return body + crc(body)
+
+    async def transact(self, pdu: bytes) -> tuple[Response, float]:
+        """Send a PDU and await its response; returns it and when it was sent [s]."""
+        data, sent = self.adu(pdu), clock.now()
+        self._buffer = b""
+        number = 0 if self.is_rtu else self.number
+        self.port.write(data)
+        found = expect_reply(await self.next(lambda each: each.number == number), pdu[0])
+        assert isinstance(found, Response)  # noqa: S101
+        expect_equal(found.unit, self.address, "unit of a response")
+        is_own = found.pdu[0] & ~EXCEPTION == pdu[0]
+        expect(is_own, "function of a response", expected=pdu[0], seen=found.pdu[0])
+        if pdu[0] == WRITE and not found.pdu[0] & EXCEPTION:
+            expect_equal(found.pdu, pdu[:5], "response to a write")
+        return found, sent
+
+    async def read(self, first: int, count: int, *, function: int = READ) -> tuple[int, ...]:
+        """Read registers; Violation for an exception."""
+        response, _ = await self.transact(struct.pack(">BHH", function, first, count))
+        return registers_of(response.pdu, count, first)
+
+    async def hello(self) -> Values:
+        """Read the identity."""
+        registers = await self.read(IDENTITY, 2 + 4 * TEXT)
+        expect_equal(registers[0], 0, "tag of the identity")
+        identity: Values = {"versions": registers[1]}
+        raw = struct.pack(f">{4 * TEXT}H", *registers[2:])
+        for at, name in enumerate(("vendor", "product", "serial_number", "firmware")):
+            text = raw[2 * TEXT * at : 2 * TEXT * (at + 1)].rstrip(b"\0")
+            identity[name] = text.decode("utf-8", errors="replace")
+            is_good = "\ufffd" not in identity[name] and identity[name].isprintable()
+            expect(is_good, name, expected="UTF-8 without control characters", seen=text)
+        return identity
+
+    async def exchange(self, number: int, words: Sequence[int]) -> Answer:
+        """Write a message, then read its reply; one that shows the present is read alone."""
+        tag, when = None, None
+        if number not in PRESENT or words:
+            pdu = self.write_of(number, words)
+            tag = self.number % 0xFFFF + 1  # that of the frame, see `write_of`
+            response, sent = await self.transact(pdu)
+            when = sent, response.at
+            if response.pdu[0] & EXCEPTION:
+                code = _EXCEPTIONS.get(response.pdu[1], f"exception {response.pdu[1]}")
+                return Answer(code, None, (), self.answer(*when, number, ()).when)
+        sent = clock.now()
+        count = HEAD + min(self.reply_words.get(number, MAX_WORDS), MAX_WORDS)
+        shown, result, *reply = await self.read(BOX * number + REPLY, count)
+        if tag is not None:
+            expect_equal(shown, tag, f"tag of the reply to message {number}")
+        when = when or (sent, clock.now())
+        if result:
+            return self.refusal(*when, number, (number, *divmod(result, 256)))
+        return self.answer(*when, number, reply)
+
+    def write_of(self, number: int, words: Sequence[int], *, tag: int | None = None) -> bytes:
+        """Return the PDU that writes a message, tagged with the number of its frame."""
+        tag = self.number % 0xFFFF + 1 if tag is None else tag
+        row = (tag, *words)
+        head = struct.pack(">BHHB", WRITE, BOX * number % 0x10000, len(row), 2 * len(row) % 256)
+        return head + struct.pack(f">{len(row)}H", *row)
+
+    def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
+        """Return the frame that writes a message."""
+        return self.adu(self.write_of(number, words), unit=to)
+
+    def damaged(self, number: int, words: Sequence[int]) -> Mapping[str, bytes]:
+        """Return frames with damage of all kinds."""
+        pdu = self.write_of(number, words)
+        other = {"another unit": self.adu(pdu, unit=self.address % self.addresses + 1)}
+        if not self.is_rtu:
+            return other
+        frame = self.adu(pdu)
+        wrong = {f"byte {at} of the CRC wrong": _altered(frame, at - 3) for at in (1, 2)}
+        return {**wrong, "a wrong byte": _altered(frame, len(frame) - 4), **other}
+
+    async def send(self, data: bytes, quiet: float = QUIET) -> list[Heard]:
+        """Send bytes; return what is heard until a time [s] has passed."""
+        self._buffer = b""
+        heard = await super().send(data, quiet)
+        if self.is_rtu:
+            await asyncio.sleep(QUIET)  # ends a frame that is not whole
+        return heard
+
+
+def registers_of(pdu: bytes, count: int, first: int) -> tuple[int, ...]:
+    """Return the registers in a response; Violation for an exception or another length."""
+    if pdu[0] & EXCEPTION:
+        what = f"response to a read of {count} registers from {first}"
+        raise Violation(what, expected="the registers", seen=f"exception {pdu[1]}")
+    expect_equal((len(pdu), pdu[1]), (2 + 2 * count, 2 * count), "length of a response")
+    return struct.unpack(f">{count}H", pdu[2:])
+
+
+def crc(data: bytes) -> bytes:
+    """CRC-16 of Modbus, low byte first."""
+    remainder = 0xFFFF
+    for byte in data:
+        remainder ^= byte
+        for _ in range(8):
+            remainder = remainder >> 1 ^ (0xA001 if remainder & 1 else 0)
+    return remainder.to_bytes(2, "little")
+
+
+def _altered(frame: bytes, at: int) -> bytes:
+    changed = bytearray(frame)
+    changed[at] ^= 0x10
+    return bytes(changed)

@@ -1,0 +1,59 @@
+"""Opens the line of an amplifier for its checks, by its URL."""
+
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from functools import partial
+
+from drivers.backends.hardware import number_below
+from drivers.errors import LinkError
+from drivers.protocol.table import MESSAGES
+from drivers.verdict.can_client import CanClient
+from drivers.verdict.client import Client, Port
+from drivers.verdict.modbus_client import ModbusClient
+from drivers.verdict.serial_client import SerialClient
+from drivers.wires.known import address_of
+
+CLIENTS: Mapping[str, Callable[[Port, int], Client]] = {
+    "serial": SerialClient,
+    "CAN": CanClient,
+    "Modbus RTU": partial(ModbusClient, is_rtu=True),
+    "Modbus TCP": partial(ModbusClient, is_rtu=False),
+}
+"""Clients by the protocol that a wire's settings name."""
+
+
+class _Behind:
+    """What a port hands over, once there is a client."""
+
+    client: Client | None = None
+
+    def received(self, data: bytes) -> None:
+        if self.client is not None:
+            self.client.received(data)
+
+    def lost(self, cause: str) -> None:
+        if self.client is not None:
+            self.client.loss = cause
+
+
+@asynccontextmanager
+async def opened(url: str) -> AsyncIterator[Client]:
+    """The client of an amplifier by its URL while its line is open.
+
+    Raises CommandError for a URL that is none, LinkError for a line that cannot be opened.
+    """
+    address = address_of(url)
+    protocol = str(address.settings["protocol"])
+    if protocol not in CLIENTS:
+        raise LinkError(f"{url}: wire must be {', '.join(CLIENTS)}, got {protocol}")
+    behind = _Behind()
+    port = await address.open_port(behind.received, behind.lost)
+    try:
+        client = behind.client = CLIENTS[protocol](port, address.number)
+        client.session = number_below(1 << 16)
+        request = client.request(MESSAGES["GetCaps"].number, ())
+        client.transit = address.make_wire().round_trip("GetCaps", len(request))
+        yield client
+    finally:
+        port.close()
+        await port.wait_closed()

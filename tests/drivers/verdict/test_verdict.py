@@ -1,0 +1,206 @@
+"""Conformance of protocol 3: sound amplifiers pass on every wire, and no verdict is missing."""
+
+import asyncio
+import math
+import os
+import pty
+from collections.abc import Mapping
+from functools import partial
+
+import pytest
+
+from drivers import clock
+from drivers.errors import LinkError
+from drivers.verdict import CHECKS, Result, judge, of_kind
+from drivers.verdict.check import Check, CheckResult, Report, run_checks
+from drivers.verdict.expected import alike, alone, cosine, later, lines, together, unsure, within
+from drivers.verdict.findings import Violation
+from drivers.verdict.subject import Subject, layer
+from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
+from model.rig.rig import Rig
+from sim.amplifier.contract import Amplifier
+from sim.bench.bench import Bench, keep_time
+from sim.far_ends.serial_amplifiers import SerialAmplifiers
+from virtual_loop import VirtualLoop, in_virtual_time
+
+SKIPPED = {
+    "serial": {"sensors", "steps_as_stated", "limited", "readings"},
+    "can": {"sensors", "steps_as_stated", "limited", "readings"},
+    "rtu": {"sensors", "steps_as_stated", "limited", "readings", "events"},
+    "tcp": {"sensors", "steps_as_stated", "limited", "readings", "events"},
+}
+MINUTE = 60.0
+
+
+def expect_passed(results: list[CheckResult], skipped: set[str]) -> None:
+    """Require that all have passed but those that are skipped, within a minute."""
+    failed = [f"{each.check.name}: {each.reason}" for each in results if each.result == "failed"]
+    assert not failed, failed[0]
+    assert {each.check.name for each in results if each.result == "skipped"} == skipped
+    assert {each.attempts for each in results} == {1}
+    assert sum(each.seconds for each in results) < MINUTE
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_simulated_amplifier_passes(kind: str) -> None:
+    """Every check of its wire; nothing is skipped but what it has not."""
+    results = judged(kind)
+    assert [each.number for each in results] == [number for number, _ in of_kind(kind)]
+    expect_passed(results, SKIPPED[kind])
+
+
+def test_amplifier_with_the_whole_table_passes_loud() -> None:
+    """At 0.9 of full level, where a sum of layers is limited."""
+    results = judged("serial", level=0.9, far=plain())
+    expect_passed(results, SKIPPED["serial"] - {"limited"})
+
+
+@in_virtual_time
+async def test_sensors_on_a_plate_pass(coarse_rig: Rig) -> None:
+    """Those at the feet of a rig's actuators, which read what plays."""
+    bench = Bench(coarse_rig, now=clock.now(), make_amplifier=Amplifier)
+    (far,) = bench.amplifiers.values()
+    assert isinstance(far, Amplifier)
+    running = asyncio.ensure_future(keep_time(bench))
+    results = await results_of("serial", far, ["sensors", "readings"])
+    running.cancel()
+    expect_passed(results, set())
+
+
+class _PlaysOn(Amplifier):
+    """An amplifier that plays on after Stop."""
+
+    def _silence(self, moment: float, *, ramp: float) -> None:
+        if self.state != "OPERATION_ENABLED":
+            super()._silence(moment, ramp=ramp)
+
+
+def test_nothing_is_run_after_one_that_is_not_silenced() -> None:
+    """The verdict comes within seconds: the checks that follow would drive it."""
+    results = judged("serial", far=_PlaysOn("loud", channels=2))
+    assert results[-1].result is Result.FAILED
+    assert "silence after a Stop" in results[-1].reason or "levels" in results[-1].reason
+    assert len(results) < len(of_kind("serial"))
+    assert sum(each.seconds for each in results) < 10
+
+
+def test_mute_amplifier_fails() -> None:
+    """The first check says so, and no other is run."""
+    far = plain()
+    far.is_answering = False
+    (result,) = judged("serial", far=far)
+    assert (result.result, result.seen) == (Result.FAILED, "reply to message 1: none within 0.5 s")
+
+
+def _stall(duration: float) -> None:
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    loop.now += duration
+
+
+async def _stalled(stalls: list[float], subject: Subject) -> None:
+    """Drive it amid a stall of this program."""
+    await subject.arm()
+    begun = await subject.play(layer(0, subject.tone(), ramp=100))
+    if stalls:
+        _stall(stalls.pop())
+    await subject.follow({0: alone(cosine(0.1, 0, 1))}, begun, 0.12, "rise")
+
+
+def _tried(stalls: list[float]) -> Check:
+    return Check("stalled", "passes", "", drives=True, kinds=(), run=partial(_stalled, stalls))
+
+
+@in_virtual_time
+async def test_check_is_made_again_where_this_program_was_late() -> None:
+    """Its third attempt, undisturbed, passes: a stall is no fault of the amplifier."""
+    line = JudgedLine("serial", varied())
+    (result,) = await run_checks([(1, _tried([0.11, 1.45]))], line.client, level=0.2)
+    line.close()
+    assert (result.result, result.attempts) == (Result.PASSED, 3)
+
+
+@in_virtual_time
+async def test_machine_that_is_always_late_has_no_verdict() -> None:
+    """It is no failure of the amplifier, and not passed."""
+    line = JudgedLine("serial", varied())
+    with pytest.raises(LinkError, match="late 10 times"):
+        await run_checks([(1, _tried([0.11] * 20))], line.client, level=0.2)
+    line.close()
+
+
+async def test_verdict_over_a_real_port() -> None:
+    """Those that only read, then all others continue the report; its keys are a contract."""
+    far, near = pty.openpty()
+    loop = asyncio.get_running_loop()
+    end = SerialAmplifiers({1: plain()}, lambda data: _written(far, data))
+    loop.add_reader(far, lambda: end.receive(os.read(far, 4096), clock.now()))
+    url = f"serial://{os.ttyname(near)}"
+    report = await judge(url, drives=False)
+    loop.remove_reader(far)
+    os.close(far)
+    os.close(near)
+    shown = report.to_json()
+    assert (shown["overall"], shown["failed"], shown["level"]) == ("incomplete", 0, 0.0)
+    assert list(shown) == [
+        *("url", "overall", "level", "passed", "failed", "skipped", "not_run", "seconds"),
+        "checks",
+    ]
+    assert list(shown["checks"][0]) == [
+        *("number", "name", "requirement", "place", "result", "reason", "seen", "expected"),
+        *("seconds", "attempts"),
+    ]
+    assert shown["not_run"] == sum(check.drives for _, check in of_kind("serial"))
+
+
+def _written(far: int, data: bytes) -> None:
+    os.write(far, data)
+
+
+def test_report_says_the_worst() -> None:
+    """One that failed makes all fail; a violation says what must be, and what was seen."""
+    found = Violation("latch", expected=3, seen=4)
+    assert (str(found), found.seen) == ("latch must be 3, got 4", "latch: 4")
+    bad = CheckResult(CHECKS[0], 1, Result.FAILED, str(found), found.seen, found.expected)
+    good = CheckResult(CHECKS[1], 2, Result.PASSED)
+    assert Report("x", 0.2, (bad, good), 0).overall == "failed"
+    assert Report("x", 0.2, (good,), 1).overall == "incomplete"
+    report = Report("x", 0.2, (good,), 0)
+    assert (report.overall, report.to_json()["passed"]) == ("passed", 1)
+    assert "driven at up to 20%" in report.summary
+
+
+def test_every_check_says_what_it_requires() -> None:
+    """Once, in a sentence, beside the place of the rule."""
+    names = [check.name for check in CHECKS]
+    assert len({*names}) == len(names)
+    assert all(check.requirement and check.place for check in CHECKS)
+
+
+CURVES: Mapping[str, tuple[complex, complex]] = {
+    # A raised cosine is at (1 - cos 45 degrees)/2 after a quarter, and at a half after half.
+    "quarter of a rise": (cosine(0.1, 0, 1)(0.025), (1 - math.sqrt(0.5)) / 2),
+    "half of a turn": (cosine(0.1, 1, -1)(0.05), 0),
+    "before": (cosine(0.1, 0.5, 1)(-1), 0.5),
+    "after": (cosine(0.1, 0.5, 1)(0.2), 1),
+    "on a line": (lines(0.1, 0, 1, 1j)(0.15), 0.5 + 0.5j),
+    "behind lines": (lines(0.1, 0, 1, 1j)(9), 1j),
+    "one after the other": (later(1.0, cosine(1, 0, 1), cosine(2, 1, 0))(2.0), 0.5),
+}
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_curves_are_those_of_the_decision(name: str) -> None:
+    """By hand: raised cosines and straight lines."""
+    seen, expected = CURVES[name]
+    assert seen == pytest.approx(expected)
+
+
+def test_levels_have_bounds_in_time() -> None:
+    """A transition may begin 2 ms late, and was read within an interval."""
+    rise = alone(lines(1.0, 0, 1))
+    assert within(rise, 0.5, 0.6) == pytest.approx((0.4975, 0.6006))
+    assert alike(lines(1, 0.5, 0.5), lines(1, -0.5, -0.5))(0) == (0, 1)
+    assert together(lines(1, 0.7, 0.7), lines(1, 0.5, 0.5))(0) == (1, 1)
+    begun = unsure(lambda passed: alone(lines(1.0, passed, passed)), (0.2, 0.3))
+    assert begun(0.0) == pytest.approx((0.198, 0.3))

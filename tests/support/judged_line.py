@@ -1,0 +1,114 @@
+"""A simulated amplifier of protocol 3 in memory, on a virtual clock, and its conformance."""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from functools import partial
+
+from drivers.verdict import CHECKS, LEVEL, CheckResult, of_kind
+from drivers.verdict.can_client import CanClient
+from drivers.verdict.check import run_checks
+from drivers.verdict.client import Client, Port
+from drivers.verdict.modbus_client import ModbusClient
+from drivers.verdict.serial_client import SerialClient
+from sim.amplifier.contract import Amplifier
+from sim.far_ends.can_bus.amplifiers import CanAmplifiers
+from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
+from sim.far_ends.serial_amplifiers import SerialAmplifiers
+from virtual_loop import run_virtual
+
+KINDS = ("serial", "rtu", "tcp", "can")
+DELAY = 0.0002  # s; of bytes on their way
+_TURN = 0.0005  # s; between looks at what is due
+_CLIENTS: dict[str, Callable[[Port, int], Client]] = {
+    "serial": SerialClient,
+    "can": CanClient,
+    "rtu": partial(ModbusClient, is_rtu=True),
+    "tcp": partial(ModbusClient, is_rtu=False),
+}
+
+
+class JudgedLine:
+    """A line to a simulated amplifier at address 1; a `Port` of its client."""
+
+    def __init__(self, kind: str, far: Amplifier) -> None:
+        self._loop = asyncio.get_running_loop()
+        self.client = _CLIENTS[kind](self, 1)
+        ends = {1: far}
+        self._can = CanAmplifiers(ends, self._send) if kind == "can" else None
+        if self._can is not None:
+            self._end: SerialAmplifiers | ModbusAmplifiers | CanAmplifiers = self._can
+            self._can.start(self._loop.time())
+        elif kind == "serial":
+            self._end = SerialAmplifiers(ends, self._send)
+        else:
+            self._end = ModbusAmplifiers(ends, self._send, is_rtu=kind == "rtu")
+        self._far = far
+        self._ticking = self._loop.create_task(self._tick())
+
+    def write(self, data: bytes) -> None:
+        """Send bytes to the amplifier."""
+        self._loop.call_later(DELAY, lambda: self._end.receive(data, self._loop.time()))
+
+    def close(self) -> None:
+        """End what is due by itself."""
+        self._ticking.cancel()
+
+    def _send(self, data: bytes) -> None:
+        self._loop.call_later(DELAY, self.client.received, data)
+
+    async def _tick(self) -> None:
+        """Let happen what is due by itself."""
+        end = self._far if self._can is None else self._can
+        while True:
+            now = self._loop.time()
+            end.tick(now)
+            if isinstance(self._end, ModbusAmplifiers):
+                self._end.pause(now)
+            await asyncio.sleep(_TURN if self._can is None else min(_TURN, 0.001))
+
+
+def plain() -> Amplifier:
+    """An amplifier with all that the table allows."""
+    return Amplifier("plain", channels=4)
+
+
+def varied(channels: int = 4) -> Amplifier:
+    """An amplifier whose channels and ranges differ, from those of the table too."""
+    far = Amplifier("varied", channels=channels)
+    far.capabilities.update(ramp_max=800, watchdog_min=150, watchdog_max=1500, set_words=600)
+    far.capabilities.update(envelope_step_min=20, envelope_step_max=800, knots=30, layers=6)
+    far.capabilities["limits"][1].update(frequency_min=300, frequency_max=8000, level_max=9000)
+    far.capabilities["limits"][2].update(level_max=9500)
+    return far
+
+
+async def results_of(
+    kind: str,
+    far: Amplifier,
+    names: Sequence[str] = (),
+    *,
+    level: float = LEVEL,
+    on_result: Callable[[CheckResult], None] = lambda result: None,
+) -> list[CheckResult]:
+    """Results of checks by name, all without names, on an amplifier on a kind of wire."""
+    line = JudgedLine(kind, far)
+    chosen = [each for each in of_kind(kind) if not names or each[1].name in names]
+    try:
+        return [*await run_checks(chosen, line.client, level=level, on_result=on_result)]
+    finally:
+        line.close()
+
+
+def judged(
+    kind: str,
+    names: Sequence[str] = (),
+    *,
+    level: float = LEVEL,
+    far: Amplifier | None = None,
+    on_result: Callable[[CheckResult], None] = lambda result: None,
+) -> list[CheckResult]:
+    """Results on a simulated amplifier, a `varied` one if none is given, in virtual time."""
+    unknown = set(names) - {check.name for check in CHECKS}
+    assert not unknown, unknown
+    far = far or varied()
+    return run_virtual(results_of(kind, far, names, level=level, on_result=on_result))

@@ -41,13 +41,14 @@ typedef struct {           /* a tone, from start through its points, a step apar
 } Voice;
 
 typedef struct {
-    uint16_t token, ramp, valid_for, waiting[SET_WORDS];
+    uint16_t token, ramp, valid_for, waiting[SET_WORDS], waiting_token;
     int waiting_words;
     double ends, waits_until;
 } Layer;
 
 static Voice voices[CHANNELS][VOICES];
 static Layer layers[LAYERS];
+static int limited;        /* the sum of a channel, since the last status */
 
 #define EACH_VOICE(channel, voice)                      \
     for (int channel = 0; channel < CHANNELS; channel++) \
@@ -73,6 +74,7 @@ static double level_of(int channel, double time) { /* at the most: voices may ca
     double level = 0;
     for (int i = 0; i < VOICES; i++)
         if (voices[channel][i].is_on) level += cabs(amplitude_of(&voices[channel][i], time));
+    if (level > 1 + 0.5 / FULL) limited = 1;
     return fmin(level, 1);
 }
 
@@ -98,18 +100,16 @@ static void fade(Voice *voice, double time, double ramp, int by_ending) {
 }
 
 static void let_last(int layer) { layers[layer].ends = layers[layer].waits_until = INFINITY; }
-
 static void fade_layer(int layer, double time, double ramp, int by_ending) {
     EACH_VOICE(channel, voice) if (plays_in(voice, layer)) fade(voice, time, ramp, by_ending);
     let_last(layer);
 }
 
-static Voice *free_voice(int channel) { /* where all sound, the one that began to fade first */
-    Voice *oldest = &voices[channel][0];
-    for (int i = 0; i < VOICES; i++) {
-        Voice *voice = &voices[channel][i];
+static Voice *free_voice(int channel) { /* or the one that began to fade first: layers are fewer */
+    Voice *oldest = NULL;
+    for (Voice *voice = voices[channel]; voice < voices[channel] + VOICES; voice++) {
         if (!voice->is_on) return voice;
-        if (voice->has_ended && voice->start < oldest->start) oldest = voice;
+        if (voice->has_ended && (!oldest || voice->start < oldest->start)) oldest = voice;
     }
     return oldest;
 }
@@ -198,7 +198,7 @@ static void read_layer(Words *words, int plays, uint16_t token, double time, int
         state->waits_until = waits;
         state->waiting_words = words->at - start;
         memcpy(state->waiting, words->word + start, state->waiting_words * sizeof(uint16_t));
-        state->waiting[SET_WORDS - 1] = token;
+        state->waiting_token = token;
         return;
     }
     EACH_VOICE(channel, voice)
@@ -241,12 +241,13 @@ static void tick(double now) {
         Layer *one = &layers[layer];
         if (now >= one->waits_until) {
             Words words = {one->waiting, one->waiting_words, 0, 0, NO_CHANNEL};
-            read_layer(&words, 1, one->waiting[SET_WORDS - 1], one->waits_until, 1);
+            read_layer(&words, 1, one->waiting_token, one->waits_until, 1);
         }
         if (now >= one->ends) fade_layer(layer, one->ends, one->ramp / 1000.0, 1);
     }
     EACH_VOICE(channel, voice)
         if (voice->is_on && !last_of(voice) && now >= end_of(voice)) voice->is_on = 0;
+    for (int channel = 0; channel < CHANNELS; channel++) level_of(channel, now);
     if (state == REACTION && now >= silent_from) state = FAULT;
     if (state == SWITCHED_ON && now >= silent_from) state = DISABLED;
 }
@@ -263,7 +264,7 @@ static int token_of(int layer) {
 
 static void status(double now) {
     int is_on = state == ENABLED || state == SWITCHED_ON || now < silent_from;
-    put(state), put(fault), put(is_on), put(latch);
+    put(state), put(fault), put(is_on | limited << 2), put(latch), limited = 0;
     put(state == ENABLED ? (int)lround(1000 * (last_fed + watchdog - now)) : 0);
     put(250), put(is_on ? 1800 : 0), put(committed), put(CHANNELS << 8 | LAYERS);
     for (int channel = 0; channel < CHANNELS; channel++)
@@ -279,7 +280,6 @@ static void play(const uint16_t *word, int count, uint16_t token, double now) {
 }
 
 static int drop(int code) { return memset(&staged, 0, sizeof staged), code; }
-
 static int taken(uint16_t token, int is_staged, int is_played, int missing) {
     return put(token), put(1 << 2 | is_staged << 1 | is_played), put(missing), 0;
 }
@@ -305,7 +305,7 @@ static int take_part(const uint16_t *in, int count, double now, int *channel) {
     staged.words = 0;
     for (int i = 0; i < parts; i++) {
         int length = staged.length[i] - 1;
-        if (staged.words + length > SET_WORDS - 1) return drop(BAD_LENGTH);
+        if (staged.words + length > SET_WORDS) return drop(BAD_LENGTH);
         memcpy(staged.word + staged.words, staged.part[i], length * sizeof *in);
         staged.words += length;
     }
@@ -383,10 +383,9 @@ static int handle(int type, const uint16_t *in, int count, double now, int *chan
     if (code) return code;
     if (feeds && state == ENABLED) last_fed = now;
     tick(now);
-    if (type == SET) return 0;
-    if (type == GET_ACHIEVED) return achieved(in[0]);
+    if (type == SET || type == GET_ACHIEVED) return type == SET ? 0 : achieved(in[0]);
     if (type == GET_FAULTS) {
-        uint32_t age = (uint32_t)(1000 * (now - fault_at));
+        uint32_t age = (uint32_t)(1000 * (now - fault_at)); /* of the newest, the only one kept */
         put(fault_at >= 0), put(WATCHDOG_FAULT), put(NO_CHANNEL), put(age >> 16), put(age & 0xFFFF);
         return out_count = fault_at >= 0 ? 5 : 1, 0;
     }
@@ -467,15 +466,26 @@ static void received(int line, const uint8_t *stuffed, int length, double now) {
     send_frame(line, frame, 5 + 2 * out_count);
 }
 
+static void take(int line, const uint8_t *data, ssize_t count, double now) {
+    static uint8_t frame[PAYLOAD + 16];
+    static int length;
+    for (ssize_t i = 0; i < count; i++) {
+        if (data[i] && length < (int)sizeof frame) frame[length++] = data[i];
+        if (data[i]) continue;
+        if (length && length < (int)sizeof frame) received(line, frame, length, now);
+        length = 0;
+    }
+}
+
 int main(int argc, char **argv) {
-    int line = argc == 2 ? open(argv[1], O_RDWR | O_NOCTTY) : STDIN_FILENO, length = 0;
+    int line = argc == 2 ? open(argv[1], O_RDWR | O_NOCTTY) : STDIN_FILENO;
     struct termios raw;
     if (line < 0 || tcgetattr(line, &raw)) return fprintf(stderr, "usage: amplifier [TTY]\n"), 2;
     cfmakeraw(&raw);
     cfsetspeed(&raw, B921600);
     tcsetattr(line, TCSANOW, &raw);
     for (int layer = 0; layer < LAYERS; layer++) let_last(layer);
-    uint8_t frame[PAYLOAD + 16], data[256];
+    uint8_t data[256];
     struct pollfd ready = {line, POLLIN, 0};
     for (;;) {
         poll(&ready, 1, 1);
@@ -484,15 +494,6 @@ int main(int argc, char **argv) {
         double now = (double)clock.tv_sec + clock.tv_nsec / 1e9;
         tick(now);
         if (ready.revents & (POLLHUP | POLLERR)) return 0;
-        if (!(ready.revents & POLLIN)) continue;
-        ssize_t count = read(line, data, sizeof data);
-        for (ssize_t i = 0; i < count; i++) {
-            if (data[i]) {
-                if (length <= (int)sizeof frame - 2) frame[length++] = data[i];
-            } else {
-                if (length && length < (int)sizeof frame - 1) received(line, frame, length, now);
-                length = 0;
-            }
-        }
+        if (ready.revents & POLLIN) take(line, data, read(line, data, sizeof data), now);
     }
 }

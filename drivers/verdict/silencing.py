@@ -69,10 +69,14 @@ async def stop_ramps(subject: Subject) -> None:
         await subject.follow(bounds, stopped, ramp / 1000, f"Stop along {ramp} ms")
         await _expect_off(subject, _STOPPED, stopped.latest + ramp / 1000, "Stop")
         await subject.ask("Clear", latch=subject.latch)
-    if subject.can["ramp_max"] < 1000:
+    longest = subject.can["ramp_max"] / 1000
+    for name in ("Stop", "Disarm"):
         await _armed(subject)
-        await subject.ask("Stop", ramp=subject.can["ramp_max"] + 1)
-        await subject.until(is_silent, "silence after a Stop with a ramp above its longest")
+        stopped = (await subject.ask(name, ramp=0xFFFF)).when
+        curve = alone(cosine(longest, 1, 0))
+        await subject.follow({0: curve}, stopped, longest, f"{name} with a ramp above its longest")
+        await subject.until(is_silent, f"silence after a {name} with a ramp above its longest")
+        await subject.rest()
 
 
 @driving(_PLACE)

@@ -34,10 +34,10 @@ class JudgedLine:
         self._loop = asyncio.get_running_loop()
         self.client = _CLIENTS[kind](self, 1)
         ends = {1: far}
-        self._can = CanAmplifiers(ends, self._send) if kind == "can" else None
-        if self._can is not None:
-            self._end: SerialAmplifiers | ModbusAmplifiers | CanAmplifiers = self._can
-            self._can.start(self._loop.time())
+        if kind == "can":
+            self._end: SerialAmplifiers | ModbusAmplifiers | CanAmplifiers
+            self._end = bus = CanAmplifiers(ends, self._send)
+            bus.start(self._loop.time())
         elif kind == "serial":
             self._end = SerialAmplifiers(ends, self._send)
         else:
@@ -58,13 +58,11 @@ class JudgedLine:
 
     async def _tick(self) -> None:
         """Let happen what is due by itself."""
-        end = self._far if self._can is None else self._can
         while True:
             now = self._loop.time()
-            end.tick(now)
-            if isinstance(self._end, ModbusAmplifiers):
-                self._end.pause(now)
-            await asyncio.sleep(_TURN if self._can is None else min(_TURN, 0.001))
+            self._far.tick(now)
+            self._end.tick(now)
+            await asyncio.sleep(_TURN)
 
 
 def plain() -> Amplifier:

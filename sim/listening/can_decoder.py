@@ -41,6 +41,7 @@ class CanDecoder:
         self._text = {"amplifier": reader("amplifier"), "host": reader("host")}
         self._sent: deque[tuple[int, bytes]] = deque(maxlen=_KEPT)
         self._senders: dict[tuple[int, bool], _Sender] = {}  # by identifier, and whether numbered
+        self._incomplete: int | None = None  # number of a message that another one has ended
 
     def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
         """Decode bytes; returns the complete frames."""
@@ -50,7 +51,11 @@ class CanDecoder:
                 seen.append((text.raw, Damaged("a malformed frame line")))
             elif text.frame is not None:
                 take = self._from_host if direction == "amplifier" else self._from_bus
-                seen.append((text.raw, take(time, text.frame)))
+                message = take(time, text.frame)
+                if self._incomplete is not None:
+                    seen.append((b"", Damaged(f"message {self._incomplete} without all frames")))
+                    self._incomplete = None
+                seen.append((text.raw, message))
         return seen
 
     def has_partial_frame(self, direction: Direction) -> bool:
@@ -65,7 +70,7 @@ class CanDecoder:
         if kind != REQUEST:
             return None
         sender = self._sender(frame.identifier, frame.data)
-        words = sender.add(time, frame.data)
+        words = self._add(sender, time, frame.data)
         if not isinstance(words, Words):
             return words
         key = (node, words.number, words.type) if node else None
@@ -84,7 +89,7 @@ class CanDecoder:
             return None if known is None else OtherHost(node, known.name)
         if kind != REPLY or not node:
             return None
-        words = self._sender(frame.identifier, frame.data).add(time, frame.data)
+        words = self._add(self._sender(frame.identifier, frame.data), time, frame.data)
         if not isinstance(words, Words):
             return words
         if words.number == 0:
@@ -97,6 +102,10 @@ class CanDecoder:
             return Damaged(f"a reply of unknown type {words.type}")
         name = HELLO if words.type == HELLO_NUMBER else BY_NUMBER[words.type].name
         return reply_of(name, words.words, node, (node, words.number, words.type))
+
+    def _add(self, sender: "_Sender", time: float, data: bytes) -> Words | Damaged | None:
+        self._incomplete = sender.ended_by(data)
+        return sender.add(time, data)
 
     def _sender(self, identifier: int, data: bytes) -> "_Sender":
         is_numbered = data[:1] != b"\0"
@@ -116,11 +125,15 @@ class _Sender:
         self._number: int | None = None  # of the last frame
         self._is_whole = True
 
+    def ended_by(self, data: bytes) -> int | None:
+        """Return the number of a message that is not whole and that a frame ends; None for none."""
+        is_other = data[:1] != bytes([self._number or 0])
+        return self._number if is_other and not self._is_whole else None
+
     def add(self, time: float, data: bytes) -> Words | Damaged | None:
         """Take the data of a frame; returns the message that it completes."""
         if len(data) != _BLOCK:
             return Damaged(f"a frame of {len(data)} bytes, must be {_BLOCK}")
-        lost = None if self._is_whole or data[0] == self._number else self._number
         if data[0] != self._number or (self._is_whole and data[1] == 0):
             self._number, self._is_whole, self.begun = data[0], False, time
         before = self._counters.invalid_frames, self._counters.unexpected_frames
@@ -131,6 +144,4 @@ class _Sender:
             return Damaged("a frame that fits no message")
         elif self._counters.unexpected_frames > before[1]:
             self._is_whole = True  # an older one, or a copy
-        if words is None and lost is not None:
-            return Damaged(f"message {lost} without all of its frames")
         return words

@@ -189,7 +189,8 @@ class ExpectedAmplifier(ExpectedState):
             self._report("latched", end, f"{self._name} accepted Arm in {self._state_name()}")
 
     def _stopped(self, request: Request, when: Interval) -> None:
-        ramp = QUANTITIES["ramp"].from_wire(request.values["ramp"])
+        highest = self.capabilities.get("ramp_max", QUANTITIES["ramp"].maximum)
+        ramp = QUANTITIES["ramp"].from_wire(min(request.values["ramp"], highest))
         self._silence(when, ramp, request.name)
         if request.name == "Stop":
             if self.state is None:  # it may have been in a fault before

@@ -140,17 +140,17 @@ class HostRules:
         """Only a silencing request may precede a reply that is pending on its wire."""
         request = sent.request
         if request.name in _SILENCING or is_silent:
-            wire.preempted_at = sent.begun
+            wire.preempted_by = sent.number
             return
         if wire.is_disturbed(sent.begun):
             return
-        # A last lift preempts too, even if a finger has come since.
-        preempted = max(wire.preempted_at, self._inputs.last_lift)
         is_to_each = wire.kind == "modbus-tcp" and len(wire.sessions) > 1
         for pending in wire.pending.values():
             awaited, at = pending.sent.request, pending.sent.begun
             is_broadcast = is_to_each and awaited.name in BROADCAST
-            if at <= preempted or awaited.name in _READINGS or is_broadcast:
+            # A last lift preempts too, even if a finger has come since.
+            is_preempted = pending.sent.number < wire.preempted_by or at <= self._inputs.last_lift
+            if is_preempted or awaited.name in _READINGS or is_broadcast:
                 continue
             # The host counts from its write: the bytes may have waited in a transport since.
             if sent.begun - at < self._times.reply - max(self._times.slack, _IN_TRANSPORT):

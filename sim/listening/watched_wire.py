@@ -48,7 +48,8 @@ class WatchedWire:
     """A wire; sessions: by the addresses of the amplifiers; recent: last frames of the host.
 
     answered: keys of the requests that had their replies last; abandoned: of a host that has
-    closed the wire since; preempted_at: when a request that silences came before others [s];
+    closed the wire since; preempted_by: number of the last request that silences, before which
+    others may lose their replies;
     damaged_at: when a frame of the host was damaged last [s].
     """
 
@@ -60,7 +61,8 @@ class WatchedWire:
         self.pending: dict[Hashable, Pending] = {}
         self.abandoned: set[Hashable] = set()
         self.answered: deque[Hashable] = deque(maxlen=_COPIES)
-        self.preempted_at = self.damaged_at = -math.inf
+        self.preempted_by = 0
+        self.damaged_at = -math.inf
         self._faults_until = self._disturbed_until = -math.inf
         self.reset()
 

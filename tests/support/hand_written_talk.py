@@ -27,9 +27,9 @@ class Talk:
             for address, name in enumerate(names, 1)
         }
         times = {"slack": 0.002, "heartbeat": 3.0}
-        self.witness = Witness(
-            {"wires": {"a": "serial"}, "amplifiers": amplifiers, "times_s": times}
-        )
+        self.config = {"wires": {"a": "serial"}, "amplifiers": amplifiers, "times_s": times}
+        self.capture: list[str] = []
+        self.witness = Witness(self.config, record=self.capture.append)
         self.time = 1.0
         self.sequence = 0
         self.latch = 0

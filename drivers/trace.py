@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TextIO
 
@@ -40,14 +41,10 @@ class Direction(StrEnum):
     IN = "<"
 
 
-def is_active() -> bool:
-    """Whether anything is traced; ask it where the bytes of a frame must be made first."""
-    return _wire.isEnabledFor(logging.DEBUG)
-
-
-def has_requests() -> bool:
-    """Whether requests are traced."""
-    return _request.isEnabledFor(logging.DEBUG)
+is_active = partial(_wire.isEnabledFor, logging.DEBUG)
+"""Whether anything is traced; ask it where the bytes of a frame must be made first."""
+has_requests = partial(_request.isEnabledFor, logging.DEBUG)
+"""Whether requests are traced."""
 
 
 def frame(direction: Direction, data: bytes, where: str, decode: Callable[[], str]) -> None:

@@ -90,10 +90,12 @@ class Line:
             self._start(job)
             self._schedule()
             return future
-        for queued in self._queue.superseded_by(priority, member):
-            self._fail(queued, Preempted(SUPERSEDED))
+        if self._queue.jobs:
+            for queued in self._queue.superseded_by(priority, member):
+                self._fail(queued, Preempted(SUPERSEDED))
         self._queue.add(job)
-        self._preempt()
+        if self._current is not None:
+            self._preempt()
         self.pump()
         return future
 

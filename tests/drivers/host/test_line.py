@@ -1,0 +1,117 @@
+"""One line: which request goes when, how often, and what callers learn."""
+
+import asyncio
+
+import pytest
+
+from drivers.contents import Layer, Tone
+from drivers.errors import CommandRefused, LinkTimeout
+from drivers.host.jobs import Priority
+from drivers.host.serial_wire import SerialWire
+from drivers.protocol.records import Refusal, Values
+from virtual_loop import in_virtual_time
+from words_line import KINDS, MemoryLine, unaltered
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@in_virtual_time
+async def test_request_that_has_waited_for_50_ms_goes_before_newer_heartbeats(kind: str) -> None:
+    """With a heartbeat queued whenever one is answered; without that rule it waits for ever."""
+    end = MemoryLine(kind, "a", "b")
+    first, second = end.hosts.values()
+    await first.open()
+    await second.open()
+    await first.arm(77)
+    end.outward = lambda name, data: [(0.004, data)]
+
+    async def beat() -> None:
+        while True:
+            await first.ping()
+
+    beating = [asyncio.ensure_future(beat()) for _ in range(3)]
+    await asyncio.sleep(0.01)
+    began = end.loop.time()
+    async with asyncio.timeout(0.3):
+        await second.read_status()
+    assert 0.05 < end.loop.time() - began < 0.1
+    for each in beating:
+        each.cancel()
+    await asyncio.wait(beating)
+
+
+@pytest.mark.parametrize(("baud", "attempts"), [(921_600, 3), (38_400, 2)])
+@in_virtual_time
+async def test_request_is_repeated_twice_and_once_on_a_slow_line(baud: int, attempts: int) -> None:
+    """A status of 250 bytes takes 65 ms at 38 400 baud, more than the 30 ms of others."""
+    end = MemoryLine("serial", "a")
+    end.line.wire = SerialWire(baud, sequence=0)
+    (host,) = end.hosts.values()
+    await host.open()
+    end.outward = lambda name, data: []
+    end.sent.clear()
+    with pytest.raises(LinkTimeout):
+        await host.read_status()
+    assert [each for _, each in end.sent] == ["1:9"] * attempts
+    assert (host.counts.timeouts, host.counts.retries) == (attempts, attempts - 1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@in_virtual_time
+async def test_refusal_after_no_reply_says_that_it_may_have_played(kind: str) -> None:
+    """The reply to a commit is lost, and the commit that is repeated is refused; then one alone."""
+    end = MemoryLine(kind, "a")
+    (host,) = end.hosts.values()
+    await host.open()
+    await host.arm(77)
+    await host.stage(5, [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)])
+    far = end.far["a"]
+    handle, commits = far.handle, iter([True])
+
+    def once(name: str, values: Values, now: float) -> Values:
+        if name == "Commit" and not next(commits, False):
+            raise Refusal("not now", "WRONG_STATE")
+        return handle(name, values, now)
+
+    far.handle = once  # type: ignore[method-assign]
+    lost = iter([True])
+    end.outward = lambda name, data: [] if next(lost, False) else unaltered(name, data)
+    with pytest.raises(CommandRefused) as raised:
+        await host.commit(5)
+    assert raised.value.may_play
+    await host.stage(6, [Layer(0, ())])
+    with pytest.raises(CommandRefused) as raised:
+        await host.commit(6)
+    assert not raised.value.may_play
+
+
+@in_virtual_time
+async def test_statistics_are_those_of_the_amplifier_and_of_its_line() -> None:
+    """A retry of one of two amplifiers; both have sent frames, and the last round trip is known."""
+    end = MemoryLine("serial", "a", "b")
+    for host in end.hosts.values():
+        await host.open()
+    lost = iter([True])
+    end.outward = lambda name, data: [] if next(lost, False) else unaltered(name, data)
+    await end.hosts["a"].read_status()
+    one, other = (end.hosts[name].statistics for name in "ab")
+    assert (one.retries, one.timeouts, other.retries, other.timeouts) == (1, 1, 0, 0)
+    assert one.frames_out == other.frames_out == 8
+    assert one.frames_in == 7
+    assert one.last_round_trip == pytest.approx(0.0004)
+
+
+@in_virtual_time
+async def test_reading_gives_way_to_a_set_at_once() -> None:
+    """A reading whose reply does not come is abandoned when a set is queued, and comes again."""
+    end = MemoryLine("serial", "a")
+    (host,) = end.hosts.values()
+    await host.open()
+    await host.arm(77)
+    end.outward = lambda name, data: [(0.025 if name == "GetMeasured" else 0.0002, data)]
+    reading = asyncio.ensure_future(host.read_measured())
+    await asyncio.sleep(0.001)
+    began = end.loop.time()
+    await host.stage(5, [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)])
+    assert end.loop.time() - began < 0.001
+    assert len(await reading) == 2
+    assert Priority.READING > Priority.OTHER

@@ -1,0 +1,249 @@
+"""The adapter and its signal generator: a host, a pseudo-terminal, and the instrument over TCP."""
+
+import asyncio
+import signal
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from subprocess import PIPE, Popen
+
+import numpy as np
+import pytest
+
+import era_haptics
+from drivers.contents import Layer, Tone
+from drivers.errors import CommandRefused, LinkError
+from drivers.host.amplifier import Amplifier
+from drivers.host.group import Group
+from drivers.opening import Lines
+from drivers.protocol.table import FAULTS, STATES
+from registry.limits import GuardLimits
+from scpi_generator import Generator, on_tcp
+
+SCRIPT = Path(era_haptics.__file__).parents[1] / "examples" / "adapter" / "scpi.py"
+LIMITS = GuardLimits(20.0, 900.0, 1.0)
+FULL = 5.0  # V
+PATIENCE = 20.0  # s
+HOST = """
+import asyncio, sys
+from drivers.contents import Layer, Tone
+from drivers.host.group import Group
+from drivers.opening import Lines
+from registry.limits import GuardLimits
+async def main():
+    limits = GuardLimits(20.0, 900.0, 1.0)
+    host = await Lines().amplifier(sys.argv[1], limits, name="a", is_output=True)
+    group = Group({"a": host})
+    await group.open()
+    await group.arm(0.25)
+    await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.5),), 0.0)]})
+    print("plays", flush=True)
+    while True:
+        await group.beat()
+asyncio.run(main())
+"""
+
+pytestmark = pytest.mark.real_time
+
+
+class Instrument(Generator):
+    """A generator that may stop replying, and can be waited for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_mute = False
+        self._heard = asyncio.Event()
+
+    def message(self, text: str) -> str | None:
+        """Execute a message, unless it is mute."""
+        self._heard.set()
+        return None if self.is_mute else super().message(text)
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether both outputs are off."""
+        return not any(output.is_on for output in self.outputs)
+
+    async def until(self, *, silent: bool) -> None:
+        """Wait until both outputs are off, or one is on."""
+        async with asyncio.timeout(PATIENCE):
+            while self.is_silent is not silent:
+                self._heard.clear()
+                await self._heard.wait()
+
+    def force(self, channel: int, frequency: float) -> complex:
+        """Amplitude and phase at a frequency [Hz] of the squared voltage, 1 for full voltage."""
+        times = np.arange(10_000) / 10_000.0 + max(each.origin for each in self.outputs)
+        squared = self.voltage(channel, times) ** 2
+        wave = np.exp(-2j * np.pi * frequency * (times - times[0]))
+        return complex(2 * np.mean(squared * wave) / (FULL**2 / 2) * 1j)
+
+
+async def printed(running: Popen[bytes]) -> str:
+    """Wait for the next line that a program prints."""
+    assert running.stdout is not None
+    return (await asyncio.to_thread(running.stdout.readline)).decode().strip()
+
+
+async def ended(running: Popen[bytes]) -> int:
+    """Wait until a program has ended; its status."""
+    return await asyncio.to_thread(running.wait, PATIENCE)
+
+
+@asynccontextmanager
+async def driven() -> AsyncIterator[tuple[Instrument, Popen[bytes], str]]:
+    """The instrument, the adapter in front of it, and its URL."""
+    instrument = Instrument()
+    async with on_tcp(instrument) as port:
+        program = [sys.executable, str(SCRIPT), f"127.0.0.1:{port}"]
+        with Popen(program, stdout=PIPE) as running:  # noqa: ASYNC220
+            try:
+                yield instrument, running, await printed(running)
+            finally:
+                instrument.is_mute = False
+                running.send_signal(signal.SIGCONT)
+                running.terminate()
+                await ended(running)
+                await instrument.until(silent=True)  # whatever became of it
+
+
+@asynccontextmanager
+async def armed(url: str, watchdog: float = 2.0) -> AsyncIterator[tuple[Group, Amplifier]]:
+    """A host that has armed the adapter."""
+    lines = Lines()
+    try:
+        host = await lines.amplifier(url, LIMITS, name="a", is_output=True)
+        group = Group({"a": host})
+        async with asyncio.timeout(PATIENCE):
+            while True:  # until the adapter has found the outputs off
+                await group.open()
+                try:
+                    await group.arm(watchdog)
+                    break
+                except CommandRefused:
+                    continue
+        yield group, host
+    finally:
+        await lines.close()
+
+
+def layer(level: float, *, ramp: float = 0.0, keep_phase: bool = False) -> Layer:
+    """Two tones of 100 Hz, the second at full level and 120 degrees behind."""
+    first = Tone(0, 100.0, level, 30.0, keep_phase=keep_phase)
+    return Layer(0, (first, Tone(1, 100.0, 1.0, -90.0, keep_phase=keep_phase)), ramp)
+
+
+async def state(host: Amplifier, name: str) -> None:
+    """Wait until a status has a state, and silence."""
+    async with asyncio.timeout(PATIENCE):
+        while True:
+            status = await host.read_status()
+            if status["state"] == STATES[name] and not any(status["levels"]):
+                return
+
+
+async def playing(group: Group, one: Layer) -> None:
+    """Play until that fails."""
+    async with asyncio.timeout(PATIENCE):
+        await group.apply({"a": [one]})
+        while True:
+            await group.beat()
+
+
+async def test_force_is_that_of_the_set_and_follows_it() -> None:
+    """A quarter of the force is half the voltage, at half the frequency; then along a ramp."""
+    async with driven() as (instrument, _, url), armed(url) as (group, host):
+        await group.apply({"a": [layer(0.25)]})
+        async with asyncio.timeout(PATIENCE):
+            while abs(instrument.force(2, 100.0)) < 0.9:
+                await host.read_status()
+        first, second = instrument.force(1, 100.0), instrument.force(2, 100.0)
+        assert (abs(first), abs(second)) == pytest.approx((0.25, 1.0), rel=1e-3)
+        assert np.degrees(np.angle(first / second)) == pytest.approx(120.0, abs=0.1)
+        before = len(instrument.log)
+        await group.apply({"a": [layer(0.64, ramp=0.05, keep_phase=True)]})
+        async with asyncio.timeout(PATIENCE):
+            while abs(instrument.force(1, 100.0)) < 0.6399:
+                await host.read_status()
+        followed = instrument.log[before:]
+        assert sum("SOUR1:VOLT" in each for each in followed) > 2
+        assert not any("PHAS:SYNC" in each for each in followed)
+        assert np.degrees(np.angle(instrument.force(1, 100.0) / second)) == pytest.approx(
+            120.0, abs=0.1
+        )
+
+
+async def test_confirmed_stop_has_switched_the_outputs_off() -> None:
+    """At the moment at which the host takes it for confirmed."""
+    async with driven() as (instrument, _, url), armed(url) as (group, _host):
+        await group.apply({"a": [layer(0.5)]})
+        await instrument.until(silent=False)
+        stopped = await group.stop()
+        assert stopped["a"].is_confirmed
+        assert instrument.is_silent
+
+
+async def test_watchdog_switches_the_outputs_off() -> None:
+    """200 ms without a heartbeat."""
+    async with driven() as (instrument, _, url), armed(url, 0.2) as (group, host):
+        await group.apply({"a": [layer(0.5)]})
+        await instrument.until(silent=False)
+        await instrument.until(silent=True)
+        await state(host, "FAULT")
+        assert (await host.read_status())["fault"] == FAULTS["WATCHDOG"]
+
+
+async def test_killed_host_leaves_silence() -> None:
+    """Its heartbeats end, and with them the vibration."""
+    async with driven() as (instrument, _, url):
+        async with armed(url) as (group, _):
+            await group.disarm()
+        with Popen([sys.executable, "-c", HOST, url], stdout=PIPE) as host:  # noqa: ASYNC220
+            assert await printed(host) == "plays"
+            await instrument.until(silent=False)
+            host.kill()
+        await instrument.until(silent=True)
+
+
+async def test_mute_instrument_is_never_reported_silent() -> None:
+    """It trips, no stop is confirmed; once the instrument replies again it is switched off."""
+    async with driven() as (instrument, _, url), armed(url) as (group, host):
+        await group.apply({"a": [layer(0.5)]})
+        await instrument.until(silent=False)
+        instrument.is_mute = True
+        with pytest.raises((CommandRefused, LinkError)):
+            await playing(group, layer(0.3))
+        stopped = await group.stop()
+        assert not stopped["a"].is_confirmed
+        assert not instrument.is_silent
+        with pytest.raises(CommandRefused):
+            await group.arm()
+        instrument.is_mute = False
+        await state(host, "FAULT")
+        assert instrument.is_silent
+
+
+@pytest.mark.parametrize("what", [signal.SIGKILL, signal.SIGSTOP])
+async def test_ended_or_stalled_adapter_is_silenced_by_its_watcher(what: signal.Signals) -> None:
+    """Killed or paused while it plays; one that was paused ends when it goes on."""
+    async with driven() as (instrument, program, url), armed(url) as (group, _host):
+        await group.apply({"a": [layer(0.5)]})
+        await instrument.until(silent=False)
+        program.send_signal(what)
+        await instrument.until(silent=True)
+        if what is signal.SIGSTOP:
+            program.send_signal(signal.SIGCONT)
+        assert await ended(program) != 0
+
+
+async def test_instrument_that_reports_an_error_is_switched_off() -> None:
+    """An error in its queue, here one that a person at the front panel has caused."""
+    async with driven() as (instrument, _, url), armed(url) as (group, host):
+        await group.apply({"a": [layer(0.5)]})
+        await instrument.until(silent=False)
+        instrument.errors.append((-222, "Data out of range"))
+        with pytest.raises((CommandRefused, LinkError)):
+            await playing(group, layer(0.3))
+        await state(host, "FAULT")
+        assert instrument.is_silent

@@ -100,6 +100,7 @@ class Adapter:
         self._loop = asyncio.get_running_loop()
         self._device, self._sign = device, sign
         self._changed = asyncio.Event()
+        self._was_reached = False  # from the first time on silence is owed
         self._sent: list[Tone | None] = [None] * device.channels
         self.amplifier = AdaptedAmplifier(name, channels=device.channels)
         self._terminal = make_terminal(self._receive)
@@ -115,7 +116,8 @@ class Adapter:
         self._terminal.listen()
         try:
             while True:
-                self._sign(ALIVE)
+                if self._was_reached:
+                    self._sign(ALIVE)
                 try:
                     await self._follow()
                 except (OSError, ValueError) as error:  # a timeout is an OSError
@@ -123,9 +125,10 @@ class Adapter:
                     await asyncio.sleep(RETRY)
         finally:
             self._terminal.close()
-            async with asyncio.timeout(REPLY):
-                await self._device.silence()
-            self._sign(DONE)
+            if self._was_reached:
+                async with asyncio.timeout(REPLY):
+                    await self._device.silence()
+                self._sign(DONE)
 
     def _lose(self, error: Exception) -> None:
         """Trip where the device has failed."""
@@ -140,6 +143,7 @@ class Adapter:
         if amplifier.is_lost:
             async with asyncio.timeout(REPLY):
                 await self._device.silence()
+            self._was_reached = True
             self._sent = [None] * len(self._sent)
             amplifier.device_levels = [0.0] * len(self._sent)
             amplifier.is_lost = False
@@ -183,8 +187,8 @@ def watch(silence: Callable[[], None]) -> Callable[[bytes], None]:
     """Start the process that silences the device once this one stalls or ends.
 
     Call it before an event loop runs. silence: repeated until it raises nothing. Returns what takes
-    ALIVE, at least every `BEAT`, or DONE: the device is silent, and nothing is left to do. It
-    raises OSError where the other process has silenced the device, or is gone.
+    ALIVE, from the first time on at least every `BEAT`, or DONE: the device is silent, and nothing
+    is left to do. It raises OSError where the other process has silenced the device, or is gone.
     """
     read, write = os.pipe()
     if os.fork():
@@ -197,7 +201,11 @@ def watch(silence: Callable[[], None]) -> Callable[[bytes], None]:
         return sign
     os.close(write)
     os.setsid()  # Ctrl-C is for the other process
-    while select.select([read], [], [], STALLED)[0] and (signs := os.read(read, 1024)):
+    signs = os.read(read, 1)
+    if not signs:
+        os._exit(0)
+    while signs and select.select([read], [], [], STALLED)[0]:
+        signs = os.read(read, 1024)
         if signs.endswith(DONE):
             os._exit(0)
     while True:

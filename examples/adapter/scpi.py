@@ -143,7 +143,10 @@ def main() -> None:
     parser.add_argument("--full-voltage", type=float, default=5.0, help="peak at level 1 [V]")
     given = parser.parse_args()
     host, _, port = given.address.partition(":")
-    generator = Generator(host, int(port or 5025), given.full_voltage)
+    try:
+        generator = Generator(host, int(port or 5025), given.full_voltage)
+    except ValueError as error:
+        parser.error(str(error))
     try:
         asyncio.run(serve(given.address, generator, watch(generator.silence_now)))
     except OSError as error:

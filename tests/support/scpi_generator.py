@@ -18,7 +18,6 @@ import numpy as np
 
 from drivers import clock
 from model.arrays import FloatArray
-from sim.transport.pseudo_terminal import make_terminal
 
 QUEUE = 20  # errors
 NO_ERROR = (0, "No error")
@@ -263,24 +262,3 @@ async def on_tcp(generator: Generator) -> AsyncIterator[int]:
         yield server.sockets[0].getsockname()[1]
     finally:
         server.close()
-
-
-@asynccontextmanager
-async def on_terminal(generator: Generator) -> AsyncIterator[str]:
-    """Serve a generator over a pseudo-terminal; the path of the host's side."""
-    rest = b""
-
-    def received(data: bytes) -> None:
-        nonlocal rest
-        *lines, rest = (rest + data).split(b"\n")
-        for line in lines:
-            answer = generator.message(line.decode("ascii").strip())
-            if answer is not None:
-                terminal.write(f"{answer}\r\n".encode("ascii"))
-
-    terminal = make_terminal(received)
-    terminal.listen()
-    try:
-        yield terminal.port
-    finally:
-        terminal.close()

@@ -6,7 +6,7 @@ the files amplifier.eds and amplifier.dbc whole.
 
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from amplifier_dbc import dbc_text
@@ -81,7 +81,7 @@ _MEANINGS = {
 }
 
 
-def _table(head: Sequence[str], rows: Iterator[Sequence[object]]) -> str:
+def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     lines = [head, ["---"] * len(head), *([str(cell) for cell in row] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 

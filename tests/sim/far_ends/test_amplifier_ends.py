@@ -1,0 +1,169 @@
+"""Far ends of protocol 3 on real ports, asked with bytes written by hand."""
+
+import asyncio
+import contextlib
+import os
+import socket
+import struct
+import tty
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+
+from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
+from drivers.errors import LinkError
+from model.rig.rig import Rig
+from sim.far_ends.amplifier_ends import ModbusLineEnd, ModbusPortEnd, SerialLineEnd
+from words_bench import make_bench
+
+TIMEOUT = 15.0  # s; of a busy machine
+IDENTITY = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, 1065, 66)  # read of 66 registers, TCP
+IDENTITY_SIZE = 9 + 2 * 66
+HELLO = encode_frame(Frame(kind=1, address=1, sequence=1, payload=b"", version=0))
+
+Client = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+
+@asynccontextmanager
+async def tcp_end(rig: Rig) -> AsyncIterator[ModbusPortEnd]:
+    """The amplifier of a rig on a TCP port."""
+    end = ModbusPortEnd(list(make_bench(rig)[1].values()))
+    await end.start()
+    try:
+        yield end
+    finally:
+        await end.close()
+
+
+@asynccontextmanager
+async def client(end: ModbusPortEnd) -> AsyncIterator[Client]:
+    """A connection to it."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", end.port)
+    try:
+        yield reader, writer
+    finally:
+        writer.close()
+        with contextlib.suppress(ConnectionError):
+            await writer.wait_closed()
+
+
+async def ask(one: Client, request: bytes, size: int) -> bytes:
+    """What a client receives for bytes that it sends."""
+    one[1].write(request)
+    return await asyncio.wait_for(one[0].readexactly(size), TIMEOUT)
+
+
+async def read(fd: int, size: int) -> bytes:
+    """So many bytes of a terminal."""
+    data = b""
+    async with asyncio.timeout(TIMEOUT):
+        while len(data) < size:
+            with contextlib.suppress(BlockingIOError):
+                data += os.read(fd, size - len(data))
+            await asyncio.sleep(0.001)
+    return data
+
+
+def opened(port: str) -> int:
+    """The host's side of a terminal, raw."""
+    fd = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    tty.setraw(fd)
+    return fd
+
+
+async def test_connections_share_the_registers_of_a_unit(coarse_rig: Rig) -> None:
+    """What one client has written, tag 7 to Stop, the other reads: another unit says nothing."""
+    async with tcp_end(coarse_rig) as end, client(end) as one, client(end) as other:
+        write = struct.pack(">HHHBBHHBHH", 2, 0, 11, 1, 16, 256 * 8, 2, 4, 7, 0)
+        assert (await ask(one, write, 12))[6:] == write[6:12]
+        look = struct.pack(">HHHBBHH", 3, 0, 6, 1, 3, 256 * 8 + 128, 3)
+        elsewhere = struct.pack(">HHHBBHH", 4, 0, 6, 9, 3, 256 * 8 + 128, 3)
+        reply = await ask(other, elsewhere + look, 15)
+        assert struct.unpack(">HHHBBBHHH", reply) == (3, 0, 9, 1, 3, 6, 7, 0, 5)
+
+
+async def test_client_that_does_not_read_is_disconnected(coarse_rig: Rig) -> None:
+    """Its replies fill no memory, and others are served."""
+    async with tcp_end(coarse_rig) as end, client(end) as other:
+        loop = asyncio.get_running_loop()
+        with socket.socket() as deaf:
+            deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+            deaf.setblocking(False)
+            await loop.sock_connect(deaf, ("127.0.0.1", end.port))
+
+            async def ask_on() -> None:
+                while True:
+                    await loop.sock_sendall(deaf, IDENTITY * 50)
+                    await asyncio.sleep(0)
+
+            with pytest.raises(OSError, match=r"reset|pipe"):
+                await asyncio.wait_for(ask_on(), TIMEOUT)
+        assert len(await ask(other, IDENTITY, IDENTITY_SIZE)) == IDENTITY_SIZE
+        assert len(end.connections) == 1
+
+
+async def test_seventeenth_connection_is_closed_at_once(coarse_rig: Rig) -> None:
+    """The first ones go on."""
+    async with tcp_end(coarse_rig) as end, contextlib.AsyncExitStack() as stack:
+        clients = [await stack.enter_async_context(client(end)) for _ in range(17)]
+        assert await asyncio.wait_for(clients[16][0].read(), TIMEOUT) == b""
+        assert len(await ask(clients[0], IDENTITY, IDENTITY_SIZE)) == IDENTITY_SIZE
+        assert len(end.connections) == 16
+
+
+async def test_port_in_use_is_refused(coarse_rig: Rig) -> None:
+    """LinkError with the port and what to do."""
+    async with tcp_end(coarse_rig) as end:
+        second = ModbusPortEnd(list(make_bench(coarse_rig)[1].values()), port=end.port)
+        with pytest.raises(LinkError, match=f"port {end.port}: .*choose another"):
+            await second.start()
+
+
+async def test_frame_of_unknown_function_ends_with_silence(coarse_rig: Rig) -> None:
+    """Over RTU its length is not known: exception 1 comes once the line was silent."""
+    end = ModbusLineEnd(list(make_bench(coarse_rig)[1].values()))
+    end.start()
+    fd = opened(end.port)
+    try:
+        os.write(fd, _with_check(bytes([1, 0x41, 1, 2, 3])))
+        assert await read(fd, 5) == _with_check(bytes([1, 0xC1, 1]))
+    finally:
+        os.close(fd)
+        end.close()
+
+
+def _with_check(body: bytes) -> bytes:
+    """A frame with its CRC-16, bit by bit as the specification of Modbus has it."""
+    check = 0xFFFF
+    for byte in body:
+        check ^= byte
+        for _ in range(8):
+            check = check >> 1 ^ (0xA001 if check & 1 else 0)
+    return body + check.to_bytes(2, "little")
+
+
+async def test_serial_line_outlives_its_hosts(coarse_rig: Rig) -> None:
+    """Hosts come and go; one that does not read loses replies, which are counted."""
+    end = SerialLineEnd(list(make_bench(coarse_rig)[1].values()))
+    end.start()
+    try:
+        for _ in range(3):
+            fd = opened(end.port)
+            os.write(fd, HELLO)
+            found: list[Frame] = []
+            reader = FrameReader()
+            while not found:
+                found = list(reader.feed(await read(fd, 1)))
+            assert (found[0].kind, found[0].version) == (0x81, 0)
+            assert b"SIM-main" in found[0].payload
+            os.close(fd)
+        fd = opened(end.port)
+        async with asyncio.timeout(TIMEOUT):
+            while not end.dropped_replies:
+                with contextlib.suppress(BlockingIOError):
+                    os.write(fd, HELLO)
+                await asyncio.sleep(0)
+        os.close(fd)
+    finally:
+        end.close()

@@ -16,7 +16,7 @@ from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from sim.far_ends.can_bus.bus import CanBus
-from sim.far_ends.can_bus.slcan_adapter import SlcanEnd
+from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter, SlcanEnd
 from sim.far_ends.can_bus.socketcand_server import SocketcandEnd
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
@@ -112,6 +112,19 @@ class _Nodes:
     def _send(self, data: bytes) -> None:
         for frame in unpack_frames(data):
             self._bus.send(frame, sender=self._listener)
+
+
+class _SlcanServer:
+    """Amplifiers on a bus behind an adapter, as a far end of bytes."""
+
+    def __init__(self, amplifiers: Mapping[int, Amplifier], send: Callable[[bytes], None]) -> None:
+        bus = CanBus()
+        _Nodes(bus, amplifiers)
+        self._adapter = SlcanAdapter(bus, send)
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take text from the host."""
+        self._adapter.receive(data)
 
 
 @asynccontextmanager
@@ -213,7 +226,15 @@ WORD_WIRES: Mapping[str, Callable[[int], Any]] = {
         partial(ModbusAmplifiers, is_rtu=False),
         lambda port, number: f"modbus+tcp://127.0.0.1:{port}/{number}",
     ),
+    "modbus+rtu server": lambda count: _server(
+        count,
+        partial(ModbusAmplifiers, is_rtu=True),
+        lambda port, number: f"modbus+rtu://127.0.0.1:{port}#{number}",
+    ),
     "can+slcan": _slcan,
+    "can+slcan server": lambda count: _server(
+        count, _SlcanServer, lambda port, node: f"can+slcan://127.0.0.1:{port}#{node}"
+    ),
     "can+socketcand": _socketcand,
     "can+python-can virtual": lambda count: _python_can(count, "virtual", "plate"),
     "can+python-can udp_multicast": lambda count: _python_can(

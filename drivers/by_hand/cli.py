@@ -6,11 +6,14 @@ import sys
 from collections.abc import Coroutine
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
+
+if TYPE_CHECKING:
+    from drivers.verdict import CheckResult
 
 _T = TypeVar("_T")
 
@@ -243,6 +246,60 @@ def clear(url: Url, trace: Trace = None, json_: Json = False) -> None:
     from drivers.by_hand import actions
 
     _show(_run(actions.clear(url), trace), as_json=json_)
+
+
+@amp.command()
+def conformance(
+    url: Url,
+    write: Annotated[
+        bool, typer.Option("--write", help="Drive the outputs too, without confirmation.")
+    ] = False,
+    level: Annotated[
+        float | None,
+        typer.Option(
+            metavar="LEVEL",
+            min=0.1,  # below it fractions are too close together for measured levels
+            max=1.0,
+            show_default=False,
+            help="Level at which channels are driven, of full level; 0.2 if not given.",
+        ),
+    ] = None,
+    trace: Trace = None,
+    json_: Json = False,
+) -> None:
+    """Check that an amplifier fulfils the contract. Reads only, unless --write is given."""
+    from drivers.verdict import LEVEL, judge
+
+    level = LEVEL if level is None else level
+    show = _no_result if json_ else _show_result
+    report = _run(judge(url, drives=False, level=level, on_result=show), trace)
+    if not write and not json_ and sys.stdin.isatty():
+        write = typer.confirm(
+            f"{report.not_run} more checks arm the amplifier and drive its channels at "
+            f"{level:.0%} of full level. Continue?"
+        )
+    if write and report.overall != "failed":
+        more = judge(url, drives=True, level=level, on_result=show, before=report)
+        report = _run(more, trace)
+    if json_:
+        print(json.dumps(report.to_json()))
+    else:
+        print(report.summary)
+        if report.not_run and report.overall != "failed":
+            print(f"Next: era amp conformance {shlex.quote(url)} --write")
+    if report.overall == "failed":
+        raise typer.Exit(1)
+
+
+def _no_result(result: "CheckResult") -> None:
+    """Show nothing."""
+
+
+def _show_result(result: "CheckResult") -> None:
+    mark = result.result.value
+    print(f"{mark.upper() if mark == 'failed' else mark:<7}  It {result.check.requirement}.")
+    if result.reason:
+        print(f"         {result.reason} ({result.check.place})")
 
 
 def _run(work: Coroutine[Any, Any, _T], trace: Path | None, *, needs_trace: bool = True) -> _T:

@@ -118,11 +118,17 @@ class Line:
                 except LinkError as error:
                     self.lose(str(error))
                     return
+                self._go_on(job)
                 continue
             self._current = None
             self._end(job, arrival)
         if self._queue.jobs:
             self.pump()
+
+    def _go_on(self, job: Job) -> None:
+        """Give a request that was answered in part its time anew, unless a stop waits."""
+        if not any(each.priority.is_stop_class for each in self._queue.jobs):
+            job.due, job.looks = max(job.due, self._loop.time() + job.timeout), 0
 
     def _end(self, job: Job, arrival: Reply | Nak | Broken) -> None:
         """End the request that was on the line by what came back."""

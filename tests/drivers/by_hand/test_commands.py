@@ -1,7 +1,9 @@
 """The `era amp` commands of version 3, at amplifiers simulated in the process itself."""
 
+import asyncio
 import json
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import pytest
@@ -12,6 +14,7 @@ from typer.testing import CliRunner
 from drivers.by_hand.cli import app
 from drivers.errors import CommandError
 from model.rig.file import example_rig_path
+from word_wires import WORD_WIRES
 
 URL = f"sim://{example_rig_path()}?exact"
 COMMON = {
@@ -89,6 +92,32 @@ def test_tones_too_close_are_an_error_of_the_command() -> None:
     """Exit status 2 of the program, by the error's class."""
     tones = ["--frequency", "110", "--frequency", "112", "--window", "0.1"]
     assert isinstance(invoke("measure", URL, *tones).exception, CommandError)
+
+
+def test_conformance_reads_first_and_reports_what_is_left() -> None:
+    """All reading checks of a serial line pass; driving ones are not run, and named as next."""
+    report = result_of("conformance", URL)
+    assert (report["overall"], report["failed"], report["level"]) == ("incomplete", 0, 0.0)
+    assert report["not_run"] > 40
+    assert {row["result"] for row in report["checks"]} <= {"passed", "skipped"}
+    shown = invoke("conformance", URL)
+    assert shown.exit_code == 0, shown.output
+    assert shown.stdout.splitlines()[-1] == f"Next: era amp conformance '{URL}' --write"
+
+
+@pytest.mark.real_time
+async def test_conformance_stops_after_a_failed_reading_check() -> None:
+    """An amplifier that is armed already: exit status 1, and nothing is driven."""
+    async with WORD_WIRES["serial"](1) as far:
+        far.amplifiers[1].handle("Arm", {"session": 5, "watchdog": 2000}, monotonic())
+        arguments = ("conformance", far.url(1), "--write", "--json")
+        result = await asyncio.to_thread(invoke, *arguments)
+        assert result.exit_code == 1, result.output
+        report = json.loads(result.stdout)
+        assert report["overall"] == "failed"
+        assert report["not_run"] > 40
+        rows = {row["name"]: row for row in report["checks"]}
+        assert rows["starts_disarmed"]["result"] == "failed"
 
 
 def test_discover_reports_why_a_port_cannot_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,7 @@
 """The host's side of Modbus: bytes written by hand, and responses that belong to no request."""
 
+import asyncio
+
 import pytest
 
 from drivers.host.modbus_wire import ModbusWire
@@ -223,6 +225,31 @@ def test_damaged_length_costs_one_attempt() -> None:
         end.inward = lengthened
         await end.hosts["a"].read_status()
         assert end.retries == 1
+
+    run_virtual(run())
+
+
+@pytest.mark.parametrize("kind", ["rtu", "tcp"])
+def test_each_response_has_its_time(kind: str) -> None:
+    """25 ms for that of the write and 25 ms for that of the read: no attempt is repeated.
+
+    A stop that waits is not kept waiting for the second one.
+    """
+
+    async def run() -> None:
+        end = MemoryLine(kind, "a")
+        host = end.hosts["a"]
+        await host.open()
+        end.outward = lambda name, data: [(0.025, data)]
+        await host.read_status()
+        assert end.retries == 0
+        begin = end.loop.time()
+        reading = asyncio.ensure_future(host.read_status())
+        await asyncio.sleep(0.02)
+        stopping = asyncio.ensure_future(host.stop())
+        await asyncio.gather(reading, stopping)
+        stopped = min(time for time, request in end.sent if request == "1:8")
+        assert stopped - begin <= 0.02 + 0.008 + 0.001
 
     run_virtual(run())
 

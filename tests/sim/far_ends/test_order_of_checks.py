@@ -67,3 +67,10 @@ def test_stop_and_disarm_are_not_refused_for_their_ramp(kind: int, state: str) -
     line.amplifier.tick(1.001)
     assert (line.amplifier.state, line.amplifier.playback.level(0, 1.0)) == (state, 0.0)
     assert line.amplifier.state in STATES
+
+
+def test_echo_of_an_event_gets_no_reply() -> None:
+    """Of an adapter that hears what it sends: neither Nak nor anything else."""
+    line = OnALine()
+    line.end.receive(encode_frame(Frame(30, 1, 9, bytes(8), 3)), 0.0)
+    assert line.replies == []

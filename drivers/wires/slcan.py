@@ -27,7 +27,7 @@ class SlcanAddress(CanAddress):
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
     ) -> Port:
         """Open the port, and the adapter's channel at the bit rate; raises LinkError."""
-        port = TextPort(SlcanReader(), slcan_line, on_data, goodbye=_CLOSE)
+        port = TextPort(SlcanReader(), slcan_line, on_data, cut_off=b"\r", goodbye=_CLOSE)
         if self.bus.host:
             port.below = await open_connection(self.bus.host, self.bus.port, port.received, on_loss)
         else:

@@ -21,8 +21,8 @@ class _Reader(Protocol):
 class TextPort:
     """A port of frames on one of text, below; implements `Port`.
 
-    text_of: a frame as the adapter takes it; on_data: called with packed frames; goodbye: sent
-    before it is closed.
+    text_of: a frame as the adapter takes it; on_data: called with packed frames; cut_off: ends a
+    line of which a port that was blocked has dropped the rest; goodbye: sent before it is closed.
     """
 
     def __init__(
@@ -30,10 +30,11 @@ class TextPort:
         reader: _Reader,
         text_of: Callable[[CanFrame], bytes],
         on_data: Callable[[bytes], None],
+        cut_off: bytes = b"",
         goodbye: bytes = b"",
     ) -> None:
         self._reader, self._text_of, self._on_data = reader, text_of, on_data
-        self._goodbye = goodbye
+        self._cut_off, self._goodbye = cut_off, goodbye
         self.below: Port  # set once open
 
     @property
@@ -44,8 +45,7 @@ class TextPort:
     def write(self, data: bytes) -> None:
         """Send frames; raises LinkError."""
         text = b"".join(map(self._text_of, unpack_frames(data)))
-        # A serial port drops what it has not taken of an earlier request: an end for its last line.
-        self.below.write(b"\r" + text if self.below.is_blocked else text)
+        self.below.write(self._cut_off + text if self.below.is_blocked else text)
 
     def poll(self) -> None:
         """Hand over what has come and was not read yet."""

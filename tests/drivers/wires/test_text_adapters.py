@@ -7,19 +7,22 @@ from contextlib import asynccontextmanager, suppress
 
 import pytest
 
+from drivers.codec.can_bus.adapter_text import SlcanReader
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from drivers.errors import LinkError
+from drivers.opening import Lines
 from drivers.wires import socketcand
 from drivers.wires.known import address_of
 from drivers.wires.text_port import TextPort
+from registry.limits import GuardLimits
 
 FRAME = CanFrame(0x185, bytes.fromhex("0102030405060708"))
 ELEMENT = b"< frame 185 1.000000 0102030405060708 >"
 
 
 @asynccontextmanager
-async def server(*replies: bytes) -> AsyncIterator[str]:
+async def server(*replies: bytes, accepted: asyncio.Event | None = None) -> AsyncIterator[str]:
     """A server that greets with the first text, and replies to each element with the next.
 
     Its URL, of node 5. After the last text it closes the connection if that is empty.
@@ -28,6 +31,8 @@ async def server(*replies: bytes) -> AsyncIterator[str]:
     ended = asyncio.Event()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if accepted is not None:
+            accepted.set()
         with suppress(EOFError, ConnectionError):
             for reply in replies:
                 writer.write(reply)
@@ -43,7 +48,8 @@ async def server(*replies: bytes) -> AsyncIterator[str]:
         yield f"can+socketcand://127.0.0.1:{listening.sockets[0].getsockname()[1]}/can0#5"
     finally:
         listening.close()
-        await ended.wait()
+        async with asyncio.timeout(10.0):
+            await ended.wait()
         await asyncio.sleep(0)  # the connection ends
 
 
@@ -89,6 +95,20 @@ async def test_server_that_does_not_open_the_bus_is_told(
             await open_port(url, lambda data: None)
 
 
+async def test_opening_that_is_given_up_leaves_nothing() -> None:
+    """The server has accepted, and says nothing: the connection ends with the caller."""
+    lines = Lines()
+    limits = GuardLimits(20.0, 1000.0, 1.0)
+    accepted = asyncio.Event()
+    async with server(b" ", accepted=accepted) as url:  # which ends with its connection
+        opening = asyncio.ensure_future(lines.amplifier(url, limits, name="a"))
+        await accepted.wait()
+        opening.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await opening
+    await lines.close()
+
+
 async def test_slcan_is_closed_then_opened_at_its_bit_rate_and_closed_at_the_end() -> None:
     """LAWICEL's commands: C, S5 for 250 kbit/s, O; a frame as t with its bytes in hexadecimal."""
     master, slave = os.openpty()
@@ -115,7 +135,7 @@ async def test_line_that_was_cut_off_is_ended_before_the_next_frame() -> None:
         def write(self, data: bytes) -> None:
             self.written += data
 
-    port = TextPort(iter, lambda frame: b"t1850\r", lambda data: None)  # type: ignore[arg-type]
+    port = TextPort(SlcanReader(), lambda frame: b"t1850\r", lambda data: None, cut_off=b"\r")
     port.below = below = Blocked()  # type: ignore[assignment]
     port.write(pack_frames([FRAME]))
     assert below.written == b"\rt1850\r"

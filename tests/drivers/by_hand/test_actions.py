@@ -2,6 +2,7 @@
 
 import asyncio
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import minimalmodbus
@@ -13,7 +14,8 @@ from drivers.by_hand.discovery import identify_all
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
 from drivers.opening import Lines
-from drivers.protocol.table import FEATURES
+from drivers.protocol.records import Values
+from drivers.protocol.table import FEATURES, STATES
 from drivers.trace import tracing
 from registry.limits import GuardLimits
 from word_wires import WORD_WIRES, FarSide
@@ -59,6 +61,42 @@ async def test_stop_of_a_mute_amplifier_may_play() -> None:
     assert (result["silence"], result["may_play_for_s"]) == ("may_play", None)
     assert "no reply" in result["cause"]
     assert "state" not in result
+
+
+def stale(status: Values, stops: int) -> Values:
+    """A status of an earlier stop, as a converter may have kept it."""
+    return {**status, "state": STATES["QUICK_STOP_ACTIVE"], "levels": [0], "latch": 1}
+
+
+def of_no_channel(status: Values, stops: int) -> Values:
+    """A status of this stop, with the level of no channel."""
+    return {**stale(status, stops), "channels": 0, "levels": [], "latch": 1 + stops}
+
+
+@pytest.mark.parametrize("lie", [stale, of_no_channel])
+async def test_status_that_proves_nothing_confirms_no_silence(
+    lie: Callable[[Values, int], Values], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It plays on, and says after each Stop what an earlier status said, or nothing of channels."""
+    monkeypatch.setattr(actions, "_STOP_TIMEOUT", 0.3)
+    async with WORD_WIRES["serial"](1) as far:
+        await leave_playing(far)
+        amplifier, stops = far.amplifiers[1], 0
+        handle = amplifier.handle
+
+        def lying(name: str, values: Values, now: float) -> Values:
+            nonlocal stops
+            stops += name == "Stop"
+            if stops and name in ("Stop", "GetStatus"):
+                return lie(handle("GetStatus", {}, now), stops)
+            return handle(name, values, now)
+
+        monkeypatch.setattr(amplifier, "handle", lying)
+        result = await actions.stop(far.url(1))
+        assert stops >= 2
+        assert far.level(1) == pytest.approx(0.5)
+    assert result["silence"] == "may_play"
+    assert "switch it off" in result["cause"]
 
 
 async def test_stop_at_a_missing_port_is_unconfirmed() -> None:

@@ -37,12 +37,14 @@ _T = TypeVar("_T")
 class BlockingAmplifier:
     """The amplifier at a URL within limits, open while the context lasts.
 
-    Leaving the context disarms it. Raises what `Amplifier` raises.
+    is_output: what full level must be, the output of a linear amplifier or the motion of a stiff
+    source; None for either. Leaving the context disarms it. Raises what `Amplifier` raises.
     """
 
-    def __init__(self, url: str, *, limits: GuardLimits) -> None:
+    def __init__(self, url: str, *, limits: GuardLimits, is_output: bool | None = None) -> None:
         self._url = url
         self._limits = limits
+        self._is_output = is_output
         self._token = 1
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name=f"amplifier {url}")
@@ -133,13 +135,17 @@ class BlockingAmplifier:
 
         Raises CommandRefused if the amplifier stops by itself, or its replies contradict requests.
         """
-        return self._wait(self._played(tones, ramp, duration))
+        played = self.apply(tones, ramp=ramp, valid_for=duration)
+        self._wait(self._keep_alive(duration))
+        return played
 
     async def _open(self) -> tuple[Lines, Amplifier]:
         lines = Lines()
         try:
             url = self._url
-            amplifier = await lines.amplifier(url, self._limits, name=url, is_output=None)
+            amplifier = await lines.amplifier(
+                url, self._limits, name=url, is_output=self._is_output
+            )
             await amplifier.open()
         except BaseException:
             await lines.close()
@@ -152,13 +158,11 @@ class BlockingAmplifier:
         layer = Layer(0, tuple(tones), ramp, valid_for)
         return await self._amplifier.stage(self._token, [layer], now=True)
 
-    async def _played(self, tones: Sequence[Tone], ramp: float, duration: float) -> Staged:
-        played = await self._applied(tones, ramp, duration)
+    async def _keep_alive(self, duration: float) -> None:
         end = clock.now() + duration
         while (left := end - clock.now()) > 0:
             await asyncio.sleep(min(HEARTBEAT, left))
             await self._amplifier.ping()
-        return played
 
     async def _measured(self, frequencies: Sequence[float], window: float) -> Reading:
         is_armed = (await self._amplifier.read_status())["state"] == _ENABLED

@@ -6,7 +6,7 @@ import pytest
 
 from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.contents import Tone
-from drivers.errors import CommandError, CommandRefused
+from drivers.errors import CommandError, CommandRefused, LinkError
 from model.rig.file import example_rig_path
 from registry.limits import GuardLimits
 
@@ -73,6 +73,14 @@ def test_play_raises_when_the_watchdog_has_tripped(monkeypatch: pytest.MonkeyPat
         amplifier.arm(0.1)
         with pytest.raises(CommandRefused, match=r"WATCHDOG.*clear"):
             amplifier.play([Tone(0, 110.0, 0.2)], duration=1.0)
+
+
+def test_amplifier_of_another_full_level_is_refused() -> None:
+    """A rig says which one it has: the simulated one is of motion."""
+    with pytest.raises(LinkError, match="full level"):
+        BlockingAmplifier(URL, limits=LIMITS, is_output=True).__enter__()
+    with BlockingAmplifier(URL, limits=LIMITS, is_output=False):
+        pass
 
 
 def test_blocking_amplifier_ends_its_thread_when_opening_fails() -> None:

@@ -6,7 +6,7 @@ Frames are words: what a word means depends on the message. ASCII only, as DBC r
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from drivers.codec.can_bus.frame import CANOPEN, cob_id
+from drivers.codec.can_bus.canopen import CANOPEN, cob_id
 from drivers.codec.can_bus.segments import REPLY, REQUEST, frames_of
 from drivers.protocol.serial_payload import HELLO
 from drivers.protocol.table import EVENT, FAULTS, MAX_WORDS, MESSAGES, NAK, STATES

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from drivers.codec.can_bus.frame import CANOPEN, cob_id
+from drivers.codec.can_bus.canopen import CANOPEN, cob_id
 from drivers.protocol.table import MESSAGES
 from word_names import word_names
 

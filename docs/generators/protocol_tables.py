@@ -11,7 +11,7 @@ from pathlib import Path
 
 from amplifier_dbc import dbc_text
 from amplifier_eds import eds_text
-from drivers.codec.can_bus.frame import CANOPEN
+from drivers.codec.can_bus.canopen import CANOPEN
 from drivers.protocol.records import Bits, Number, Numbers, Real, Record, Rest, Rows, Text
 from drivers.protocol.serial_payload import HELLO
 from drivers.protocol.table import (
@@ -116,7 +116,8 @@ def messages() -> str:
 def records() -> str:
     """Return the words of replies and of the parts of a set."""
     rows = ((name, layout(record)) for name, record in {**_OTHERS, **_REPLIES}.items())
-    return _table(("record", "words"), (*rows, ("sensor of a Reading", layout(sensor_reading(1)))))
+    last = "sensor of a Reading", layout(sensor_reading(1))
+    return _table(("record", "words"), iter([*rows, last]))
 
 
 def layout(record: Record) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 
-from drivers.protocol.definition import WireQuantity
+from drivers.protocol.quantity import WireQuantity
 from drivers.protocol.records import Bits, Number, Numbers, Record, Rows
 
 

@@ -6,7 +6,7 @@ Its bytes are packed frames (`drivers.codec.can_bus.segments`), for a port that 
 from collections import deque
 
 from drivers import clock
-from drivers.codec.can_bus.frame import BLOCK, CANOPEN, CanFrame, cob_id
+from drivers.codec.can_bus.canopen import BLOCK, CANOPEN, CanFrame, cob_id, frame_time
 from drivers.codec.can_bus.segments import (
     NODE_MAX,
     NUMBER_MAX,
@@ -20,7 +20,6 @@ from drivers.codec.can_bus.segments import (
     segments,
     unpack_frames,
 )
-from drivers.codec.can_bus.timing import CanTimes
 from drivers.host.wire import Arrival, Broken, Event, OtherHost, Reply, Several, read_nak
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import BROADCAST, HELLO
@@ -51,7 +50,7 @@ class CanWire:
     def __init__(self, bitrate: int, *, sequence: int, delay: float = 0.0) -> None:
         self.counters = WireCounters()
         self.delay = delay
-        self._frame_time = CanTimes(bitrate).frame(BLOCK)
+        self._frame_time = frame_time(bitrate)
         self._sequence = sequence
         self._numbers: dict[int, int] = {}  # last ones by node
         self._sent: deque[CanFrame] = deque(maxlen=_KEPT)

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from drivers.errors import CommandError
-from drivers.protocol.definition import WireQuantity
+from drivers.protocol.quantity import WireQuantity
 from drivers.protocol.records import Values
 from drivers.protocol.table import QUANTITIES
 from registry.limits import GuardLimits

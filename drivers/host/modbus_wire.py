@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from drivers.codec.modbus.adu import ModbusResponse, RequestAdu, ResponseReader, build_adu
 from drivers.codec.modbus.exchanges import Read, Write
 from drivers.host.wire import Arrival, Broken, More, Nak, Reply, Several, read_nak
-from drivers.protocol.definition import WireQuantity
+from drivers.protocol.quantity import WireQuantity
 from drivers.protocol.records import Number, Numbers, Real, Record, Refusal, Rest, Rows, Values
 from drivers.protocol.serial_payload import BROADCAST
 from drivers.protocol.table import MAX_WORDS, MESSAGES, QUANTITIES

@@ -1,89 +1,16 @@
 """The protocol's numbers as typed values, loaded once from protocol.yaml."""
 
-import math
 import random
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
 
-from drivers.errors import CommandError
-
-_STRUCT_CODES = {"u8": "B", "u16": "H", "u32": "I", "i16": "h"}
-
-# Sums of floats may exceed a range by rounding: a thousandth of a step is allowed.
-_TOLERANCE = 1e-3
-
-
-@dataclass(frozen=True)
-class WireQuantity:
-    """A kind of number on the wire: an integer of `per_unit` steps per unit, within a range.
-
-    wire: u8, u16, u32 or i16; minimum, maximum: as integers; wraps: an angle, modulo 360.
-    """
-
-    name: str
-    wire: str
-    per_unit: int
-    unit: str
-    minimum: int
-    maximum: int
-    wraps: bool = False
-
-    @cached_property
-    def struct_code(self) -> str:
-        """Format character of `struct`."""
-        return _STRUCT_CODES[self.wire]
-
-    @cached_property
-    def step(self) -> float:
-        """Resolution on the wire, in the unit."""
-        return 1 / self.per_unit
-
-    @property
-    def low(self) -> float:
-        """Smallest value, in the unit."""
-        return self.minimum / self.per_unit
-
-    @property
-    def high(self) -> float:
-        """Largest value, in the unit."""
-        return self.maximum / self.per_unit
-
-    def to_wire(self, value: float) -> int:
-        """Encode a value [unit] as an integer, rounded to the nearest step.
-
-        Raises CommandError for NaN, infinities and values out of range; nothing is clipped.
-        """
-        scaled = value * self.per_unit
-        if self.minimum <= scaled <= self.maximum:
-            return round(scaled)
-        if not math.isfinite(value):
-            raise CommandError(f"{self.name} must be a finite number, got {value}")
-        if self.wraps:
-            span = self.maximum - self.minimum + 1
-            return (round(scaled) - self.minimum) % span + self.minimum
-        if not self.minimum - _TOLERANCE <= scaled <= self.maximum + _TOLERANCE:
-            unit = f" {self.unit}" if self.unit else ""
-            raise CommandError(
-                f"{self.name} must be {self.low:g} to {self.high:g}{unit}, got {value:g}{unit}"
-            )
-        return round(scaled)
-
-    def from_wire(self, integer: int) -> float:
-        """Decode an integer in range (see `holds`) to a value [unit]."""
-        return integer / self.per_unit
-
-    def holds(self, integer: int) -> bool:
-        """Whether an integer from the wire is in range."""
-        return self.minimum <= integer <= self.maximum
-
-    def quantise(self, value: float) -> float:
-        """Return the value [unit] that arrives when this one is sent."""
-        return self.to_wire(value) / self.per_unit
+from drivers.protocol.quantity import WireQuantity as WireQuantity
+from drivers.protocol.tokens import is_newer_token as is_newer_token
+from drivers.protocol.tokens import token_after as token_after
 
 
 @dataclass(frozen=True)
@@ -204,16 +131,6 @@ def _load() -> Protocol:
 
 
 PROTOCOL = _load()
-
-
-def token_after(token: int) -> int:
-    """Return the token after this one (0 before the first): 1..65535, then 1 again."""
-    return token % PROTOCOL.quantities.token.maximum + 1
-
-
-def is_newer_token(token: int, than: int) -> bool:
-    """Whether a token follows another by less than half of 2^16 (RFC 1982); any follows 0, none."""
-    return than == 0 or 0 < (token - than) % (1 << 16) < 1 << 15
 
 
 def is_newer_latch(latch: int, than: int) -> bool:

@@ -13,7 +13,7 @@ from itertools import groupby
 from typing import Any, Protocol
 
 from drivers.errors import FrameError
-from drivers.protocol.definition import WireQuantity
+from drivers.protocol.quantity import WireQuantity
 
 WORD = 0x10000
 _REAL_MAX = (2 - 2**-23) * 2.0**127  # of IEEE 754 binary32

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from drivers.protocol.definition import WireQuantity
+from drivers.protocol.quantity import WireQuantity
 from drivers.protocol.records import (
     Bits,
     Number,

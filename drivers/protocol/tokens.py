@@ -1,7 +1,5 @@
 """Numbers that follow each other: tokens of sets, and latches of stops and faults."""
 
-import random
-
 from drivers.protocol.table import QUANTITIES
 
 _SPAN = 1 << 16
@@ -16,9 +14,3 @@ def token_after(number: int) -> int:
 def is_newer_token(number: int, than: int) -> bool:
     """Whether one follows another by less than half of 2^16 (RFC 1982); any follows 0, none."""
     return than == 0 or 0 < (number - than) % _SPAN < _SPAN // 2
-
-
-def drawn(name: str) -> int:
-    """Return a random number of a quantity, as a session or token that no earlier host had."""
-    quantity = QUANTITIES[name]
-    return random.randint(quantity.minimum, quantity.maximum)  # noqa: S311  not a secret

@@ -12,7 +12,7 @@ from typing import Any, final
 import can
 
 from drivers.backends.urls.can_bus import CanBusUrl
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import REQUEST, pack_frames, unpack_frames
 from drivers.errors import LinkError, system_message
 from drivers.threads import close_in_thread, in_thread

@@ -5,9 +5,8 @@ How they are packed: `drivers.codec.can_bus.segments`.
 
 from drivers.backends.hardware import number_below
 from drivers.backends.urls.can_bus import CanBusUrl, CanUrl
-from drivers.codec.can_bus.frame import BLOCK
+from drivers.codec.can_bus.canopen import frame_time
 from drivers.codec.can_bus.segments import NUMBER_MAX, frames_of
-from drivers.codec.can_bus.timing import CanTimes
 from drivers.errors import CommandError
 from drivers.host.can_wire import CanWire
 from drivers.host.wire import NETWORK_DELAY
@@ -32,7 +31,7 @@ class CanAddress(WireAddress):
 
     def exchange_time(self, words: int, reply: int) -> float:
         """Return how long a request and its reply of so many words take [s]."""
-        return (frames_of(words) + frames_of(reply)) * CanTimes(self.bus.bitrate).frame(BLOCK)
+        return (frames_of(words) + frames_of(reply)) * frame_time(self.bus.bitrate)
 
     def make_wire(self) -> CanWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""

@@ -6,7 +6,7 @@ masters read, concern no rule.
 
 from collections import deque
 
-from drivers.codec.can_bus.frame import CANOPEN, cob_id
+from drivers.codec.can_bus.canopen import CANOPEN, cob_id
 from drivers.codec.can_bus.segments import NODE_MAX, REPLY, REQUEST, Assembler, frames_of
 from drivers.codec.can_bus.segments import Message as Words
 from drivers.protocol.serial_payload import HELLO as HELLO_NUMBER

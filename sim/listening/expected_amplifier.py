@@ -8,7 +8,6 @@ carried out: the next status says so.
 import math
 from collections.abc import Mapping, Sequence
 
-from drivers.protocol.definition import is_newer_token
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import (
@@ -18,6 +17,7 @@ from drivers.protocol.table import (
     STAGED_LIFE,
     STATUS_FLAGS,
 )
+from drivers.protocol.tokens import is_newer_token
 from sim.listening.decoded import CHANGING, FEEDING, STATUS_RECORD, Request
 from sim.listening.expected_outputs import Interval
 from sim.listening.expected_state import (

@@ -2,9 +2,9 @@
 
 import math
 
-from drivers.protocol.definition import is_newer_token
 from drivers.protocol.records import Values
 from drivers.protocol.table import FAULTS, QUANTITIES, STATES
+from drivers.protocol.tokens import is_newer_token
 from sim.listening.expected_outputs import ExpectedOutputs, Interval
 from sim.listening.set_replies import SetReplies
 from sim.listening.unanswered import ENABLED, LATCHED, Unanswered

@@ -3,9 +3,9 @@
 import math
 from collections.abc import Mapping, Sequence
 
-from drivers.protocol.definition import is_newer_token
 from drivers.protocol.sets import Command, LayerSet
 from drivers.protocol.table import QUANTITIES
+from drivers.protocol.tokens import is_newer_token
 from sim.listening.amplifier_session import AmplifierSession, is_vibrating
 
 _STEP = 0.6  # of a step of the wire; tolerance of rounding

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
-from drivers.codec.can_bus.frame import CANOPEN, CanFrame, cob_id
+from drivers.codec.can_bus.canopen import CANOPEN, CanFrame, cob_id
 from drivers.codec.can_bus.segments import REQUEST, pack_frames, unpack_frames
 from drivers.codec.serial_line.frame import FrameReader
 from drivers.host.amplifier import Amplifier as Host

@@ -6,7 +6,7 @@ Readers take bytes and yield complete frames; invalid text is skipped.
 import re
 from collections.abc import Iterator
 
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 
 _MAX_LENGTH = 512  # characters without a terminator; twice a CAN FD frame
 _FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)

@@ -8,20 +8,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from drivers.codec.can_bus.canopen import BLOCK as BLOCK
+from drivers.codec.can_bus.canopen import CanFrame as CanFrame
 from drivers.protocol.definition import PROTOCOL
 
-BLOCK = 8  # bytes; a classic frame holds one, a CAN FD frame up to eight
-
 CANOPEN: Mapping[str, Any] = PROTOCOL.canopen
-
-
-@dataclass(frozen=True, slots=True)
-class CanFrame:
-    """A data frame with an 11-bit identifier; fd: sent as CAN FD."""
-
-    id: int
-    data: bytes
-    fd: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from drivers.codec.can_bus.frame import BLOCK, CanFrame
+from drivers.codec.can_bus.canopen import BLOCK, CanFrame
 from drivers.protocol.table import MAX_WORDS
 from drivers.statistics import WireCounters
 

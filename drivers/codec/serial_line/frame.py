@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from cobs import cobs
 
-from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.table import MAX_WORDS
 
 REPLY = 0x80
 NEUTRAL = 0
@@ -25,7 +25,9 @@ _TYPE_MASK = 0x7F
 _HEADER = struct.Struct("<BBBH")
 _CRC = struct.Struct("<I")
 _OVERHEAD = _HEADER.size + _CRC.size
-_STUFFED_MAX = _OVERHEAD + PROTOCOL.serial.payload_max + 1
+PAYLOAD_MAX = 2 * MAX_WORDS
+"""Bytes; header, payload and CRC stay in one COBS block, so that its overhead is one byte."""
+_STUFFED_MAX = _OVERHEAD + PAYLOAD_MAX + 1
 
 
 class Frame(NamedTuple):
@@ -39,7 +41,7 @@ class Frame(NamedTuple):
     address: int
     sequence: int
     payload: bytes
-    version: int = PROTOCOL.version
+    version: int = 2
 
     @property
     def type(self) -> int:
@@ -62,11 +64,8 @@ class FrameCounters:
 
 def encode_frame(frame: Frame) -> bytes:
     """Encode a frame with its delimiters; ValueError for a payload that is too long."""
-    if len(frame.payload) > PROTOCOL.serial.payload_max:
-        raise ValueError(
-            f"payload must have at most {PROTOCOL.serial.payload_max} bytes, got "
-            f"{len(frame.payload)}"
-        )
+    if len(frame.payload) > PAYLOAD_MAX:
+        raise ValueError(f"payload must have at most {PAYLOAD_MAX} bytes, got {len(frame.payload)}")
     header = _HEADER.pack(frame.kind, frame.version, frame.address, frame.sequence)
     body = header + frame.payload
     stuffed: bytes = cobs.encode(body + _CRC.pack(zlib.crc32(body)))

@@ -6,7 +6,7 @@ Frames come and go packed (`drivers.codec.can_bus.segments`), those of a message
 import struct
 from collections.abc import Callable, Mapping
 
-from drivers.codec.can_bus.frame import CANOPEN, CanFrame, cob_id
+from drivers.codec.can_bus.canopen import CANOPEN, CanFrame, cob_id
 from drivers.codec.can_bus.segments import (
     NODE_MAX,
     REPLY,

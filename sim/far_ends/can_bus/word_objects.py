@@ -8,13 +8,13 @@ import struct
 import zlib
 from collections.abc import Callable
 
-from drivers.codec.can_bus.frame import CANOPEN, cob_id
+from drivers.codec.can_bus.canopen import CANOPEN, cob_id
 from drivers.protocol.table import FAULTS, MESSAGES
 from sim.amplifier.contract import AmplifierPort
 from sim.far_ends.can_bus.sdo import BAD_LENGTH, NO_OBJECT, NO_SUBINDEX, READ_ONLY, SdoAbort
 
 FAULT_NAMES = {number: name for name, number in FAULTS.items()}
-_INDEX = {name: declared["index"] for name, declared in CANOPEN["objects"].items()}
+_INDEX = CANOPEN["objects"]
 _TEXTS = ("vendor", "product", "serial_number", "firmware")
 
 

@@ -89,7 +89,7 @@ async def silence_never_later(subject: Subject) -> None:
         stopped = (await subject.ask("Stop", ramp=second)).when
         since = stopped if second == silent else begun
         await _expect_silence(subject, since, silent / 1000, f"Stops of {first} and {second} ms")
-        await subject.ask("Clear", latch=subject.latch)
+        await subject.rest()  # its fade may last, though its level is below a step
     await _armed(subject)
     begun = await subject.play(layer(0, ramp=short))
     await subject.ask("Stop", ramp=long)

@@ -162,7 +162,8 @@ static void read_layer(Words *words, int plays, uint16_t token, double time, int
     int plays_now = plays && waits <= time, named = 0;
     for (int i = 0; i < count; i++) {
         uint16_t flags = next(words), frequency = next(words);
-        int channel = flags >> 4, has_onset = flags >> 1 & 1, has_ending = flags & 1;
+        int channel = flags >> 4 & 15, has_onset = flags >> 1 & 1, has_ending = flags & 1;
+        check(words, !(flags >> 8), BAD_VALUE, NO_CHANNEL);
         int is_new = channel < CHANNELS && !(named >> channel & 1);
         double complex last = polar(words, channel);
         check(words, is_new, BAD_CHANNEL, channel);

@@ -89,6 +89,8 @@ class Playback:
             return
         while (due := self._next_due()) is not None and due[0] <= time:
             at, number = due
+            # What has faded before is gone; a set that waited for its end may continue a voice.
+            self._drop_faded(math.nextafter(at - self.uncertainty, -math.inf))
             layer = self._layers[number]
             if layer.waiting is not None and layer.waiting[0] <= at:
                 _, one, token = layer.waiting
@@ -96,15 +98,18 @@ class Playback:
                 self._start(one, token, at)
             else:
                 self._end(number, at)
-        faded = time - self.uncertainty
+        self._drop_faded(time - self.uncertainty)
+        self._note_changes()
+
+    def _drop_faded(self, time: float) -> None:
+        """Drop the voices that are silent from a time on."""
         for channel, voices in enumerate(self.all_voices):
             kept = []
             for voice in voices:
-                if voice.transition.last or voice.transition.end > faded:
+                if voice.transition.last or voice.transition.end > time:
                     kept.append(voice)
             if len(kept) < len(voices):
                 self.all_voices[channel] = tuple(kept)
-        self._note_changes()
 
     def _note_changes(self) -> None:
         """Note when a voice has faded, or a layer ends or starts, next."""
@@ -285,7 +290,9 @@ class Playback:
         ramp = self._layers.pop(layer).ramp / _PER_RAMP
         self.all_voices = [
             tuple(
-                each.ended(time, ramp, self.uncertainty) if each.layer == layer else each
+                each.ended(time, ramp, self.uncertainty)
+                if each.layer == layer and not each.has_ended
+                else each
                 for each in voices
             )
             for voices in self.all_voices

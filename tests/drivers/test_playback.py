@@ -110,6 +110,26 @@ def test_waiting_set_starts_when_the_onset_ends() -> None:
     assert playback.voices_of(0) == ()
 
 
+def test_end_of_a_layer_leaves_endings_under_way() -> None:
+    """A channel that falls silent by its ending goes on to, through 0.25 amid the last step."""
+    ending = Envelope(100, ((5000, 0),))
+    playback = Playback(2, 8)
+    playback.commit([layer(0, tone(ending=ending), tone(1))], 1, 0.0)
+    playback.commit([LayerSet(0, 0, 5, (tone(1),))], 2, 1.0)
+    playback.advance(1.015)
+    assert amplitudes(playback, 1.015) == pytest.approx([0.25])
+
+
+def test_voice_that_has_faded_is_not_continued_however_seldom_time_advances() -> None:
+    """Its onset to level 0 ended at 20 ms, before that of the channel for which a set waits."""
+    playback = Playback(2, 8)
+    short, long = Envelope(100, ((2000, 0),)), Envelope(200, ((2000, 0),))
+    playback.commit([layer(0, tone(level=0, onset=short), tone(1, onset=long))], 1, 0.0)
+    playback.commit([layer(0, tone(keep_phase=True), after=True)], 2, 0.01)
+    playback.advance(1.0)
+    assert [voice.origin for voice in playback.voices_of(0)] == pytest.approx([0.04])
+
+
 def test_oldest_fade_makes_room_for_a_voice_too_many() -> None:
     """Of nine voices the one that has faded longest is silent within 2 ms; no set is refused."""
     playback = Playback(1, 8)

@@ -145,7 +145,7 @@ async def stop(url: str) -> dict[str, Any]:
     return {
         "url": url,
         "silence": "may_play" if cause else "confirmed_silent",
-        "may_play_for_s": None if cause else 0.0,
+        "may_play_for_s": None,
         "cause": cause,
         **rows,
     }

@@ -93,11 +93,11 @@ def achieved_problem(sent: LayerSet, achieved: LayerSet, can: Values) -> str | N
         return f"channels of layer {sent.layer} must be {[*commands]}, got {[*played]}"
     for channel, command in commands.items():
         got = played[channel]
-        turn = (got.phase - command.phase + _HALF_TURN) % (2 * _HALF_TURN) - _HALF_TURN
+        phase = (got.phase - command.phase + _HALF_TURN) % (2 * _HALF_TURN) - _HALF_TURN
         for name, difference in (
             ("frequency", got.frequency - command.frequency),
             ("level", got.level - command.level),
-            ("phase", turn),
+            ("phase", phase),
         ):
             if abs(difference) > (can[f"{name}_step"] + 1) / 2:
                 return (

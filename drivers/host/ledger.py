@@ -70,7 +70,7 @@ class Ledger:
         """
         try:
             requested = self._rounding.layers(layers)
-            if not _is_vibration(requested):
+            if not is_vibrating(*requested):
                 return self._silence(requested, now, delay)
             if self._doubt is not None:
                 raise CommandRefused(f"set {self.doubt} must be confirmed first; read the status")
@@ -92,7 +92,7 @@ class Ledger:
         if self._doubt is not None and self._doubt[0] == token:
             return
         before: Vibration | None = None
-        if _is_vibration(layers):
+        if is_vibrating(*layers):
             is_timed = not self._budget.is_unlimited
             lasts = max(map(_lasts, layers)) if is_timed else 0.0
             before = self._budget.sent(now, lasts=lasts)
@@ -207,8 +207,8 @@ class Ledger:
         highest, power = self.limits.level / _LEVEL.per_unit * TOLERANCE, self.limits.power
         if max(before) > highest or max(after) > highest:
             return False
-        most_squared = max(math.hypot(*before), math.hypot(*after)) ** 2
-        return power == math.inf or most_squared <= power * TOLERANCE
+        highest_power = max(math.hypot(*before), math.hypot(*after)) ** 2
+        return power == math.inf or highest_power <= power * TOLERANCE
 
     def _within_budget(
         self, layers: tuple[LayerSet, ...], now: float, delay: float
@@ -233,12 +233,12 @@ class Ledger:
 
 def _fade(one: LayerSet) -> float:
     """Return how long a layer takes to end [s]: along its ramp or its longest ending."""
-    longest = _RAMP.from_wire(one.ramp)
+    fade = _RAMP.from_wire(one.ramp)
     for command in one.commands:
         if command.ending is not None:
             knots = len(command.ending.knots) + 1
-            longest = max(longest, _STEP.from_wire(command.ending.step) * knots)
-    return longest
+            fade = max(fade, _STEP.from_wire(command.ending.step) * knots)
+    return fade
 
 
 def _lasts(one: LayerSet) -> float:
@@ -248,20 +248,14 @@ def _lasts(one: LayerSet) -> float:
     return _fade(one) + (_VALID_FOR.from_wire(one.valid_for) or math.inf)
 
 
-def is_vibrating(one: LayerSet) -> bool:
-    """Whether a layer plays after its set, so that it spends time and rate."""
-    if one.renew:
-        return True
-    for command in one.commands:  # noqa: SIM110  a generator would be a call for each
-        if command.is_driven:
+def is_vibrating(*layers: LayerSet) -> bool:
+    """Whether any layer plays after its set, so that it spends time and rate."""
+    for one in layers:
+        if one.renew:
             return True
-    return False
-
-
-def _is_vibration(layers: Sequence[LayerSet]) -> bool:
-    for one in layers:  # noqa: SIM110
-        if is_vibrating(one):
-            return True
+        for command in one.commands:
+            if command.is_driven:
+                return True
     return False
 
 

@@ -29,7 +29,7 @@ from drivers.protocol.table import (
 from drivers.statistics import WireCounters
 
 _BITS = 10  # of a byte, with start and stop
-_LONGEST = frame_length(2 * MAX_WORDS)  # bytes
+_REPLY_MAX = frame_length(2 * MAX_WORDS)  # bytes
 _IDENTITY = frame_length(140)
 
 
@@ -76,7 +76,7 @@ class SerialWire:
 
     def round_trip(self, name: str, length: int) -> float:
         """Return how long a request of this many bytes and its longest reply take [s]."""
-        return self._byte_time * (length + (_IDENTITY if name == "Hello" else _LONGEST))
+        return self._byte_time * (length + (_IDENTITY if name == "Hello" else _REPLY_MAX))
 
     def _arrival(self, frame: Frame) -> Arrival | None:
         self.counters.frames_in += 1

@@ -293,10 +293,12 @@ class Run:
                     word >>= bits
                 if word:
                     raise Refusal(f"unused bits beside {parts[0][0]} must be 0")
-            elif 0 <= low <= word <= high:
-                values[name] = word
             else:
-                field.unpack(words, at, values)
+                if low < 0 and word >= WORD // 2:
+                    word -= WORD
+                if not low <= word <= high:
+                    field.unpack(words, at, values)  # raises
+                values[name] = word
             at += 1
         return at
 

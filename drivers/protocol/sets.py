@@ -135,13 +135,11 @@ def parts(stream: Sequence[int], *, session: int, token: int, now: bool) -> list
     cuts = range(0, max(len(stream), 1), _PART_WORDS)
     if len(cuts) > MAX_PARTS:
         raise ValueError(f"a set must have at most {MAX_PARTS} parts, got {len(cuts)}")
-    return [
-        {
-            **{"session": session, "token": token, "index": index, "parts": len(cuts)},
-            **{"now": int(now), "stream": list(stream[at : at + _PART_WORDS])},
-        }
-        for index, at in enumerate(cuts)
-    ]
+    made: list[Values] = []
+    for index, at in enumerate(cuts):
+        values = {"session": session, "token": token, "index": index, "parts": len(cuts)}
+        made.append({**values, "now": int(now), "stream": list(stream[at : at + _PART_WORDS])})
+    return made
 
 
 @dataclass

@@ -8,9 +8,9 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from drivers.budget import COMMIT_DELAY, Budget, Vibration
 from drivers.command import CommandSet, DriveCommand, Envelope
 from drivers.errors import CommandRefused
-from drivers.guard.budget import COMMIT_DELAY, Budget, Vibration
 from drivers.guard.channel_state import (
     ChannelState,
     Interval,

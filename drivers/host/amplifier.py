@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from drivers import clock
+from drivers.budget import COMMIT_DELAY
 from drivers.contents import Layer, is_silence
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout, Preempted
-from drivers.guard.budget import COMMIT_DELAY
 from drivers.host.comparison import achieved_problem, name_of
 from drivers.host.dialogue import Dialogue, Staged
 from drivers.host.identification import check_capabilities, check_identity
@@ -21,7 +21,6 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import (
     FAULTS,
-    FEATURES,
     MAX_WORDS,
     QUANTITIES,
     STATES,
@@ -38,7 +37,6 @@ LISTENING = 0.3  # s; to an amplifier that is found armed
 SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
-_VOLTAGE, _CURRENT = QUANTITIES["channel_voltage"], QUANTITIES["channel_current"]
 _ENABLED = STATES["OPERATION_ENABLED"]
 _LATCHED = tuple(STATES[name] for name in ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT"))
 PART_BYTES = 2 * MAX_WORDS
@@ -225,19 +223,6 @@ class Amplifier(Dialogue):
         else:
             self.ledger.achieved(achieved, values["token"])
         return achieved
-
-    async def read_measured(self) -> list[tuple[float, float]]:
-        """Read voltage [V] and current [A] of each channel; empty without the feature."""
-        if not self.capabilities["features"] >> FEATURES["electrical"] & 1:
-            return []
-        measured = await self._request("GetMeasured", {}, Priority.READING)
-        return [
-            (
-                _VOLTAGE.from_wire(each["channel_voltage"]),
-                _CURRENT.from_wire(each["channel_current"]),
-            )
-            for each in measured["channels"]
-        ]
 
     async def silence(self, ramp: float) -> Values:
         """Let all layers fall silent along a ramp [s]; it stays armed."""

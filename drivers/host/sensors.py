@@ -1,4 +1,4 @@
-"""What the sensors of an amplifier are, and readings of tones at them.
+"""What an amplifier measures: its channels, and tones at its sensors.
 
 Nothing here needs a session, feeds the watchdog, or changes what plays.
 """
@@ -85,6 +85,16 @@ async def read_sensors(amplifier: Amplifier) -> tuple[Sensor, ...]:
         is_last = len(found) > _Q["sensor"].maximum or not listed["sensors"]
         if is_last or len(found) == listed["all"]:
             return tuple(found)
+
+
+async def read_measured(amplifier: Amplifier) -> list[tuple[float, float]]:
+    """Read voltage [V] and current [A] of each channel; empty if it does not measure them."""
+    if not amplifier.capabilities["features"] >> FEATURES["electrical"] & 1:
+        return []
+    rows = (await _request(amplifier, "GetMeasured", {}))["channels"]
+    voltages = [_Q["channel_voltage"].from_wire(row["channel_voltage"]) for row in rows]
+    currents = [_Q["channel_current"].from_wire(row["channel_current"]) for row in rows]
+    return list(zip(voltages, currents, strict=True))
 
 
 async def start_reading(

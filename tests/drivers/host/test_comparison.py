@@ -8,6 +8,7 @@ from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused
 from drivers.host.comparison import achieved_problem
 from drivers.host.group import Group
+from drivers.host.sensors import read_measured
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
 from sim.amplifier.contract import capabilities
@@ -113,7 +114,7 @@ async def test_voltage_and_current_of_each_channel(kind: str) -> None:
     }
     far._measured = lambda now: iter(values["channels"])  # type: ignore[method-assign]
     await host.open()
-    assert await host.read_measured() == [(1234.5, 250e-6), (0.0, 0.0)]
+    assert await read_measured(host) == [(1234.5, 250e-6), (0.0, 0.0)]
     far.capabilities = {**far.capabilities, "features": 0}
     await host.open()
-    assert await host.read_measured() == []
+    assert await read_measured(host) == []

@@ -87,3 +87,29 @@ def test_line_that_is_busy_for_too_long_commits_nothing() -> None:
         assert not group.is_armed
 
     run_virtual(run())
+
+
+def test_stop_while_a_line_is_kept_for_its_commit_commits_nothing() -> None:
+    """One line is free, the other busy for 90 ms: the stop goes out at once on the first."""
+
+    async def run() -> None:
+        ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
+        hosts = {name: host for end in ends for name, host in end.hosts.items()}
+        group = Group(hosts, draw=lambda low, high: 77)
+        await group.open()
+        await group.arm()
+        ends[1].outward = lambda name, data: [(0.025, data)]
+        applying = asyncio.ensure_future(group.apply({name: [LAYER] for name in hosts}))
+        reading = asyncio.ensure_future(hosts["b"].read_status())
+        await asyncio.sleep(0.04)
+        assert [name for _, name in ends[0].sent][-1] == "1:5"
+        began = ends[0].loop.time()
+        stopped = await group.stop()
+        assert stopped["a"].is_confirmed
+        assert [each for each in ends[0].sent if each[0] == began] == [(began, "1:8")]
+        with pytest.raises(DriverError):
+            await applying
+        await reading
+        assert [started(end) for end in ends] == [[], []]
+
+    run_virtual(run())

@@ -7,6 +7,7 @@ import pytest
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, LinkTimeout
 from drivers.host.jobs import Priority
+from drivers.host.sensors import read_measured
 from drivers.host.serial_wire import SerialWire
 from drivers.protocol.records import Refusal, Values
 from virtual_loop import in_virtual_time
@@ -108,7 +109,7 @@ async def test_reading_gives_way_to_a_set_at_once() -> None:
     await host.open()
     await host.arm(77)
     end.outward = lambda name, data: [(0.025 if name == "GetMeasured" else 0.0002, data)]
-    reading = asyncio.ensure_future(host.read_measured())
+    reading = asyncio.ensure_future(read_measured(host))
     await asyncio.sleep(0.001)
     began = end.loop.time()
     await host.stage(5, [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)])

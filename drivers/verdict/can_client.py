@@ -1,7 +1,7 @@
 """A CAN bus, frame by frame."""
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from drivers import clock
 from drivers.codec.can_bus.frame import CANOPEN, CanFrame, cob_id
@@ -17,7 +17,7 @@ from drivers.codec.can_bus.segments import (
 )
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import HELLO
-from drivers.protocol.table import EVENT, IDENTITY, NAK
+from drivers.protocol.table import IDENTITY, NAK
 from drivers.statistics import WireCounters
 from drivers.verdict.client import Answer, Client, Heard, Port, expect_reply
 from drivers.verdict.findings import Violation, expect_equal
@@ -102,28 +102,25 @@ class CanClient(Client):
         node = self.address if to is None else to
         return pack_frames(CanFrame(REQUEST + node, each) for each in data)
 
-    def damaged(self, number: int, words: Sequence[int]) -> Mapping[str, bytes]:
-        """Return frames with damage of all kinds."""
-        first, *rest = segments(self.next_number(), number, words)
-        flawed = {
-            "seven bytes in its first frame": self.packed([first[:7], *rest]),
-            "another node": self.packed([first, *rest], to=self.address % NODE_MAX + 1),
-            "121 words": self.packed([first[:3] + b"\x79" + first[4:], *rest]),
-            "the number of a broadcast": self.packed([b"\0" + first[1:], *rest]),
-        }
-        if rest:
-            late = bytes([rest[-1][0], rest[-1][1], *(byte ^ 1 for byte in rest[-1][2:])])
-            flawed["its last frame missing"] = self.packed(
-                segments(*self._head(number, words))[:-1]
-            )
-            flawed["its first frame missing"] = self.packed(
-                segments(*self._head(number, words))[1:]
-            )
-            flawed["two frames of one place"] = self.packed([late, *rest, first])
-        return flawed
+    def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
+        """Yield frames with damage of all kinds, each under the next number."""
 
-    def _head(self, number: int, words: Sequence[int]) -> tuple[int, int, Sequence[int]]:
-        return self.next_number(), number, words
+        def frames() -> list[bytes]:
+            return segments(self.next_number(), number, words)
+
+        first, *rest = frames()
+        yield "seven bytes in its first frame", self.packed([first[:7], *rest])
+        yield "another node", self.packed(frames(), to=self.address % NODE_MAX + 1)
+        first, *rest = frames()
+        yield "121 words", self.packed([first[:3] + b"\x79" + first[4:], *rest])
+        first, *rest = frames()
+        yield "the number of a broadcast", self.packed([b"\0" + first[1:], *rest])
+        if rest:
+            yield "its last frame missing", self.packed(frames()[:-1])
+            yield "its first frame missing", self.packed(frames()[1:])
+            first, *rest = frames()
+            other = rest[-1][:2] + bytes(byte ^ 1 for byte in rest[-1][2:])
+            yield "two frames of one place", self.packed([other, *rest, first])
 
     @property
     def emergencies(self) -> list[bytes]:
@@ -131,8 +128,3 @@ class CanClient(Client):
         return [
             frame.data for _, frame in self.frames if frame.id == cob_id("emergency", self.address)
         ]
-
-    @property
-    def event_type(self) -> int:
-        """Type of events."""
-        return EVENT

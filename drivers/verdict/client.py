@@ -6,7 +6,7 @@ and what was not asked for is kept, so that checks see it.
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol
 
@@ -61,7 +61,8 @@ class Answer:
 class Client(ABC):
     """One amplifier at an address of a line.
 
-    heard: messages that no request was waiting for; events: those of type Event. reply_words: the
+    heard: messages that no request was waiting for; events: those of type Event; order: types of
+    all, as they came. reply_words: the
     longest reply to each message by its number, where it is known. transit: time on the wire [s] of
     a request and the longest reply. session: that was begun last. loss: why the line was
     lost.
@@ -81,6 +82,7 @@ class Client(ABC):
         self.address = address
         self.heard: list[Heard] = []
         self.events: list[Heard] = []
+        self.order: list[int] = []
         self.reply_words: dict[int, int] = {}
         self.transit = 0.0
         self.session = 0
@@ -104,8 +106,8 @@ class Client(ABC):
         """Return the frames of a request; to: its address, 0 for all, None for this amplifier."""
 
     @abstractmethod
-    def damaged(self, number: int, words: Sequence[int]) -> Mapping[str, bytes]:
-        """Return frames that must have no effect and no reply, by what is wrong with them."""
+    def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
+        """Yield what is wrong, and frames that must have no effect and no reply, made in turn."""
 
     async def send(self, data: bytes, quiet: float = QUIET) -> list[Heard]:
         """Send bytes; return what is heard until a time [s] has passed."""
@@ -118,6 +120,7 @@ class Client(ABC):
     def take(self, message: Heard, *, is_event: bool = False) -> None:
         """Keep a message that was heard."""
         (self.events if is_event else self.heard).append(message)
+        self.order.append(message.type)
         self._news.set()
 
     async def next(

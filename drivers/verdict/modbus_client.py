@@ -2,7 +2,7 @@
 
 import asyncio
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from drivers import clock
@@ -153,15 +153,15 @@ class ModbusClient(Client):
         """Return the frame that writes a message."""
         return self.adu(self.write_of(number, words), unit=to)
 
-    def damaged(self, number: int, words: Sequence[int]) -> Mapping[str, bytes]:
-        """Return frames with damage of all kinds."""
+    def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
+        """Yield frames with damage of all kinds."""
         pdu = self.write_of(number, words)
-        other = {"another unit": self.adu(pdu, unit=self.address % self.addresses + 1)}
-        if not self.is_rtu:
-            return other
-        frame = self.adu(pdu)
-        wrong = {f"byte {at} of the CRC wrong": _altered(frame, at - 3) for at in (1, 2)}
-        return {**wrong, "a wrong byte": _altered(frame, len(frame) - 4), **other}
+        yield "another unit", self.adu(pdu, unit=self.address % self.addresses + 1)
+        if self.is_rtu:
+            frame = self.adu(pdu)
+            for at in (1, 2):
+                yield f"byte {at} of the CRC wrong", _altered(frame, at - 3)
+            yield "a wrong byte", _altered(frame, len(frame) - 4)
 
     async def send(self, data: bytes, quiet: float = QUIET) -> list[Heard]:
         """Send bytes; return what is heard until a time [s] has passed."""

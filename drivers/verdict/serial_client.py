@@ -1,7 +1,7 @@
 """A serial line, frame by frame."""
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 from cobs import cobs
 
@@ -101,8 +101,8 @@ class SerialClient(Client):
         address = self.address if to is None else to
         return encode_frame(Frame(number, address, self.sequence, payload, version))
 
-    def damaged(self, number: int, words: Sequence[int]) -> Mapping[str, bytes]:
-        """Return frames with damage of all kinds."""
+    def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
+        """Yield frames with damage of all kinds."""
         good = self.request(number, words)
         content = cobs.decode(good[1:-1])
         wrong = {
@@ -111,7 +111,7 @@ class SerialClient(Client):
         }
         long = content[:-_CRC_SIZE] + bytes(2 * MAX_WORDS + 2 - 2 * len(words))
         reply = bytes([content[0] | REPLY]) + content[1:-_CRC_SIZE]
-        return {
+        flawed = {
             **wrong,
             "a wrong byte": self._altered(content, _SEQUENCE_AT),
             "its last byte missing": good[:-2] + b"\0",
@@ -122,6 +122,7 @@ class SerialClient(Client):
             "the bit of a reply": _framed(_checked(reply)),
             "another address": self.request(number, words, to=self.address % self.addresses + 1),
         }
+        yield from flawed.items()
 
     @staticmethod
     def _altered(content: bytes, at: int) -> bytes:

@@ -24,7 +24,7 @@ async def damaged_frames(subject: Subject) -> None:
     stream = pack_layers([layer(0, subject.tone(0, 0.5))])
     words = [subject.session, subject.token + 1, 1 << 1 | 1, *stream]
     for number, content in ((_PING, [subject.session]), (_SET, words)):
-        for what, data in client.damaged(number, content).items():
+        for what, data in client.damaged(number, content):
             text = f"message {number} with {what}"
             heard = await client.send(data)
             expect(not heard, f"replies to {text}", expected="none", seen=len(heard))

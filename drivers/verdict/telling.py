@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from drivers import clock
 from drivers.protocol.records import Record, Refusal, Values
-from drivers.protocol.table import EVENT_RECORD, MESSAGES, NO_CHANNEL, sensor_reading
+from drivers.protocol.table import EVENT, EVENT_RECORD, MESSAGES, NO_CHANNEL, sensor_reading
 from drivers.verdict.check import driving, reading
 from drivers.verdict.client import Client
 from drivers.verdict.findings import Optional, Violation, expect, expect_equal
@@ -13,6 +13,7 @@ from drivers.verdict.subject import NAMES, SLACK, Subject, layer
 
 _MOMENTARY = ("READY_TO_SWITCH_ON", "SWITCHED_ON", "FAULT_REACTION_ACTIVE")  # may last no time
 _WINDOW = 100  # ms
+_TYPE = 0x7F  # of a frame, without the bit of a reply
 _MOVED = 0.1  # s; until an amplifier has taken its address
 _SENSORS = "Messages: GetSensors, Measure, GetReading"
 
@@ -25,11 +26,11 @@ async def events(subject: Subject) -> None:
         raise Optional("this wire carries no Events")
     stated = subject.has("events")
     client.events.clear()
+    client.order.clear()
     await subject.arm(subject.can["watchdog_min"] / 1000)
-    at = subject.client.events[-1].at if client.events else 0.0
-    replied = (await subject.ask("GetStatus")).when
-    is_before = not stated or (bool(client.events) and at <= replied.earliest)
-    expect(is_before, "Event of Arm", expected="before its reply", seen="none before it")
+    expected = [EVENT, MESSAGES["Arm"].number] if stated else [MESSAGES["Arm"].number]
+    seen = [each & _TYPE for each in client.order]
+    expect_equal(seen, expected, "types of the messages after Arm, the Event before the reply")
     await subject.play(layer(0, subject.tone()))
     subject.starve()
     await subject.until(lambda each: NAMES[each["state"]] == "FAULT", "FAULT")
@@ -42,12 +43,12 @@ async def events(subject: Subject) -> None:
     stop = subject.latch
     await subject.ask("Clear", latch=stop)
     await asyncio.sleep(0.02)
-    seen = [EVENT_RECORD.unpack(each.words, is_strict=False) for each in client.events]
+    told_of = [EVENT_RECORD.unpack(each.words, is_strict=False) for each in client.events]
     if not stated:
-        expect(not seen, "Events of one that states none", expected="none", seen=seen)
+        expect(not told_of, "Events of one that states none", expected="none", seen=told_of)
         return
     told = [
-        (NAMES.get(each["state"], each["state"]), each["fault"], each["latch"]) for each in seen
+        (NAMES.get(each["state"], each["state"]), each["fault"], each["latch"]) for each in told_of
     ]
     wanted = [
         *(("OPERATION_ENABLED", 0, stop - 2), ("FAULT_REACTION_ACTIVE", 1, stop - 1)),
@@ -60,7 +61,7 @@ async def events(subject: Subject) -> None:
     needed = [each for each in wanted if each[0] not in _MOMENTARY or each in told]
     told = [each for each in told if each[0] not in _MOMENTARY or each in wanted]
     expect_equal(told, needed, "states, faults and latches of Events")
-    channels = {each["channel"] for each in seen}
+    channels = {each["channel"] for each in told_of}
     expect_equal(channels, {NO_CHANNEL}, "channels of Events")
 
 

@@ -8,7 +8,7 @@ from drivers.verdict.check import driving
 from drivers.verdict.findings import expect, expect_equal
 from drivers.verdict.subject import NAMES, SLACK, Subject, flag, is_silent, layer
 
-_STATES = "Decided: states, sessions"
+_STATES = "protocol.md#states"
 _OFF, _ENABLED = "SWITCH_ON_DISABLED", "OPERATION_ENABLED"
 
 
@@ -87,7 +87,7 @@ async def arms_again(subject: Subject) -> None:
     await subject.expect_levels(0.5, why="set that was staged before the same Arm")
 
 
-@driving("Sessions")
+@driving("protocol.md#sessions-and-the-watchdog")
 async def sessions(subject: Subject) -> None:
     """It obeys the session that armed it, of 16 bits, and no other; an ended one arms no more."""
     subject.client.session = 0x1233

@@ -14,7 +14,7 @@ from drivers.verdict.check import driving, reading
 from drivers.verdict.findings import Late, Violation, expect, expect_equal
 from drivers.verdict.subject import NAMES, Subject, layer
 
-_PLACE = "Wires: CAN"
+_PLACE = "can.md#messages-as-frames"
 _PING, _SET = MESSAGES["Ping"].number, MESSAGES["Set"].number
 _LIFE, _FORGOTTEN = 0.09, 0.12  # s; for which a number is kept, after which any begins
 _QUIET = 0.015  # s; in which a reply comes
@@ -77,7 +77,7 @@ async def numbers(subject: Subject) -> None:
     await subject.expect_levels(0.5, why="after frames that make no message")
 
 
-@driving(_PLACE, "can")
+@driving("can.md#network-management", "can")
 async def network_management(subject: Subject) -> None:
     """It replies while operational only, and stops what plays when it is taken out of operation."""
     client = _client(subject)
@@ -119,7 +119,7 @@ def _heartbeats(client: CanClient) -> list[int]:
     return [frame.data[0] for _, frame in client.frames if frame.id == sent]
 
 
-@driving(_PLACE, "can")
+@driving("can.md#network-management", "can")
 async def heartbeats(subject: Subject) -> None:
     """It sends its state in the interval of object 1017, and emergencies of faults."""
     client = _client(subject)
@@ -146,7 +146,7 @@ async def heartbeats(subject: Subject) -> None:
     expect(told, "emergencies of a fault that was cleared", expected=(pair, (0, 0)), seen=codes)
 
 
-@reading(_PLACE, "can")
+@reading("can.md#objects", "can")
 async def objects(subject: Subject) -> None:
     """It shows identity, capabilities and status as objects, of which 1017 alone can be written."""
     client = _client(subject)

@@ -10,7 +10,7 @@ from drivers.verdict.expected import Bounds, alone, cosine, later, lines, steady
 from drivers.verdict.findings import Optional, expect, expect_equal
 from drivers.verdict.subject import DRIFT, SLACK, Subject, flag, is_silent, layer
 
-_PLACE = "A set: layers"
+_PLACE = "protocol.md#sets"
 _EARLY = 0.002  # s; by which an end may come later than its time
 
 
@@ -59,7 +59,7 @@ async def layers_play_on(subject: Subject) -> None:
     expect_equal(status["tokens"][:2], [0, subject.token], "tokens of layers 0 and 1")
 
 
-@driving("Sum")
+@driving("protocol.md#what-a-channel-plays")
 async def limited(subject: Subject) -> None:
     """It limits the sum of its layers to full level, and says once that it was limited."""
     if subject.level * 2 <= 1.0:
@@ -133,7 +133,7 @@ async def valid_for(subject: Subject) -> None:
     await subject.expect_levels(1.0, why="valid_for of the set before")
 
 
-@driving("A set: renew")
+@driving("protocol.md#sets")
 async def renew(subject: Subject) -> None:
     """It starts valid_for anew by a renewal, and changes nothing else."""
     await subject.arm()
@@ -159,7 +159,7 @@ async def renew(subject: Subject) -> None:
     await subject.expect_levels(0.5, why="renewal without an end")
 
 
-@driving("A set: after")
+@driving("protocol.md#sets")
 async def after(subject: Subject) -> None:
     """It starts commands with *after* once the onsets of the layer have ended, at once without."""
     await subject.arm()

@@ -21,7 +21,7 @@ from drivers.verdict.modbus_client import (
 )
 from drivers.verdict.subject import Subject, layer
 
-_PLACE = "Wires: Modbus"
+_PLACE = "modbus.md#registers"
 _AREA = HEAD + MAX_WORDS
 _PING, _STATUS, _CAPS = (MESSAGES[name].number for name in ("Ping", "GetStatus", "GetCaps"))
 
@@ -92,7 +92,7 @@ async def present_areas(subject: Subject) -> None:
         await subject.expect_levels(why="Stop for all")
 
 
-@driving(_PLACE, "rtu", "tcp")
+@driving("modbus.md#functions-and-exceptions", "rtu", "tcp")
 async def exceptions(subject: Subject) -> None:
     """It raises exceptions for what Modbus defines, which change and feed nothing."""
     client = _client(subject)
@@ -141,7 +141,7 @@ def _write(first: int, registers: list[int]) -> bytes:
     return head + struct.pack(f">{len(registers)}H", *registers)
 
 
-@reading(_PLACE, "rtu", "tcp")
+@reading("modbus.md#the-line", "rtu", "tcp")
 async def pieces(subject: Subject) -> None:
     """It takes a frame in pieces, gives half a frame up after a pause, and loses none behind it."""
     client = _client(subject)

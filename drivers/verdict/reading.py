@@ -24,7 +24,7 @@ _FEATURE_OF = {
 }
 
 
-@reading("Hello")
+@reading("protocol.md#messages")
 async def identity(subject: Subject) -> None:
     """It says who it is, always the same, and that it speaks version 3."""
     first = subject.identity
@@ -34,7 +34,7 @@ async def identity(subject: Subject) -> None:
     expect_equal(await subject.client.hello(), first, "identity, read again")
 
 
-@reading("One contract")
+@reading("protocol.md#messages")
 async def capabilities(subject: Subject) -> None:
     """It states capabilities within their ranges, always the same."""
     can = subject.can
@@ -58,7 +58,7 @@ async def capabilities(subject: Subject) -> None:
     expect_equal((await subject.ask("GetCaps")).values, can, "capabilities, read again")
 
 
-@reading("States")
+@reading("protocol.md#states")
 async def starts_disarmed(subject: Subject) -> None:
     """It is disarmed and silent unless it was armed, and shows what it has only."""
     status = (await subject.ask("GetStatus")).values
@@ -72,7 +72,7 @@ async def starts_disarmed(subject: Subject) -> None:
     expect(status["flags"] < 8, "flags", expected="defined bits", seen=status["flags"])
 
 
-@reading("Messages")
+@reading("protocol.md#times")
 async def replies_in_time(subject: Subject) -> None:
     """It begins each reply within 10 ms."""
     for name in ("GetStatus", "GetCaps", "GetFaults"):
@@ -89,7 +89,7 @@ async def replies_in_time(subject: Subject) -> None:
         )
 
 
-@reading("Messages")
+@reading("protocol.md#messages")
 async def unknown_types(subject: Subject) -> None:
     """It refuses messages that it does not know, and those of what it does not have."""
     for number in _UNKNOWN:
@@ -103,10 +103,9 @@ async def unknown_types(subject: Subject) -> None:
             )
 
 
-@driving("Words")
+@driving("protocol.md#checks-in-this-order")
 async def lengths(subject: Subject) -> None:
     """It refuses messages that are a word too short or too long."""
-    codes = ("BAD_LENGTH", "WRONG_STATE")  # it is disarmed: either is right
     for message in BY_NUMBER.values():
         words = _shortest(message.name)
         feature = _FEATURE_OF.get(message.name)
@@ -116,10 +115,10 @@ async def lengths(subject: Subject) -> None:
             if altered == words or (message.name, what) == ("Set", "long"):
                 continue
             text = f"{message.name}, a word too {what}"
-            await subject.refused_words(codes, message.name, altered, what=text)
+            await subject.refused_words("BAD_LENGTH", message.name, altered, what=text)
 
 
-@reading("Messages")
+@reading("protocol.md#messages")
 async def reading_changes_nothing(subject: Subject) -> None:
     """It shows the achieved tones of every layer, none while disarmed, and its faults."""
     for number in subject.layers:
@@ -136,7 +135,7 @@ async def reading_changes_nothing(subject: Subject) -> None:
         expect_equal(after[name], before[name], f"{name} after reading")
 
 
-@reading("Messages")
+@reading("protocol.md#messages")
 async def ages_and_temperature(subject: Subject) -> None:
     """It states a temperature and a voltage in range, and faults that it knows."""
     faults = (await subject.ask("GetFaults")).values["faults"]
@@ -147,7 +146,7 @@ async def ages_and_temperature(subject: Subject) -> None:
         expect(is_known, "channel of a fault", expected="one of its own", seen=each["channel"])
 
 
-@reading("Frames", "serial")
+@reading("serial.md#receiving", "serial")
 async def hello_for_ever(subject: Subject) -> None:
     """It answers a Hello of any version and length, and no other version of anything else."""
     client = subject.client

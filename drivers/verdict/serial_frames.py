@@ -10,7 +10,7 @@ from drivers.verdict.findings import expect, expect_equal
 from drivers.verdict.serial_client import SerialClient
 from drivers.verdict.subject import Subject, layer
 
-_PLACE = "Wires: frames"
+_PLACE = "protocol.md#checks-in-this-order"
 _PING, _SET = MESSAGES["Ping"].number, MESSAGES["Set"].number
 
 
@@ -59,7 +59,7 @@ async def doubled_frames(subject: Subject) -> None:
     await subject.expect_levels(why="after a set came again that has ended")
 
 
-@driving(_PLACE, "serial")
+@driving("serial.md#receiving", "serial")
 async def tolerated_frames(subject: Subject) -> None:
     """It finds frames in noise, in pieces, and back to back, and replies to each."""
     client = subject.client

@@ -12,7 +12,7 @@ from drivers.verdict.check import driving
 from drivers.verdict.findings import Late, Optional, expect, expect_equal
 from drivers.verdict.subject import FULL, SLACK, Subject, layer
 
-_PLACE = "A set is a stream of words"
+_PLACE = "protocol.md#sets"
 _LIFE = 1.0  # s; from the first part of a set to its commit
 _HEAD = 3  # words of a Set before its stream
 _LAYER_HEAD, _SHAPED = 3, 8  # words of a layer, of a command with two empty envelopes
@@ -50,7 +50,7 @@ async def levels_of_every_frequency(subject: Subject) -> None:
             await subject.expect_levels(*(0.0,) * number, 1.0, why=why)
 
 
-@driving("Messages: GetAchieved")
+@driving("protocol.md#messages")
 async def achieved(subject: Subject) -> None:
     """It says what each layer plays within half a step, and *exact* where that was asked."""
     await subject.arm()
@@ -100,7 +100,7 @@ def _expect_achieved(
             expect(error <= max(half, 0), what, expected=f"{wanted} within {half:g}", seen=seen)
 
 
-@driving("Capabilities: steps")
+@driving("protocol.md#messages")
 async def steps_as_stated(subject: Subject) -> None:
     """It rounds to the steps that it states."""
     base = subject.tone(0, 0.5)
@@ -191,7 +191,7 @@ def _bad_words(subject: Subject) -> Iterator[_Bad]:
     yield _Bad("a command missing", [good[0] + 1, *good[1:]], "BAD_LENGTH", None)
 
 
-@driving("Decided: numbers beyond a capability")
+@driving("protocol.md#sets")
 async def all_or_nothing(subject: Subject) -> None:
     """It refuses a set as a whole, says why and names the channel; what plays and waits stays."""
     await subject.arm()
@@ -227,7 +227,7 @@ _OF_A_COMMAND = (
 """What an amplifier may blame on the channel of its command."""
 
 
-@driving("Capabilities")
+@driving("protocol.md#messages")
 async def accepts_its_ranges(subject: Subject) -> None:
     """It takes what is just within its ranges, and any frequency of a silent channel."""
     await subject.arm()

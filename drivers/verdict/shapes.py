@@ -19,12 +19,12 @@ from drivers.verdict.expected import (
 from drivers.verdict.findings import Late, Optional, expect, expect_equal
 from drivers.verdict.subject import Subject, layer, passed
 
-_RAMP, _ENVELOPE, _PHASE = "A set: ramp", "A set: envelope", "A set: t and phases"
+_PLACE = "protocol.md#what-a-channel-plays"
 _RIGHT = math.pi / 2
 _SLOW = 400  # steps of frequency: 20 Hz, whose phase is known from times
 
 
-@driving(_RAMP)
+@driving(_PLACE)
 async def ramps(subject: Subject) -> None:
     """It rises and falls along the ramp of a layer, a raised cosine, on every channel."""
     await subject.arm()
@@ -40,7 +40,7 @@ async def ramps(subject: Subject) -> None:
         await subject.follow(fall, begun, time + 0.01, f"fall along {ramp} ms")
 
 
-@driving(_RAMP)
+@driving(_PLACE)
 async def cross_fades(subject: Subject) -> None:
     """It cross-fades tones that differ in frequency, each along its own raised cosine."""
     await subject.arm()
@@ -57,7 +57,7 @@ async def cross_fades(subject: Subject) -> None:
     await subject.follow(bounds, begun, time + 0.01, "cross-fade of one frequency")
 
 
-@driving(_RAMP)
+@driving(_PLACE)
 async def interrupted_ramps(subject: Subject) -> None:
     """It continues an interrupted ramp from its present level, and prolongs no fade."""
     await subject.arm()
@@ -87,7 +87,7 @@ async def interrupted_ramps(subject: Subject) -> None:
     await subject.follow({0: bounds}, begun, later_ramp / 1000, "fade that a longer one follows")
 
 
-@driving("A set: keep phase")
+@driving("protocol.md#sets")
 async def kept_phase(subject: Subject) -> None:
     """It leads a tone whose phase is kept from its present amplitude to the new one."""
     await subject.arm()
@@ -111,7 +111,7 @@ async def kept_phase(subject: Subject) -> None:
     await subject.follow(bounds, begun, time + 0.01, "keep phase at another frequency")
 
 
-@driving(_ENVELOPE)
+@driving(_PLACE)
 async def onsets(subject: Subject) -> None:
     """It leads an onset along straight lines in the complex plane, from 0 or what it keeps."""
     _require_knots(subject)
@@ -141,7 +141,7 @@ async def onsets(subject: Subject) -> None:
     await subject.follow({0: bounds}, begun, 3 * step, "onset with kept phase amid a ramp")
 
 
-@driving(_ENVELOPE)
+@driving(_PLACE)
 async def endings(subject: Subject) -> None:
     """It leads a tone to silence by its ending: without a command, at level 0, at its end."""
     _require_knots(subject)
@@ -182,7 +182,7 @@ async def endings(subject: Subject) -> None:
     await subject.follow(gone, begun, ramp / 1000, "kept phase without the ending of before")
 
 
-@driving(_ENVELOPE)
+@driving(_PLACE)
 async def endings_amid(subject: Subject) -> None:
     """It begins an ending at the present amplitude, plays it once, and lets nothing prolong it."""
     _require_knots(subject)
@@ -209,7 +209,7 @@ async def endings_amid(subject: Subject) -> None:
     await subject.follow({0: fall}, begun, 2 * step + 0.02, "ending that a longer ramp follows")
 
 
-@driving(_ENVELOPE)
+@driving(_PLACE)
 async def extreme_envelopes(subject: Subject) -> None:
     """It plays as many knots as it states, along its shortest and longest step."""
     _require_knots(subject)
@@ -256,7 +256,7 @@ async def _require_interference(subject: Subject) -> None:
         raise Optional("its levels do not show that tones of one frequency interfere")
 
 
-@driving(_PHASE)
+@driving(_PLACE)
 async def phases(subject: Subject) -> None:
     """It plays the phases of a set on every channel and layer, counted from their commit."""
     await subject.arm()
@@ -302,7 +302,7 @@ async def _expect_turned(subject: Subject, channel: int, phase: float, periods: 
     )
 
 
-@driving(_PHASE)
+@driving(_PLACE)
 async def frequency(subject: Subject) -> None:
     """It plays the frequency that it says: tones a second apart are in the phase that follows."""
     await subject.arm()

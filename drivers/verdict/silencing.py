@@ -8,7 +8,7 @@ from drivers.verdict.expected import alone, cosine
 from drivers.verdict.findings import expect, expect_equal
 from drivers.verdict.subject import NAMES, SLACK, Subject, flag, is_silent, layer
 
-_PLACE = "One contract: Stop, Disarm, Silence"
+_PLACE = "protocol.md#states"
 _SETTLING = 0.01  # s; state and high voltage, once silent
 _STOPPED, _OFF, _ENABLED = "QUICK_STOP_ACTIVE", "SWITCH_ON_DISABLED", "OPERATION_ENABLED"
 
@@ -197,7 +197,7 @@ async def disarm(subject: Subject) -> None:
     expect_equal(NAMES[status["state"]], _OFF, "state after Disarm again")
 
 
-@driving("Messages: Silence")
+@driving("protocol.md#sets")
 async def silence(subject: Subject) -> None:
     """It silences all layers along the ramp of Silence, drops what is staged, and stays armed."""
     slow = subject.envelope(0.1, 1, 1)

@@ -5,7 +5,14 @@ from collections.abc import Sequence
 
 from drivers import clock
 from drivers.protocol.records import Record, Refusal, Values
-from drivers.protocol.table import EVENT, EVENT_RECORD, MESSAGES, NO_CHANNEL, sensor_reading
+from drivers.protocol.table import (
+    EVENT,
+    EVENT_RECORD,
+    MESSAGES,
+    NO_CHANNEL,
+    READING_STATES,
+    sensor_reading,
+)
 from drivers.verdict.check import driving, reading
 from drivers.verdict.client import Client
 from drivers.verdict.findings import Optional, Violation, expect, expect_equal
@@ -13,12 +20,13 @@ from drivers.verdict.subject import NAMES, SLACK, Subject, layer
 
 _MOMENTARY = ("READY_TO_SWITCH_ON", "SWITCHED_ON", "FAULT_REACTION_ACTIVE")  # may last no time
 _WINDOW = 100  # ms
+_LOW = 1  # steps of frequency: less than a period of the window
 _TYPE = 0x7F  # of a frame, without the bit of a reply
 _MOVED = 0.1  # s; until an amplifier has taken its address
-_SENSORS = "Messages: GetSensors, Measure, GetReading"
+_SENSORS = "protocol.md#sensors"
 
 
-@driving("Messages: Event")
+@driving("protocol.md#states")
 async def events(subject: Subject) -> None:
     """It sends one Event of every change of state, before the reply to its cause."""
     client = subject.client
@@ -65,7 +73,7 @@ async def events(subject: Subject) -> None:
     expect_equal(channels, {NO_CHANNEL}, "channels of Events")
 
 
-@driving("Wires: broadcast", "serial", "rtu", "can")
+@driving("protocol.md#what-a-host-does-and-may-rely-on", "serial", "rtu", "can")
 async def broadcasts(subject: Subject) -> None:
     """It obeys a Commit or Stop that is for all, without a reply, and no other broadcast."""
     client = subject.client
@@ -112,7 +120,7 @@ async def broadcasts(subject: Subject) -> None:
     expect_equal(shown, ("QUICK_STOP_ACTIVE", latch % 0xFFFF + 1, 0), "state, latch, level after")
 
 
-@driving("Messages: SetAddress")
+@driving("protocol.md#set-the-address")
 async def addresses(subject: Subject) -> None:
     """It takes a new address by its serial number while it is disarmed, and replies there alone."""
     subject.require("address")
@@ -168,7 +176,7 @@ async def _free(client: Client, own: int) -> int:
         client.address = own
 
 
-@driving("Messages: GetMeasured")
+@driving("protocol.md#messages")
 async def measured(subject: Subject) -> None:
     """It measures voltage and current of every channel, armed or not, more where more plays."""
     subject.require("electrical")
@@ -250,18 +258,13 @@ async def readings(subject: Subject) -> None:
     expect_equal(shown, (7, subject.token), "reading, token of a reading that begins")
     whole, read = await _read_until_over(subject)
     expect_equal((whole["reading"], whole["window_left"]), (7, 0), "reading, window_left, over")
-    shown = whole["state"] != begun["state"], len(read)
-    expect_equal(shown, (True, len(found)), "whether the state has changed, sensors that were read")
-    again, _ = (await subject.ask("Measure", **{**request, "reading": 8})), None
+    expect_equal(len(read), len(found), "sensors that were read")
+    again = await subject.ask("Measure", **{**request, "reading": 8})
     await subject.play(layer(0, subject.tone(0, 0.5, frequency=tone)))
     disturbed, _ = await _read_until_over(subject)
-    states = {begun["state"], whole["state"], disturbed["state"]}
-    expect(len(states) == 3, "state of a disturbed reading", expected="its own", seen=states)
-    expect_equal(again["state"], begun["state"], "state of a reading that begins")
-    low = QUANTITY_LOW
-    for frequencies in ([low], [tone, tone], [tone, tone + 1]):
+    states = [each["state"] for each in (begun, whole, again, disturbed)]
+    expected = [READING_STATES[name] for name in ("RUNNING", "COMPLETE", "RUNNING", "DISTURBED")]
+    expect_equal(states, expected, "states of two readings, the second disturbed")
+    for frequencies in ([_LOW], [tone, tone], [tone, tone + 1]):
         wrong = {**request, "tones": len(frequencies), "frequencies": frequencies}
         await subject.refused("BAD_VALUE", "Measure", **wrong)
-
-
-QUANTITY_LOW = 1  # steps of frequency: less than a period of the window

@@ -9,7 +9,7 @@ from drivers.verdict.expected import alone, cosine
 from drivers.verdict.findings import expect, expect_equal
 from drivers.verdict.subject import Subject, layer
 
-_PLACE = "A set: tokens"
+_PLACE = "protocol.md#sets"
 
 
 @driving(_PLACE)

@@ -14,7 +14,7 @@ _SHORTENED = 0.002  # s
 _PAUSE = 0.004  # s; between sets
 
 
-@driving("Voices")
+@driving("protocol.md#what-a-channel-plays")
 async def voices(subject: Subject) -> None:
     """It refuses no set for its fades: with a voice too many the oldest fade ends within 2 ms."""
     await subject.arm()
@@ -51,7 +51,7 @@ async def voices(subject: Subject) -> None:
     await subject.expect_levels(1.0, why="after all fades")
 
 
-@driving("Voices")
+@driving("protocol.md#what-a-channel-plays")
 async def voices_of_layers(subject: Subject) -> None:
     """It cuts fades only: what lasts on all layers plays on while others fade."""
     await subject.arm()

@@ -209,7 +209,7 @@ static void read_layer(Words *words, int plays, uint16_t token, double time, int
 
 static int state = DISABLED, fault;
 static uint16_t session, latch, committed;
-static double watchdog, last_fed, silent_from, fault_at = -1;
+static double watchdog, last_fed, silent_from, faults_at[2] = {-1, -1};
 static struct {
     uint16_t token, word[SET_WORDS], part[127][118];
     int words, parts, length[127], is_whole;
@@ -234,8 +234,8 @@ static void silence(double time, double ramp) {
 
 static void tick(double now) {
     if (state == ENABLED && now >= last_fed + watchdog) {
-        fault_at = last_fed + watchdog;
-        silence(fault_at, 0.005);
+        faults_at[1] = faults_at[0], faults_at[0] = last_fed + watchdog;
+        silence(faults_at[0], 0.005);
         state = REACTION, fault = WATCHDOG_FAULT, latch = after(latch);
     }
     for (int layer = 0; layer < LAYERS; layer++) {
@@ -262,7 +262,6 @@ static int token_of(int layer) {
     EACH_VOICE(channel, voice) if (plays_in(voice, layer)) return layers[layer].token;
     return 0;
 }
-
 static void status(double now) {
     int is_on = state == ENABLED || state == SWITCHED_ON || now < silent_from;
     put(state), put(fault), put(is_on | limited << 2), put(latch), limited = 0;
@@ -292,8 +291,8 @@ static int take_part(const uint16_t *in, int count, double now, int *channel) {
     if (!token || !is_newer(token, committed)) return BAD_TOKEN;
     if (index >= parts || count > 121) return BAD_VALUE;
     if (staged.token != token || now - staged.began > 1) {
-        int is_recent = staged.token && now - staged.began <= 1;
-        if (is_recent && !is_newer(token, staged.token)) return BAD_TOKEN;
+        if (staged.token && now - staged.began <= 1 && !is_newer(token, staged.token))
+            return BAD_TOKEN;
         memset(&staged, 0, sizeof staged);
         staged.token = token, staged.parts = parts, staged.began = now;
     }
@@ -386,9 +385,12 @@ static int handle(int type, const uint16_t *in, int count, double now, int *chan
     tick(now);
     if (type == SET || type == GET_ACHIEVED) return type == SET ? 0 : achieved(in[0]);
     if (type == GET_FAULTS) {
-        uint32_t age = (uint32_t)(1000 * (now - fault_at)); /* of the newest, the only one kept */
-        put(fault_at >= 0), put(WATCHDOG_FAULT), put(NO_CHANNEL), put(age >> 16), put(age & 0xFFFF);
-        return out_count = fault_at >= 0 ? 5 : 1, 0;
+        put((faults_at[0] >= 0) + (faults_at[1] >= 0));
+        for (int i = 0; i < 2 && faults_at[i] >= 0; i++) {
+            uint32_t age = (uint32_t)(1000 * (now - faults_at[i]));
+            put(WATCHDOG_FAULT), put(NO_CHANNEL), put(age >> 16), put(age & 0xFFFF);
+        }
+        return 0;
     }
     if (type != GET_CAPS) return status(now), 0;
     int caps[] = {CHANNELS, LAYERS, VOICES, SET_WORDS, KNOTS, 0, FREQUENCY_MIN, FREQUENCY_MAX, 1,
@@ -450,9 +452,8 @@ static void received(int line, const uint8_t *stuffed, int length, double now) {
         frame[0] = HELLO | REPLY, frame[1] = 0, frame[5] = 1 << VERSION, frame[6] = 0;
         int at = 7;
         for (int i = 0; i < 4; i++) {
-            frame[at++] = (uint8_t)strlen(texts[i]);
-            memcpy(frame + at, texts[i], strlen(texts[i]));
-            at += (int)strlen(texts[i]);
+            frame[at] = (uint8_t)strlen(texts[i]);
+            memcpy(frame + at + 1, texts[i], frame[at]), at += 1 + frame[at];
         }
         send_frame(line, frame, at);
         return;

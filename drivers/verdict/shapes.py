@@ -204,6 +204,7 @@ async def endings_amid(subject: Subject) -> None:
     await subject.follow({0: bounds}, begun, 0.1, "phase kept amid an onset to level 0")
     await subject.play(layer(0, subject.tone(ending=ending)))
     begun = await subject.play(layer(0))
+    await subject.pause_until(begun.latest + step / 2)
     await subject.play(layer(0, ramp=min(500, subject.can["ramp_max"])))
     fall = alone(lines(step, 1, 0.25, 0))
     await subject.follow({0: fall}, begun, 2 * step + 0.02, "ending that a longer ramp follows")

@@ -4,11 +4,14 @@ import asyncio
 import math
 import os
 import pty
+import re
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 
 import pytest
 
+import era_haptics
 from drivers import clock
 from drivers.errors import LinkError
 from drivers.verdict import CHECKS, Result, judge, of_kind
@@ -30,6 +33,14 @@ SKIPPED = {
     "tcp": {"sensors", "steps_as_stated", "limited", "readings", "events"},
 }
 MINUTE = 60.0
+PAGES = Path(era_haptics.__file__).parents[1] / "docs" / "reference"
+
+
+def headings(page: Path) -> set[str]:
+    """Anchors of the headings of a page."""
+    lines = page.read_text("utf-8").splitlines()
+    titles = [line.lstrip("# ").lower() for line in lines if line.startswith("#")]
+    return {re.sub(r"[^a-z0-9 -]", "", title).replace(" ", "-") for title in titles}
 
 
 def expect_passed(results: list[CheckResult], skipped: set[str]) -> None:
@@ -174,7 +185,10 @@ def test_every_check_says_what_it_requires() -> None:
     """Once, in a sentence, beside the place of the rule."""
     names = [check.name for check in CHECKS]
     assert len({*names}) == len(names)
-    assert all(check.requirement and check.place for check in CHECKS)
+    assert all(check.requirement for check in CHECKS)
+    for place in {check.place for check in CHECKS}:
+        page, heading = place.split("#")
+        assert heading in headings(PAGES / page), place
 
 
 CURVES: Mapping[str, tuple[complex, complex]] = {

@@ -41,7 +41,7 @@ CHECKS: tuple[Check, ...] = (
     *(watchdog.what_does_not_feed, watchdog.trips_amid_other_requests),
     *(watchdog.trips_amid_fades, watchdog.fault_list),
     *(sets.every_channel, sets.levels_of_every_frequency, sets.achieved, sets.steps_as_stated),
-    *(sets.all_or_nothing, sets.accepts_its_ranges, sets.parts_of_sets, sets.longest_set),
+    *(sets.all_or_nothing, sets.accepts_its_ranges, sets.parts_of_sets, sets.max_set),
     sets.sets_expire,
     *(tokens.stage_and_commit, tokens.repeats_change_nothing, tokens.tokens_wrap),
     *(tokens.newer_sets_replace, tokens.committed_together),

@@ -24,7 +24,9 @@ async def plays_nothing_disarmed(subject: Subject) -> None:
     status = await subject.expect_levels(why="while disarmed")
     expect_equal(NAMES[status["state"]], _OFF, "state after refused requests")
     expect_equal(flag(status, "high_voltage"), False, "high voltage while disarmed")
-    expect_equal((await subject.ask("Ping", session=1))["state"], status["state"], "state, Ping")
+    expect_equal(
+        (await subject.request("Ping", session=1))["state"], status["state"], "state, Ping"
+    )
 
 
 @driving(_STATES)
@@ -37,7 +39,7 @@ async def arming(subject: Subject) -> None:
     expect_equal((status["token"], status["fault"]), (0, 0), "token, fault after Arm")
     await subject.play(layer(0, subject.tone()), token=40_000)
     staged = await subject.stage(layer(0, subject.tone()), token=40_001)
-    await subject.ask("Disarm", ramp=0)
+    await subject.request("Disarm", ramp=0)
     await subject.until(lambda each: NAMES[each["state"]] == _OFF, "disarming")
     status = (await subject.arm()).values
     expect_equal(status["token"], 0, "token after Arm")
@@ -62,7 +64,7 @@ async def watchdog_ranges(subject: Subject) -> None:
         status = (await subject.arm(time / 1000)).values
         left = status["watchdog_left"]
         expect(time - 10 <= left <= time, "watchdog_left after Arm", expected=time, seen=left)
-        await subject.ask("Disarm", ramp=0)
+        await subject.request("Disarm", ramp=0)
 
 
 @driving(_STATES)
@@ -72,15 +74,15 @@ async def arms_again(subject: Subject) -> None:
     await subject.play(layer(0, subject.tone()))
     staged = await subject.stage(layer(0, subject.tone(0, 0.5)))
     low = subject.can["watchdog_min"]
-    again = await subject.ask("Arm", session=subject.session, watchdog=low)
+    again = await subject.request("Arm", session=subject.session, watchdog=low)
     expect(
         low - 10 <= again.values["watchdog_left"] <= low,
         "watchdog_left after the same Arm with a shorter watchdog",
         expected=f"{low - 10} to {low}",
         seen=again.values["watchdog_left"],
     )
-    longest = subject.can["watchdog_max"]
-    await subject.ask("Arm", session=subject.session, watchdog=longest)
+    maximum = subject.can["watchdog_max"]
+    await subject.request("Arm", session=subject.session, watchdog=maximum)
     status = await subject.expect_levels(1.0, why="after the same Arm")
     expect_equal(status["token"], subject.token - 1, "token after the same Arm")
     await subject.commit(staged)
@@ -108,10 +110,10 @@ async def sessions(subject: Subject) -> None:
     await subject.expect_levels(1.0, why="after requests of other sessions")
     await subject.refused_words("BAD_VALUE", "Ping", [0], what="Ping with session 0")
     ended = subject.session
-    await subject.ask("Disarm", ramp=0)
+    await subject.request("Disarm", ramp=0)
     await subject.until(lambda each: NAMES[each["state"]] == _OFF, "disarming")
-    longest = subject.can["watchdog_max"]
-    await subject.refused("WRONG_SESSION", "Arm", session=ended, watchdog=longest)
+    maximum = subject.can["watchdog_max"]
+    await subject.refused("WRONG_SESSION", "Arm", session=ended, watchdog=maximum)
     await subject.arm()
     await subject.refused("WRONG_SESSION", "Set", **part)
     await subject.expect_levels(why="after a set of the session that ended")
@@ -123,7 +125,7 @@ async def arming_ends_fades(subject: Subject) -> None:
     await subject.arm()
     await subject.play(layer(0, subject.tone()))
     ramp = subject.can["ramp_max"]
-    await subject.ask("Disarm", ramp=ramp)
+    await subject.request("Disarm", ramp=ramp)
     armed = await subject.arm()
     when, _ = await subject.until(lambda each: not any(each["levels"]), "silence after Arm")
     latest = armed.when.latest + 0.005 + SLACK

@@ -55,7 +55,7 @@ async def numbers(subject: Subject) -> None:
         frames = segments(number, _SET, words)
         expect_equal(await replies(*frames[::order]), 1, "replies to frames in another order")
         client.number = number
-        shown = (await subject.ask("GetStatus"))["token"]
+        shown = (await subject.request("GetStatus"))["token"]
         expect_equal(shown, token, "token of a set")
     subject.token = 3
     await asyncio.sleep(_FORGOTTEN)
@@ -91,10 +91,10 @@ async def network_management(subject: Subject) -> None:
         data = client.packed(segments(client.next_number(), MESSAGES["GetStatus"].number, []))
         expect_equal(len(await client.send(data)), 0, f"replies after {command}")
         await client.command("start")
-        status = (await subject.ask("GetStatus")).values
+        status = (await subject.request("GetStatus")).values
         shown = NAMES[status["state"]], status["latch"], any(status["levels"])
         expect_equal(shown, ("QUICK_STOP_ACTIVE", latch + 1, False), f"state after {command}")
-        await subject.ask("Clear", latch=subject.latch)
+        await subject.request("Clear", latch=subject.latch)
     await subject.arm()
     await subject.play(layer(0, subject.tone()))
     await client.command("start")
@@ -109,7 +109,7 @@ async def network_management(subject: Subject) -> None:
     expect_equal(beats[:1], [0], "first heartbeat after reset_node")
     expect_equal(beats[-1], _PRE_OPERATIONAL, "state in the heartbeat after reset_node")
     await client.command("start")
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     shown = NAMES[status["state"]], any(status["levels"]), status["token"]
     expect_equal(shown, ("SWITCH_ON_DISABLED", False, 0), "state, levels, token after reset_node")
 
@@ -130,20 +130,20 @@ async def heartbeats(subject: Subject) -> None:
         client.frames.clear()
         await asyncio.sleep(0.5)
         beats = _heartbeats(client)
-        wanted = 500 / interval if interval else 0
-        is_met = abs(len(beats) - wanted) <= 0.15 * wanted + (interval > 0)
-        expect(is_met, f"heartbeats of {interval} ms in 0.5 s", expected=wanted, seen=len(beats))
+        required = 500 / interval if interval else 0
+        is_met = abs(len(beats) - required) <= 0.15 * required + (interval > 0)
+        expect(is_met, f"heartbeats of {interval} ms in 0.5 s", expected=required, seen=len(beats))
         expect(set(beats) <= {_OPERATIONAL}, "state in a heartbeat", expected="5", seen=beats)
     await subject.arm(subject.can["watchdog_min"] / 1000)
     client.frames.clear()
     subject.starve()
     await subject.until(lambda each: NAMES[each["state"]] == "FAULT", "FAULT")
-    await subject.ask("Clear", latch=subject.latch)
+    await subject.request("Clear", latch=subject.latch)
     known = CANOPEN["emergencies"]
     codes = [struct.unpack_from("<HB", each) for each in client.emergencies]
     pair = known["WATCHDOG"]["code"], known["WATCHDOG"]["error_register"]
-    told = pair in codes and codes[-1:] == [(0, 0)]
-    expect(told, "emergencies of a fault that was cleared", expected=(pair, (0, 0)), seen=codes)
+    reported = pair in codes and codes[-1:] == [(0, 0)]
+    expect(reported, "emergencies of a fault that was cleared", expected=(pair, (0, 0)), seen=codes)
 
 
 @reading("can.md#objects", "can")
@@ -169,7 +169,7 @@ async def objects(subject: Subject) -> None:
     words = 9 + len(subject.channels) + len(subject.layers)
     expect_equal((await _read(client, 0x2002, 0))[0], words, "words of object 2002")
     state = int.from_bytes(await _read(client, 0x2002, 1), "little")
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     expect_equal(state, status["state"], "state in object 2002")
     for index, subindex in ((0x1003, 0), (0x1016, 1), (0x2000, 6), (0x2001, len(caps) + 1)):
         answer = await _sdo(client, struct.pack("<BHB4x", _UPLOAD, index, subindex))

@@ -133,18 +133,18 @@ async def identified(client: Client, level: float) -> Subject:
     answer = await client.exchange(2, ())
     if answer.code:
         raise Violation("GetCaps", expected="carried out", seen=answer.code)
-    can = Subject.read(_NOBODY, "GetCaps", answer).values
+    can = Subject.read(_UNIDENTIFIED, "GetCaps", answer).values
     return Subject(client, identity, can, level)
 
 
-class _Nobody(Subject):
+class _Unidentified(Subject):
     """An amplifier of which nothing is known yet."""
 
     def __init__(self) -> None:
         self.channels = self.layers = range(0)
 
 
-_NOBODY = _Nobody()
+_UNIDENTIFIED = _Unidentified()
 
 
 async def run_checks(

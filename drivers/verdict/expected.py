@@ -14,7 +14,7 @@ Bounds: TypeAlias = Callable[[float], tuple[float, float]]
 """Least and largest level at a time."""
 _POINTS, _POINT = (24, 600), 2e-5  # of an interval at which a curve is looked at; s apart
 _PARTS = 4  # of an interval that has passed
-_BEGIN = 0.002  # s; by which a transition may begin later
+_LATE_START = 0.002  # s; by which a transition may begin later
 _DRIFT = 1e-3  # of a time, by the amplifier's clock
 
 
@@ -85,7 +85,7 @@ def alike(*curves: Curve) -> Bounds:
 
 def unsure(make: Callable[[float], Bounds], passed: tuple[float, float]) -> Bounds:
     """Return the levels of what began when another had passed for a time within an interval [s]."""
-    low, high = max(passed[0] - _BEGIN, 0.0), passed[1]
+    low, high = max(passed[0] - _LATE_START, 0.0), passed[1]
     cases = [make(low + (high - low) * part / _PARTS) for part in range(_PARTS + 1)]
 
     def at(time: float) -> tuple[float, float]:
@@ -97,7 +97,7 @@ def unsure(make: Callable[[float], Bounds], passed: tuple[float, float]) -> Boun
 
 def within(bounds: Bounds, earliest: float, latest: float) -> tuple[float, float]:
     """Return the least and largest level of an interval [s], with what clocks may be off."""
-    low = earliest * (1 - _DRIFT) - _BEGIN
+    low = earliest * (1 - _DRIFT) - _LATE_START
     high = max(latest * (1 + _DRIFT), low)
     count = min(max(round((high - low) / _POINT), _POINTS[0]), _POINTS[1])
     width = (high - low) / (count - 1)

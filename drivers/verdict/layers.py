@@ -44,7 +44,7 @@ async def layers_play_on(subject: Subject) -> None:
     await subject.arm()
     ramp, low = subject.ramp, 0.25
     slow = layer(0, subject.tone(0, 0.75), ramp=ramp, valid_for=ramp + 100)
-    begun = await subject.play(slow)
+    started = await subject.play(slow)
     await asyncio.sleep(0.02)
     for fraction in (low, low / 2, low):
         other = subject.tone(0, fraction, frequency=subject.other)
@@ -52,9 +52,9 @@ async def layers_play_on(subject: Subject) -> None:
     rise = cosine(ramp / 1000, 0, 0.75)
     bounds: Mapping[int, Bounds] = {0: together(rise, steady(low))}
     await subject.follow(
-        bounds, begun, ramp / 1000 + 0.05, "layer 0 beside sets of layer 1", begin=0.04
+        bounds, started, ramp / 1000 + 0.05, "layer 0 beside sets of layer 1", since=0.04
     )
-    await _expect_end(subject, [low], begun, ramp / 1000 + 0.1, ramp / 1000, "layer 0")
+    await _expect_end(subject, [low], started, ramp / 1000 + 0.1, ramp / 1000, "layer 0")
     status = await subject.expect_levels(low, why="layer 1 after layer 0 has ended")
     expect_equal(status["tokens"][:2], [0, subject.token], "tokens of layers 0 and 1")
 
@@ -66,39 +66,41 @@ async def limited(subject: Subject) -> None:
         raise Optional("tried above half of full level only; see --level")
     await subject.arm()
     await subject.play(layer(0, subject.tone()))
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     expect_equal(flag(status, "limited"), False, "flag limited with one layer")
     for end in (True, False):
         await subject.play(layer(1, subject.tone(frequency=subject.other)))
         if end:
             await subject.play(layer(1))
-        status = (await subject.ask("GetStatus")).values
+        status = (await subject.request("GetStatus")).values
         expect_equal(
             flag(status, "limited"), True, "flag limited, first status after a sum above 1"
         )
     expect_equal(status["levels"][0], 10_000, "level of a sum above 1")
     await subject.play(layer(1))
-    await subject.ask("GetStatus")
-    status = (await subject.ask("GetStatus")).values
+    await subject.request("GetStatus")
+    status = (await subject.request("GetStatus")).values
     expect_equal(flag(status, "limited"), False, "flag limited, read again")
 
 
 async def _expect_end(
-    subject: Subject, after: Sequence[float], begun: When, time: float, ramp: float, why: str
+    subject: Subject, after: Sequence[float], started: When, time: float, ramp: float, why: str
 ) -> None:
     """Require that levels end a time [s] after a commit, then along a ramp [s]."""
-    await subject.pause_until(begun.earliest + time * (1 - DRIFT) - 0.02)
-    wanted = [round(each * subject.level * 10_000) for each in after] + [0] * len(subject.channels)
+    await subject.pause_until(started.earliest + time * (1 - DRIFT) - 0.02)
+    required = [round(each * subject.level * 10_000) for each in after] + [0] * len(
+        subject.channels
+    )
     slack = subject.tolerance * 10_000
 
     def is_over(status: Mapping[str, Sequence[int]]) -> bool:
-        return all(abs(a - b) <= slack for a, b in zip(status["levels"], wanted, strict=False))
+        return all(abs(a - b) <= slack for a, b in zip(status["levels"], required, strict=False))
 
     when, _ = await subject.until(is_over, f"end of {why}", timeout=ramp + 0.3)
     end = time + ramp
-    earliest = begun.earliest + (time + 0.8 * ramp) * (1 - DRIFT) - SLACK
-    latest = begun.latest + end * (1 + DRIFT) + _EARLY + SLACK
-    seen = f"{1e3 * (when.latest - begun.earliest):.1f} ms after its commit"
+    earliest = started.earliest + (time + 0.8 * ramp) * (1 - DRIFT) - SLACK
+    latest = started.latest + end * (1 + DRIFT) + _EARLY + SLACK
+    seen = f"{1e3 * (when.latest - started.earliest):.1f} ms after its commit"
     is_met = earliest <= when.latest and when.earliest <= latest
     expect(is_met, f"end of {why}", expected=f"{1e3 * end:.0f} ms", seen=seen)
 
@@ -108,28 +110,28 @@ async def valid_for(subject: Subject) -> None:
     """It ends a layer after its valid_for, along its ramp, and stays armed; 0 and 60 s last."""
     await subject.arm()
     for time, ramp in ((1, 0), (100, 0), (150, min(100, subject.can["ramp_max"]))):
-        begun = await subject.play(layer(0, subject.tone(), ramp=ramp, valid_for=time))
+        started = await subject.play(layer(0, subject.tone(), ramp=ramp, valid_for=time))
         if ramp:
             rise = cosine(ramp / 1000, 0, 1)
             fall = cosine(ramp / 1000, 1, 0)
             curve = {0: alone(later(time / 1000, rise, fall))}
             whole = (time + ramp) / 1000
-            await subject.follow(curve, begun, whole, f"valid_for {time} ms")
-        await _expect_end(subject, [0], begun, time / 1000, ramp / 1000, f"valid_for {time} ms")
+            await subject.follow(curve, started, whole, f"valid_for {time} ms")
+        await _expect_end(subject, [0], started, time / 1000, ramp / 1000, f"valid_for {time} ms")
         status = await subject.expect_levels(why="after valid_for")
         shown = status["tokens"][0], status["token"], is_silent(status)
         expect_equal(shown, (0, subject.token, True), "token of layer 0, token, silent")
-    begun = await subject.play(
+    started = await subject.play(
         layer(0, subject.tone(0, 0.5), valid_for=100),
         layer(1, subject.tone(0, 0.25, frequency=subject.apart(1)), valid_for=60_000),
         layer(2, subject.tone(0, 0.25, frequency=subject.apart(2))),
     )
-    await _expect_end(subject, [0.5], begun, 0.1, 0.0, "layer 0 of three")
-    await subject.pause_until(begun.latest + 0.3)
+    await _expect_end(subject, [0.5], started, 0.1, 0.0, "layer 0 of three")
+    await subject.pause_until(started.latest + 0.3)
     await subject.expect_levels(0.5, why="layers of valid_for 60 s and 0")
     await subject.play(layer(0, subject.tone(0, 0.5), valid_for=60))
-    begun = await subject.play(layer(0, subject.tone(0, 0.5)))
-    await subject.pause_until(begun.latest + 0.1)
+    started = await subject.play(layer(0, subject.tone(0, 0.5)))
+    await subject.pause_until(started.latest + 0.1)
     await subject.expect_levels(1.0, why="valid_for of the set before")
 
 
@@ -142,20 +144,20 @@ async def renew(subject: Subject) -> None:
     token = subject.token
     await subject.play(layer(1, subject.tone(0, 0.25, frequency=subject.apart(1))))
     await asyncio.sleep(0.1)
-    begun = await subject.play(layer(0, renew=True, valid_for=250, ramp=0))
+    started = await subject.play(layer(0, renew=True, valid_for=250, ramp=0))
     status = await subject.expect_levels(0.75, why="after a renewal")
     shown = status["token"], status["tokens"][:2]
     expect_equal(shown, (subject.token, [token, token + 1]), "token, tokens after a renewal")
-    await subject.pause_until(begun.latest + 0.2)
+    await subject.pause_until(started.latest + 0.2)
     await subject.expect_levels(0.75, why="200 ms after a renewal of 250 ms")
     whole = f"layer that was renewed, along its ramp of {ramp} ms"
-    await _expect_end(subject, [0.25], begun, 0.25, ramp / 1000, whole)
+    await _expect_end(subject, [0.25], started, 0.25, ramp / 1000, whole)
     await subject.play(layer(2, renew=True, valid_for=100))
     await subject.expect_levels(0.25, why="renewal of a silent layer")
     third = subject.tone(0, 0.25, frequency=subject.apart(3))
     await subject.play(layer(3, third, valid_for=60))
-    begun = await subject.play(layer(3, renew=True))
-    await subject.pause_until(begun.latest + 0.12)
+    started = await subject.play(layer(3, renew=True))
+    await subject.pause_until(started.latest + 0.12)
     await subject.expect_levels(0.5, why="renewal without an end")
 
 
@@ -165,21 +167,23 @@ async def after(subject: Subject) -> None:
     await subject.arm()
     onset = subject.envelope(0.05, 0.5, 1, 0.5)
     step, long = onset.step / 10_000, 4 * onset.step / 10_000
-    begun = await subject.play(layer(0, subject.tone(onset=onset)))
+    started = await subject.play(layer(0, subject.tone(onset=onset)))
     token = subject.token
     waiting = layer(0, subject.tone(0, 0.25, frequency=subject.other), after=True)
     for one in (layer(0, subject.tone(0, 0.75), after=True), waiting):  # the newer replaces
         await subject.play(one)
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     shown = status["token"], status["tokens"][0]
     expect_equal(shown, (subject.token, token), "token, that of a layer whose next set waits")
-    plays = (await subject.ask("GetAchieved", layer=0)).values["commands"]
+    plays = (await subject.request("GetAchieved", layer=0)).values["commands"]
     expect_equal(plays[0]["frequency"], subject.frequency, "frequency that is achieved")
     bounds = {0: alone(later(long, lines(step, 0, 0.5, 1, 0.5, 1), steady(0.25)))}
-    await subject.follow(bounds, begun, long + 0.05, "an onset and the set that waits for it")
+    await subject.follow(bounds, started, long + 0.05, "an onset and the set that waits for it")
     status = await subject.expect_levels(0.25, why="set that has waited")
     expect_equal(status["tokens"][0], subject.token, "token of a set that has waited")
-    begun = await subject.play(layer(0, subject.tone(0, 0.5, frequency=subject.other), after=True))
+    started = await subject.play(
+        layer(0, subject.tone(0, 0.5, frequency=subject.other), after=True)
+    )
     await subject.expect_levels(0.5, why="set with *after* where no onset lasts")
     await _dropped(subject, layer(0, subject.tone(onset=onset)), waiting)
 
@@ -187,15 +191,15 @@ async def after(subject: Subject) -> None:
 async def _dropped(subject: Subject, first: LayerSet, waiting: LayerSet) -> None:
     """Require that what silences the layer drops the set that waits."""
     for name in ("layer", "Silence", "set"):
-        begun = await subject.play(first)
+        started = await subject.play(first)
         await subject.play(waiting)
         level = 0.0
         if name == "Silence":
-            await subject.ask(name, session=subject.session, ramp=0)
+            await subject.request(name, session=subject.session, ramp=0)
         elif name == "layer":
             await subject.play(layer(0))
         else:
             await subject.play(layer(0, subject.tone(0, 0.75)))
             level = 0.75
-        await subject.pause_until(begun.latest + 0.25)
+        await subject.pause_until(started.latest + 0.25)
         await subject.expect_levels(level, why=f"waiting set after a {name} that ends its layer")

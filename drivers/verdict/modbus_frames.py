@@ -75,7 +75,7 @@ async def present_areas(subject: Subject) -> None:
     client = _client(subject)
     await subject.arm()
     await subject.play(layer(0, subject.tone()))
-    await subject.ask("Ping", session=subject.session)
+    await subject.request("Ping", session=subject.session)
     kept = await client.read(BOX * _PING + REPLY, _AREA)
     await subject.play(layer(0, subject.tone(0, 0.5)))
     await subject.expect_levels(0.5, why="status without a write")
@@ -99,7 +99,7 @@ async def exceptions(subject: Subject) -> None:
     await subject.arm()
     await subject.play(layer(0, subject.tone()))
     session = subject.session
-    await subject.ask("Ping", session=session)
+    await subject.request("Ping", session=session)
     ping = client.write_of(_PING, [session])
     last = BOX * _PING + REPLY + _AREA
     cases = [

@@ -55,13 +55,13 @@ async def capabilities(subject: Subject) -> None:
         expect(is_within, what, expected="above 0, within that of all", seen=one["level_max"])
     is_known = can["features"] < 1 << len(FEATURES)
     expect(is_known, "features", expected="defined bits", seen=f"{can['features']:#x}")
-    expect_equal((await subject.ask("GetCaps")).values, can, "capabilities, read again")
+    expect_equal((await subject.request("GetCaps")).values, can, "capabilities, read again")
 
 
 @reading("protocol.md#states")
 async def starts_disarmed(subject: Subject) -> None:
     """It is disarmed and silent unless it was armed, and shows what it has only."""
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     expect(status["state"] != 4, "state before Arm", expected="disarmed", seen=NAMES[4])
     expect_equal(status["watchdog_left"], 0, "watchdog_left while disarmed")
     expect(not any(status["levels"]), "levels while disarmed", expected="0", seen=status["levels"])
@@ -78,13 +78,13 @@ async def replies_in_time(subject: Subject) -> None:
     for name in ("GetStatus", "GetCaps", "GetFaults"):
         fastest = math.inf
         for _ in range(_TRIES):
-            when = (await subject.ask(name)).when
+            when = (await subject.request(name)).when
             fastest = min(fastest, when.latest - when.earliest)
-        longest = REACTION + subject.client.transit
+        maximum = REACTION + subject.client.transit
         expect(
-            fastest <= longest,
+            fastest <= maximum,
             f"fastest of {_TRIES} replies to {name}",
-            expected=f"within {1e3 * longest:.1f} ms",
+            expected=f"within {1e3 * maximum:.1f} ms",
             seen=f"{1e3 * fastest:.1f} ms",
         )
 
@@ -122,15 +122,15 @@ async def lengths(subject: Subject) -> None:
 async def reading_changes_nothing(subject: Subject) -> None:
     """It shows the achieved tones of every layer, none while disarmed, and its faults."""
     for number in subject.layers:
-        achieved = (await subject.ask("GetAchieved", layer=number)).values
+        achieved = (await subject.request("GetAchieved", layer=number)).values
         shown = achieved["token"], achieved["layer"], achieved["commands"]
         expect_equal(shown, (0, number, []), f"token, layer and commands of silent layer {number}")
     for number in range(len(subject.layers), 16):
         await subject.refused("BAD_VALUE", "GetAchieved", layer=number)
-    before = (await subject.ask("GetStatus")).values
+    before = (await subject.request("GetStatus")).values
     for name in ("GetFaults", "GetCaps", "GetStatus"):
-        await subject.ask(name)
-    after = (await subject.ask("GetStatus")).values
+        await subject.request(name)
+    after = (await subject.request("GetStatus")).values
     for name in ("state", "fault", "latch", "token", "levels", "tokens"):
         expect_equal(after[name], before[name], f"{name} after reading")
 
@@ -138,7 +138,7 @@ async def reading_changes_nothing(subject: Subject) -> None:
 @reading("protocol.md#messages")
 async def ages_and_temperature(subject: Subject) -> None:
     """It states a temperature and a voltage in range, and faults that it knows."""
-    faults = (await subject.ask("GetFaults")).values["faults"]
+    faults = (await subject.request("GetFaults")).values["faults"]
     ages = [each["age"] for each in faults]
     expect_equal(ages, sorted(ages), "ages of faults, the newest first")
     for each in faults:

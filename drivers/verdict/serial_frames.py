@@ -20,7 +20,7 @@ async def damaged_frames(subject: Subject) -> None:
     await subject.arm()
     await subject.play(layer(0, subject.tone()))
     client = subject.client
-    await subject.ask("Ping", session=subject.session)
+    await subject.request("Ping", session=subject.session)
     stream = pack_layers([layer(0, subject.tone(0, 0.5))])
     words = [subject.session, subject.token + 1, 1 << 1 | 1, *stream]
     for number, content in ((_PING, [subject.session]), (_SET, words)):
@@ -87,7 +87,7 @@ async def tolerated_frames(subject: Subject) -> None:
         expect_equal(len(heard), count, f"replies to a frame with {what}")
     for sequence in (0, 0xFFFF):
         client.sequence = (sequence - 1) % 0x10000
-        await subject.ask("Ping", session=1)
+        await subject.request("Ping", session=1)
     before = client.invalid
     for _ in range(3):
         await client.exchange_payload(_PING, pack_words([1]), VERSION)

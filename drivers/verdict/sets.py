@@ -71,33 +71,35 @@ async def achieved(subject: Subject) -> None:
             valid_for=50_000 + number,
         )
         (part, *_) = subject.parts(made[number])
-        is_exact = bool((await subject.ask("Set", **part))["exact"])
-        shown = (await subject.ask("GetAchieved", layer=number)).values
-        wanted = subject.token, number, number + 1, 50_000 + number
+        is_exact = bool((await subject.request("Set", **part))["exact"])
+        shown = (await subject.request("GetAchieved", layer=number)).values
+        required = subject.token, number, number + 1, 50_000 + number
         seen = tuple(shown[name] for name in ("token", "layer", "ramp", "valid_for"))
-        expect_equal(seen, wanted, f"token, layer, ramp, valid_for of achieved layer {number}")
+        expect_equal(seen, required, f"token, layer, ramp, valid_for of achieved layer {number}")
         _expect_achieved(can, made[number].commands, shown, number, is_exact=is_exact)
     for number in subject.layers:
-        shown = (await subject.ask("GetAchieved", layer=number)).values
+        shown = (await subject.request("GetAchieved", layer=number)).values
         _expect_achieved(can, made[number].commands, shown, number, is_exact=False)
     for number in range(len(subject.layers), 16):
         await subject.refused("BAD_VALUE", "GetAchieved", layer=number)
 
 
 def _expect_achieved(
-    can: Values, asked: tuple[Command, ...], shown: Values, number: int, *, is_exact: bool
+    can: Values, requested: tuple[Command, ...], shown: Values, number: int, *, is_exact: bool
 ) -> None:
     found = {each["channel"]: each for each in shown["commands"]}
-    expect_equal(sorted(found), sorted(one.channel for one in asked), f"channels of layer {number}")
-    for one in asked:
+    expect_equal(
+        sorted(found), sorted(one.channel for one in requested), f"channels of layer {number}"
+    )
+    for one in requested:
         for name in ("frequency", "level", "phase"):
-            wanted, seen = getattr(one, name), found[one.channel][name]
+            required, seen = getattr(one, name), found[one.channel][name]
             half = 0 if is_exact else can[f"{name}_step"] / 2
             error = abs(
-                (seen - wanted + 18000) % 36000 - 18000 if name == "phase" else seen - wanted
+                (seen - required + 18000) % 36000 - 18000 if name == "phase" else seen - required
             )
             what = f"achieved {name} of channel {one.channel} in layer {number}"
-            expect(error <= max(half, 0), what, expected=f"{wanted} within {half:g}", seen=seen)
+            expect(error <= max(half, 0), what, expected=f"{required} within {half:g}", seen=seen)
 
 
 @driving("protocol.md#messages")
@@ -114,7 +116,7 @@ async def steps_as_stated(subject: Subject) -> None:
         for number in range(_SCANNED):
             command = replace(base, **{name: start + number * step // _SCANNED})
             await subject.play(layer(0, command))
-            shown = (await subject.ask("GetAchieved", layer=0)).values
+            shown = (await subject.request("GetAchieved", layer=0)).values
             found.add(shown["commands"][0][name])
         what = f"values achieved of {_SCANNED} within a step of {name}"
         expect(len(found) <= 2, what, expected="at most two", seen=found)
@@ -131,7 +133,9 @@ def _bad_sets(subject: Subject) -> Iterator[_Bad]:
     """Yield sets that must be refused, with the code and the channel."""
     can, tone = subject.can, subject.tone()
 
-    def bad(what: str, one: LayerSet, code: str = "BAD_VALUE", channel: int | None = None) -> _Bad:
+    def flawed(
+        what: str, one: LayerSet, code: str = "BAD_VALUE", channel: int | None = None
+    ) -> _Bad:
         return _Bad(what, pack_layers([layer(1, subject.tone(0, 0.5)), one]), code, channel)
 
     for number, limits in enumerate(can["limits"]):
@@ -150,25 +154,25 @@ def _bad_sets(subject: Subject) -> Iterator[_Bad]:
                 (f"an ending with a knot of level {loud + 1}", replace(own, ending=above)),
             ]
         for what, one in tones:
-            yield bad(f"{what} on channel {number}", layer(0, one), channel=number)
+            yield flawed(f"{what} on channel {number}", layer(0, one), channel=number)
     if len(subject.channels) < 16:
         beyond = replace(tone, channel=len(subject.channels))
-        yield bad("a channel too many", layer(0, beyond), "BAD_CHANNEL", beyond.channel)
-    yield bad("a channel twice", layer(0, tone, tone), "BAD_CHANNEL", 0)
+        yield flawed("a channel too many", layer(0, beyond), "BAD_CHANNEL", beyond.channel)
+    yield flawed("a channel twice", layer(0, tone, tone), "BAD_CHANNEL", 0)
     if len(subject.layers) < 16:
-        yield bad("a layer too many", layer(len(subject.layers), tone))
-    yield bad("a layer twice", layer(1, tone))
-    yield bad("renew with commands", layer(0, tone, renew=True))
-    yield bad("after without commands", layer(0, after=True))
+        yield flawed("a layer too many", layer(len(subject.layers), tone))
+    yield flawed("a layer twice", layer(1, tone))
+    yield flawed("renew with commands", layer(0, tone, renew=True))
+    yield flawed("after without commands", layer(0, after=True))
     if can["ramp_max"] < 1000:
-        yield bad("a ramp above the longest", layer(0, tone, ramp=can["ramp_max"] + 1))
+        yield flawed("a ramp above the longest", layer(0, tone, ramp=can["ramp_max"] + 1))
     knots = ((100, 0),)
     for step in {can["envelope_step_min"] - 1, can["envelope_step_max"] + 1} - {0, 1001}:
         one = replace(tone, onset=Envelope(step, knots))
-        yield bad(f"a step of {step}", layer(0, one), channel=0)
+        yield flawed(f"a step of {step}", layer(0, one), channel=0)
     if can["knots"] < 32:
         many = Envelope(can["envelope_step_min"], knots * (can["knots"] + 1))
-        yield bad("a knot too many", layer(0, replace(tone, onset=many)), channel=0)
+        yield flawed("a knot too many", layer(0, replace(tone, onset=many)), channel=0)
     yield from _bad_words(subject)
 
 
@@ -176,16 +180,16 @@ def _bad_words(subject: Subject) -> Iterator[_Bad]:
     """Yield streams that no set can have: numbers beyond the table, too few words, bits unused."""
     good = pack_layers([layer(0, subject.tone())])
 
-    def bad(what: str, at: int, word: int, code: str = "BAD_VALUE") -> _Bad:
+    def flawed(what: str, at: int, word: int, code: str = "BAD_VALUE") -> _Bad:
         return _Bad(what, [*good[:at], word, *good[at + 1 :]], code, None)
 
-    yield bad("unused bits beside a layer", 0, good[0] | 1 << 15)
-    yield bad("a ramp of 1001 ms", 1, 1001)
-    yield bad("a valid_for of 60001 ms", 2, 60_001)
-    yield bad(_BITS, 3, good[3] | 1 << 12)
-    yield bad("a level of 10001", 5, FULL + 1)
-    yield bad("a phase of 180 degrees", 6, 18_000)
-    yield bad("a phase of -180.01 degrees", 6, 0x10000 - 18_001)
+    yield flawed("unused bits beside a layer", 0, good[0] | 1 << 15)
+    yield flawed("a ramp of 1001 ms", 1, 1001)
+    yield flawed("a valid_for of 60001 ms", 2, 60_001)
+    yield flawed(_BITS, 3, good[3] | 1 << 12)
+    yield flawed("a level of 10001", 5, FULL + 1)
+    yield flawed("a phase of 180 degrees", 6, 18_000)
+    yield flawed("a phase of -180.01 degrees", 6, 0x10000 - 18_001)
     yield _Bad("its last word missing", good[:-1], "BAD_LENGTH", None)
     yield _Bad("a word too many", [*good, 0], "BAD_LENGTH", None)
     yield _Bad("a command missing", [good[0] + 1, *good[1:]], "BAD_LENGTH", None)
@@ -276,7 +280,7 @@ async def parts_of_sets(subject: Subject) -> None:
         expect(count > 1, "parts of a long set", expected="two or more", seen=count)
         order = [*range(count - 1, 0, -1), count - 1, 0]
         for index in order:
-            taken = await subject.ask("Set", **parts[index])
+            taken = await subject.request("Set", **parts[index])
             is_whole = index == 0
             shown = taken["token"], taken["staged"], taken["played"], taken["missing"]
             expected = subject.token, is_whole and not now, is_whole and now, 0
@@ -286,7 +290,7 @@ async def parts_of_sets(subject: Subject) -> None:
                 await subject.refused("INCOMPLETE", "Commit", **commit)
         if not now:
             await subject.expect_levels(1.0, why="set that is staged")
-            again = await subject.ask("Set", **parts[-1])
+            again = await subject.request("Set", **parts[-1])
             expect_equal((again["staged"], again["missing"]), (1, 0), "staged after a part again")
             await subject.commit(subject.token)
         await asyncio.sleep(0.05)
@@ -294,7 +298,7 @@ async def parts_of_sets(subject: Subject) -> None:
         await subject.play(layer(0, subject.tone()), *(layer(n) for n in subject.layers[1:]))
         await asyncio.sleep(0.05)
     parts = subject.parts(*made, now=False)
-    taken = await subject.ask("Set", **parts[0])
+    taken = await subject.request("Set", **parts[0])
     expect_equal((taken["staged"], taken["missing"]), (0, 1), "staged, missing after part 0")
     await _wrong_parts(subject, parts)
 
@@ -306,21 +310,21 @@ async def _wrong_parts(subject: Subject, parts: list[Values]) -> None:
     await subject.refused("BAD_VALUE", "Set", **{**parts[1], "parts": count + 1})
     await subject.refused("BAD_TOKEN", "Set", **{**parts[1], "token": subject.token - 2})
     for part in parts[1:]:
-        taken = await subject.ask("Set", **part)
+        taken = await subject.request("Set", **part)
     expect_equal(taken["staged"], 1, "staged after the other parts")
     newer = subject.parts(*_long_set(subject), now=False)
-    taken = await subject.ask("Set", **newer[0])
+    taken = await subject.request("Set", **newer[0])
     expect_equal((taken["staged"], taken["missing"]), (0, 1), "staged, missing of a newer set")
     older: Values = {"session": subject.session, "token": subject.token - 1}
     await subject.refused("BAD_TOKEN", "Commit", **older)
     await subject.refused("BAD_TOKEN", "Set", **parts[0])
     for part in newer[1:]:
-        await subject.ask("Set", **part)
+        await subject.request("Set", **part)
     await subject.commit(subject.token)
 
 
 @driving(_PLACE)
-async def longest_set(subject: Subject) -> None:
+async def max_set(subject: Subject) -> None:
     """It takes a set of as many words as it states, and refuses a longer one."""
     await subject.arm()
     room = subject.can["set_words"]
@@ -329,19 +333,19 @@ async def longest_set(subject: Subject) -> None:
     await _send(subject, stream, "", f"a set of {len(stream)} words")
     await subject.commit(subject.token)
     if len(stream) == room:
-        shown = (await subject.ask("GetStatus")).values["tokens"][: len(layers)]
+        shown = (await subject.request("GetStatus")).values["tokens"][: len(layers)]
         expect_equal(shown, [subject.token] * len(layers), "tokens of the longest set")
         await _send(subject, [*stream, 0], "BAD_LENGTH", "a longer set")
 
 
 def _layers_of(subject: Subject, room: int) -> list[LayerSet]:
     """Make a set of this many words, or of as many as there can be."""
-    channels, most = len(subject.channels), subject.can["knots"]
+    channels, max_knots = len(subject.channels), subject.can["knots"]
     # All but the heads of layers has an even number of words.
     counts = [each for each in range(1, len(subject.layers) + 1) if each % 2 == room % 2]
     bare = _LAYER_HEAD + _SHAPED * channels
     count = next(
-        (each for each in counts if each * (bare + 4 * channels * most) >= room), counts[-1]
+        (each for each in counts if each * (bare + 4 * channels * max_knots) >= room), counts[-1]
     )
     left = max(room - count * bare, 0) // 2  # knots
     layers = []
@@ -350,7 +354,7 @@ def _layers_of(subject: Subject, room: int) -> list[LayerSet]:
         for channel in subject.channels:
             shapes = []
             for _ in range(2):
-                knots = min(left, most)
+                knots = min(left, max_knots)
                 left -= knots
                 shapes.append(subject.envelope(0.001, *[0.1 + 0j] * knots))
             tones.append(subject.tone(channel, 0.1, onset=shapes[0], ending=shapes[1]))
@@ -375,9 +379,9 @@ async def sets_expire(subject: Subject) -> None:
     """It discards a set that is not committed, or not complete, 1 s after its first part."""
     await subject.arm()
     for at, is_kept in ((0.9, True), (1.1, False)):
-        began = (await subject.ask("Ping", session=subject.session)).when.latest
+        began = (await subject.request("Ping", session=subject.session)).when.latest
         token = await subject.stage(layer(0, subject.tone()))
-        staged = (await subject.ask("Ping", session=subject.session)).when.earliest
+        staged = (await subject.request("Ping", session=subject.session)).when.earliest
         await subject.pause_until((began if is_kept else staged) + at)
         answer = await subject.answer("Commit", {"session": subject.session, "token": token})
         late = answer.when.latest - began >= _LIFE - SLACK
@@ -386,12 +390,12 @@ async def sets_expire(subject: Subject) -> None:
         code = "" if is_kept else "BAD_TOKEN"
         expect_equal(answer.code, code, f"refusal of a Commit {at:g} s after its set was staged")
     parts = subject.parts(*_long_set(subject), now=False)
-    await subject.ask("Set", **parts[-1])
-    begun = (await subject.ask("Ping", session=subject.session)).when.earliest
-    await subject.pause_until(begun + 0.6)
+    await subject.request("Set", **parts[-1])
+    started = (await subject.request("Ping", session=subject.session)).when.earliest
+    await subject.pause_until(started + 0.6)
     for part in parts[1:-1]:
-        await subject.ask("Set", **part)
-    await subject.pause_until(begun + 1.1)
-    taken = await subject.ask("Set", **parts[0])
+        await subject.request("Set", **part)
+    await subject.pause_until(started + 1.1)
+    taken = await subject.request("Set", **parts[0])
     shown = taken["staged"], taken["missing"]
     expect_equal(shown, (0, 1), "staged, missing of a set whose first part came 1.1 s before")

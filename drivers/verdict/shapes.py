@@ -32,12 +32,12 @@ async def ramps(subject: Subject) -> None:
     for ramp in {subject.ramp, 20, subject.can["ramp_max"]}:
         time = ramp / 1000
         tones = [subject.tone(channel) for channel in every]
-        begun = await subject.play(layer(0, *tones, ramp=ramp))
+        started = await subject.play(layer(0, *tones, ramp=ramp))
         rise = dict.fromkeys(every, alone(cosine(time, 0, 1)))
-        await subject.follow(rise, begun, time + 0.01, f"rise along {ramp} ms")
-        begun = await subject.play(layer(0, ramp=ramp))
+        await subject.follow(rise, started, time + 0.01, f"rise along {ramp} ms")
+        started = await subject.play(layer(0, ramp=ramp))
         fall = dict.fromkeys(every, alone(cosine(time, 1, 0)))
-        await subject.follow(fall, begun, time + 0.01, f"fall along {ramp} ms")
+        await subject.follow(fall, started, time + 0.01, f"fall along {ramp} ms")
 
 
 @driving(_PLACE)
@@ -48,13 +48,13 @@ async def cross_fades(subject: Subject) -> None:
     time = ramp / 1000
     await subject.play(layer(0, subject.tone(0, 0.5)))
     other = subject.tone(0, 1.0, frequency=subject.other)
-    begun = await subject.play(layer(0, other, ramp=ramp))
+    started = await subject.play(layer(0, other, ramp=ramp))
     bounds = {0: together(cosine(time, 0.5, 0), cosine(time, 0, 1))}
-    await subject.follow(bounds, begun, time + 0.01, "cross-fade of two frequencies")
+    await subject.follow(bounds, started, time + 0.01, "cross-fade of two frequencies")
     await subject.play(layer(0, subject.tone(0, 0.5)))
-    begun = await subject.play(layer(0, subject.tone(0, 0.5, 180.0), ramp=ramp))
+    started = await subject.play(layer(0, subject.tone(0, 0.5, 180.0), ramp=ramp))
     bounds = {0: lambda at: (0.0, alike(cosine(time, 0.5, 0), cosine(time, 0, 0.5))(at)[1])}
-    await subject.follow(bounds, begun, time + 0.01, "cross-fade of one frequency")
+    await subject.follow(bounds, started, time + 0.01, "cross-fade of one frequency")
 
 
 @driving(_PLACE)
@@ -66,25 +66,25 @@ async def interrupted_ramps(subject: Subject) -> None:
     other = subject.tone(0, 0.5, frequency=subject.other)
     first = await subject.play(layer(0, subject.tone(), ramp=ramp))
     await subject.pause_until(first.latest + part * time)
-    begun = await subject.play(layer(0, other, ramp=ramp))
+    started = await subject.play(layer(0, other, ramp=ramp))
     rise = cosine(time, 0, 1)
     bounds = unsure(
-        lambda at: together(cosine(time, rise(at), 0), cosine(time, 0, 0.5)), passed(first, begun)
+        lambda at: together(cosine(time, rise(at), 0), cosine(time, 0, 0.5)), passed(first, started)
     )
-    await subject.follow({0: bounds}, begun, time + 0.01, "rise that was interrupted")
+    await subject.follow({0: bounds}, started, time + 0.01, "rise that was interrupted")
     await subject.play(layer(0, subject.tone()))
     first = await subject.play(layer(0, other, ramp=ramp))  # the first tone fades until ramp
     await subject.pause_until(first.latest + part * time)
     later_ramp = min(3 * ramp, subject.can["ramp_max"])
-    begun = await subject.play(layer(0, ramp=later_ramp))
+    started = await subject.play(layer(0, ramp=later_ramp))
     rest, risen = cosine(time, 1, 0), cosine(time, 0, 0.5)
     bounds = unsure(
         lambda at: together(
             lambda moment: rest(moment + at), cosine(later_ramp / 1000, risen(at), 0)
         ),
-        passed(first, begun),
+        passed(first, started),
     )
-    await subject.follow({0: bounds}, begun, later_ramp / 1000, "fade that a longer one follows")
+    await subject.follow({0: bounds}, started, later_ramp / 1000, "fade that a longer one follows")
 
 
 @driving("protocol.md#sets")
@@ -96,19 +96,21 @@ async def kept_phase(subject: Subject) -> None:
     for phase, fraction in ((0.0, 0.5), (180.0, 1.0), (90.0, 1.0)):
         await subject.play(layer(0, subject.tone()))
         await asyncio.sleep(0.003)
-        begun = await subject.play(layer(0, subject.tone(0, fraction, phase, keep=True), ramp=ramp))
+        started = await subject.play(
+            layer(0, subject.tone(0, fraction, phase, keep=True), ramp=ramp)
+        )
         curve = alone(cosine(time, 1, polar(fraction, phase)))
         await subject.follow(
-            {0: curve}, begun, time + 0.01, f"kept phase, led to {phase:g} degrees"
+            {0: curve}, started, time + 0.01, f"kept phase, led to {phase:g} degrees"
         )
     await subject.play(layer(0))
     # Where nothing plays, or another frequency does, keep phase begins a tone of its own.
     await subject.play(layer(0, subject.tone(0, 0.5)))
-    begun = await subject.play(
+    started = await subject.play(
         layer(0, subject.tone(0, 1.0, 180.0, keep=True, frequency=subject.other), ramp=ramp)
     )
     bounds = {0: together(cosine(time, 0.5, 0), cosine(time, 0, 1))}
-    await subject.follow(bounds, begun, time + 0.01, "keep phase at another frequency")
+    await subject.follow(bounds, started, time + 0.01, "keep phase at another frequency")
 
 
 @driving(_PLACE)
@@ -119,26 +121,26 @@ async def onsets(subject: Subject) -> None:
     for fractions in ([1, 0.25, 0.75], [0.5, -0.5, -0.5j], []):
         shape = subject.envelope(0.05, *fractions)
         step = shape.step / 10_000
-        begun = await subject.play(layer(0, subject.tone(0, 0.5, onset=shape)))
+        started = await subject.play(layer(0, subject.tone(0, 0.5, onset=shape)))
         whole = step * (len(fractions) + 1)
         # Without knots there is a step alone, along a raised cosine.
         curve = alone(lines(step, 0, *fractions, 0.5) if fractions else cosine(step, 0, 0.5))
-        await subject.follow({0: curve}, begun, whole + 0.01, f"onset of {len(fractions)} knots")
+        await subject.follow({0: curve}, started, whole + 0.01, f"onset of {len(fractions)} knots")
         await subject.play(layer(0))
     knots = (0.25, -0.5)
     shape = subject.envelope(0.05, *knots)
     await subject.play(layer(0, subject.tone(0, 1.0)))
-    begun = await subject.play(layer(0, subject.tone(0, 0.5, onset=shape, keep=True)))
+    started = await subject.play(layer(0, subject.tone(0, 0.5, onset=shape, keep=True)))
     curve = alone(lines(step, 1, *knots, 0.5))
-    await subject.follow({0: curve}, begun, 3 * step + 0.01, "onset with kept phase")
+    await subject.follow({0: curve}, started, 3 * step + 0.01, "onset with kept phase")
     ramp = subject.ramp
     first = await subject.play(layer(0, subject.tone(0, 0.0), ramp=0))
     first = await subject.play(layer(0, subject.tone(), ramp=ramp))
     await subject.pause_until(first.latest + 0.4 * ramp / 1000)
-    begun = await subject.play(layer(0, subject.tone(0, 0.5, onset=shape, keep=True)))
+    started = await subject.play(layer(0, subject.tone(0, 0.5, onset=shape, keep=True)))
     rise = cosine(ramp / 1000, 0, 1)
-    bounds = unsure(lambda at: alone(lines(step, rise(at), *knots, 0.5)), passed(first, begun))
-    await subject.follow({0: bounds}, begun, 3 * step, "onset with kept phase amid a ramp")
+    bounds = unsure(lambda at: alone(lines(step, rise(at), *knots, 0.5)), passed(first, started))
+    await subject.follow({0: bounds}, started, 3 * step, "onset with kept phase amid a ramp")
 
 
 @driving(_PLACE)
@@ -159,12 +161,12 @@ async def endings(subject: Subject) -> None:
     }
     for why, one in cases.items():
         await subject.play(layer(0, subject.tone(last, ending=shape)))
-        begun = await subject.play(one)
-        await subject.follow({last: fall}, begun, 3 * step + 0.02, f"ending by {why}")
-    begun = await subject.play(layer(0, subject.tone(ending=shape), valid_for=100))
+        started = await subject.play(one)
+        await subject.follow({last: fall}, started, 3 * step + 0.02, f"ending by {why}")
+    started = await subject.play(layer(0, subject.tone(ending=shape), valid_for=100))
     curve = lines(step, 1, *knots, 0)
     await subject.follow(
-        {0: alone(later(0.1, steady(1), curve))}, begun, 0.12 + 3 * step, "ending by valid_for"
+        {0: alone(later(0.1, steady(1), curve))}, started, 0.12 + 3 * step, "ending by valid_for"
     )
     ramp = subject.ramp
     gone = {0: alone(cosine(ramp / 1000, 1, 0))}
@@ -173,13 +175,13 @@ async def endings(subject: Subject) -> None:
         ("another tone", subject.tone(0, 0.0, onset=subject.envelope(0.1))),
     ):
         await subject.play(layer(0, subject.tone(ending=shape)))
-        begun = await subject.play(layer(0, command, ramp=ramp))
-        await subject.follow(gone, begun, ramp / 1000 + 0.01, f"{why}: along the ramp")
+        started = await subject.play(layer(0, command, ramp=ramp))
+        await subject.follow(gone, started, ramp / 1000 + 0.01, f"{why}: along the ramp")
     # The ending is that of the command that plays, and is of it alone.
     await subject.play(layer(0, subject.tone(ending=shape)))
     await subject.play(layer(0, subject.tone(keep=True)))
-    begun = await subject.play(layer(0, ramp=ramp))
-    await subject.follow(gone, begun, ramp / 1000, "kept phase without the ending of before")
+    started = await subject.play(layer(0, ramp=ramp))
+    await subject.follow(gone, started, ramp / 1000, "kept phase without the ending of before")
 
 
 @driving(_PLACE)
@@ -193,21 +195,21 @@ async def endings_amid(subject: Subject) -> None:
     # Towards level 0: a voice counts until its onset has ended.
     first = await subject.play(layer(0, subject.tone(0, 0.0, onset=onset, ending=ending)))
     await subject.pause_until(first.latest + half)
-    begun = await subject.play(layer(0))
-    bounds = unsure(lambda at: alone(lines(step, rise(at), 0.25, 0)), passed(first, begun))
-    await subject.follow({0: bounds}, begun, 2 * step + 0.02, "ending amid an onset to level 0")
+    started = await subject.play(layer(0))
+    bounds = unsure(lambda at: alone(lines(step, rise(at), 0.25, 0)), passed(first, started))
+    await subject.follow({0: bounds}, started, 2 * step + 0.02, "ending amid an onset to level 0")
     first = await subject.play(layer(0, subject.tone(0, 0.0, onset=onset)))
     await subject.pause_until(first.latest + half)
-    begun = await subject.play(layer(0, subject.tone(0, 1.0, keep=True), ramp=subject.ramp))
+    started = await subject.play(layer(0, subject.tone(0, 1.0, keep=True), ramp=subject.ramp))
     ramp = subject.ramp / 1000
-    bounds = unsure(lambda at: alone(cosine(ramp, rise(at), 1)), passed(first, begun))
-    await subject.follow({0: bounds}, begun, 0.1, "phase kept amid an onset to level 0")
+    bounds = unsure(lambda at: alone(cosine(ramp, rise(at), 1)), passed(first, started))
+    await subject.follow({0: bounds}, started, 0.1, "phase kept amid an onset to level 0")
     await subject.play(layer(0, subject.tone(ending=ending)))
-    begun = await subject.play(layer(0))
-    await subject.pause_until(begun.latest + step / 2)
+    started = await subject.play(layer(0))
+    await subject.pause_until(started.latest + step / 2)
     await subject.play(layer(0, ramp=min(500, subject.can["ramp_max"])))
     fall = alone(lines(step, 1, 0.25, 0))
-    await subject.follow({0: fall}, begun, 2 * step + 0.02, "ending that a longer ramp follows")
+    await subject.follow({0: fall}, started, 2 * step + 0.02, "ending that a longer ramp follows")
 
 
 @driving(_PLACE)
@@ -215,23 +217,23 @@ async def extreme_envelopes(subject: Subject) -> None:
     """It plays as many knots as it states, along its shortest and longest step."""
     _require_knots(subject)
     await subject.arm()
-    most = subject.can["knots"]
-    levels = [(0.2 + 0.8 * (at % 5) / 4) * (1 if at % 3 else -1) for at in range(most)]
+    max_knots = subject.can["knots"]
+    levels = [(0.2 + 0.8 * (at % 5) / 4) * (1 if at % 3 else -1) for at in range(max_knots)]
     for step_ms in (subject.can["envelope_step_min"] / 10, 10.0):
         shape = subject.envelope(step_ms / 1000, *levels)
         step = shape.step / 10_000
-        begun = await subject.play(layer(0, subject.tone(0, 0.5, onset=shape)))
+        started = await subject.play(layer(0, subject.tone(0, 0.5, onset=shape)))
         curve = alone(lines(step, 0, *levels, 0.5))
-        whole = step * (most + 1)
+        whole = step * (max_knots + 1)
         await subject.follow(
-            {0: curve}, begun, whole + 0.01, f"{most} knots, {1e3 * step:g} ms apart"
+            {0: curve}, started, whole + 0.01, f"{max_knots} knots, {1e3 * step:g} ms apart"
         )
         await subject.play(layer(0))
-    longest = subject.envelope(subject.can["envelope_step_max"] / 10_000, 1)
-    step = longest.step / 10_000
-    begun = await subject.play(layer(0, subject.tone(0, 0.5, onset=longest)))
+    maximum = subject.envelope(subject.can["envelope_step_max"] / 10_000, 1)
+    step = maximum.step / 10_000
+    started = await subject.play(layer(0, subject.tone(0, 0.5, onset=maximum)))
     curve = alone(lines(step, 0, 1, 0.5))
-    await subject.follow({0: curve}, begun, 2 * step + 0.01, f"a step of {1e3 * step:g} ms")
+    await subject.follow({0: curve}, started, 2 * step + 0.01, f"a step of {1e3 * step:g} ms")
 
 
 def _require_knots(subject: Subject) -> None:
@@ -247,11 +249,11 @@ async def _require_interference(subject: Subject) -> None:
     slow = max(subject.lowest, _SLOW)
     tones = [subject.tone(0, 0.5, phase, frequency=slow) for phase in (0.0, 180.0)]
     await subject.play(layer(0, tones[0]), layer(1, tones[1]))
-    seen = [(await subject.ask("GetStatus"))["levels"][0]]
+    seen = [(await subject.request("GetStatus"))["levels"][0]]
     first = await subject.play(layer(0, tones[0]), layer(1))
     await subject.pause_until(first.latest + 10 / slow)
     await subject.play(layer(1, tones[0]))
-    seen.append((await subject.ask("GetStatus"))["levels"][0])
+    seen.append((await subject.request("GetStatus"))["levels"][0])
     await subject.play(layer(0), layer(1))
     if min(seen) > 0.8 * subject.level * 10_000:
         raise Optional("its levels do not show that tones of one frequency interfere")
@@ -282,7 +284,7 @@ async def _expect_turned(subject: Subject, channel: int, phase: float, periods: 
     first = await subject.play(layer(0, subject.tone(channel, 0.5, frequency=frequency)))
     await subject.pause_until(first.latest + periods / hertz)
     second = await subject.play(layer(1, subject.tone(channel, 0.5, phase, frequency=frequency)))
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     apart = second.earliest - first.latest, second.latest - first.earliest
     if 2 * math.pi * hertz * (apart[1] - apart[0]) > _RIGHT:
         raise Late("two sets were too far apart in time")
@@ -290,7 +292,7 @@ async def _expect_turned(subject: Subject, channel: int, phase: float, periods: 
         math.radians(phase) - 2 * math.pi * hertz * (apart[0] + (apart[1] - apart[0]) * at / 32)
         for at in range(33)
     ]
-    levels = [0.5 * abs(1 + polar(1, math.degrees(turn))) * subject.level for turn in turns]
+    levels = [0.5 * abs(1 + polar(1, math.degrees(angle))) * subject.level for angle in turns]
     seen = status["levels"][channel] / 10_000
     # One may begin 2 ms later than the other.
     slack = subject.tolerance + subject.level * math.pi * hertz * 0.001
@@ -329,7 +331,7 @@ async def _kept(subject: Subject, *, keep: bool) -> None:
     width = second.latest - second.earliest + first.latest - first.earliest
     if width * hertz > 0.1:
         raise Late("two sets were too far apart in time")
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     seen = status["levels"][0] / 10_000 / subject.level
     await subject.play(layer(0), layer(1))
     is_met = seen > 0.95 if keep else seen < 0.5

@@ -37,21 +37,21 @@ async def stop(subject: Subject) -> None:
     await _armed(subject, *[1.0] * len(subject.channels))
     staged = await subject.stage(layer(0, subject.tone(0, 0.5)))
     latch, session = subject.latch, subject.session
-    status = (await subject.ask("Stop", ramp=0)).values
+    status = (await subject.request("Stop", ramp=0)).values
     shown = NAMES[status["state"]], status["latch"], status["levels"], any(status["tokens"])
     expected = _STOPPED, latch % 0xFFFF + 1, [0] * len(subject.channels), False
     expect_equal(shown, expected, "state, latch, levels, tokens in the reply to Stop")
     await asyncio.sleep(0.02)
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     left = flag(status, "high_voltage"), status["watchdog_left"], any(status["levels"])
     expect_equal(left, (False, 0, False), "high voltage, watchdog_left, levels after Stop")
-    longest = subject.can["watchdog_max"]
-    await subject.refused("WRONG_STATE", "Arm", session=session + 1, watchdog=longest)
+    maximum = subject.can["watchdog_max"]
+    await subject.refused("WRONG_STATE", "Arm", session=session + 1, watchdog=maximum)
     await subject.refused("WRONG_STATE", "Commit", session=session, token=staged)
     (part,) = subject.parts(layer(0, subject.tone()))
     await subject.refused("WRONG_STATE", "Set", **part)
     await subject.refused("WRONG_STATE", "Silence", session=session, ramp=0)
-    status = (await subject.ask("Disarm", ramp=0)).values
+    status = (await subject.request("Disarm", ramp=0)).values
     expect_equal(NAMES[status["state"]], _STOPPED, "state after a Disarm")
     await asyncio.sleep(0.1)
     await subject.expect_levels(why="0.1 s after Stop")
@@ -63,18 +63,18 @@ async def stop_ramps(subject: Subject) -> None:
     count = len(subject.channels)
     for ramp in (subject.ramp, min(500, subject.can["ramp_max"])):
         await _armed(subject, *[1.0] * count)
-        stopped = (await subject.ask("Stop", ramp=ramp)).when
+        stopped = (await subject.request("Stop", ramp=ramp)).when
         curve = alone(cosine(ramp / 1000, 1, 0))
         bounds = dict.fromkeys(subject.channels, curve)
         await subject.follow(bounds, stopped, ramp / 1000, f"Stop along {ramp} ms")
         await _expect_off(subject, _STOPPED, stopped.latest + ramp / 1000, "Stop")
-        await subject.ask("Clear", latch=subject.latch)
-    longest = subject.can["ramp_max"] / 1000
+        await subject.request("Clear", latch=subject.latch)
+    maximum = subject.can["ramp_max"] / 1000
     for name in ("Stop", "Disarm"):
         await _armed(subject)
-        stopped = (await subject.ask(name, ramp=0xFFFF)).when
-        curve = alone(cosine(longest, 1, 0))
-        await subject.follow({0: curve}, stopped, longest, f"{name} with a ramp above its longest")
+        stopped = (await subject.request(name, ramp=0xFFFF)).when
+        curve = alone(cosine(maximum, 1, 0))
+        await subject.follow({0: curve}, stopped, maximum, f"{name} with a ramp above its longest")
         await subject.until(is_silent, f"silence after a {name} with a ramp above its longest")
         await subject.rest()
 
@@ -85,15 +85,15 @@ async def silence_never_later(subject: Subject) -> None:
     long, short = min(400, subject.can["ramp_max"]), 50
     for first, second, silent in ((long, short, short), (short, long, short)):
         await _armed(subject)
-        begun = (await subject.ask("Stop", ramp=first)).when
-        stopped = (await subject.ask("Stop", ramp=second)).when
-        since = stopped if second == silent else begun
+        started = (await subject.request("Stop", ramp=first)).when
+        stopped = (await subject.request("Stop", ramp=second)).when
+        since = stopped if second == silent else started
         await _expect_silence(subject, since, silent / 1000, f"Stops of {first} and {second} ms")
         await subject.rest()  # its fade may last, though its level is below a step
     await _armed(subject)
-    begun = await subject.play(layer(0, ramp=short))
-    await subject.ask("Stop", ramp=long)
-    await _expect_silence(subject, begun, short / 1000, "a Stop amid a shorter fade")
+    started = await subject.play(layer(0, ramp=short))
+    await subject.request("Stop", ramp=long)
+    await _expect_silence(subject, started, short / 1000, "a Stop amid a shorter fade")
 
 
 async def _expect_silence(subject: Subject, since: When, time: float, why: str) -> None:
@@ -124,11 +124,11 @@ async def stop_ends_all(subject: Subject) -> None:
         await subject.arm()
         for each in sets:
             await subject.play(each)
-        stopped = (await subject.ask("Stop", ramp=10)).when
+        stopped = (await subject.request("Stop", ramp=10)).when
         await _expect_silence_by(subject, stopped, 0.01, f"Stop {why}")
         await asyncio.sleep(0.05)
         await subject.expect_levels(why=f"50 ms after a Stop {why}")
-        await subject.ask("Clear", latch=subject.latch)
+        await subject.request("Clear", latch=subject.latch)
 
 
 async def _expect_silence_by(subject: Subject, since: When, time: float, why: str) -> None:
@@ -143,20 +143,20 @@ async def stops_are_numbered(subject: Subject) -> None:
     """It numbers every Stop, also of one disarmed; Clear names the last, else changes nothing."""
     latch = subject.latch
     for count in (1, 2, 3):
-        status = (await subject.ask("Stop", ramp=0)).values
+        status = (await subject.request("Stop", ramp=0)).values
         shown = NAMES[status["state"]], status["latch"]
         expected = _STOPPED, (latch + count - 1) % 0xFFFF + 1
         expect_equal(shown, expected, f"state, latch after Stop {count}")
     for wrong in (subject.latch - 1, subject.latch + 1, subject.latch ^ 0x100):
         await subject.refused("WRONG_LATCH", "Clear", latch=wrong % 0x10000)
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     expect_equal(NAMES[status["state"]], _STOPPED, "state after Clears of other latches")
-    status = (await subject.ask("Clear", latch=subject.latch)).values
+    status = (await subject.request("Clear", latch=subject.latch)).values
     expect_equal(NAMES[status["state"]], _OFF, "state after Clear")
-    status = (await subject.ask("Clear", latch=subject.latch)).values
+    status = (await subject.request("Clear", latch=subject.latch)).values
     expect_equal(NAMES[status["state"]], _OFF, "state after Clear again")
     await _armed(subject)
-    await subject.ask("Clear", latch=subject.latch)
+    await subject.request("Clear", latch=subject.latch)
     await subject.expect_levels(1.0, why="after a Clear while armed")
 
 
@@ -165,14 +165,14 @@ async def clear_too_early(subject: Subject) -> None:
     """It stays stopped by a Clear amid its fade."""
     await _armed(subject)
     ramp = subject.can["ramp_max"]
-    await subject.ask("Stop", ramp=ramp)
-    early = await subject.ask("Clear", latch=subject.latch)
+    await subject.request("Stop", ramp=ramp)
+    early = await subject.request("Clear", latch=subject.latch)
     expect_equal(NAMES[early.values["state"]], _STOPPED, "state after a Clear amid the fade")
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     expect_equal(NAMES[status["state"]], _STOPPED, "state after a Clear amid the fade")
     await asyncio.sleep(ramp / 1000 + 0.02)
-    await subject.ask("Clear", latch=subject.latch)
-    status = (await subject.ask("GetStatus")).values
+    await subject.request("Clear", latch=subject.latch)
+    status = (await subject.request("GetStatus")).values
     expect_equal(NAMES[status["state"]], _OFF, "state after a Clear once silent")
 
 
@@ -181,19 +181,19 @@ async def disarm(subject: Subject) -> None:
     """It falls silent along the ramp of a Disarm, takes no set meanwhile, and is off then."""
     await _armed(subject, *[1.0] * len(subject.channels))
     latch, ramp = subject.latch, subject.ramp
-    begun = await subject.ask("Disarm", ramp=ramp)
-    expect_equal(NAMES[begun.values["state"]], "SWITCHED_ON", "state amid the fade of a Disarm")
+    started = await subject.request("Disarm", ramp=ramp)
+    expect_equal(NAMES[started.values["state"]], "SWITCHED_ON", "state amid the fade of a Disarm")
     (part,) = subject.parts(layer(0, subject.tone()))
     await subject.refused("WRONG_STATE", "Set", **part)
     curve = alone(cosine(ramp / 1000, 1, 0))
     bounds = dict.fromkeys(subject.channels, curve)
-    await subject.follow(bounds, begun.when, ramp / 1000, f"Disarm along {ramp} ms")
-    await _expect_off(subject, _OFF, begun.when.latest + ramp / 1000, "Disarm")
-    status = (await subject.ask("GetStatus")).values
+    await subject.follow(bounds, started.when, ramp / 1000, f"Disarm along {ramp} ms")
+    await _expect_off(subject, _OFF, started.when.latest + ramp / 1000, "Disarm")
+    status = (await subject.request("GetStatus")).values
     shown = status["watchdog_left"], status["latch"], any(status["tokens"])
     expect_equal(shown, (0, latch, False), "watchdog_left, latch, tokens after Disarm")
-    await subject.ask("Disarm", ramp=0)
-    status = (await subject.ask("GetStatus")).values
+    await subject.request("Disarm", ramp=0)
+    status = (await subject.request("GetStatus")).values
     expect_equal(NAMES[status["state"]], _OFF, "state after Disarm again")
 
 
@@ -209,7 +209,7 @@ async def silence(subject: Subject) -> None:
         layer(2, subject.tone(1 % len(subject.channels), 0.1)),
     )
     staged = await subject.stage(layer(0, subject.tone()))
-    silenced = await subject.ask("Silence", session=subject.session, ramp=ramp)
+    silenced = await subject.request("Silence", session=subject.session, ramp=ramp)
     shown = NAMES[silenced.values["state"]], silenced.values["latch"]
     expect_equal(shown, (_ENABLED, latch), "state, latch after Silence")
     expect(

@@ -82,7 +82,7 @@ class Subject:
         self.exchange_time = min(self.exchange_time, took)
         return answer
 
-    async def ask(self, name: str, **values: object) -> Reply:
+    async def request(self, name: str, **values: object) -> Reply:
         """Send a request that must be carried out."""
         answer = await self.answer(name, values)
         if answer.code:
@@ -138,8 +138,8 @@ class Subject:
     async def status(self) -> Reply:
         """Read the status; feeds the watchdog where that is due."""
         if self._is_hungry:
-            return await self.ask("Ping", session=self.session)
-        return await self.ask("GetStatus")
+            return await self.request("Ping", session=self.session)
+        return await self.request("GetStatus")
 
     async def arm(self, watchdog: float = 2.0) -> Reply:
         """Arm under a new session with a watchdog [s], or the nearest that is possible."""
@@ -147,7 +147,7 @@ class Subject:
         low, high = self.can["watchdog_min"], self.can["watchdog_max"]
         milliseconds = min(max(round(1000 * watchdog), low), high)
         self.watchdog = milliseconds / 1000
-        reply = await self.ask("Arm", session=self.session, watchdog=milliseconds)
+        reply = await self.request("Arm", session=self.session, watchdog=milliseconds)
         expect_equal(NAMES[reply.values["state"]], "OPERATION_ENABLED", "state after Arm")
         self.fed, self.token = reply.when, 0
         return reply
@@ -177,10 +177,10 @@ class Subject:
     async def rest(self) -> None:
         """Bring it to silence, disarmed, nothing latched."""
         self.starve()
-        await self.ask("Stop", ramp=0)
+        await self.request("Stop", ramp=0)
         _, status = await self.until(is_silent, "silence after a Stop with ramp 0")
-        await self.ask("Clear", latch=status["latch"])
-        status = (await self.ask("GetStatus")).values
+        await self.request("Clear", latch=status["latch"])
+        status = (await self.request("GetStatus")).values
         expect_equal(NAMES[status["state"]], "SWITCH_ON_DISABLED", "state after Clear")
 
     def has(self, feature: str) -> bool:
@@ -246,7 +246,7 @@ class Subject:
         """Play a set at once; returns when it was committed."""
         taken = None
         for part in self.parts(*layers, token=token):
-            taken = await self.ask("Set", **part)
+            taken = await self.request("Set", **part)
         assert taken is not None  # noqa: S101  a set has a part
         expect_equal((taken["played"], taken["staged"]), (1, 0), "played, staged of a set")
         return taken.when
@@ -255,21 +255,21 @@ class Subject:
         """Stage a set; returns its token."""
         made = self.parts(*layers, token=token, now=False)
         for part in made:
-            taken = await self.ask("Set", **part)
+            taken = await self.request("Set", **part)
         expect_equal((taken["played"], taken["staged"]), (0, 1), "played, staged of a staged set")
         return int(made[0]["token"])
 
     async def commit(self, token: int) -> Reply:
         """Commit a staged set."""
-        return await self.ask("Commit", session=self.session, token=token)
+        return await self.request("Commit", session=self.session, token=token)
 
     # Expectations
 
     @property
     def ramp(self) -> int:
         """A ramp [ms] that is long against an exchange."""
-        wanted = max(200, math.ceil(30_000 * min(self.exchange_time, 0.03)))
-        return int(min(wanted, self.can["ramp_max"]))
+        required = max(200, math.ceil(30_000 * min(self.exchange_time, 0.03)))
+        return int(min(required, self.can["ramp_max"]))
 
     @property
     def tolerance(self) -> float:
@@ -280,7 +280,7 @@ class Subject:
         """Wait until a time [s], feeding the watchdog."""
         while (left := time - clock.now()) > 0:
             if self._is_hungry:
-                await self.ask("Ping", session=self.session)
+                await self.request("Ping", session=self.session)
                 continue
             await asyncio.sleep(min(left, self.watchdog / 8 or left))
 
@@ -318,9 +318,9 @@ class Subject:
     async def expect_not_fed(self, by: str) -> None:
         """Require that the watchdog was not fed by something since it was fed last."""
         assert self.fed is not None  # noqa: S101
-        asked = await self.ask("GetStatus")
-        high = self.watchdog - (asked.when.earliest - self.fed.latest) + SLACK
-        left, limit = asked["watchdog_left"] / 1000, f"at most {high:.3f} s"
+        reply = await self.request("GetStatus")
+        high = self.watchdog - (reply.when.earliest - self.fed.latest) + SLACK
+        left, limit = reply["watchdog_left"] / 1000, f"at most {high:.3f} s"
         expect(left <= high, f"watchdog_left after {by}", expected=limit, seen=left)
 
     async def expect_levels(self, *levels: float, why: str) -> Values:
@@ -339,16 +339,16 @@ class Subject:
         duration: float,
         why: str,
         *,
-        begin: float = 0.0,
+        since: float = 0.0,
     ) -> None:
         """Require levels along curves in fractions of the test level, others silent.
 
-        duration, begin [s] of what is followed, from the commit on; raises Late where this machine
+        duration, since [s]: what is followed, from the commit on; raises Late where this machine
         was too slow to see them.
         """
-        await self.pause_until(commit.earliest + begin)
+        await self.pause_until(commit.earliest + since)
         end, seen = commit.earliest + duration, 0
-        pause = max((duration - begin) / (2 * _SAMPLES) - min(self.exchange_time, 1.0), 0.0)
+        pause = max((duration - since) / (2 * _SAMPLES) - min(self.exchange_time, 1.0), 0.0)
         while clock.now() < end:
             reply = await self.status()
             self.expect_at(reply, bounds, commit, why)
@@ -356,7 +356,7 @@ class Subject:
             is_narrow = width <= _NARROW + 2 * self.exchange_time
             seen += is_narrow
             await asyncio.sleep(pause * is_narrow)
-        time = duration - begin
+        time = duration - since
         if seen < max(min(_SAMPLES / 3, time / _EACH, time / (4 * self.exchange_time)), 2):
             raise Late(f"only {seen} samples of {why} were in time")
 
@@ -374,8 +374,8 @@ class Subject:
     ) -> None:
         level = values["levels"][channel] / FULL
         is_met = low - self.tolerance <= level <= min(high, 1.0) + self.tolerance
-        wanted = f"{low:.4f}" if high - low < 1e-4 else f"{low:.4f} to {high:.4f}"
-        expect(is_met, f"level of channel {channel} ({why})", expected=wanted, seen=level)
+        required = f"{low:.4f}" if high - low < 1e-4 else f"{low:.4f} to {high:.4f}"
+        expect(is_met, f"level of channel {channel} ({why})", expected=required, seen=level)
 
 
 _STATUSES = tuple(name for name, each in MESSAGES.items() if "levels" in each.reply.names)

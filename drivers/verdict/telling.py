@@ -42,23 +42,23 @@ async def events(subject: Subject) -> None:
     await subject.play(layer(0, subject.tone()))
     subject.starve()
     await subject.until(lambda each: NAMES[each["state"]] == "FAULT", "FAULT")
-    await subject.ask("Clear", latch=subject.latch)
+    await subject.request("Clear", latch=subject.latch)
     await subject.arm()
     await subject.play(layer(0, subject.tone()))
-    await subject.ask("Disarm", ramp=50)
+    await subject.request("Disarm", ramp=50)
     await asyncio.sleep(0.1)
-    await subject.ask("Stop", ramp=0)
+    await subject.request("Stop", ramp=0)
     stop = subject.latch
-    await subject.ask("Clear", latch=stop)
+    await subject.request("Clear", latch=stop)
     await asyncio.sleep(0.02)
-    told_of = [EVENT_RECORD.unpack(each.words, is_strict=False) for each in client.events]
+    reports = [EVENT_RECORD.unpack(each.words, is_strict=False) for each in client.events]
     if not stated:
-        expect(not told_of, "Events of one that states none", expected="none", seen=told_of)
+        expect(not reports, "Events of one that states none", expected="none", seen=reports)
         return
-    told = [
-        (NAMES.get(each["state"], each["state"]), each["fault"], each["latch"]) for each in told_of
+    reported = [
+        (NAMES.get(each["state"], each["state"]), each["fault"], each["latch"]) for each in reports
     ]
-    wanted = [
+    required = [
         *(("OPERATION_ENABLED", 0, stop - 2), ("FAULT_REACTION_ACTIVE", 1, stop - 1)),
         *(("FAULT", 1, stop - 1), ("SWITCH_ON_DISABLED", 0, stop - 1)),
         *(("OPERATION_ENABLED", 0, stop - 1), ("SWITCHED_ON", 0, stop - 1)),
@@ -66,10 +66,10 @@ async def events(subject: Subject) -> None:
         ("SWITCH_ON_DISABLED", 0, stop),
     ]
     # A state that lasts no time may be left out or told.
-    needed = [each for each in wanted if each[0] not in _MOMENTARY or each in told]
-    told = [each for each in told if each[0] not in _MOMENTARY or each in wanted]
-    expect_equal(told, needed, "states, faults and latches of Events")
-    channels = {each["channel"] for each in told_of}
+    needed = [each for each in required if each[0] not in _MOMENTARY or each in reported]
+    reported = [each for each in reported if each[0] not in _MOMENTARY or each in required]
+    expect_equal(reported, needed, "states, faults and latches of Events")
+    channels = {each["channel"] for each in reports}
     expect_equal(channels, {NO_CHANNEL}, "channels of Events")
 
 
@@ -85,13 +85,13 @@ async def broadcasts(subject: Subject) -> None:
         expect(not heard, f"replies to a {name} for all", expected="none", seen=len(heard))
 
     await send("Arm", session=9, watchdog=subject.can["watchdog_max"])
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     expect_equal(NAMES[status["state"]], "SWITCH_ON_DISABLED", "state after an Arm for all")
     await subject.arm(0.5)
     session, watchdog = subject.session, subject.watchdog
     await subject.play(layer(0, subject.tone()))
     (part,) = subject.parts(layer(0, subject.tone(0, 0.5)))
-    await subject.ask("Ping", session=session)
+    await subject.request("Ping", session=session)
     for name, values in (
         ("Set", part),
         ("Silence", {"session": session, "ramp": 0}),
@@ -106,16 +106,16 @@ async def broadcasts(subject: Subject) -> None:
     await asyncio.sleep(0.1)
     began = clock.now()
     await send("Commit", session=session, token=token)
-    asked = await subject.ask("GetStatus")
-    expect_equal(asked["token"], token, "token after a Commit for all")
-    least = watchdog - (asked.when.latest - began) - SLACK
-    left = asked.values["watchdog_left"] / 1000
+    reply = await subject.request("GetStatus")
+    expect_equal(reply["token"], token, "token after a Commit for all")
+    least = watchdog - (reply.when.latest - began) - SLACK
+    left = reply.values["watchdog_left"] / 1000
     expect(left >= least, "watchdog_left after it", expected=f"at least {least:.3f} s", seen=left)
     await subject.expect_levels(0.5, why="Commit for all")
     latch = subject.latch
     subject.starve()
     await send("Stop", ramp=0)
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     shown = NAMES[status["state"]], status["latch"], status["levels"][0]
     expect_equal(shown, ("QUICK_STOP_ACTIVE", latch % 0xFFFF + 1, 0), "state, latch, level after")
 
@@ -137,10 +137,10 @@ async def addresses(subject: Subject) -> None:
         await subject.refused_words("BAD_VALUE", "SetAddress", words, what=what)
     await subject.arm()
     await subject.refused("WRONG_STATE", "SetAddress", address=free, serial_number=serial)
-    await subject.ask("Disarm", ramp=0)
+    await subject.request("Disarm", ramp=0)
     await asyncio.sleep(0.05)
     try:
-        await subject.ask("SetAddress", address=free, serial_number=serial)
+        await subject.request("SetAddress", address=free, serial_number=serial)
         await asyncio.sleep(_MOVED)
         expect_equal(await _is_at(client, own), False, "whether it replies at its old address")
         expect_equal(await _is_at(client, free), True, "whether it replies at its new address")
@@ -149,7 +149,7 @@ async def addresses(subject: Subject) -> None:
             if await _is_at(client, address):
                 break
         if client.address != own:
-            await subject.ask("SetAddress", address=own, serial_number=serial)
+            await subject.request("SetAddress", address=own, serial_number=serial)
             await asyncio.sleep(_MOVED)
             client.address = own
         client.heard.clear()
@@ -193,7 +193,7 @@ async def measured(subject: Subject) -> None:
 
 
 async def _voltages(subject: Subject) -> Sequence[int]:
-    shown = (await subject.ask("GetMeasured")).values
+    shown = (await subject.request("GetMeasured")).values
     expect_equal(shown["count"], len(subject.channels), "number of channels that are measured")
     return [each["channel_voltage"] for each in shown["channels"]]
 
@@ -203,7 +203,7 @@ async def _sensors(subject: Subject) -> list[Values]:
     subject.require("sensors")
     found: list[Values] = []
     while True:
-        shown = (await subject.ask("GetSensors", first=len(found))).values
+        shown = (await subject.request("GetSensors", first=len(found))).values
         found += shown["sensors"]
         if len(found) >= shown["all"]:
             return found
@@ -225,7 +225,7 @@ async def sensors(subject: Subject) -> None:
 async def _read_until_over(subject: Subject) -> tuple[Values, list[Values]]:
     """Return a reading once its window is over, and the values of every sensor."""
     await asyncio.sleep(_WINDOW / 1000 + 0.02)
-    shown = (await subject.ask("GetReading", first=0)).values
+    shown = (await subject.request("GetReading", first=0)).values
     record = Record(*sensor_reading(shown["tones"]).fields)
     read: list[Values] = []
     while True:
@@ -238,7 +238,7 @@ async def _read_until_over(subject: Subject) -> tuple[Values, list[Values]]:
             read.append(row)
         if not shown["count"] or len(read) >= len(await _sensors(subject)):
             return shown, read
-        shown = (await subject.ask("GetReading", first=len(read))).values
+        shown = (await subject.request("GetReading", first=len(read))).values
 
 
 @driving(_SENSORS)
@@ -251,18 +251,18 @@ async def readings(subject: Subject) -> None:
     await subject.arm()
     await subject.play(layer(0, subject.tone(frequency=tone)))
     await asyncio.sleep(0.3)
-    await subject.ask("Ping", session=subject.session)
-    begun = await subject.ask("Measure", **request)
+    await subject.request("Ping", session=subject.session)
+    started = await subject.request("Measure", **request)
     await subject.expect_not_fed("Measure")
-    shown = begun["reading"], begun["token"]
+    shown = started["reading"], started["token"]
     expect_equal(shown, (7, subject.token), "reading, token of a reading that begins")
     whole, read = await _read_until_over(subject)
     expect_equal((whole["reading"], whole["window_left"]), (7, 0), "reading, window_left, over")
     expect_equal(len(read), len(found), "sensors that were read")
-    again = await subject.ask("Measure", **{**request, "reading": 8})
+    again = await subject.request("Measure", **{**request, "reading": 8})
     await subject.play(layer(0, subject.tone(0, 0.5, frequency=tone)))
     disturbed, _ = await _read_until_over(subject)
-    states = [each["state"] for each in (begun, whole, again, disturbed)]
+    states = [each["state"] for each in (started, whole, again, disturbed)]
     expected = [READING_STATES[name] for name in ("RUNNING", "COMPLETE", "RUNNING", "DISTURBED")]
     expect_equal(states, expected, "states of two readings, the second disturbed")
     for frequencies in ([_LOW], [tone, tone], [tone, tone + 1]):

@@ -36,7 +36,7 @@ async def stage_and_commit(subject: Subject) -> None:
     again = layer(0, subject.tone(0, 0.5), ramp=50), layer(1, beside)
     for now in (False, True):
         (part,) = subject.parts(*again, token=token, now=now)
-        taken = await subject.ask("Set", **part)
+        taken = await subject.request("Set", **part)
         expect_equal((taken["token"], taken["played"]), (token, 1), "token, played of a set again")
     await subject.expect_levels(0.75, why="after the set came again")
     (part,) = subject.parts(layer(0, subject.tone()), token=token)
@@ -53,16 +53,16 @@ async def repeats_change_nothing(subject: Subject) -> None:
     await subject.arm()
     lasting = 300
     token = await subject.stage(layer(0, subject.tone(), valid_for=lasting))
-    begun = (await subject.commit(token)).when
-    await subject.pause_until(begun.latest + 0.2)
+    started = (await subject.commit(token)).when
+    await subject.pause_until(started.latest + 0.2)
     await subject.commit(token)
     (part,) = subject.parts(layer(0, subject.tone(), valid_for=lasting), token=token)
-    await subject.ask("Set", **part)
-    await subject.pause_until(begun.latest + 0.33)
+    await subject.request("Set", **part)
+    await subject.pause_until(started.latest + 0.33)
     status = await subject.expect_levels(why="after valid_for, its commit came again meanwhile")
     expect_equal(status["tokens"][0], 0, "token of a layer that has ended")
     await subject.commit(token)
-    await subject.ask("Set", **part)
+    await subject.request("Set", **part)
     status = await subject.expect_levels(why="commit again of what has ended")
     expect_equal((status["token"], status["tokens"][0]), (token, 0), "token, that of the layer")
 
@@ -103,11 +103,11 @@ async def newer_sets_replace(subject: Subject) -> None:
     for name in ("Silence", "Arm"):
         staged = await subject.stage(layer(0, subject.tone()))
         if name == "Arm":
-            await subject.ask("Disarm", ramp=0)
+            await subject.request("Disarm", ramp=0)
             await asyncio.sleep(0.02)
             await subject.arm()
         else:
-            await subject.ask(name, session=session, ramp=0)
+            await subject.request(name, session=session, ramp=0)
         commit: Values = {"session": subject.session, "token": staged}
         await subject.refused("BAD_TOKEN", "Commit", **commit)
     await subject.expect_levels(why="sets that were dropped")
@@ -124,7 +124,7 @@ async def committed_together(subject: Subject) -> None:
             for number in subject.layers
         )
     )
-    begun = await subject.commit(token)
-    expect_equal(begun.values["tokens"], [token] * len(subject.layers), "tokens after Commit")
+    started = await subject.commit(token)
+    expect_equal(started.values["tokens"], [token] * len(subject.layers), "tokens after Commit")
     bounds = dict.fromkeys(subject.channels, alone(cosine(ramp / 1000, 0, 1)))
-    await subject.follow(bounds, begun.when, ramp / 1000 + 0.02, "set of all layers")
+    await subject.follow(bounds, started.when, ramp / 1000 + 0.02, "set of all layers")

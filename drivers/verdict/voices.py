@@ -9,7 +9,7 @@ from drivers.verdict.expected import Curve, cosine, steady, together
 from drivers.verdict.findings import Late
 from drivers.verdict.subject import Subject, layer
 
-_MOST = 24  # voices that are tried
+_MAX_VOICES = 24  # voices that are tried
 _SHORTENED = 0.002  # s
 _PAUSE = 0.004  # s; between sets
 
@@ -22,16 +22,16 @@ async def voices(subject: Subject) -> None:
     time = ramp / 1000
     # Each tone is at its level at once, and falls along the ramp of the next set.
     onset = subject.envelope(0.0001)
-    sets = min(count, _MOST) + 4
+    sets = min(count, _MAX_VOICES) + 4
     share = 1 / sets
     commits: list[float] = []
-    begun = None
+    started = None
     for number in range(sets):
         tone = replace(_tone(subject, number, share), onset=onset)
-        begun = await subject.play(layer(0, tone, ramp=ramp))
-        commits.append((begun.earliest + begun.latest) / 2)
+        started = await subject.play(layer(0, tone, ramp=ramp))
+        commits.append((started.earliest + started.latest) / 2)
         await asyncio.sleep(_PAUSE + onset.step / 10_000)
-    assert begun is not None  # noqa: S101
+    assert started is not None  # noqa: S101
     if commits[-1] - commits[0] > 0.8 * time:
         raise Late("sets were too far apart for so many voices")
     await asyncio.sleep(2 * _SHORTENED + _slew_time(subject, share))
@@ -41,7 +41,7 @@ async def voices(subject: Subject) -> None:
     curves.append(steady(share))
     lasting = curves[max(sets - count, 0) :]
     status = await subject.status()
-    subject.expect_at(status, {0: together(*lasting)}, begun, f"the newest of {sets} voices")
+    subject.expect_at(status, {0: together(*lasting)}, started, f"the newest of {sets} voices")
     # A full pool refuses neither another layer nor a layer's silence, nor a fade of all.
     for number in subject.layers[1:3]:
         await subject.play(layer(number, _tone(subject, number, share), ramp=ramp))
@@ -58,11 +58,11 @@ async def voices_of_layers(subject: Subject) -> None:
     ramp, share = subject.can["ramp_max"], 1 / (2 * len(subject.layers))
     others = subject.layers[1:]
     await subject.play(*(layer(number, _tone(subject, number, share)) for number in others))
-    for number in range(min(subject.can["voices"], _MOST) + 2):
+    for number in range(min(subject.can["voices"], _MAX_VOICES) + 2):
         tone = _tone(subject, number + len(others) + 1, share / 4)
-        begun = await subject.play(layer(0, tone, ramp=ramp))
+        started = await subject.play(layer(0, tone, ramp=ramp))
     await subject.play(layer(0, ramp=0))
-    await subject.pause_until(begun.latest + ramp / 1000 + 0.02)
+    await subject.pause_until(started.latest + ramp / 1000 + 0.02)
     await subject.expect_levels(share * len(others), why="layers that last, after many fades")
 
 

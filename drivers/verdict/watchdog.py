@@ -56,21 +56,21 @@ async def expect_trip(subject: Subject, fed: When, why: str, time: float) -> Non
 
 async def _expect_listed(subject: Subject, fed: When, time: float, why: str) -> None:
     """Require that the newest fault is the watchdog's, at its time by its age."""
-    asked = await subject.ask("GetFaults")
-    faults = asked["faults"]
+    reply = await subject.request("GetFaults")
+    faults = reply["faults"]
     expect(bool(faults), f"faults ({why})", expected="one", seen="none")
     expect_equal(faults[0]["fault"], FAULTS["WATCHDOG"], f"newest fault ({why})")
     age = faults[0]["age"] / 1000
     earliest = fed.earliest + time * (1 - DRIFT) - SLACK
     latest = fed.latest + (time + _TRIP) * (1 + DRIFT) + SLACK
-    is_met = earliest <= asked.when.latest - age and asked.when.earliest - age <= latest
-    seen = f"{1e3 * (asked.when.latest - age - fed.earliest):.1f} ms after it was fed"
+    is_met = earliest <= reply.when.latest - age and reply.when.earliest - age <= latest
+    seen = f"{1e3 * (reply.when.latest - age - fed.earliest):.1f} ms after it was fed"
     what, limit = f"time of the fault by its age ({why})", f"{1e3 * time:.0f} ms"
     expect(is_met, what, expected=limit, seen=seen)
 
 
 async def _clear(subject: Subject) -> None:
-    await subject.ask("Clear", latch=subject.latch)
+    await subject.request("Clear", latch=subject.latch)
 
 
 @driving(_PLACE)
@@ -91,10 +91,10 @@ async def _trips(subject: Subject, time: float) -> None:
     await subject.refused("WRONG_LATCH", "Clear", latch=(subject.latch + 7) % 0x10000)
     (part,) = subject.parts(layer(0, subject.tone()))
     await subject.refused("WRONG_STATE", "Set", **part)
-    stopped = (await subject.ask("Disarm", ramp=0)).values
+    stopped = (await subject.request("Disarm", ramp=0)).values
     expect_equal(NAMES[stopped["state"]], "FAULT", "state after a Disarm in FAULT")
     await _clear(subject)
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     shown = NAMES[status["state"]], status["fault"]
     expect_equal(shown, ("SWITCH_ON_DISABLED", 0), "state, fault after Clear")
 
@@ -108,7 +108,7 @@ async def watchdog_unread(subject: Subject) -> None:
     subject.starve()
     await asyncio.sleep(time + 0.4)
     await _expect_listed(subject, fed, time, "nothing was asked")
-    status = (await subject.ask("GetStatus")).values
+    status = (await subject.request("GetStatus")).values
     expect_equal(NAMES[status["state"]], "FAULT", "state after the watchdog time")
 
 
@@ -118,10 +118,10 @@ async def watchdog_left(subject: Subject) -> None:
     fed = (await subject.arm(0.5)).when
     for moment in (0.1, 0.2, 0.3):
         await asyncio.sleep(max(fed.earliest + moment - clock.now(), 0.0))
-        asked = await subject.ask("GetStatus")
-        low = subject.watchdog - (asked.when.latest - fed.earliest)
-        high = subject.watchdog - (asked.when.earliest - fed.latest)
-        left = asked.values["watchdog_left"] / 1000
+        reply = await subject.request("GetStatus")
+        low = subject.watchdog - (reply.when.latest - fed.earliest)
+        high = subject.watchdog - (reply.when.earliest - fed.latest)
+        left = reply.values["watchdog_left"] / 1000
         expected = f"{low:.3f} to {high:.3f} s"
         is_met = low - SLACK <= left <= high + SLACK
         expect(is_met, f"watchdog_left {moment:g} s after Arm", expected=expected, seen=left)
@@ -140,25 +140,25 @@ async def what_feeds(subject: Subject) -> None:
 
     async def part() -> None:
         long = _long_set(subject)
-        await subject.ask("Set", **subject.parts(*long, now=False)[0])
+        await subject.request("Set", **subject.parts(*long, now=False)[0])
 
     feeds: Sequence[tuple[str, Callable[[], Awaitable[object]]]] = (
-        ("Ping", lambda: subject.ask("Ping", session=session)),
+        ("Ping", lambda: subject.request("Ping", session=session)),
         ("Set with now", lambda: subject.play(layer(0, subject.tone()))),
         ("Set", stage),
         ("Commit", lambda: subject.commit(staged[-1])),
         ("Commit again", lambda: subject.commit(staged[-1])),
         ("part of a Set", part),
-        ("Silence", lambda: subject.ask("Silence", session=session, ramp=0)),
-        ("Arm", lambda: subject.ask("Arm", session=session, watchdog=time)),
+        ("Silence", lambda: subject.request("Silence", session=session, ramp=0)),
+        ("Arm", lambda: subject.request("Arm", session=session, watchdog=time)),
     )
     for name, feed in feeds:
         await asyncio.sleep(0.1)
         began = clock.now()
         await feed()
-        asked = await subject.ask("GetStatus")
-        low = subject.watchdog - (asked.when.latest - began) - SLACK
-        left = asked.values["watchdog_left"] / 1000
+        reply = await subject.request("GetStatus")
+        low = subject.watchdog - (reply.when.latest - began) - SLACK
+        left = reply.values["watchdog_left"] / 1000
         expected = f"at least {low:.3f} s"
         expect(left >= low, f"watchdog_left after {name}", expected=expected, seen=left)
 
@@ -179,7 +179,7 @@ async def what_does_not_feed(subject: Subject) -> None:
     other, session = subject.other_session, subject.session
     (part,) = subject.parts(layer(0, subject.tone()))
     old = (subject.token - 1 + 0x8000) % 0x10000
-    bad = {**part, "token": subject.token + 5, "stream": [0xFFFF, 0, 0]}
+    flawed = {**part, "token": subject.token + 5, "stream": [0xFFFF, 0, 0]}
     requests: Sequence[tuple[str, Values]] = (
         *(("GetStatus", {}), ("GetCaps", {}), ("GetFaults", {}), ("GetAchieved", {"layer": 0})),
         *(
@@ -187,7 +187,7 @@ async def what_does_not_feed(subject: Subject) -> None:
             ("Ping", {"session": other}),
             ("Set", {**part, "session": other}),
         ),
-        *(("Set", {**part, "token": old}), ("Set", bad)),
+        *(("Set", {**part, "token": old}), ("Set", flawed)),
         *(
             ("Commit", {"session": session, "token": 20_000}),
             ("Commit", {"session": other, "token": 1}),
@@ -195,11 +195,11 @@ async def what_does_not_feed(subject: Subject) -> None:
         *(("Silence", {"session": other, "ramp": 0}), ("Arm", {"session": other, "watchdog": 500})),
     )
     for name, values in requests:
-        await subject.ask("Ping", session=session)
+        await subject.request("Ping", session=session)
         await asyncio.sleep(0.02)
         await subject.answer(name, values)
         await subject.expect_not_fed(name)
-    await subject.ask("Ping", session=session)
+    await subject.request("Ping", session=session)
     await asyncio.sleep(0.02)
     await subject.client.exchange(63, ())
     await subject.answer_to("Ping", [session, 0])
@@ -268,15 +268,15 @@ async def fault_list(subject: Subject) -> None:
         await subject.until(lambda each: NAMES[each["state"]] == "FAULT", "FAULT")
         await _clear(subject)
         ages.append(clock.now())
-    asked = await subject.ask("GetFaults")
-    faults = asked.values["faults"]
+    reply = await subject.request("GetFaults")
+    faults = reply.values["faults"]
     expect(len(faults) > 1, "faults after two trips", expected="two at least", seen=len(faults))
     for at, one in zip(reversed(ages), faults, strict=False):
         expect_equal(one["fault"], FAULTS["WATCHDOG"], "fault of a trip of the watchdog")
-        age = asked.when.latest - at
-        is_met = abs(one["age"] / 1000 - age) < 0.05 + asked.when.latest - asked.when.earliest
+        age = reply.when.latest - at
+        is_met = abs(one["age"] / 1000 - age) < 0.05 + reply.when.latest - reply.when.earliest
         expect(is_met, "age of a fault", expected=f"{age:.2f} s", seen=one["age"] / 1000)
     await asyncio.sleep(0.1)
-    older = (await subject.ask("GetFaults")).values["faults"][0]["age"]
+    older = (await subject.request("GetFaults")).values["faults"][0]["age"]
     is_met = older - faults[0]["age"] >= 90
     expect(is_met, "age of a fault 0.1 s later", expected="0.1 s more", seen=older)

@@ -63,9 +63,8 @@ static double complex last_of(const Voice *voice) { return voice->point[voice->p
 
 static double complex amplitude_of(const Voice *voice, double time) {
     if (time >= end_of(voice)) return last_of(voice);
-    double steps = (time - voice->start) / voice->step;
+    double steps = (time - voice->start) / voice->step, way = steps - (int)steps;
     int index = (int)steps;
-    double way = steps - index;
     if (voice->points == 2) way = (1 - cos(M_PI * way)) / 2;
     return voice->point[index] + (voice->point[index + 1] - voice->point[index]) * way;
 }

@@ -88,21 +88,22 @@ class Amplifier(Dialogue):
             await self._listen_for_another_host(status)
             await self.disarm(STOP_RAMP)
 
-    async def identify(self) -> Values:
+    async def identify(self, *, timeout: float = OPEN_TIMEOUT) -> Values:
         """Read identity and capabilities, and return the status; raises LinkError.
 
-        Its latch is that of the status from now on: it may have lost its supply meanwhile.
+        timeout [s]: of a reply. Its latch is that of the status from now on: it may have lost its
+        supply meanwhile.
         """
         self._are_several = False
         try:
-            identity = await self._request("Hello", {}, Priority.OTHER, timeout=OPEN_TIMEOUT)
+            identity = await self._request("Hello", {}, Priority.OTHER, timeout=timeout)
             await asyncio.sleep(SECOND_REPLY)
         except LinkTimeout:
             self._check_alone()
             raise
         self._check_alone()
         check_identity(identity, self.name, self._serial_number)
-        can = await self._request("GetCaps", {}, Priority.OTHER, timeout=OPEN_TIMEOUT)
+        can = await self._request("GetCaps", {}, Priority.OTHER, timeout=timeout)
         check_capabilities(can, self.name, is_output=self._is_output)
         if self._ledger is None:
             self._ledger = Ledger(self.limits, can)
@@ -127,7 +128,7 @@ class Amplifier(Dialogue):
         It is identified anew: it may have lost its supply, and come back with other limits.
         """
         before = self.silences
-        await self.identify()
+        await self.identify(timeout=REPLY_TIMEOUT)  # before the watchdogs of others that are armed
         wire = _WATCHDOG.to_wire(watchdog)
         low, high = (self.capabilities[f"watchdog_{end}"] for end in ("min", "max"))
         if not low <= wire <= high:
@@ -262,7 +263,7 @@ class Amplifier(Dialogue):
 
         It is identified anew: one that has lost its supply since counts its latches from 1 again.
         """
-        shown, status = self.latch, await self.identify()
+        shown, status = self.latch, await self.identify(timeout=REPLY_TIMEOUT)
         if latch is None:
             has_restarted = shown is None or is_newer_token(shown, status["latch"])
             latch = status["latch"] if has_restarted else shown

@@ -165,3 +165,22 @@ def test_ping_that_a_network_delivers_late_is_accounted_for() -> None:
         assert end.levels("a") == [0.0, 0.0]
 
     run_virtual(run())
+
+
+def test_mute_amplifier_leaves_the_others_disarmed_and_without_a_fault(wire: str) -> None:
+    """It is known within 0.1 s that it does not reply: before the watchdog of those armed passes."""
+
+    async def run() -> None:
+        ends = [MemoryLine(wire, "a"), MemoryLine(wire, "b")]
+        hosts = {name: host for end in ends for name, host in end.hosts.items()}
+        group = Group(hosts, draw=lambda low, high: 77)
+        await group.open()
+        ends[1].outward = lambda name, data: []
+        began = ends[0].loop.time()
+        with pytest.raises(LinkError):
+            await group.arm()
+        assert ends[0].loop.time() - began < 0.6
+        assert ends[0].levels("a") == [0.0, 0.0]
+        assert ends[0].far["a"].fault == "NONE"
+
+    run_virtual(run())

@@ -168,7 +168,7 @@ def test_ping_that_a_network_delivers_late_is_accounted_for() -> None:
 
 
 def test_mute_amplifier_leaves_the_others_disarmed_and_without_a_fault(wire: str) -> None:
-    """It is known within 0.1 s that it does not reply: before the watchdog of those armed passes."""
+    """It is known within 0.1 s not to reply: before the watchdogs of those armed pass."""
 
     async def run() -> None:
         ends = [MemoryLine(wire, "a"), MemoryLine(wire, "b")]

@@ -248,3 +248,14 @@ def _damaged_frame_carried_out() -> Talk:
     talk.sequence = 77
     talk.rest(0.001).replies(hand.PING, hand.status())
     return talk
+
+
+@breaks("token")
+def _older_set_accepted() -> Talk:
+    talk = Talk().armed().playing()
+    talk.witness.faults(talk.time, "a", are_on=True)  # which excuses the host alone
+    stale = hand.frame(hand.SET, hand.part(4, hand.layer(0)), sequence=99)
+    talk.sequence = 99
+    talk.host_bytes(stale)
+    talk.rest(0.001).replies(hand.SET, hand.taken(4))
+    return talk

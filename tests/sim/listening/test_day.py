@@ -7,7 +7,7 @@ import random
 import pytest
 
 from drivers.contents import Layer, Shape, Tone
-from drivers.errors import CommandRefused
+from drivers.errors import CommandRefused, Preempted
 from drivers.host.group import Group
 from drivers.host.jobs import Priority
 from listened_line import ListenedLine, witness_of
@@ -32,12 +32,12 @@ class Day:
         await self.group.arm()
         background = [asyncio.ensure_future(self.line.keep_sensing())]
         background.append(asyncio.ensure_future(self._keep_beating()))
-        await self.plays()
-        await self.stops()
-        await self.trips()
-        await self.stalls()
-        for each in background:
-            each.cancel()
+        try:
+            for part in (self.plays, self.stops, self.trips, self.stalls):
+                await part()
+        finally:
+            for each in background:
+                each.cancel()
 
     async def plays(self) -> None:
         """A tone is renewed, read back and ends by itself; another swells and fades beside it."""
@@ -50,7 +50,13 @@ class Day:
         await self.apply(Layer(1, (), 0.005), rest=0.2)
 
     async def stops(self) -> None:
-        """It is stopped amid a tone, cleared and armed."""
+        """It is silenced, disarmed and stopped amid a tone each, cleared and armed."""
+        await self.apply(Layer(0, (Tone(0, 100.0, 0.5),), 0.01), rest=0.05)
+        await self.group.silence(0.01)
+        await asyncio.sleep(0.05)
+        await self.apply(Layer(0, (Tone(0, 100.0, 0.5),), 0.01), rest=0.05)
+        await self.group.disarm()
+        await self.group.arm()
         await self.apply(Layer(0, (Tone(0, 100.0, 0.5),), 0.01), rest=0.05)
         await self.group.stop()
         await self.again()
@@ -101,9 +107,15 @@ def test_witness_finds_nothing_in_a_day(kind: str) -> None:
     """It plays, is stopped, has a fault, and hangs."""
     witness = witness_of({"line": (kind, ("a",))}, slew_per_s=400)
 
+    problems: list[str] = []
+
     async def run() -> None:
-        await Day(ListenedLine(witness, "line", kind, "a")).run()
+        try:
+            await Day(ListenedLine(witness, "line", kind, "a")).run()
+        except (CommandRefused, Preempted) as problem:
+            problems.append(str(problem))
 
     run_virtual(run())
     assert not witness.finish(), str(witness.finish()[0])
+    assert not problems
     assert witness.frames > 100

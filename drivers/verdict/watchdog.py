@@ -11,6 +11,7 @@ from drivers.protocol.table import FAULTS
 from drivers.verdict.check import driving
 from drivers.verdict.client import When
 from drivers.verdict.findings import expect, expect_equal
+from drivers.verdict.parts import long_set
 from drivers.verdict.subject import DRIFT, NAMES, SLACK, Subject, flag, layer
 
 _PLACE = "protocol.md#sessions-and-the-watchdog"
@@ -139,7 +140,7 @@ async def what_feeds(subject: Subject) -> None:
         staged.append(await subject.stage(layer(0, subject.tone(0, 0.5))))
 
     async def part() -> None:
-        long = _long_set(subject)
+        long = long_set(subject)
         await subject.request("Set", **subject.parts(*long, now=False)[0])
 
     feeds: Sequence[tuple[str, Callable[[], Awaitable[object]]]] = (
@@ -161,14 +162,6 @@ async def what_feeds(subject: Subject) -> None:
         left = reply.values["watchdog_left"] / 1000
         expected = f"at least {low:.3f} s"
         expect(left >= low, f"watchdog_left after {name}", expected=expected, seen=left)
-
-
-def _long_set(subject: Subject) -> list[LayerSet]:
-    """Make a set of two parts or more."""
-    knots = [0.5 + 0j] * min(max(subject.can["knots"], 1), 32)
-    onset = subject.envelope(0.005, *knots)
-    tones = [subject.tone(channel, onset=onset, ending=onset) for channel in subject.channels]
-    return [layer(number, *tones) for number in subject.layers[:4]]
 
 
 @driving(_PLACE)

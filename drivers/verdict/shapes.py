@@ -1,6 +1,5 @@
 """Checks of transitions: raised cosines, envelopes, endings, kept phases, interference."""
 
-import asyncio
 import math
 
 from drivers import clock
@@ -27,34 +26,31 @@ _SLOW = 400  # steps of frequency: 20 Hz, whose phase is known from times
 @driving(_PLACE)
 async def ramps(subject: Subject) -> None:
     """It rises and falls along the ramp of a layer, a raised cosine, on every channel."""
-    await subject.arm()
     every = subject.channels
+    tones = [subject.tone(channel) for channel in every]
     for ramp in {subject.ramp, 20, subject.can["ramp_max"]}:
         time = ramp / 1000
-        tones = [subject.tone(channel) for channel in every]
-        started = await subject.play(layer(0, *tones, ramp=ramp))
         rise = dict.fromkeys(every, alone(cosine(time, 0, 1)))
-        await subject.follow(rise, started, time + 0.01, f"rise along {ramp} ms")
-        started = await subject.play(layer(0, ramp=ramp))
+        up = layer(0, *tones, ramp=ramp)
+        await subject.course(rise, time + 0.01, f"rise along {ramp} ms", up)
         fall = dict.fromkeys(every, alone(cosine(time, 1, 0)))
-        await subject.follow(fall, started, time + 0.01, f"fall along {ramp} ms")
+        down = layer(0, *tones), layer(0, ramp=ramp)
+        await subject.course(fall, time + 0.01, f"fall along {ramp} ms", *down)
 
 
 @driving(_PLACE)
 async def cross_fades(subject: Subject) -> None:
     """It cross-fades tones that differ in frequency, each along its own raised cosine."""
-    await subject.arm()
-    ramp = subject.ramp
-    time = ramp / 1000
-    await subject.play(layer(0, subject.tone(0, 0.5)))
-    other = subject.tone(0, 1.0, frequency=subject.other)
-    started = await subject.play(layer(0, other, ramp=ramp))
-    bounds = {0: together(cosine(time, 0.5, 0), cosine(time, 0, 1))}
-    await subject.follow(bounds, started, time + 0.01, "cross-fade of two frequencies")
-    await subject.play(layer(0, subject.tone(0, 0.5)))
-    started = await subject.play(layer(0, subject.tone(0, 0.5, 180.0), ramp=ramp))
-    bounds = {0: lambda at: (0.0, alike(cosine(time, 0.5, 0), cosine(time, 0, 0.5))(at)[1])}
-    await subject.follow(bounds, started, time + 0.01, "cross-fade of one frequency")
+    time = subject.ramp / 1000
+    first = layer(0, subject.tone(0, 0.5))
+    fall, rise = cosine(time, 0.5, 0), cosine(time, 0, 1)
+    other = layer(0, subject.tone(0, 1.0, frequency=subject.other), ramp=subject.ramp)
+    bounds = {0: together(fall, rise)}
+    await subject.course(bounds, time + 0.01, "cross-fade of two frequencies", first, other)
+    again = layer(0, subject.tone(0, 0.5, 180.0), ramp=subject.ramp)
+    # What two tones of one frequency add up to depends on when each began.
+    bounds = {0: lambda at: (0.0, alike(fall, cosine(time, 0, 0.5))(at)[1])}
+    await subject.course(bounds, time + 0.01, "cross-fade of one frequency", first, again)
 
 
 @driving(_PLACE)
@@ -90,51 +86,41 @@ async def interrupted_ramps(subject: Subject) -> None:
 @driving("protocol.md#sets")
 async def kept_phase(subject: Subject) -> None:
     """It leads a tone whose phase is kept from its present amplitude to the new one."""
-    await subject.arm()
-    ramp = subject.ramp
+    ramp, first = subject.ramp, layer(0, subject.tone())
     time = ramp / 1000
     for phase, fraction in ((0.0, 0.5), (180.0, 1.0), (90.0, 1.0)):
-        await subject.play(layer(0, subject.tone()))
-        await asyncio.sleep(0.003)
-        started = await subject.play(
-            layer(0, subject.tone(0, fraction, phase, keep=True), ramp=ramp)
-        )
-        curve = alone(cosine(time, 1, polar(fraction, phase)))
-        await subject.follow(
-            {0: curve}, started, time + 0.01, f"kept phase, led to {phase:g} degrees"
-        )
-    await subject.play(layer(0))
-    # Where nothing plays, or another frequency does, keep phase begins a tone of its own.
-    await subject.play(layer(0, subject.tone(0, 0.5)))
-    started = await subject.play(
-        layer(0, subject.tone(0, 1.0, 180.0, keep=True, frequency=subject.other), ramp=ramp)
-    )
-    bounds = {0: together(cosine(time, 0.5, 0), cosine(time, 0, 1))}
-    await subject.follow(bounds, started, time + 0.01, "keep phase at another frequency")
+        curve = {0: alone(cosine(time, 1, polar(fraction, phase)))}
+        kept = layer(0, subject.tone(0, fraction, phase, keep=True), ramp=ramp)
+        why = f"kept phase, led to {phase:g} degrees"
+        await subject.course(curve, time + 0.01, why, first, kept)
+    # Where another frequency plays, keep phase begins a tone of its own.
+    tone = subject.tone(0, 1.0, 180.0, keep=True, frequency=subject.other)
+    bounds = {0: together(cosine(time, 1, 0), cosine(time, 0, 1))}
+    why = "keep phase at another frequency"
+    await subject.course(bounds, time + 0.01, why, first, layer(0, tone, ramp=ramp))
 
 
 @driving(_PLACE)
 async def onsets(subject: Subject) -> None:
     """It leads an onset along straight lines in the complex plane, from 0 or what it keeps."""
     _require_knots(subject)
-    await subject.arm()
     for fractions in ([1, 0.25, 0.75], [0.5, -0.5, -0.5j], []):
         shape = subject.envelope(0.05, *fractions)
         step = shape.step / 10_000
-        started = await subject.play(layer(0, subject.tone(0, 0.5, onset=shape)))
-        whole = step * (len(fractions) + 1)
         # Without knots there is a step alone, along a raised cosine.
         curve = alone(lines(step, 0, *fractions, 0.5) if fractions else cosine(step, 0, 0.5))
-        await subject.follow({0: curve}, started, whole + 0.01, f"onset of {len(fractions)} knots")
-        await subject.play(layer(0))
+        whole, why = step * (len(fractions) + 1), f"onset of {len(fractions)} knots"
+        one = layer(0, subject.tone(0, 0.5, onset=shape))
+        await subject.course({0: curve}, whole + 0.01, why, one)
     knots = (0.25, -0.5)
     shape = subject.envelope(0.05, *knots)
-    await subject.play(layer(0, subject.tone(0, 1.0)))
-    started = await subject.play(layer(0, subject.tone(0, 0.5, onset=shape, keep=True)))
+    kept = layer(0, subject.tone(0, 0.5, onset=shape, keep=True))
     curve = alone(lines(step, 1, *knots, 0.5))
-    await subject.follow({0: curve}, started, 3 * step + 0.01, "onset with kept phase")
+    why = "onset with kept phase"
+    await subject.course({0: curve}, 3 * step + 0.01, why, layer(0, subject.tone()), kept)
+    await subject.rest()
+    await subject.arm()
     ramp = subject.ramp
-    first = await subject.play(layer(0, subject.tone(0, 0.0), ramp=0))
     first = await subject.play(layer(0, subject.tone(), ramp=ramp))
     await subject.pause_until(first.latest + 0.4 * ramp / 1000)
     started = await subject.play(layer(0, subject.tone(0, 0.5, onset=shape, keep=True)))
@@ -147,41 +133,33 @@ async def onsets(subject: Subject) -> None:
 async def endings(subject: Subject) -> None:
     """It leads a tone to silence by its ending: without a command, at level 0, at its end."""
     _require_knots(subject)
-    await subject.arm()
     knots = (0.25, 0.75j)
     shape = subject.envelope(0.05, *knots)
-    step = shape.step / 10_000
-    fall = alone(lines(step, 1, *knots, 0))
-    last = len(subject.channels) - 1
-    other = [subject.tone(0, 0.0)] if last else []
-    cases = {
-        "a layer without commands": layer(0),
-        "a command of level 0": layer(0, subject.tone(last, 0.0)),
-        "a layer that does not name it": layer(0, *other),
-    }
-    for why, one in cases.items():
-        await subject.play(layer(0, subject.tone(last, ending=shape)))
-        started = await subject.play(one)
-        await subject.follow({last: fall}, started, 3 * step + 0.02, f"ending by {why}")
-    started = await subject.play(layer(0, subject.tone(ending=shape), valid_for=100))
-    curve = lines(step, 1, *knots, 0)
-    await subject.follow(
-        {0: alone(later(0.1, steady(1), curve))}, started, 0.12 + 3 * step, "ending by valid_for"
-    )
-    ramp = subject.ramp
-    gone = {0: alone(cosine(ramp / 1000, 1, 0))}
-    for why, command in (
-        ("skip ending", subject.tone(0, 0.0, skip=True)),
-        ("another tone", subject.tone(0, 0.0, onset=subject.envelope(0.1))),
+    step, last = shape.step / 10_000, len(subject.channels) - 1
+    fall = lines(step, 1, *knots, 0)
+    tone = subject.tone(last, ending=shape)
+    for why, one in (
+        ("a layer without commands", layer(0)),
+        ("a command of level 0", layer(0, subject.tone(last, 0.0))),
+        ("a layer that does not name it", layer(0, *([subject.tone(0, 0.0)] if last else []))),
     ):
-        await subject.play(layer(0, subject.tone(ending=shape)))
-        started = await subject.play(layer(0, command, ramp=ramp))
-        await subject.follow(gone, started, ramp / 1000 + 0.01, f"{why}: along the ramp")
-    # The ending is that of the command that plays, and is of it alone.
-    await subject.play(layer(0, subject.tone(ending=shape)))
-    await subject.play(layer(0, subject.tone(keep=True)))
-    started = await subject.play(layer(0, ramp=ramp))
-    await subject.follow(gone, started, ramp / 1000, "kept phase without the ending of before")
+        whole = 3 * step + 0.02
+        await subject.course({last: alone(fall)}, whole, f"ending by {why}", layer(0, tone), one)
+    curve = {last: alone(later(0.1, steady(1), fall))}
+    ended = layer(0, tone, valid_for=100)
+    await subject.course(curve, 0.12 + 3 * step, "ending by valid_for", ended)
+    ramp = subject.ramp
+    gone = {last: alone(cosine(ramp / 1000, 1, 0))}
+    silent = layer(0, ramp=ramp)
+    for why, sets in (
+        ("skip ending", [layer(0, subject.tone(last, 0.0, skip=True), ramp=ramp)]),
+        (
+            "another tone in place of an ending",
+            [layer(0, subject.tone(last, 0.0, onset=subject.envelope(0.1)), ramp=ramp)],
+        ),
+        ("kept phase without the ending", [layer(0, subject.tone(last, keep=True)), silent]),
+    ):
+        await subject.course(gone, ramp / 1000 + 0.01, why, layer(0, tone), *sets)
 
 
 @driving(_PLACE)
@@ -216,24 +194,19 @@ async def endings_amid(subject: Subject) -> None:
 async def extreme_envelopes(subject: Subject) -> None:
     """It plays as many knots as it states, along its shortest and longest step."""
     _require_knots(subject)
-    await subject.arm()
-    max_knots = subject.can["knots"]
-    levels = [(0.2 + 0.8 * (at % 5) / 4) * (1 if at % 3 else -1) for at in range(max_knots)]
-    for step_ms in (subject.can["envelope_step_min"] / 10, 10.0):
-        shape = subject.envelope(step_ms / 1000, *levels)
-        step = shape.step / 10_000
-        started = await subject.play(layer(0, subject.tone(0, 0.5, onset=shape)))
-        curve = alone(lines(step, 0, *levels, 0.5))
-        whole = step * (max_knots + 1)
-        await subject.follow(
-            {0: curve}, started, whole + 0.01, f"{max_knots} knots, {1e3 * step:g} ms apart"
-        )
-        await subject.play(layer(0))
-    maximum = subject.envelope(subject.can["envelope_step_max"] / 10_000, 1)
-    step = maximum.step / 10_000
-    started = await subject.play(layer(0, subject.tone(0, 0.5, onset=maximum)))
-    curve = alone(lines(step, 0, 1, 0.5))
-    await subject.follow({0: curve}, started, 2 * step + 0.01, f"a step of {1e3 * step:g} ms")
+    count = subject.can["knots"]
+    levels = [(0.2 + 0.8 * (at % 5) / 4) * (1 if at % 3 else -1) for at in range(count)]
+    for step, knots in (
+        (subject.can["envelope_step_min"] / 10_000, levels),
+        (0.01, levels),
+        (subject.can["envelope_step_max"] / 10_000, [1.0]),
+    ):
+        shape = subject.envelope(step, *knots)
+        exact = shape.step / 10_000
+        curve = alone(lines(exact, 0, *knots, 0.5))
+        whole, why = exact * (len(knots) + 1), f"{len(knots)} knots, {1e3 * exact:g} ms apart"
+        one = layer(0, subject.tone(0, 0.5, onset=shape))
+        await subject.course({0: curve}, whole + 0.01, why, one)
 
 
 def _require_knots(subject: Subject) -> None:

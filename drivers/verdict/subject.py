@@ -360,6 +360,20 @@ class Subject:
         if seen < max(min(_SAMPLES / 3, time / _EACH, time / (4 * self.exchange_time)), 2):
             raise Late(f"only {seen} samples of {why} were in time")
 
+    async def course(
+        self, bounds: Mapping[int, Bounds], duration: float, why: str, *sets: LayerSet
+    ) -> None:
+        """Require the levels that follow the last of these sets, from silence on; see `follow`."""
+
+        async def case() -> None:
+            await self.rest()
+            await self.arm()
+            for one in sets:
+                started = await self.play(one)
+            await self.follow(bounds, started, duration, why)
+
+        await self.in_time(case)
+
     def expect_at(self, reply: Reply, bounds: Mapping[int, Bounds], commit: When, why: str) -> None:
         """Require the levels of a status that was read in a known interval."""
         earliest = reply.when.earliest - commit.latest

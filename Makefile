@@ -21,8 +21,8 @@ demo: .venv/installed
 firmware:
 	$(MAKE) -C firmware
 
-# The tests of the firmware, conformance on every wire among them, mutated frames
-# under sanitizers, and its sizes; a million frames: make firmware-test FIRMWARE=--long
+# The tests of the firmware, mutated frames under sanitizers, and its sizes; a million frames:
+# make firmware-test FIRMWARE=--long
 firmware-test: .venv/installed-test
 	.ci/install gcc-arm-none-eabi:arm-none-eabi-gcc libnewlib-arm-none-eabi:
 	$(BIN)/python firmware/test/run.py $(FIRMWARE)

@@ -21,12 +21,10 @@ if TYPE_CHECKING:
     from controller.api.client_protocol import Unreachable as Unreachable
     from controller.api.jsonrpc import NotSilent as NotSilent
     from controller.api.jsonrpc import RpcError as RpcError
-    from drivers.blocking import BlockingAmplifier as BlockingAmplifier
-    from drivers.command import DriveCommand as DriveCommand
+    from drivers.by_hand.blocking import BlockingAmplifier as BlockingAmplifier
     from drivers.errors import CommandRefused as CommandRefused
     from drivers.errors import DriverError as DriverError
     from drivers.errors import LinkError as LinkError
-    from drivers.guard import GuardLimits as GuardLimits
     from era_haptics.amplifiers import commands_for as commands_for
     from era_haptics.amplifiers import open_amplifier as open_amplifier
     from era_haptics.calibration import calibrate as calibrate
@@ -54,6 +52,7 @@ if TYPE_CHECKING:
     from model.table.table import LocalizationTable as LocalizationTable
     from model.vibration.excitation import Tone as Tone
     from model.vibration.maps import PlateMap as PlateMap
+    from registry.limits import GuardLimits as GuardLimits
     from sim.plant.playback import Playback as Playback
 
 _NAMES = {
@@ -61,10 +60,8 @@ _NAMES = {
     "controller.api.client": "Client",
     "controller.api.client_protocol": "LeaseLost Notification Unreachable",
     "controller.api.jsonrpc": "NotSilent RpcError",
-    "drivers.blocking": "BlockingAmplifier",
-    "drivers.command": "DriveCommand",
+    "drivers.by_hand.blocking": "BlockingAmplifier",
     "drivers.errors": "CommandRefused DriverError LinkError",
-    "drivers.guard": "GuardLimits",
     "era_haptics.amplifiers": "commands_for open_amplifier",
     "era_haptics.calibration": "calibrate",
     "era_haptics.drive": "Drive",
@@ -85,6 +82,7 @@ _NAMES = {
     "model.table.table": "LocalizationTable",
     "model.vibration.excitation": "Tone",
     "model.vibration.maps": "PlateMap",
+    "registry.limits": "GuardLimits",
     "sim.plant.playback": "Playback",
 }
 """Names by the module that defines them."""

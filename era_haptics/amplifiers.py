@@ -1,8 +1,8 @@
 """Amplifiers of a rig for scripts: opened by the rig's URLs and limits."""
 
 from controller.loop.routing import route
-from drivers.blocking import BlockingAmplifier
-from drivers.command import DriveCommand
+from drivers.by_hand.blocking import BlockingAmplifier
+from drivers.contents import Tone
 from era_haptics.arguments import expect_rig
 from era_haptics.drive import Drives, excitation_of
 from model.arguments import shown
@@ -28,17 +28,15 @@ def open_amplifier(
     if url is not None and not isinstance(url, str):
         raise InputError(f"url must be text such as 'sim://', got {shown(url)}")
     (found,) = chosen
-    return BlockingAmplifier(
-        url or rig.amplifiers[found], limits=rig.limits, voltage=rig.voltage_of(found)
-    )
+    return BlockingAmplifier(url or rig.amplifiers[found], limits=rig.limits)
 
 
-def commands_for(rig: Rig, drive: Pattern | Drives) -> dict[str, tuple[DriveCommand, ...]]:
+def commands_for(rig: Rig, drive: Pattern | Drives) -> dict[str, tuple[Tone, ...]]:
     """Convert to commands by name of the amplifier, for its `play` and `apply`.
 
     Channels by the rig's wiring, levels 0..1 of full stroke, phases in degrees; without the
     envelopes of a pattern. Raises InputError for an unknown ERA.
     """
     expect_rig(rig)
-    sets = route(excitation_of(drive, rig), rig, token=1, ramp=0.0)
-    return {name: command_set.commands for name, command_set in sets.items()}
+    layers = route(excitation_of(drive, rig), rig, ramp=0.0)
+    return {name: layer.tones for name, layer in layers.items()}

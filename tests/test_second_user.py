@@ -10,7 +10,8 @@ from drivers.errors import LinkError
 from drivers.protocol.messages import AmplifierState
 from drivers.registry import open_backend
 from model.rig.rig import Rig
-from wires import WIRES, FarSide, far_side
+from rig_on_wire import FarSide, far_side
+from wires import WIRES
 
 REPLY_TIMEOUT = 2.0  # s
 

@@ -6,8 +6,8 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import replace
 
 import pytest
-
 from controller.group.synchronized_play import SynchronizedPlay
+
 from drivers import clock
 from drivers.amplifier import WATCHDOG_REACTION, Amplifier
 from drivers.errors import LinkError

@@ -1,19 +1,21 @@
-"""`era daemon` whose touches wait for a shaped onset for another time than usual.
+"""`era daemon` with shaped onsets, or with plain ramps.
 
     python -m benchmarks.latency.daemon SECONDS CONFIG
 
-0 for plain ramps without delay.
+0 for plain ramps; other times for what the wire carries.
 """
 
 import sys
 
 from controller.cli.main import main
-from controller.loop.loop import Controller
+from controller.loop import capabilities
+from controller.loop.envelopes import RAMPS_ONLY
 
 
 def run_daemon() -> int:
     """Run it with the arguments of this process; return the exit status."""
-    Controller.__init__.__kwdefaults__["max_loading_time"] = float(sys.argv[1])  # type: ignore[index]
+    if float(sys.argv[1]) <= 0:
+        capabilities.envelope_support = lambda rig, amplifiers: RAMPS_ONLY
     sys.argv[1:2] = ["daemon"]
     return main()
 

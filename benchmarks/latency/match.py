@@ -12,12 +12,13 @@ import numpy as np
 from benchmarks.latency.touches import FLOODING, HELD, Work, places
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.intent import BuzzNewestContact
-from controller.loop.routing import route
+from controller.loop.routing import phasor_of, route
 from controller.loop.selection import MOVE_TOLERANCE, Selector
 from controller.sources.contacts import Contact, ContactKey
 from drivers.codec.serial_line.exchanges import decode_request
 from drivers.codec.serial_line.frame import Frame
-from drivers.command import CommandSet, DriveCommand
+from drivers.command import DriveCommand
+from drivers.contents import Layer
 from drivers.protocol.messages import Apply, Commit, Stage
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
@@ -186,13 +187,13 @@ class Expected:
             ]
             intent = BuzzNewestContact().intent(contacts, 0.0)
             pattern = Selector(self._table).select(contacts, intent, self._capabilities).pattern
-            sets: Mapping[str, CommandSet] = {}
+            layers: Mapping[str, Layer] = {}
             if pattern is not None:
-                sets = route(pattern.excitation, self._rig, token=1, ramp=pattern.ramp)
+                layers = route(pattern.excitation, self._rig, ramp=pattern.ramp)
             self._known[place] = {
-                (name, each.channel): (each.frequency, each.phasor)
-                for name, one in sets.items()
-                for each in one.commands
+                (name, each.channel): (each.frequency, phasor_of(each))
+                for name, one in layers.items()
+                for each in one.tones
                 if each.level > 0
             }
         return self._known[place]

@@ -7,9 +7,11 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -21,12 +23,14 @@ from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.api.schema import LatencySummary
 from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
-from drivers.protocol.messages import Capabilities
-from drivers.protocol.wire_times import WireTimes
+from controller.loop.envelopes import RAMPS_ONLY
+from drivers.host.ledger import Ledger
+from drivers.host.serial_wire import SerialWire
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
-from sim.amplifier.amplifier import capabilities
+from registry.limits import GuardLimits
+from sim.amplifier.contract import capabilities
 
 FLOOD_RATE = 10_000  # Hz
 WORKERS = 2  # programs at work in the loaded case, one for each core
@@ -88,13 +92,13 @@ class Disturbed(Exception):
     """The machine was too busy to measure."""
 
 
-@dataclass(frozen=True)
 class _Open:
-    """An amplifier as far as it decides the pattern."""
+    """An amplifier on a line of its own, as far as it decides the pattern."""
 
-    capabilities: Capabilities
-    bus: str | None = None
-    wire_times: WireTimes = field(default_factory=WireTimes)
+    def __init__(self, limits: GuardLimits) -> None:
+        self.capabilities = capabilities(4)
+        self.ledger = Ledger(limits, self.capabilities)
+        self.line = SimpleNamespace(wire=SerialWire(921_600, sequence=0))
 
 
 def attempt(
@@ -227,8 +231,9 @@ LAST = 0.1  # s; a set may wait for a fade; fingers expire later, and silence ha
 
 
 def _capabilities(rig: Rig, touch_wait: float) -> PlaybackCapabilities:
-    opened = {name: _Open(capabilities(4)) for name in rig.amplifiers}
-    return playback_capabilities(rig, opened, max_loading_time=touch_wait * 1e-3)
+    opened: Any = {name: _Open(rig.limits) for name in rig.amplifiers}
+    found = playback_capabilities(rig, opened)
+    return found if touch_wait > 0 else replace(found, envelope_support=RAMPS_ONLY)
 
 
 def _daemon_file(folder: Path, urls: Sequence[str], table: Path, port: int) -> Path:

@@ -74,9 +74,6 @@ class StatusResult(Message):
     contacts: list[ContactStatus] = Field(description="in order of arrival, newest last")
     drive: dict[str, PlayedTone] = Field(description="by ERA, without silent ones")
     silence_reason: str | None = Field(None, description="why nothing plays although armed")
-    ramp_only_reason: str | None = Field(
-        None, description="why onsets are plain ramps although shaped ones are possible"
-    )
     robust_felt_contrast_db: float | None = Field(None, description=PROMISED)
     predicted_felt_contrast_db: float | None = Field(
         None, description="the same on the plate as modelled"

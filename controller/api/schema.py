@@ -34,9 +34,6 @@ DaemonStateName: TypeAlias = Literal[
 GroupStateName: TypeAlias = Literal["closed", "disarmed", "armed", "lost"]
 """State of all amplifiers together."""
 
-AmplifierClassName: TypeAlias = Literal["A", "B", "C"]
-"""Class of an amplifier, by what it has."""
-
 LearningStateName: TypeAlias = Literal[
     "off",
     "starting",
@@ -188,9 +185,6 @@ class AmplifierStatus(Message):
     name: str
     url: str
     serial_number: str | None
-    amplifier_class: AmplifierClassName | None = Field(
-        None, description="what it has; C: no watchdog, so that it plays on without the daemon"
-    )
     state: str | None = Field(description="its own state, by the names of CiA 402")
     fault: str | None
     levels: list[float] = Field(

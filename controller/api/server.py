@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 from controller.api.acceptor import Acceptor
 from controller.api.admission import RESERVE_METHODS, Admission
+from controller.api.coalesced_calls import CoalescedCalls
 from controller.api.connection import STOP, Connection
 from controller.api.jsonrpc import (
     ErrorCode,
@@ -30,7 +31,6 @@ from controller.api.methods import METHODS, TouchParams
 from controller.api.schema import Message
 from controller.api.turns import Turns
 from controller.api.waiting_touches import supersedes
-from controller.group.tasks import CoalescedCalls
 from drivers import clock
 from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError

@@ -56,11 +56,6 @@ class SilenceEvent(Message):
     contacts: list[ContactStatus]
     reason: str
     latency_ms: float | None = Field(description="null if no command was needed")
-    late_ms: float | None = Field(
-        None,
-        description="how long after its time the vibration was ended; null where amplifiers end it "
-        "themselves",
-    )
 
 
 class AmplifiersEvent(Message):
@@ -73,9 +68,6 @@ class LatencyEvent(Message):
     """Latencies, at the subscribed rate."""
 
     latency_ms: LatencySummary
-    ramp_only_reason: str | None = Field(
-        description="why onsets are plain ramps although shaped ones are possible"
-    )
 
 
 class LogEvent(Message):

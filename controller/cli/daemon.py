@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-import drivers.cli
+import drivers.by_hand.cli
 from drivers.errors import CommandRefused, LinkError
 from model.counting import counted
 from model.errors import InputError
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-EXIT_STATUS = {**drivers.cli.EXIT_STATUS, InputError: 2}
+EXIT_STATUS = {**drivers.by_hand.cli.EXIT_STATUS, InputError: 2}
 """Exit status by error class."""
 
 Socket = Annotated[
@@ -301,7 +301,7 @@ def _print_state(era: "Client", *, as_json: bool) -> None:
 
 def show_event(event: "Notification", *, ahead: float) -> str:
     """Format an event; ahead: offset of the wall clock to the daemon's [s]."""
-    from drivers.cli import in_words
+    from drivers.by_hand.cli import in_words
 
     at = datetime.fromtimestamp(event.time + ahead).isoformat(timespec="milliseconds")[11:]
     lost = f"  ({event.lost} lost)" if event.lost else ""
@@ -361,8 +361,6 @@ def show_status(status: "StatusResult") -> str:
         lines.append(f"  silent: {status.silence_reason}")
     elif status.contacts and status.state == "READY_TO_SWITCH_ON":
         lines.append("  silent: not armed; arm with era arm")
-    if status.ramp_only_reason is not None:
-        lines.append(f"  plain ramps: {status.ramp_only_reason}")
     if status.learning is not None:
         lines += _show_learning(status.learning)
     for era, tone in status.drive.items():
@@ -371,10 +369,6 @@ def show_status(status: "StatusResult") -> str:
         )
     for amplifier in status.amplifiers:
         parts = [amplifier.state] if amplifier.state else []
-        if amplifier.amplifier_class == "C":
-            parts.append("CLASS C: no watchdog, plays on without the daemon")
-        elif amplifier.amplifier_class == "B":
-            parts.append("class B")
         if amplifier.degraded:
             parts.append("does not reply, may play")
         if amplifier.lost:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-import drivers.cli
+import drivers.by_hand.cli
 from controller.cli.layout import layout_app
 from controller.cli.rig import rig_app
 from model.commands.next_line import next_line
@@ -21,7 +21,7 @@ app = typer.Typer()
 app.add_typer(layout_app, name="layout")
 app.add_typer(rig_app, name="rig")
 
-EXIT_STATUS = {**drivers.cli.EXIT_STATUS, InputError: 2}
+EXIT_STATUS = {**drivers.by_hand.cli.EXIT_STATUS, InputError: 2}
 """Exit status by error class."""
 
 

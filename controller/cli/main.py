@@ -24,7 +24,12 @@ from model.errors import reworded
 from registry.plugins import failed_plugin, failure_text
 
 COMMANDS = (
-    *("controller.cli.demo", "controller.cli.daemon", "drivers.cli", "controller.gateway.cli"),
+    *(
+        "controller.cli.demo",
+        "controller.cli.daemon",
+        "drivers.by_hand.cli",
+        "controller.gateway.cli",
+    ),
     *("model.cli", "controller.report.cli", "sim.cli"),
 )
 """Modules with commands, by name: packages beside this one do not import each other."""

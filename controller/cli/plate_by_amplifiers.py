@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from model.identification.measured_plate import MeasuredPlate
     from model.rig.rig import Rig
 
-_REPLY_TIMEOUT = 0.5  # s; a measurement may be slow, and silence is the task of the watchdog
-
 
 @contextmanager
 def rig_of_file(path: Path) -> "Iterator[tuple[Document, Rig]]":
@@ -65,8 +63,7 @@ def measured_by_amplifiers(
 
     from controller.cli.amplifier_urls import urls_of
     from controller.diagnosis.plate_measurement import PlateSelfMeasurement
-    from drivers.amplifier import Amplifier
-    from drivers.registry import open_backend
+    from drivers.opening import Lines
     from model.commands.progress import progress_bar
 
     at = urls_of(rig, urls)
@@ -74,14 +71,8 @@ def measured_by_amplifiers(
     async def measure() -> "MeasuredPlate":
         with ExitStack() as shown:
             on_step = shown.enter_context(progress_bar("steps")) if is_shown else _ignore
-            amplifiers = {
-                name: Amplifier(
-                    open_backend(at[name], rig.voltage_of(name)), reply_timeout=_REPLY_TIMEOUT
-                )
-                for name in rig.amplifiers
-            }
             found = await PlateSelfMeasurement(
-                rig, amplifiers, level=level, is_quick=is_quick, on_step=on_step
+                rig, Lines, at, level=level, is_quick=is_quick, on_step=on_step
             ).run()
             return found.as_measured
 

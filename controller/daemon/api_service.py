@@ -25,9 +25,10 @@ from controller.api.methods import (
     TouchParams,
     UnsubscribeParams,
 )
-from controller.api.schema import AmplifierSilence, Empty, GroupStateName
+from controller.api.schema import Empty, GroupStateName
 from controller.api.server import Handler
 from controller.daemon.active_layout import ActiveLayout
+from controller.daemon.api_views import amplifier_silence
 from controller.daemon.config import DaemonConfig
 from controller.daemon.hello import hello_result
 from controller.daemon.lease import LeaseHolder
@@ -42,12 +43,9 @@ from controller.daemon.states import (
 )
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches
-from controller.group.guards import is_known_unwatched
-from controller.group.quick_stops import QuickStops
 from controller.learning.learning import Learning
 from controller.loop.loop import Controller
 from drivers import clock
-from drivers.amplifier import Amplifier
 from drivers.errors import DriverError
 from model.table.table import LocalizationTable
 
@@ -74,7 +72,6 @@ class ApiService:
         controller: Controller,
         supervisor: Supervisor,
         *,
-        amplifiers: Mapping[str, Amplifier],
         publisher: EventPublisher,
         touches: ApiTouches,
         layout: ActiveLayout,
@@ -85,7 +82,6 @@ class ApiService:
         self._table = table
         self._controller = controller
         self._supervisor = supervisor
-        self._amplifiers = amplifiers
         self._publisher = publisher
         self._touches = touches
         self._layout = layout
@@ -131,7 +127,6 @@ class ApiService:
         machine, view, now = self._supervisor.machine, self._publisher.view, clock.now()
         lease = self._lease.current(now)
         pattern = view.pattern_event() if machine.state is _ENABLED else None
-        is_unwatched = any(map(is_known_unwatched, self._amplifiers.values()))
         return StatusResult(
             time_s=now,
             unix_time_s=time.time(),
@@ -139,16 +134,14 @@ class ApiService:
             cause=machine.cause,
             remedy=machine.remedy,
             amplifiers_state=cast("GroupStateName", self._controller.group_state.name.lower()),
-            assume_energised=machine.assume_energised(now)
-            or (is_unwatched and machine.lost_for(now) is not None),
+            assume_energised=machine.assume_energised(now),
             lost_for_s=machine.lost_for(now),
-            watchdog_s=None if is_unwatched else machine.watchdog,
+            watchdog_s=machine.watchdog,
             armed_by=lease.owner if lease else None,
             lease_left_s=lease.expires_at - now if lease else None,
             contacts=view.contact_statuses(),
             drive=view.drive() if pattern else {},
             silence_reason=view.silenced.reason if view.silenced and lease else None,
-            ramp_only_reason=self._controller.ramp_only_reason,
             robust_felt_contrast_db=pattern.robust_felt_contrast_db if pattern else None,
             predicted_felt_contrast_db=pattern.predicted_felt_contrast_db if pattern else None,
             robust_contrast_db=pattern.robust_contrast_db if pattern else None,
@@ -166,7 +159,7 @@ class ApiService:
         return hello_result(
             self._config,
             self._table,
-            self._amplifiers,
+            self._controller.amplifiers,
             drive_mode=self._controller.drive_mode,
             layout=self._publisher.layout_event().layout,
         )
@@ -224,12 +217,9 @@ class ApiService:
             outcomes = await self._supervisor.stop(cause, "clear (era clear), then arm again")
         except Exception:
             _logger.exception("stop failed, stopping each amplifier individually")
-            outcomes = await QuickStops(self._amplifiers).stop()
+            outcomes = await self._controller.group.stop()
         now = clock.now()
-        amplifiers = {
-            name: AmplifierSilence.model_validate(outcome.to_json(now))
-            for name, outcome in outcomes.items()
-        }
+        amplifiers = {name: amplifier_silence(each, now) for name, each in outcomes.items()}
         if not (outcomes and all(outcome.is_confirmed for outcome in outcomes.values())):
             raise NotSilent(amplifiers)
         return StopResult(amplifiers=amplifiers)

@@ -1,10 +1,11 @@
 """The state of the control loop and the amplifiers as messages of the API."""
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 from controller.api.schema import (
-    AmplifierClassName,
+    AmplifierSilence,
     AmplifierStatus,
     ContactStatus,
     LatencySummary,
@@ -13,14 +14,18 @@ from controller.api.schema import (
     PlayedTone,
 )
 from controller.api.topics import ContactsEvent, PatternEvent, PlateEvent, SilenceEvent
-from controller.daemon.message_recorder import RecordedBackend
 from controller.learning.learning_status import LearningStatus
 from controller.loop.observer import Applied, Silenced
 from controller.sources.contacts import Contact, ContactKey
 from drivers import clock
-from drivers.amplifier import Amplifier
-from drivers.errors import CommandError
-from drivers.protocol.classes import amplifier_class
+from drivers.host.amplifier import Amplifier, Stopped
+from drivers.host.comparison import name_of
+from drivers.host.group import is_lost
+from drivers.protocol.table import FAULTS, QUANTITIES, STATES, STATUS_FLAGS
+from drivers.statistics import LinkStatistics
+
+_LEVEL, _TEMPERATURE = QUANTITIES["level"], QUANTITIES["temperature"]
+_VOLTAGE, _HIGH_VOLTAGE = QUANTITIES["voltage"], STATUS_FLAGS["high_voltage"]
 
 
 @dataclass
@@ -74,7 +79,6 @@ class PlateView:
             contacts=[contact_status(contact, None) for contact in silenced.contacts],
             reason=silenced.reason,
             latency_ms=None if silenced.latency is None else 1e3 * silenced.latency,
-            late_ms=None if silenced.late is None else 1e3 * silenced.late,
         )
 
     def drive(self) -> dict[str, PlayedTone]:
@@ -118,69 +122,78 @@ def contact_status(
 
 def amplifier_statuses(
     amplifiers: Mapping[str, Amplifier],
-    backends: Mapping[str, RecordedBackend],
     urls: Mapping[str, str],
     *,
     are_open: bool,
+    missing: Collection[str],
 ) -> list[AmplifierStatus]:
-    """Describe all amplifiers from their last replies, without sending a request.
+    """Describe all amplifiers from their last statuses, without sending a request.
 
-    are_open: whether all are open together; else their last replies are left out.
+    are_open: whether all are open together; else their last statuses are left out. missing: names
+    of those whose loss has closed the others.
     """
-    is_any_missing = not are_open and any(backend.is_missing for backend in backends.values())
     return [
         _amplifier_status(
             name,
-            amplifier,
-            backends[name],
-            urls[name],
-            is_open=are_open and not amplifier.is_lost,
-            closed_with_lost=is_any_missing and not backends[name].is_missing,
+            amplifiers.get(name),
+            url,
+            is_open=are_open,
+            closed_with_lost=bool(missing) and name not in missing,
         )
-        for name, amplifier in amplifiers.items()
+        for name, url in urls.items()
     ]
 
 
 def _amplifier_status(
-    name: str,
-    amplifier: Amplifier,
-    backend: RecordedBackend,
-    url: str,
-    *,
-    is_open: bool,
-    closed_with_lost: bool,
+    name: str, amplifier: Amplifier | None, url: str, *, is_open: bool, closed_with_lost: bool
 ) -> AmplifierStatus:
     """closed_with_lost: whether it was closed because another amplifier was lost."""
-    status = backend.status if is_open else None
-    status_at = backend.status_at
-    statistics = amplifier.statistics
-    round_trip = statistics.last_round_trip
+    status = status_at = serial_number = None
+    is_degraded, counts = False, LinkStatistics()
+    if amplifier is not None:
+        is_known = is_open and not is_lost(amplifier)
+        status = amplifier.status if is_known else None
+        is_degraded = is_known and amplifier.silence_cause is not None
+        status_at = amplifier.status_at
+        serial_number = amplifier.identity.get("serial_number")
+        counts = amplifier.statistics
     return AmplifierStatus(
         name=name,
         url=url,
-        serial_number=serial_number(amplifier),
-        amplifier_class=class_of(amplifier),
-        state=status.state.name if status else None,
-        fault=status.fault.name if status else None,
-        levels=list(status.levels) if status else [],
-        temperature_c=_finite(status.temperature) if status else None,
-        high_voltage=status.high_voltage if status else None,
-        high_voltage_v=_finite(status.voltage) if status else None,
+        serial_number=serial_number,
+        state=name_of(STATES, status["state"]) if status else None,
+        fault=name_of(FAULTS, status["fault"]) if status else None,
+        levels=[_LEVEL.from_wire(level) for level in status["levels"]] if status else [],
+        temperature_c=_TEMPERATURE.from_wire(status["temperature"]) if status else None,
+        high_voltage=bool(status["flags"] >> _HIGH_VOLTAGE & 1) if status else None,
+        high_voltage_v=_VOLTAGE.from_wire(status["voltage"]) if status else None,
         reply_age_s=None if status_at is None else max(0.0, clock.now() - status_at),
-        degraded=amplifier.is_degraded,
+        degraded=is_degraded,
         lost=status is None and not closed_with_lost,
         closed_with_lost=status is None and closed_with_lost,
         statistics=LinkCounters(
-            frames_out=statistics.frames_out,
-            frames_in=statistics.frames_in,
-            invalid_frames=statistics.invalid_frames,
-            unexpected_frames=statistics.unexpected_frames,
-            events=statistics.events,
-            retries=statistics.retries,
-            timeouts=statistics.timeouts,
-            refusals=statistics.refusals,
-            round_trip_ms=None if round_trip is None else 1e3 * round_trip,
+            frames_out=counts.frames_out,
+            frames_in=counts.frames_in,
+            invalid_frames=counts.invalid_frames,
+            unexpected_frames=counts.unexpected_frames,
+            events=counts.events,
+            retries=counts.retries,
+            timeouts=counts.timeouts,
+            refusals=counts.refusals,
+            round_trip_ms=None if counts.last_round_trip is None else 1e3 * counts.last_round_trip,
         ),
+    )
+
+
+def amplifier_silence(stopped: Stopped, now: float) -> AmplifierSilence:
+    """Describe what became of a stop at a time [s]."""
+    if stopped.is_confirmed:
+        return AmplifierSilence(silence="confirmed_silent", may_play_for_s=None, cause="")
+    left = stopped.may_play_until - now
+    return AmplifierSilence(
+        silence="watchdog_elapsed" if -math.inf < left <= 0 else "may_play",
+        may_play_for_s=round(max(left, 0.0), 3) if math.isfinite(left) else None,
+        cause=stopped.cause,
     )
 
 
@@ -214,22 +227,6 @@ def plate_event(status: LearningStatus) -> PlateEvent:
         robust=status.are_robust,
         alarms=status.alarms,
     )
-
-
-def class_of(amplifier: Amplifier) -> AmplifierClassName | None:
-    """The class of an amplifier; None before it was identified."""
-    try:
-        return amplifier_class(amplifier.capabilities).value
-    except CommandError:
-        return None
-
-
-def serial_number(amplifier: Amplifier) -> str | None:
-    """The serial number of an amplifier; None before it was identified."""
-    try:
-        return amplifier.identity.serial_number
-    except CommandError:
-        return None
 
 
 def _finite(value: float | None) -> float | None:

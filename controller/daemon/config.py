@@ -15,7 +15,7 @@ from controller.sources.registry import open_source
 from controller.sources.touch import TouchSource
 from drivers.errors import CommandError
 from drivers.operation.garbage_collection import without_collections
-from drivers.registry import open_backend
+from drivers.wires.known import address_of
 from model.config.document import ConfigError, Document, read_document
 from model.config.sections import Validation
 from model.errors import InputError
@@ -194,7 +194,7 @@ def _urls(
     }
     for name, url in urls.items():
         try:
-            open_backend(url)
+            address_of(url)
         except CommandError as error:
             validation.add(("rig",), f"invalid amplifiers.{name}.url of the rig: {error}")
     if len({url.startswith("sim://") for url in urls.values()}) > 1:

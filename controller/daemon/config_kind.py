@@ -6,7 +6,7 @@ from typing import Any
 
 from controller.daemon.config import daemon_config_of, is_daemon_document
 from controller.daemon.config_sections import DaemonSection
-from drivers.rig_check import check_links
+from drivers.by_hand.rig_check import check_links
 from model.config.document import Document
 from model.config.kinds import CheckedFile
 from model.rig.voltage_costs import voltage_costs

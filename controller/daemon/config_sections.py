@@ -95,7 +95,6 @@ class DaemonSection(Section):
     layout: File | None = None
     touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]
-    supervised: bool = False
     longest_lease: Annotated[float, Quantity(TIME, at_least=MIN_LEASE, at_most=MAX_LEASE)] = (
         MAX_LEASE
     )

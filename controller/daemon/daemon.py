@@ -5,6 +5,7 @@ import contextlib
 import logging
 import signal
 import sys
+from collections.abc import Callable, Mapping
 from functools import partial
 
 from controller.api.server import ApiServer
@@ -17,7 +18,7 @@ from controller.daemon.config_reader import read_in_child
 from controller.daemon.dashboard_token import write_token
 from controller.daemon.fault_dumps import FaultDumps
 from controller.daemon.log import LogThread
-from controller.daemon.message_recorder import MessageRecorder, RecordedBackend
+from controller.daemon.message_recorder import MessageRecorder
 from controller.daemon.publisher import EventPublisher
 from controller.daemon.reload import changed_keys, reload_problem
 from controller.daemon.service_manager import ServiceManager
@@ -25,16 +26,16 @@ from controller.daemon.socket_lock import SocketLock
 from controller.daemon.states import ENERGISED, DaemonState, StateMachine
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches, TouchInputs
-from controller.group.amplifier_group import GroupState
 from controller.learning.learning import Learning, observed
+from controller.loop.lines import Lines as HostLines
 from controller.loop.loop import Controller
 from controller.sources.touch import TouchFrame
 from drivers import clock
-from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import DriverError
-from drivers.link.link import REPLY_TIMEOUT
+from drivers.host.amplifier import WATCHDOG, Amplifier
+from drivers.host.group import GroupState
+from drivers.opening import Lines
 from drivers.operation.garbage_collection import no_long_collections, without_collections
-from drivers.registry import open_backend
 from drivers.threads import in_thread
 from model.errors import InputError
 from model.table.table import LocalizationTable
@@ -49,8 +50,9 @@ _logger = logging.getLogger(__name__)
 class Daemon:
     """A daemon; create it within the event loop that runs it.
 
-    dashboard: HOST:PORT at which the gateway serves the page, or None. reply_timeout, watchdog [s]:
-    of its amplifiers, longer ones for simulated amplifiers on a machine that is busy.
+    dashboard: HOST:PORT at which the gateway serves the page, or None. lines: makes the lines to
+    its amplifiers. watchdog [s]: of these, a longer one for simulated amplifiers on a machine that
+    is busy.
     """
 
     def __init__(
@@ -61,7 +63,7 @@ class Daemon:
         log: LogThread,
         manager: ServiceManager,
         dashboard: str | None,
-        reply_timeout: float = REPLY_TIMEOUT,
+        lines: Callable[[], HostLines] = Lines,
         watchdog: float = WATCHDOG,
     ) -> None:
         self._config = config
@@ -76,17 +78,7 @@ class Daemon:
         self._shutdown_cause = "the daemon is shutting down"
         self._recorder = MessageRecorder()
         self._dumps = FaultDumps(self._recorder)
-        backends = self._make_backends(config)
-        amplifiers = {
-            name: Amplifier(
-                backend,
-                reply_timeout=reply_timeout,
-                serial_number=config.section.serial_numbers.get(name),
-            )
-            for name, backend in backends.items()
-        }
         self._supervisor = Supervisor(
-            amplifiers,
             state_changed=(
                 lambda old, new: self._publisher.state_changed(old, new),
                 lambda old, new: manager.status(f"{new.state.value}: {new.cause}"),
@@ -102,14 +94,13 @@ class Daemon:
         self._publisher = EventPublisher(
             machine=lambda: self._supervisor.machine,
             amplifiers=lambda: amplifier_statuses(
-                amplifiers,
-                backends,
+                self._controller.amplifiers,
                 config.urls,
                 are_open=self._controller.group_state in (GroupState.DISARMED, GroupState.ARMED),
+                missing=self._controller.missing,
             ),
             effect_of=self._layout.effect_of,
             layout=config.layout,
-            ramp_only_reason=lambda: self._controller.ramp_only_reason,
             learning=lambda: None if self._learning is None else self._learning.status,
         )
         self._learning: Learning | None = None
@@ -117,14 +108,16 @@ class Daemon:
         self._controller = Controller(
             config.rig,
             table,
-            amplifiers=amplifiers,
+            lines=lines,
+            urls=config.urls,
+            serial_numbers=config.section.serial_numbers,
+            connected=self._connected,
             observer=self._supervisor.observe(
                 observed(self._publisher.observer(), lambda: self._learning)
             ),
             intent_source=self._layout,
             timing=timing,
             drive_mode=config.section.mode,
-            is_supervised=config.section.supervised,
             watchdog=watchdog,
         )
         if config.learn is not None:
@@ -133,7 +126,6 @@ class Daemon:
                 table,
                 timing,
                 config.learn,
-                amplifiers=amplifiers,
                 controller=self._controller,
                 changed=self._publisher.plate_changed,
                 estimated=self._publisher.learning_latencies.add,
@@ -145,7 +137,6 @@ class Daemon:
             table,
             self._controller,
             self._supervisor,
-            amplifiers=amplifiers,
             publisher=self._publisher,
             touches=self._touches,
             layout=self._layout,
@@ -253,13 +244,10 @@ class Daemon:
                     _logger.error("closing failed", exc_info=found)
             self._publisher.hub.close()
 
-    def _make_backends(self, config: DaemonConfig) -> dict[str, RecordedBackend]:
-        return {
-            name: RecordedBackend(
-                open_backend(url, config.rig.voltage_of(name)), name, self._recorder
-            )
-            for name, url in config.urls.items()
-        }
+    def _connected(self, amplifiers: Mapping[str, Amplifier]) -> None:
+        """Follow amplifiers whose lines have been opened."""
+        self._recorder.follow(amplifiers)
+        self._supervisor.connected(amplifiers)
 
     def _start_children(self) -> None:
         socket = str(self._config.socket)

@@ -6,8 +6,6 @@ import os
 import threading
 import time
 from collections.abc import Iterable
-from dataclasses import asdict, is_dataclass
-from enum import Enum
 from pathlib import Path
 
 from controller.daemon.message_recorder import MessageRecord, MessageRecorder
@@ -83,23 +81,12 @@ def _owner_only(path: str, flags: int) -> int:
 
 
 def _as_json(record: MessageRecord) -> dict[str, object]:
-    message = record.message
     line: dict[str, object] = {
         "time_s": round(record.time, 6),
         "link": record.link,
         "way": record.direction,
-        "message": type(message).__name__,
+        "message": record.message,
     }
-    if is_dataclass(message) and not isinstance(message, type):
-        line["content"] = _plain(asdict(message))
-    elif message:
-        line["content"] = str(message)
+    if record.content:
+        line["content"] = record.content
     return line
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, dict):
-        return {str(key): _plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    return value.name if isinstance(value, Enum) else value

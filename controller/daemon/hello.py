@@ -6,8 +6,7 @@ from importlib.metadata import version
 from controller.api.methods import HelloResult
 from controller.api.schema import API_VERSION, EraPosition, RigSummary, TableSummary
 from controller.daemon.config import DaemonConfig
-from drivers.amplifier import Amplifier
-from drivers.errors import CommandError
+from drivers.host.amplifier import Amplifier
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 
@@ -51,14 +50,8 @@ def _rig_summary(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> RigSummary:
             )
             for era in rig.eras
         ],
-        simulated=any("simulated" in _product(amplifier) for amplifier in amplifiers.values()),
+        simulated=any(
+            "simulated" in each.identity.get("product", "") for each in amplifiers.values()
+        ),
         frequency_hz=[rig.limits.frequency_min, rig.limits.frequency_max],
     )
-
-
-def _product(amplifier: Amplifier) -> str:
-    """The product name of an amplifier; empty before it was identified."""
-    try:
-        return amplifier.identity.product
-    except CommandError:
-        return ""

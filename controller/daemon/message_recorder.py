@@ -1,29 +1,29 @@
-"""A ring buffer of the last messages of all links, for fault dumps."""
+"""A ring buffer of the last messages of all lines, for fault dumps."""
 
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from drivers import clock
-from drivers.backend import Backend
-from drivers.errors import LinkError
-from drivers.protocol.messages import AmplifierEvent, Broadcast, Reply, Request, Status
-from drivers.protocol.wire_times import WireTimes
-from drivers.statistics import WireCounters
+from drivers.host.amplifier import Amplifier
+from drivers.host.line import Line
+from drivers.host.wire import Arrival, Broken, Event, Nak, Reply, Wire
+from drivers.protocol.records import Values
 
-MAX_RECORDS = 400  # over all links: the last seconds under load, ten seconds at rest
+MAX_RECORDS = 400  # over all lines: the last seconds under load, ten seconds at rest
 
 _logger = logging.getLogger(__name__)
 
 
 class MessageRecord(NamedTuple):
-    """One message: time [s], link, direction, and the message (a dataclass) or a text."""
+    """One message: time [s], amplifier or line, direction, name of the message, and its content."""
 
     time: float
     link: str
     direction: str
-    message: object
+    message: str
+    content: object = ""
 
 
 class MessageRecorder:
@@ -32,109 +32,75 @@ class MessageRecorder:
     def __init__(self) -> None:
         self._records: deque[MessageRecord] = deque(maxlen=MAX_RECORDS)
 
-    def add(self, link: str, direction: str, message: object) -> None:
+    def add(self, link: str, direction: str, message: str, content: object = "") -> None:
         """Add a message, replacing the oldest if full."""
-        self._records.append(MessageRecord(clock.now(), link, direction, message))
+        self._records.append(MessageRecord(clock.now(), link, direction, message, content))
 
     def records(self) -> list[MessageRecord]:
         """All records, oldest first."""
         return list(self._records)
 
+    def follow(self, amplifiers: Mapping[str, Amplifier]) -> None:
+        """Record the messages of the lines of amplifiers, by name, from now on."""
+        by_line: dict[Line, dict[int, str]] = {}
+        for name, amplifier in amplifiers.items():
+            by_line.setdefault(amplifier.line, {})[amplifier.address] = name
+            self.add(name, "open", "")
+        for line, names in by_line.items():
+            line.wire = RecordedWire(line.wire, line.name, names, self)
 
-class RecordedBackend(Backend):
-    """Wraps a backend and records its messages.
 
-    status: the last one read since opening; status_at [s]: when it was read; is_missing: whether
-    the last attempt to open it or to exchange a message failed.
-    """
+class RecordedWire:
+    """A wire whose messages are recorded; names: of its amplifiers by address."""
 
-    def __init__(self, inner: Backend, name: str, recorder: MessageRecorder) -> None:
-        self.status: Status | None = None
-        self.status_at: float | None = None
-        self.is_missing = False
+    def __init__(
+        self, inner: Wire, line: str, names: Mapping[int, str], recorder: MessageRecorder
+    ) -> None:
+        self.counters, self.delay = inner.counters, inner.delay
         self._inner = inner
-        self._name = name
+        self._line = line
+        self._names = names
         self._add = recorder.add
+        self._asked = line
 
-    def _record(self, direction: str, message: object) -> None:
+    def request(self, address: int, name: str, values: Values) -> bytes:
+        """Return the bytes of a request; see `Wire`."""
+        self._asked = self._names.get(address, self._line)
+        self._record(self._asked, "out", name, values)
+        return self._inner.request(address, name, values)
+
+    def received(self, data: bytes) -> list[Arrival]:
+        """Return what these bytes complete; see `Wire`."""
+        arrivals = self._inner.received(data)
+        for arrival in arrivals:
+            name = type(arrival).__name__
+            match arrival:
+                case Reply(values):
+                    self._record(self._asked, "in", name, values)
+                case Nak(code, channel):
+                    self._record(self._asked, "in", name, {"code": code, "channel": channel})
+                case Broken(reason):
+                    self._record(self._asked, "in", name, reason)
+                case Event(address, values):
+                    self._record(self._names.get(address, self._line), "event", name, values)
+        return arrivals
+
+    def withdraw(self) -> None:
+        """Take the request off the wire; see `Wire`."""
+        self._record(self._asked, "none", "no reply")
+        self._inner.withdraw()
+
+    def transit(self, words: int) -> float:
+        """See `Wire.transit`."""
+        return self._inner.transit(words)
+
+    def round_trip(self, name: str, length: int) -> float:
+        """See `Wire.round_trip`."""
+        return self._inner.round_trip(name, length)
+
+    def _record(self, link: str, direction: str, message: str, content: object = "") -> None:
         """Record a message; a stop depends on no record."""
         try:
-            self._add(self._name, direction, message)
+            self._add(link, direction, message, content)
         except Exception:
             _logger.exception("recorder failed")
-
-    async def open(self) -> None:
-        """Open the backend."""
-        self._record("open", "")
-        self.status = None  # may have changed meanwhile
-        try:
-            await self._inner.open()
-        except LinkError:
-            self.is_missing = True
-            raise
-
-    async def close(self) -> None:
-        """Close the backend."""
-        self._record("close", "")
-        await self._inner.close()
-
-    async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        """Exchange a request; record it and its reply or error."""
-        self._record("out", request)
-        try:
-            reply = await self._inner.exchange(request, timeout=timeout)
-        except BaseException as error:
-            self._record("none", f"{type(error).__name__}: {error}")
-            self.is_missing = self.is_missing or isinstance(error, LinkError)
-            raise
-        self.is_missing = False
-        self._record("in", reply)
-        if isinstance(reply, Status):
-            self.status, self.status_at = reply, clock.now()
-        return reply
-
-    def listen(
-        self, on_event: Callable[[AmplifierEvent], None], on_loss: Callable[[str], None]
-    ) -> None:
-        """Set the callbacks; events and the loss of the link are recorded."""
-
-        def event_received(event: AmplifierEvent) -> None:
-            self._record("event", event)
-            on_event(event)
-
-        def link_lost(reason: str) -> None:
-            self._record("lost", reason)
-            self.is_missing = True
-            on_loss(reason)
-
-        self._inner.listen(event_received, link_lost)
-
-    async def broadcast(self, request: Broadcast) -> None:
-        """Broadcast a request on the bus; record it."""
-        self._record("out", request)
-        await self._inner.broadcast(request)
-
-    @property
-    def last_sent_at(self) -> float:
-        """See `Backend.last_sent_at`."""
-        return self._inner.last_sent_at
-
-    @property
-    def counters(self) -> WireCounters:
-        """See `Backend.counters`."""
-        return self._inner.counters
-
-    @property
-    def bus(self) -> str | None:
-        """See `Backend.bus`."""
-        return self._inner.bus
-
-    @property
-    def carries_sessions(self) -> bool:
-        """See `Backend.carries_sessions`."""
-        return self._inner.carries_sessions
-
-    @property
-    def wire_times(self) -> WireTimes:
-        """See `Backend.wire_times`."""
-        return self._inner.wire_times

@@ -36,7 +36,7 @@ class EventPublisher:
     """Keeps the current state of the plate and publishes every change at `hub`.
 
     machine: the daemon's state machine; amplifiers: their statuses; effect_of: the effect that
-    plays for a contact; ramp_only_reason: why onsets are plain ramps; layout: the surface layout;
+    plays for a contact; layout: the surface layout;
     learning: what is learned of the plate, None where nothing is to be.
     """
 
@@ -46,7 +46,6 @@ class EventPublisher:
         machine: Callable[[], StateMachine],
         amplifiers: Callable[[], list[AmplifierStatus]],
         effect_of: Callable[[ContactKey], str | None],
-        ramp_only_reason: Callable[[], str | None],
         layout: SurfaceLayout | None,
         learning: Callable[[], LearningStatus | None],
     ) -> None:
@@ -66,9 +65,7 @@ class EventPublisher:
                 "pattern": self.view.pattern_event,
                 "silence": self.view.silence_event,
                 "amplifiers": lambda: AmplifiersEvent(amplifiers=amplifiers()),
-                "latency": lambda: LatencyEvent(
-                    latency_ms=self.latencies.summary(), ramp_only_reason=ramp_only_reason()
-                ),
+                "latency": lambda: LatencyEvent(latency_ms=self.latencies.summary()),
                 "layout": self.layout_event,
                 "plate": self._plate_event,
             },
@@ -99,7 +96,6 @@ class EventPublisher:
                 contacts=self.view.contact_statuses(),
                 reason=new.cause,
                 latency_ms=None,
-                late_ms=None,
             )
             self.hub.publish("silence", lambda: silence)
 

@@ -7,18 +7,12 @@ from typing import Any, Literal
 from controller.loop.loop import Controller
 from drivers import clock
 from drivers.errors import DriverError
-from drivers.link.link import ASSUME_ENERGISED, DEGRADED
 from drivers.operation.pauses import pauses
 from model.errors import InputError
 
 ALIVE_INTERVAL = 0.05  # s; between calls of `alive` while waiting
 
 LinkChange = Literal["degraded", "restored", "lost", "retry", "reopened"]
-
-
-def error_text(error: Exception) -> str:
-    """The text of an error without the warning already implied by the state."""
-    return str(error).removesuffix(ASSUME_ENERGISED).removesuffix(DEGRADED)
 
 
 async def reconnect(
@@ -41,7 +35,7 @@ async def reconnect(
             await wait_alive(controller.open(), alive)
             await controller.disarm()  # a short loss may not have expired the watchdog
         except (DriverError, InputError) as error:
-            report("retry", error_text(error))
+            report("retry", str(error))
             await controller.close()
         else:
             report("reopened", "all amplifiers reply again and are disarmed")

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from enum import Enum, StrEnum, auto
 from typing import NamedTuple
 
-from drivers.amplifier import WATCHDOG
+from drivers.host.amplifier import WATCHDOG
 
 ACKNOWLEDGE = "find the cause, then clear (era clear) and arm again"
 """Remedy of every fault."""

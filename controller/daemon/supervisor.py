@@ -14,17 +14,11 @@ from typing import Any, TypeVar
 from controller.daemon.deferred_calls import DeferredCalls, call_guarded
 from controller.daemon.read_back import (
     READ_BACK_INTERVAL,
-    all_silent,
+    are_silent,
     find_problem,
-    read_statuses,
+    is_any_armed,
 )
-from controller.daemon.reconnect import (
-    ALIVE_INTERVAL,
-    LinkChange,
-    error_text,
-    reconnect,
-    wait_alive,
-)
+from controller.daemon.reconnect import ALIVE_INTERVAL, LinkChange, reconnect, wait_alive
 from controller.daemon.states import (
     ACKNOWLEDGE,
     ENERGISED,
@@ -36,12 +30,9 @@ from controller.daemon.states import (
     failed,
     step,
 )
-from controller.group.amplifier_group import GroupState
-from controller.group.quick_stops import QuickStops
 from controller.loop.loop import Controller
 from controller.loop.observer import Observer
 from drivers import clock
-from drivers.amplifier import WATCHDOG, Amplifier
 from drivers.errors import (
     CommandRefused,
     DriverError,
@@ -50,8 +41,11 @@ from drivers.errors import (
     LinkError,
     Preempted,
 )
-from drivers.operation.silence import StopOutcome
-from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault
+from drivers.host.amplifier import WATCHDOG, Amplifier, Stopped
+from drivers.host.comparison import name_of
+from drivers.host.group import GroupState
+from drivers.protocol.records import Values
+from drivers.protocol.table import FAULTS, NO_CHANNEL
 from registry.plugins import failure_text
 
 STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
@@ -74,8 +68,8 @@ _T = TypeVar("_T")
 class Supervisor:
     """Keeps the amplifiers of a controller connected, and armed only as the state machine allows.
 
-    The controller must be created with `observe(observer)` of this supervisor and the same
-    amplifiers. state_changed are called a moment after every transition, disarmed within each one
+    The controller must be created with `observe(observer)` and `connected` of this supervisor.
+    state_changed are called a moment after every transition, disarmed within each one
     from a state in which amplifiers have or get high voltage to another; link_changed receives the
     kind of change, the lost amplifiers ("lost" only) and a message; alive is called after each
     cycle of the control loop and periodically while there is no link. watchdog [s]: of armed
@@ -84,7 +78,6 @@ class Supervisor:
 
     def __init__(
         self,
-        amplifiers: Mapping[str, Amplifier],
         *,
         state_changed: Sequence[StateObserver],
         link_changed: Callable[[LinkChange, Sequence[str], str], None],
@@ -93,7 +86,6 @@ class Supervisor:
         watchdog: float = WATCHDOG,
     ) -> None:
         self.machine = StateMachine(watchdog=watchdog)
-        self._amplifiers = amplifiers
         self._state_observers = (_log_transition, *state_changed)
         self._link_observer = link_changed
         self._alive_observer = alive
@@ -124,6 +116,11 @@ class Supervisor:
 
         return replace(observer, refused=refused, cycle_completed=cycle_completed)
 
+    def connected(self, amplifiers: Mapping[str, Amplifier]) -> None:
+        """Listen to the events of amplifiers, by name, whose lines have been opened."""
+        for name, amplifier in amplifiers.items():
+            amplifier.listeners.append(partial(self._amplifier_event, name))
+
     async def run(self, controller: Controller) -> None:
         """Open the amplifiers, run the control loop, and reconnect after every loss, until `close`.
 
@@ -132,8 +129,6 @@ class Supervisor:
         amplifiers that do not fit the configuration.
         """
         self._controller_if_running = controller
-        for name, amplifier in self._amplifiers.items():
-            amplifier.listen(partial(self._amplifier_event, name))
         await self._open()
         self.started.set()
         polling = asyncio.create_task(self._poll_disarmed())
@@ -162,6 +157,11 @@ class Supervisor:
             await asyncio.wait({loop})
         if not loop.cancelled():
             loop.result()
+        if self._controller.group_state is GroupState.CLOSED and self.machine.state not in (
+            DaemonState.COMM_LOST,
+            DaemonState.NOT_READY,
+        ):
+            raise LinkError("the amplifiers must be open, got closed ones; they are opened again")
 
     async def close(self, cause: str) -> None:
         """Ramp down, read back, disarm and close the amplifiers; ends `run`."""
@@ -170,7 +170,7 @@ class Supervisor:
             await self.handle(DaemonEvent(Trigger.CLOSE, cause))
         self._reports.flush()
 
-    async def stop(self, cause: str, remedy: str | None = None) -> Mapping[str, StopOutcome]:
+    async def stop(self, cause: str, remedy: str | None = None) -> Mapping[str, Stopped]:
         """Quick-stop all amplifiers in any state; returns the outcome of each, by name."""
         stopping = self._spawn(self._stop())
         self._step(DaemonEvent(Trigger.STOP, cause, remedy))
@@ -276,13 +276,13 @@ class Supervisor:
                 await self.handle(DaemonEvent(Trigger.FAULT, str(error), ACKNOWLEDGE))
             raise
 
-    async def _stop(self) -> Mapping[str, StopOutcome]:
+    async def _stop(self) -> Mapping[str, Stopped]:
         """Stop all amplifiers; one that is lost is a lost link. Never raises an Exception."""
         try:
             outcomes = await self._controller.stop()
         except Exception:
             _rate_limited_logger.exception("stop failed, stopping each amplifier individually")
-            outcomes = await QuickStops(self._amplifiers).stop()
+            outcomes = await self._controller.group.stop()
         try:
             await self._check_links()
         except Exception:
@@ -291,15 +291,10 @@ class Supervisor:
 
     async def _check_links(self) -> None:
         """Handle the loss of an amplifier unless it is handled already."""
-        for amplifier in self._amplifiers.values():
-            if amplifier.is_lost and self.machine.state not in (
-                DaemonState.COMM_LOST,
-                DaemonState.NOT_READY,
-            ):
-                try:
-                    await amplifier.status()  # raises the cause of the loss at once
-                except LinkError as error:
-                    await self._handle_loss(error)
+        is_handled = self.machine.state in (DaemonState.COMM_LOST, DaemonState.NOT_READY)
+        causes = self._controller.group.lost_by.values()
+        if causes and not is_handled:
+            await self._handle_loss(LinkError(next(iter(causes))))
 
     async def _open(self) -> None:
         """Open and verify the amplifiers; without a good reply they are searched for."""
@@ -309,8 +304,8 @@ class Supervisor:
                 await self._controller.close()
                 return
         except (LinkError, CommandRefused, FrameError) as error:
-            self._link_changed("retry", (), error_text(error))
-            event = DaemonEvent(Trigger.NOT_FOUND, error_text(error), _SEARCHING)
+            self._link_changed("retry", (), str(error))
+            event = DaemonEvent(Trigger.NOT_FOUND, str(error), _SEARCHING)
             await self._in_background(self.handle(event))
             return
         opened = DaemonEvent(Trigger.OPENED, "every amplifier has replied")
@@ -337,8 +332,7 @@ class Supervisor:
 
     async def _verify(self) -> None:
         """Disarm what still plays, then read back all amplifiers."""
-        statuses = await read_statuses(self._amplifiers)
-        if any(each.state is AmplifierState.OPERATION_ENABLED for each in statuses.values()):
+        if is_any_armed(await self._controller.group.statuses()):
             await self._controller.disarm()
         problem = await self._read_back()
         if self.machine.state is not DaemonState.SWITCH_ON_DISABLED:
@@ -386,7 +380,7 @@ class Supervisor:
         for _ in range(_MAX_READ_BACKS):
             if before_each is not None:
                 await before_each()
-            problem = find_problem(await read_statuses(self._amplifiers))
+            problem = find_problem(await self._controller.group.statuses())
             if problem is None or self.machine.state is not initial_state:
                 break
             await asyncio.sleep(READ_BACK_INTERVAL)
@@ -395,12 +389,9 @@ class Supervisor:
     async def _handle_loss(self, error: LinkError) -> None:
         """Handle a loss; concurrent reports of the same loss wait until it is handled."""
         async with self._loss_lock:
-            lost = [
-                name
-                for name, amplifier in self._amplifiers.items()
-                if amplifier.is_lost or amplifier.is_degraded
-            ]
-            text = error_text(error)
+            group = self._controller.group
+            lost = [name for name in group.amplifiers if name in (*group.lost_by, *group.degraded)]
+            text = str(error)
             if self.machine.state is not DaemonState.COMM_LOST:
                 self._link_changed("lost", lost, text)
             cause = f"amplifier {', '.join(lost)}: {text}" if lost else text
@@ -435,10 +426,11 @@ class Supervisor:
             await asyncio.sleep(STATUS_INTERVAL)
             if self._controller.group_state is not GroupState.DISARMED:
                 continue
+            group = self._controller.group
             try:
-                statuses = await read_statuses(self._amplifiers)
+                statuses = await group.statuses()
             except LinkError as error:
-                if self._controller.group_state is GroupState.DISARMED:
+                if group.state is GroupState.LOST:
                     await self._in_background(self._handle_loss(error))
             except DriverError:
                 continue  # preempted by another request, which reports for itself
@@ -449,9 +441,10 @@ class Supervisor:
                 if problem is not None and state is DaemonState.READY_TO_SWITCH_ON:
                     fault = DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE)
                     await self._in_background(self.handle(fault))
-                elif not all_silent(statuses) and state in (
-                    DaemonState.QUICK_STOP_ACTIVE,
-                    DaemonState.FAULT,
+                elif (
+                    not are_silent(statuses)
+                    and state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
+                    and not self.machine.is_acknowledged  # a clear reads back for itself
                 ):
                     _rate_limited_logger.error("stop repeated: %s", problem)
                     await self._stop()
@@ -485,12 +478,12 @@ class Supervisor:
         is_armed = self.machine.state is DaemonState.OPERATION_ENABLED
         return is_armed and self._controller.group_state is GroupState.DISARMED
 
-    def _amplifier_event(self, name: str, event: AmplifierEvent) -> None:
+    def _amplifier_event(self, name: str, event: Values) -> None:
         """Post a fault that an amplifier reports unsolicited, ahead of the next heartbeat."""
-        if event.fault is Fault.NONE or self.machine.state not in ENERGISED:
+        if not event["fault"] or self.machine.state not in ENERGISED:
             return
-        channel = "" if event.channel is None else f", channel {event.channel}"
-        cause = f"amplifier {name} reports {event.fault.name}{channel}"
+        channel = "" if event["channel"] == NO_CHANNEL else f", channel {event['channel']}"
+        cause = f"amplifier {name} reports {name_of(FAULTS, event['fault'])}{channel}"
         self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
 
     async def _in_background(self, work: Awaitable[object]) -> None:

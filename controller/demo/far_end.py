@@ -20,11 +20,8 @@ from controller.plate_control import PlateControl
 from drivers.errors import LinkError
 from model.finger.perception import DEFAULT_THRESHOLD
 
-REPLY_TIMEOUT = 1.0
-"""Time [s] to wait for a reply: simulated amplifiers share a machine that may be busy."""
-
 WATCHDOG = 2.0
-"""Watchdog [s] of simulated amplifiers, the longest of the protocol, for the same reason."""
+"""Watchdog [s] of simulated amplifiers, the longest of the protocol: their machine may be busy."""
 
 STARTUP_TIMEOUT = 120.0  # s; solving the plate takes long on a busy machine
 EXIT_TIMEOUT = 3.0  # s

@@ -10,7 +10,7 @@ from controller.daemon.daemon import Daemon
 from controller.daemon.log import start_log
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
-from controller.demo.far_end import REPLY_TIMEOUT, WATCHDOG, simulated_plate
+from controller.demo.far_end import WATCHDOG, simulated_plate
 from controller.gateway.installed import require_gateway
 from model.rig.file import load_rig
 from model.table.table import LocalizationTable
@@ -50,7 +50,6 @@ async def run_live(
             log=log,
             manager=ServiceManager(),
             dashboard=dashboard,
-            reply_timeout=REPLY_TIMEOUT,
             watchdog=WATCHDOG,
         )
         await daemon.run(lock)

@@ -6,12 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from controller.demo.far_end import (
-    REPLY_TIMEOUT,
-    SIM_OPTIONS,
-    WATCHDOG,
-    simulated_plate,
-)
+from controller.demo.far_end import SIM_OPTIONS, WATCHDOG, simulated_plate
 from controller.demo.picture import choose_rows, touches_figure
 from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import TouchRow
@@ -19,10 +14,9 @@ from controller.loop.loop import Controller
 from controller.loop.observer import Observer
 from controller.sources.capture import RecordedDatagram, replay_capture
 from controller.sources.tuio import TuioSource
-from drivers.amplifier import Amplifier
 from drivers.errors import CommandRefused
+from drivers.opening import Lines
 from drivers.operation.garbage_collection import no_long_collections
-from drivers.registry import open_backend
 from model.figures import save_figure
 from model.rig.file import load_rig
 from model.table.table import LocalizationTable
@@ -70,12 +64,8 @@ async def run_demo(
         controller = Controller(
             rig,
             table,
-            amplifiers={
-                name: Amplifier(
-                    open_backend(url, rig.voltage_of(name)), reply_timeout=REPLY_TIMEOUT
-                )
-                for name, url in plate.urls.items()
-            },
+            lines=Lines,
+            urls=plate.urls,
             sources=[tuio],
             observer=noting_refusals(recorder.observer, refused),
             timing=Timing(table),

@@ -11,13 +11,12 @@ from controller.diagnosis.common_start import start_together
 from controller.diagnosis.interleaved_tones import Interleaved, Step, interleaved
 from controller.diagnosis.plate_sensors import PlateSensor, PlateSensors, plate_sensors
 from controller.diagnosis.tone_player import TonePlayer
-from controller.group.guards import check_watchdogs
+from controller.loop.lines import Lines
+from controller.loop.routing import Drive
 from drivers import clock
-from drivers.amplifier import Amplifier
-from drivers.command import DriveCommand
 from drivers.errors import CommandError, CommandRefused
-from drivers.operation.watchdog import HEARTBEAT
-from drivers.protocol.messages import Reading, ReadingState
+from drivers.host.sensors import Reading, measure_tones
+from drivers.host.timing import HEARTBEAT
 from model.arrays import ComplexArray, FloatArray
 from model.choice import best_first, best_of
 from model.errors import InputError
@@ -80,23 +79,22 @@ class _Heard:
 class PlateSelfMeasurement:
     """Plays interleaved tones on all ERAs of a rig and reads the sensors of its amplifiers.
 
-    level: of every tone, 0..1 of full stroke, None for the usual one; is_quick: one round;
-    on_start: called with the steps to come, before anything plays; on_step: with the number of
-    steps done and of all.
+    lines: to its amplifiers, urls: by name. level: of every tone, 0..1 of full stroke, None for the
+    usual one; is_quick: one round; on_step: called with the number of steps done and of all.
     """
 
     def __init__(
         self,
         rig: Rig,
-        amplifiers: Mapping[str, Amplifier],
+        lines: Callable[[], Lines],
+        urls: Mapping[str, str],
         *,
         level: float | None = None,
         is_quick: bool = False,
         on_step: Callable[[int, int], None] = lambda done, of: None,
     ) -> None:
         self._rig = rig
-        self._amplifiers = amplifiers
-        self._player = TonePlayer(rig, amplifiers)
+        self._player = TonePlayer(rig, lines, urls)
         self._level = checked_level(rig, level)
         self._is_quick = is_quick
         self._on_step = on_step
@@ -108,16 +106,17 @@ class PlateSelfMeasurement:
         twice.
         """
         try:
-            await self._player.open()
-            check_watchdogs(self._amplifiers)
-            sensors = await plate_sensors(self._rig, self._amplifiers)
+            can = await self._player.open()
+            sensors = await plate_sensors(self._rig, self._player.amplifiers)
             tones = interleaved(
-                self._rig, self._frequency_range(sensors.used), is_quick=self._is_quick
+                self._rig,
+                _frequency_range(can.frequencies, sensors.used),
+                is_quick=self._is_quick,
             )
             started = clock.now()
             await self._player.arm()
             heard, half, last = await self._all(tones, sensors.used)
-            await self._player.play({})
+            await self._player.silence()
             await self._wait(self._player.ramp)
             duration = clock.now() - started
         finally:
@@ -141,28 +140,11 @@ class PlateSelfMeasurement:
         self._on_step(count, count)
         return heard, (loudest, half), last
 
-    def _frequency_range(self, sensors: Sequence[PlateSensor]) -> tuple[float, float]:
-        """Frequencies [Hz] that the rig allows, amplifiers play and sensors measure."""
-        limits = [self._rig.limits, *(guard.limits for guard in self._player.guards.values())]
-        low = max(each.frequency_min for each in limits)
-        high = min(
-            *(each.frequency_max for each in limits), *(each.frequency_max for each in sensors)
-        )
-        if not low < high:
-            raise CommandError(
-                f"sensors must measure above {low:g} Hz, the lowest frequency of rig and "
-                f"amplifiers, got up to {high:g} Hz"
-            )
-        return low, high
-
     async def _hear(
         self, step: Step, tones: Interleaved, sensors: Sequence[PlateSensor], *, level: float
     ) -> _Heard:
         """Play a step until the plate has settled, and read it."""
         eras = {self._rig.eras[number].name: frequency for number, frequency in step}
-        if self._player.pause:
-            await self._player.play({})
-            await self._wait(self._player.pause)
         plays = await self._player.play(
             {
                 era: Tone(frequency, level * self._rig.era(era).stroke)
@@ -182,7 +164,7 @@ class PlateSelfMeasurement:
     def _problem(self, readings: Mapping[str, Reading], sensors: Sequence[PlateSensor]) -> str:
         """What is wrong with readings by amplifier, or nothing."""
         for name, reading in readings.items():
-            if reading.state is not ReadingState.COMPLETE or reading.token != self._player.token:
+            if reading.state != "COMPLETE" or reading.token != self._player.token:
                 return (
                     f"amplifier {name}: what plays must stay the same during a reading, got a "
                     "change of it twice; leave the amplifier to this command, and start again"
@@ -207,9 +189,12 @@ class PlateSelfMeasurement:
 
         async def measured() -> dict[str, Reading]:
             readings = await asyncio.gather(
-                *(each.measure(frequencies, window) for each in self._amplifiers.values())
+                *(
+                    measure_tones(each, frequencies, window)
+                    for each in self._player.amplifiers.values()
+                )
             )
-            return dict(zip(self._amplifiers, readings, strict=True))
+            return dict(zip(self._player.amplifiers, readings, strict=True))
 
         reading = asyncio.create_task(measured())
         try:
@@ -223,7 +208,7 @@ class PlateSelfMeasurement:
 
     def _responses(
         self,
-        plays: Mapping[str, DriveCommand],
+        plays: Drive,
         eras: Sequence[str],
         frequencies: FloatArray,
         readings: Mapping[str, Reading],
@@ -238,8 +223,8 @@ class PlateSelfMeasurement:
             heard = sensor.accelerations(readings[sensor.amplifier], frequencies)
             for era, frequency, acceleration in zip(eras, frequencies, heard, strict=True):
                 played[number[era]] = frequency
-                plays_it = self._amplifiers[rig.wiring[era].amplifier]
-                if start_together(self._amplifiers[sensor.amplifier], plays_it):
+                plays_it = self._player.amplifiers[rig.wiring[era].amplifier]
+                if start_together(self._player.amplifiers[sensor.amplifier], plays_it):
                     command = plays[era]
                     base = command.level * rig.era(era).stroke
                     turned = np.exp(-1j * math.radians(command.phase))
@@ -285,6 +270,20 @@ class PlateSelfMeasurement:
             values = first.responses[known, n], again.responses[known, n]
             found.append(Repeat(self._rig.eras[n].name, float(first.frequencies[n]), *values))
         return tuple(found)
+
+
+def _frequency_range(
+    playable: tuple[float, float], sensors: Sequence[PlateSensor]
+) -> tuple[float, float]:
+    """Return frequencies [Hz] that rig and amplifiers play and sensors measure."""
+    low, high = playable
+    high = min(high, *(each.frequency_max for each in sensors))
+    if not low < high:
+        raise CommandError(
+            f"sensors must measure above {low:g} Hz, the lowest frequency of rig and amplifiers, "
+            f"got up to {high:g} Hz"
+        )
+    return low, high
 
 
 def checked_level(rig: Rig, level: float | None) -> float:

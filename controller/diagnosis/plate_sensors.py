@@ -5,19 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.amplifier import Amplifier
 from drivers.errors import CommandError
-from drivers.protocol.messages import Feature, Reading, SensorUnit
-from drivers.protocol.messages import Sensor as ReportedSensor
+from drivers.host.amplifier import Amplifier
+from drivers.host.sensors import Reading, read_sensors
+from drivers.host.sensors import Sensor as ReportedSensor
 from model.arrays import ComplexArray, FloatArray
 from model.identification.forward import Sensor
 from model.rig.rig import Channel, Rig
 
-_DERIVATIVES = {
-    SensorUnit.ACCELERATION: 0,
-    SensorUnit.VELOCITY: 1,
-    SensorUnit.DISPLACEMENT: 2,
-}
+_DERIVATIVES = {"ACCELERATION": 0, "VELOCITY": 1, "DISPLACEMENT": 2}
 """How often what a sensor reads is to be differentiated in time."""
 
 
@@ -36,7 +32,8 @@ class PlateSensor:
 
     def accelerations(self, reading: Reading, frequencies: FloatArray) -> ComplexArray:
         """Complex amplitudes [m/s²] (f,) of the tones [Hz] of a reading."""
-        phasors = np.array([tone.phasor for tone in reading.sensors[self.number].tones])
+        amplitudes, degrees = np.array(reading.sensors[self.number].tones).T
+        phasors = amplitudes * np.exp(1j * np.radians(degrees))
         return np.asarray(phasors * (2j * np.pi * frequencies) ** self.derivatives)
 
 
@@ -56,13 +53,14 @@ async def plate_sensors(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> PlateS
     used: list[PlateSensor] = []
     unused: list[str] = []
     for name, amplifier in amplifiers.items():
-        if Feature.SENSORS not in amplifier.capabilities.features:
+        reported = await read_sensors(amplifier)
+        if not reported:
             raise CommandError(
-                f"amplifier {name} must measure the plate (feature SENSORS of the wire protocol), "
+                f"amplifier {name} must measure the plate (feature sensors of the wire protocol), "
                 "got one without; use one with sensors, or measure with accelerometers and run "
                 "era calibrate"
             )
-        own, rest = _of_amplifier(rig, name, await amplifier.sensors())
+        own, rest = _of_amplifier(rig, name, reported)
         if not own:
             raise CommandError(
                 f"amplifier {name} must have a sensor of acceleration, velocity or displacement at "
@@ -85,7 +83,7 @@ def _of_amplifier(
         derivatives = _DERIVATIVES.get(sensor.unit)
         era = "" if sensor.channel is None else eras.get(Channel(amplifier, sensor.channel), "")
         if derivatives is None:
-            unused.append(f"sensor {name} measures {sensor.unit.name.lower()}")
+            unused.append(f"sensor {name} measures {sensor.unit.lower()}")
         elif era:
             place = Sensor(era, era)
             if any(each.place == place for each in used):

@@ -10,11 +10,11 @@ from pydantic import ValidationError
 
 from controller.api.channel import Channel
 from controller.api.client_protocol import RESPONSE_TIMEOUT, Notification, Unreachable
+from controller.api.coalesced_calls import CoalescedCalls
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import SubscribeParams
 from controller.api.schema import Message
 from controller.api.topics import TOPICS
-from controller.group.tasks import CoalescedCalls
 from drivers.operation.pauses import pauses
 
 _MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.1, 2.0  # s

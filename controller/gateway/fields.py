@@ -1,5 +1,6 @@
 """The plate's vibration field for drawing: complex amplitude per frequency on a grid."""
 
+import cmath
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,7 +9,6 @@ from functools import lru_cache
 import numpy as np
 
 from controller.api.schema import PlayedTone
-from drivers.command import Knot
 from model.arrays import ComplexArray, lattice
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -64,7 +64,7 @@ class FieldSolver:
         names = [era.name for era in self._rig.eras]
         amplitude = np.zeros((len(frequencies), self.rows * self.columns), dtype=complex)
         for name, tone in drive.items():
-            weight = Knot(tone.level, tone.phase_deg).phasor
+            weight = cmath.rect(tone.level, math.radians(tone.phase_deg))
             response = self._response(tone.frequency_hz)
             amplitude[frequencies.index(tone.frequency_hz)] += weight * response[names.index(name)]
         return Field(frequencies, amplitude.reshape(-1, self.rows, self.columns))

@@ -8,7 +8,7 @@ in one step, whole and prepared. Without an estimator they stay as they were, fo
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,6 @@ from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer, Silenced
 from controller.sources.contacts import Change, Contact
 from drivers import clock
-from drivers.amplifier import Amplifier
 from drivers.errors import CommandError, DriverError
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
@@ -67,7 +66,6 @@ class Learning:
         timing: Timing | None,
         file: Path,
         *,
-        amplifiers: Mapping[str, Amplifier],
         controller: Controller,
         changed: Callable[[LearningStatus], None] = lambda status: None,
         estimated: Callable[[float], None] = lambda latency: None,
@@ -75,7 +73,7 @@ class Learning:
     ) -> None:
         self.status = LearningStatus()
         self._rig, self._base, self._file = rig, table, file
-        self._amplifiers, self._controller = amplifiers, controller
+        self._controller = controller
         self._changed, self._estimated, self._timeouts = changed, estimated, timeouts
         self._answers = AnswersInUse(controller, table, timing)
         self._robust: Answers | None = None
@@ -143,8 +141,8 @@ class Learning:
         """Ask the amplifiers for their sensors until they tell; start an estimator if they have."""
         while True:
             try:
-                check_common_start(self._amplifiers)
-                self._sensors = (await plate_sensors(self._rig, self._amplifiers)).used
+                check_common_start(self._controller.amplifiers)
+                self._sensors = (await plate_sensors(self._rig, self._controller.amplifiers)).used
             except CommandError as error:
                 self._say(LearningState.OFF, str(error))
                 return
@@ -332,7 +330,7 @@ class Learning:
         while True:
             self._readings = SettledReadings(
                 self._rig,
-                self._amplifiers,
+                self._controller.amplifiers,
                 self._sensors,
                 settling=settling,
                 take=self._hand,

@@ -2,7 +2,7 @@
 
 A pattern has settled some time after its last fade and after the last change of the contacts. What
 plays is never delayed for a reading: its requests go last on the line, and none is sent while
-contacts change. A renewal or an ending that is added disturbs a reading, which is then repeated.
+contacts change. A renewal disturbs a reading, which is then repeated.
 """
 
 import asyncio
@@ -15,11 +15,12 @@ import numpy as np
 
 from controller.diagnosis.plate_sensors import PlateSensor
 from controller.loop.observer import Applied
+from controller.loop.routing import phasor_of
 from controller.sources.contacts import Contact
 from drivers import clock
-from drivers.amplifier import Amplifier
 from drivers.errors import DriverError, Preempted
-from drivers.protocol.messages import Reading, ReadingState
+from drivers.host.amplifier import Amplifier
+from drivers.host.sensors import Reading, finish_reading, start_reading
 from model.identification.forward import RestingFinger
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
@@ -123,7 +124,7 @@ class SettledReadings:
             if self._change.is_set():
                 self._disturbed()
                 return
-            if all(each.state is ReadingState.COMPLETE for each in readings.values()):
+            if all(each.state == "COMPLETE" for each in readings.values()):
                 break
         else:
             self._disturbed()
@@ -147,13 +148,15 @@ class SettledReadings:
             frequency,
             np.array(
                 [
-                    applied.drive[era.name].phasor * era.stroke if era.name in applied.drive else 0j
+                    phasor_of(applied.drive[era.name]) * era.stroke
+                    if era.name in applied.drive
+                    else 0j
                     for era in self._rig.eras
                 ]
             ),
             np.array(values),
             tuple(fingers),
-            has_phase=False,  # renewals and endings keep the phases of an earlier commit
+            has_phase=False,  # renewals keep the phases of an earlier commit
         )
         self._take(pattern)
 
@@ -166,13 +169,14 @@ class SettledReadings:
         amplifiers = {name: self._amplifiers[name] for name in sorted(names)}
         window = max(WINDOW, _PERIODS / frequency)
         started = {
-            name: await each.start_reading([frequency], window) for name, each in amplifiers.items()
+            name: await start_reading(each, [frequency], window)
+            for name, each in amplifiers.items()
         }
         end = clock.now() + max(each.left for each in started.values())
         if await self._changes_by(end + _MARGIN):
             return started, end
         found = {
-            name: await each.finish_reading(replace(started[name], left=0.0))
+            name: await finish_reading(each, replace(started[name], left=0.0))
             for name, each in amplifiers.items()
         }
         return found, end

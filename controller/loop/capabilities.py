@@ -1,20 +1,18 @@
 """Capabilities of the open amplifiers of a rig together, in the terms of the table."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from controller.loop.envelopes import (
-    MAX_LOADING_TIME,
-    EnvelopeSupport,
-    OpenAmplifier,
-    envelope_support,
-)
-from drivers.guard import limits_in_force
-from drivers.protocol.messages import Capabilities, Feature
+from controller.loop.envelopes import EnvelopeSupport, envelope_support
+from drivers.host.amplifier import Amplifier
+from drivers.protocol.table import QUANTITIES
 from model.drive_modes import DRIVE_MODES, playable_drive_modes
 from model.errors import InputError
 from model.rig.rig import Rig
+
+_FREQUENCY, _LEVEL, _RAMP = (QUANTITIES[name] for name in ("frequency", "level", "ramp"))
+_PHASE_STEP = QUANTITIES["phase_step"]
 
 
 @dataclass(frozen=True)
@@ -23,10 +21,8 @@ class PlaybackCapabilities:
 
     drive_mode: of the questions to the table; playable: the drive modes that every amplifier can
     play; frequencies: the lowest and highest [Hz]; max_amplitudes [m] by ERA;
-    envelope_support: which envelopes every amplifier plays; max_power: sum of squared levels of
-    all ERAs; slew [1/s]: highest rise of a level. eras_at_most: how many ERAs may play together;
-    ends_itself: whether every amplifier ends a vibration after its time; has_cross_fades: whether
-    each changes from one tone to another without silence between.
+    envelope_support: knots that every amplifier plays; max_power: sum of squared levels of
+    all ERAs; slew [1/s]: highest rise of a level; ramp_max [s].
     """
 
     drive_mode: str
@@ -36,59 +32,51 @@ class PlaybackCapabilities:
     envelope_support: EnvelopeSupport
     max_power: float = math.inf
     slew: float = math.inf
-    eras_at_most: int = 2
-    ends_itself: bool = True
-    has_cross_fades: bool = True
+    ramp_max: float = math.inf
 
 
 def playback_capabilities(
-    rig: Rig,
-    amplifiers: Mapping[str, OpenAmplifier],
-    *,
-    drive_mode: str | None = None,
-    max_loading_time: float = MAX_LOADING_TIME,
+    rig: Rig, amplifiers: Mapping[str, Amplifier], *, drive_mode: str | None = None
 ) -> PlaybackCapabilities:
     """Return what the open amplifiers of a rig, by name, can play.
 
-    drive_mode: None for the best that all can; max_loading_time [s]: how long loading envelopes may
-    delay a touch, 0 for ramps only. Raises InputError for a drive mode that one cannot play.
+    drive_mode: None for the best that all can. Raises InputError for a drive mode that one cannot
+    play, or a wired channel that its amplifier does not have.
     """
-    capabilities = {name: amplifier.capabilities for name, amplifier in amplifiers.items()}
+    for era, wired in rig.wiring.items():
+        channels = amplifiers[wired.amplifier].capabilities["channels"]
+        if wired.number >= channels:
+            raise InputError(
+                f"channel of ERA {era} must be 0 to {channels - 1} on amplifier "
+                f"{wired.amplifier}, got {wired.number}; change its wiring in the rig file"
+            )
     each = [
-        playable_drive_modes(level_step=caps.level_step, phase_step=caps.phase_step)
-        for caps in capabilities.values()
+        playable_drive_modes(
+            level_step=_LEVEL.from_wire(one.capabilities["level_step"]),
+            phase_step=_PHASE_STEP.from_wire(one.capabilities["phase_step"]),
+        )
+        for one in amplifiers.values()
     ]
     playable = tuple(name for name in DRIVE_MODES if all(name in modes for modes in each))
-    is_coherent = _are_coherent(tuple(capabilities.values()))
-    if not is_coherent:
-        playable = ("switched",)
     if drive_mode is not None and drive_mode not in playable:
         raise InputError(
             f"drive mode must be one that all amplifiers play ({', '.join(playable)}), got "
             f"{drive_mode}; leave it out for the best"
         )
-    configured = rig.limits
-    limits = {name: limits_in_force(configured, caps) for name, caps in capabilities.items()}
+    limits = {name: one.ledger.limits for name, one in amplifiers.items()}
     return PlaybackCapabilities(
         drive_mode=drive_mode or playable[-1],
         playable=playable,
         frequencies=(
-            max(one.frequency_min for one in limits.values()),
-            min(one.frequency_max for one in limits.values()),
+            max(_FREQUENCY.from_wire(one.frequency_min) for one in limits.values()),
+            min(_FREQUENCY.from_wire(one.frequency_max) for one in limits.values()),
         ),
         max_amplitudes={
-            era.name: era.stroke * limits[rig.wiring[era.name].amplifier].level for era in rig.eras
+            era.name: era.stroke * _LEVEL.from_wire(limits[rig.wiring[era.name].amplifier].level)
+            for era in rig.eras
         },
-        envelope_support=envelope_support(rig, amplifiers, max_loading_time=max_loading_time),
+        envelope_support=envelope_support(rig, amplifiers),
         max_power=min(one.power for one in limits.values()),
         slew=min(one.slew for one in limits.values()),
-        eras_at_most=2 if is_coherent else 1,
-        ends_itself=all(Feature.VALID_FOR in caps.features for caps in capabilities.values()),
-        has_cross_fades=all(caps.has_cross_fades for caps in capabilities.values()),
+        ramp_max=min(_RAMP.from_wire(one.capabilities["ramp_max"]) for one in amplifiers.values()),
     )
-
-
-def _are_coherent(each: Sequence[Capabilities]) -> bool:
-    """Whether phases hold between all channels: within each amplifier, and from a common start."""
-    needed = Feature.PHASE if len(each) == 1 else Feature.PHASE | Feature.STAGING
-    return all(needed in caps.features for caps in each)

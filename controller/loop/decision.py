@@ -1,27 +1,28 @@
-"""Decisions of the control loop, without waiting: touch frames in, safe command sets out.
+"""Decisions of the control loop, without waiting: touch frames in, sets of all amplifiers out.
 
 take(frame)  ->  contacts
-decide(now)  ->  contacts -> intent -> selection -> routing -> guard -> safe sets
+decide(now)  ->  contacts -> intent -> selection -> routing -> a set of every amplifier
 """
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.envelopes import MAX_LOADING_TIME, RAMPS_ONLY
 from controller.loop.intent import IntentSource
-from controller.loop.loading_times import LoadingTimes
-from controller.loop.safe_sets import FADE_RAMP, SafeSets, SetBuilder
+from controller.loop.plate_set import FADE_RAMP, PlateSet, SetBuilder
+from controller.loop.routing import Drive, tones_by_era
 from controller.loop.selection import Selection, Selector
 from controller.loop.table_query import is_short
-from controller.loop.validity import Validity, first_end, last_end, valid_for
+from controller.loop.validity import Validity, first_lasts, valid_for
 from controller.sources.contacts import Change, Contact, ContactTracker
 from controller.sources.touch import TouchFrame
-from drivers.command import DriveCommand
 from drivers.errors import CommandRefused
-from drivers.guard import Guard
+from drivers.host.group import Played
+from drivers.host.ledger import is_vibrating
+from drivers.protocol.sets import LayerSet
+from drivers.protocol.table import QUANTITIES
 from model.rig.rig import Rig
 from model.table.pattern import Pattern
 from model.table.question import Question
@@ -34,7 +35,7 @@ RELEASE_RAMP = 0.010
 
 # s; after a vibration a plate first rings louder than the next onset is at a quiet finger.
 _RING_DOWN = 0.4
-_ENDINGS_MARGIN = 0.1  # s; endings are loaded and committed in less
+_VALID_FOR = QUANTITIES["valid_for"]
 
 _logger = logging.getLogger(__name__)
 
@@ -45,57 +46,49 @@ class Decision:
 
     from_rest: whether nothing has played for 0.4 s, so that the plate is at rest;
     triggered_at [s]: when the change arrived.
-    sets: None if all channels are silent already; pattern: with the ramp and onset of the sets,
-    None for silence; adds_endings_only: whether the sets only add endings to the playback; refusal:
-    why a guard refused the pattern, which makes it silence; retry_at [s]: when the guard would pass
-    it, None for never. ends_due [s]: when the vibration that it ends was to end, if the amplifiers
-    do not end it themselves. held_until [s]: when to decide instead, once amplifiers that cannot
-    cross-fade have faded out.
+    set: None if all channels are silent already; pattern: with the ramp and onset of the set, None
+    for silence; refusal: why a ledger refused the pattern, which makes it silence; retry_at [s]:
+    when the ledger would admit it, None for never.
     """
 
     contacts: tuple[Contact, ...]
     selection: Selection
     from_rest: bool
     triggered_at: float
-    sets: SafeSets | None = None
+    set: PlateSet | None = None
     pattern: Pattern | None = None
-    adds_endings_only: bool = False
     refusal: str | None = None
     retry_at: float | None = None
-    ends_due: float | None = None
-    held_until: float | None = None
 
 
 @dataclass(frozen=True)
 class _Playback:
-    """Playback of the amplifiers since the last decision with sets.
+    """Playback of the amplifiers since the last decision with a set.
 
-    confirmed_commands: by ERA; has_endings: whether endings were added; endings_due [s]: when
-    endings can be added; retry_at [s]: when a guard would pass what it refused. confirmed_until
-    [s]: when the first target would have been lifted, as known when the sets were sent;
-    renewal_due, renewable_until [s]: between these they are renewed if all targets have been
-    confirmed since.
+    drive: by ERA, as confirmed; settled_at [s]: when its onset has ended.
     """
 
     decision: Decision | None = None
-    confirmed_commands: Mapping[str, DriveCommand] = field(default_factory=dict)
-    has_endings: bool = False
-    endings_due: float | None = None
-    retry_at: float | None = None
+    drive: Drive = field(default_factory=dict)
+    settled_at: float = math.inf
     validity: Validity = field(default_factory=Validity)
 
     @property
     def is_silent(self) -> bool:
         """Whether it is certain that nothing plays."""
-        sets = None if self.decision is None else self.decision.sets
-        return sets is not None and sets.is_silence
+        found = None if self.decision is None else self.decision.set
+        return found is not None and found.is_silence
+
+    @property
+    def retry_at(self) -> float | None:
+        """When [s] a ledger would admit what it refused."""
+        return None if self.decision is None else self.decision.retry_at
 
 
 class Decider:
-    """Contacts, intent, selection and safe sets of one plate; synchronous, times are arguments.
+    """Contacts, intent, selection and sets of one plate; synchronous, times are arguments.
 
-    guards: one for each amplifier, by name; max_loading_time [s]: longest loading of envelopes. A
-    decision never raises: it falls back to silence on any exception.
+    A decision never raises: it falls back to silence on any exception.
     """
 
     def __init__(
@@ -103,24 +96,26 @@ class Decider:
         rig: Rig,
         table: LocalizationTable,
         *,
-        guards: Mapping[str, Guard],
         capabilities: PlaybackCapabilities,
         intent_source: IntentSource,
         timing: Timing | None = None,
-        max_loading_time: float = MAX_LOADING_TIME,
     ) -> None:
+        self._rig = rig
         self._table = table
         self._timing = timing
         self._capabilities = capabilities
-        self._loading_times = LoadingTimes(max_loading_time)
         self._tracker = ContactTracker(rig.plate)
         self._intent_source = intent_source
         self._intent_due: float | None = None  # when the intent may change without a touch
-        self._held_until: float | None = None  # when there is room for a pattern
         self._selector = Selector(table, None if timing is None else timing.levels, rig.voltage)
-        self._builder = SetBuilder(rig, guards, timing=timing)
+        self._builder = SetBuilder(
+            rig,
+            support=capabilities.envelope_support,
+            ramp_max=capabilities.ramp_max,
+            timing=timing,
+        )
         self._selected: Selection | None = None
-        self._playing = self._playing_before = _Playback()
+        self._playing = _Playback()
         self._triggered_at: float | None = None
         self._played_until = -math.inf  # s; as far as known
 
@@ -156,12 +151,14 @@ class Decider:
             level_db_sl=-100.0,
             drive_mode=self._capabilities.drive_mode,
             playable=self._capabilities.playable,
-            eras_at_most=self._capabilities.eras_at_most,
             frequencies=self._capabilities.frequencies,
-            envelopes=support.onsets,
+            envelopes=support.onset_knots > 0,
         )
         pattern = self._timing.with_envelopes(
-            question, self._table.query(question), onset=support.onsets, ending=support.endings
+            question,
+            self._table.query(question),
+            onset=support.onset_knots > 0,
+            ending=support.ending_knots > 0,
         )
         self._timing.with_transient_measures(question, pattern)
 
@@ -169,13 +166,9 @@ class Decider:
     def due(self) -> float | None:
         """When [s] to decide next even if nothing arrives.
 
-        A source times out then, an intent expires, endings can be added, a guard would pass what it
-        refused, or the amplifiers have room for what is held back.
+        A source times out then, an intent expires, or a ledger would admit what it refused.
         """
-        moments = (
-            *(self._tracker.next_expiry, self._intent_due, self._held_until),
-            *(self._playing.endings_due, self._playing.retry_at),
-        )
+        moments = (self._tracker.next_expiry, self._intent_due, self._playing.retry_at)
         return min((moment for moment in moments if moment is not None), default=None)
 
     @property
@@ -201,90 +194,82 @@ class Decider:
         return change
 
     def forget(self) -> None:
-        """Discard the known playback: the next decision has sets."""
+        """Discard the known playback: the next decision has a set."""
         self._selected = None
         self._playing = _Playback()
 
-    def confirm(
-        self, commands: Mapping[str, DriveCommand], *, now: float, sent_at: float | None = None
-    ) -> None:
-        """Note what the amplifiers play for the last decision, by ERA, without silent ones.
+    def confirm(self, played: Played, *, now: float) -> Drive:
+        """Note what the amplifiers play for the last decision; returns it by ERA.
 
-        sent_at [s]: when the last byte of the commit was sent; pulses start with it.
+        Pulses start when the last commit was sent.
         """
+        drive = tones_by_era(played.layers, self._rig)
         decision = self._playing.decision
-        if decision is None or decision.sets is None or decision.pattern is None:
-            self._playing = replace(self._playing, confirmed_commands=commands)
-            return
+        self._playing = replace(self._playing, drive=drive)
+        if decision is None or decision.set is None or decision.pattern is None:
+            return drive
         for _, target in decision.selection.targets:
             if target.pulse is not None and target.pulse.started_at is None:
-                target.pulse.started_at = now if sent_at is None else sent_at
-        validity = self._validity(decision.sets, decision.selection, now)
-        self._playing = replace(self._playing, confirmed_commands=commands, validity=validity)
-        if decision.adds_endings_only:
-            self._playing = replace(self._playing, has_endings=True)
-        elif self._capabilities_at(now).envelope_support.endings and self._timing is not None:
-            endings_due = now + decision.sets.settled_after
-            # A commit after the end of a pulse would start it again.
-            if endings_due + _ENDINGS_MARGIN < first_end(decision.selection):
-                self._playing = replace(self._playing, endings_due=endings_due)
+                target.pulse.started_at = played.sent_at
+        self._playing = replace(
+            self._playing,
+            settled_at=now + decision.set.settled_after,
+            validity=self._validity(played, decision.selection, now),
+        )
+        return drive
 
-    def renewal(self, now: float) -> SafeSets | None:
-        """Return the sets that prolong the playback, if due at a time [s]; else None."""
+    def without_shapes(self, decision: Decision) -> Decision | None:
+        """Return the last decision along its plain ramp; None where it has no shapes."""
+        plain = None if decision.set is None else decision.set.plain
+        if plain is None or decision.pattern is None:
+            return None
+        pattern = replace(decision.pattern, onset=None, ending=None)
+        decision = replace(decision, set=plain, pattern=pattern)
+        self._playing = replace(self._playing, decision=decision)
+        return decision
+
+    def refused(self, decision: Decision, error: CommandRefused) -> Decision:
+        """Return silence in place of the last decision, which a ledger has refused."""
+        decision = replace(
+            decision,
+            set=self.silence(FADE_RAMP),
+            pattern=None,
+            refusal=str(error),
+            retry_at=error.until,
+        )
+        self._playing = _Playback(decision)
+        return decision
+
+    def renewal(self, now: float) -> PlateSet | None:
+        """Return the set that prolongs the playback, if due at a time [s]; else None."""
         decision = self._playing.decision
-        if decision is None or decision.sets is None:
+        if decision is None or decision.set is None:
             return None
         confirmed_until = self._confirmed_until(decision.selection)
         if not self._playing.validity.is_renewal_due(now, confirmed_until=confirmed_until):
             return None
-        valid_for = self._valid_for(decision.selection, now)
-        sets = self._builder.build_renewal(decision.sets, valid_for=valid_for)
-        return sets if sets is not None and sets.room_from <= now else None
+        lasts = valid_for(decision.selection, confirmed_until=confirmed_until, now=now)
+        return self._builder.build_renewal(decision.set, valid_for=lasts)
 
-    def confirm_renewal(self, sets: SafeSets, *, now: float) -> None:
-        """Note that the amplifiers have accepted the sets of a renewal."""
+    def confirm_renewal(self, played: Played, *, now: float) -> None:
+        """Note that the amplifiers have accepted a renewal."""
         if self._playing.decision is not None:
-            validity = self._validity(sets, self._playing.decision.selection, now)
+            validity = self._validity(played, self._playing.decision.selection, now)
             self._playing = replace(self._playing, validity=validity)
 
-    def without_onset(self, decision: Decision) -> Decision | None:
-        """Return the last decision along its plain ramp, since its onset was not loaded in time.
-
-        None for one that only adds endings: the playback stays as it is.
-        """
-        plain = None if decision.sets is None else decision.sets.plain
-        if plain is None or decision.pattern is None:
-            self._playing = replace(self._playing_before, endings_due=None)
-            return None
-        pattern = replace(decision.pattern, onset=None)
-        decision = replace(decision, sets=plain, pattern=pattern)
-        self._playing = replace(self._playing, decision=decision)
-        return decision
-
-    def note_loading_time(self, duration: float, *, now: float, is_late: bool = False) -> None:
-        """Note how long [s] loading envelopes took; too long means plain ramps for a while.
-
-        is_late: whether it was given up.
-        """
-        self._loading_times.note(duration, now=now, is_late=is_late)
-
-    def ramp_only_reason(self, now: float) -> str | None:
-        """Return why touches start along plain ramps though the amplifiers play envelopes."""
-        if not self._capabilities.envelope_support:
-            return None
-        return self._loading_times.ramp_only_reason(now)
+    def refuse_renewal(self, until: float | None) -> None:
+        """Note that a ledger has refused a renewal until a time [s], None: the playback ends."""
+        due = math.inf if until is None else until
+        validity = replace(self._playing.validity, renewal_due=due)
+        self._playing = replace(self._playing, validity=validity)
 
     def decide(self, now: float) -> Decision | None:
-        """Decide at a time [s]; None if nothing changes.
-
-        A pattern that the amplifiers have no room for yet is decided again once they have, unless
-        something else is then.
-        """
+        """Decide at a time [s]; None if nothing changes."""
         self.expire(now)
         contacts, playing = self._tracker.contacts, self._playing
         triggered_at = now if self._triggered_at is None else min(self._triggered_at, now)
         self._triggered_at = None
-        if playing.confirmed_commands:
+        if playing.drive:
             self._played_until = now
         from_rest = now - self._played_until >= _RING_DOWN
         decision, has_failed = None, False
@@ -292,7 +277,7 @@ class Decider:
             selection = self._select(contacts, now)
             is_new = selection != self._selected or _is_due(playing.retry_at, now)
             draft = Decision(contacts, selection, from_rest, triggered_at)
-            decision = self._with_pattern(draft, now) if is_new else self._with_endings(draft, now)
+            decision = self._with_pattern(draft, now) if is_new else None
         except Exception as error:
             has_failed = True
             selection = Selection((), contacts, None, failure_text(error))
@@ -300,127 +285,64 @@ class Decider:
             draft = Decision(contacts, selection, from_rest, triggered_at)
             if is_new:
                 _logger.exception("loop: decision failed, silencing all channels")
-        self._held_until = None
-        until = _room_from(decision)
-        if until > now:
-            self._hold(until, now, triggered_at)
-            return None
         if decision is None and is_new:
             decision = draft
             if not playing.is_silent:
-                sets = self._end(contacts, along_endings=playing.has_endings and not has_failed)
-                decision = replace(draft, sets=sets, ends_due=self._missed_end(now))
-        if decision is not None and decision.sets is not None:
-            self._playing_before = playing
-            self._playing = _Playback(decision, retry_at=decision.retry_at)
-        else:
-            self._playing = replace(
-                playing,
-                retry_at=None if is_new else playing.retry_at,
-                endings_due=None if _is_due(playing.endings_due, now) else playing.endings_due,
-            )
+                end = self._end(contacts, now, has_failed=has_failed)
+                decision = replace(draft, set=end)
+        if decision is not None and decision.set is not None:
+            self._playing = _Playback(decision)
+        elif is_new and playing.decision is not None:
+            self._playing = replace(playing, decision=replace(playing.decision, retry_at=None))
         self._selected = selection
         return decision
 
-    def _hold(self, until: float, now: float, triggered_at: float) -> None:
-        """Decide again at a time [s], as if nothing had been decided at `now` [s]."""
-        self._held_until, self._triggered_at = until, triggered_at
-        playing = self._playing
-        self._playing = replace(
-            playing,
-            retry_at=until if _is_due(playing.retry_at, now) else playing.retry_at,
-            endings_due=until if _is_due(playing.endings_due, now) else playing.endings_due,
-        )
-
-    def silence(self, *, ramp: float, before: SafeSets | None = None) -> SafeSets:
-        """Build the sets that ramp [s] every wired channel to zero; see `SetBuilder`."""
-        return self._builder.build_silence(ramp=ramp, before=before)
-
-    def _capabilities_at(self, now: float) -> PlaybackCapabilities:
-        """Return the capabilities at a time [s]: without envelopes while loading is too slow."""
-        if self._loading_times.ramp_only_reason(now) is None:
-            return self._capabilities
-        return replace(self._capabilities, envelope_support=RAMPS_ONLY)
+    def silence(self, ramp: float) -> PlateSet:
+        """Return what lets every channel fall silent along a ramp [s]."""
+        return PlateSet(ramp=ramp)
 
     def _select(self, contacts: tuple[Contact, ...], now: float) -> Selection:
         """Query the intent, and the table for it."""
         self._intent_due = None
         intent = self._intent_source.intent(contacts, now)
         self._intent_due = intent.due(now)
-        return self._selector.select(contacts, intent, self._capabilities_at(now))
+        return self._selector.select(contacts, intent, self._capabilities)
 
     def _with_pattern(self, draft: Decision, now: float) -> Decision | None:
-        """Return a draft with the sets of its pattern; None without a pattern."""
-        pattern, question = draft.selection.pattern, draft.selection.question
-        if pattern is None or question is None:
+        """Return a draft with the set of its pattern; None without a pattern."""
+        selection = draft.selection
+        if selection.pattern is None or selection.question is None:
             return None
-        support = self._capabilities_at(now).envelope_support
-        is_shaped = support.onsets and not is_short(draft.selection.targets)
-        try:
-            sets, played = self._builder.build_pattern(
-                pattern,
-                question,
-                is_shaped=is_shaped,
-                playing=self._playing.confirmed_commands,
-                valid_for=self._valid_for(draft.selection, now),
-            )
-        except CommandRefused as error:
-            silence = self.silence(ramp=FADE_RAMP)
-            if not self._capabilities.has_cross_fades:  # out, then in
-                if not self._playing.is_silent:
-                    return replace(draft, sets=silence, retry_at=now)
-                if error.until is not None:
-                    return replace(draft, held_until=error.until)
-            return replace(draft, sets=silence, refusal=str(error), retry_at=error.until)
-        return replace(draft, sets=sets, pattern=played)
-
-    def _with_endings(self, draft: Decision, now: float) -> Decision | None:
-        """Return a draft that adds endings to the playback; None if not due, or refused."""
-        pattern, question = draft.selection.pattern, draft.selection.question
-        playing = self._playing
-        if pattern is None or question is None or not playing.confirmed_commands:
-            return None
-        if not _is_due(playing.endings_due, now):
-            return None
-        sets = self._builder.build_endings(
-            pattern,
-            question,
-            playing=playing.confirmed_commands,
-            valid_for=self._valid_for(draft.selection, now),
+        until = self._confirmed_until(selection)
+        found, pattern = self._builder.build_pattern(
+            selection.pattern,
+            selection.question,
+            playing=self._playing.drive,
+            valid_for=valid_for(selection, confirmed_until=until, now=now),
+            is_shaped=not is_short(selection.targets),
+            lasts=first_lasts(selection, now),
         )
-        if sets is None:
-            return None
-        return replace(draft, sets=sets, pattern=pattern, adds_endings_only=True)
+        return replace(draft, set=found, pattern=pattern)
 
-    def _end(self, contacts: tuple[Contact, ...], *, along_endings: bool) -> SafeSets:
-        """Build the sets that end the playback: along endings only under fingers that stay."""
+    def _end(self, contacts: tuple[Contact, ...], now: float, *, has_failed: bool) -> PlateSet:
+        """Return what ends the playback: along endings only under fingers that stay."""
         if not contacts:
-            return self.silence(ramp=RELEASE_RAMP)
-        return self._builder.build_end() if along_endings else self.silence(ramp=FADE_RAMP)
+            return self.silence(RELEASE_RAMP)
+        decision = self._playing.decision
+        has_endings = decision is not None and decision.set is not None and decision.set.has_endings
+        if has_endings and not has_failed and now >= self._playing.settled_at:
+            return self._builder.build_end()
+        return self.silence(FADE_RAMP)
 
     def _confirmed_until(self, selection: Selection) -> float:
         """Return when [s] the first target is lifted unless a frame arrives."""
         expiries = [self._tracker.expiry_of(contact.key) for contact, _ in selection.targets]
         return min(expiries, default=-math.inf)
 
-    def _valid_for(self, selection: Selection, now: float) -> float:
-        """How long [s] a vibration may last by itself; 0 where the host ends it."""
-        if not self._capabilities.ends_itself:
-            return 0.0
-        return valid_for(selection, confirmed_until=self._confirmed_until(selection), now=now)
-
-    def _missed_end(self, now: float) -> float | None:
-        """Return when [s] the pulses that play were to end, if the host has to end them."""
-        decision = self._playing.decision
-        if self._capabilities.ends_itself or decision is None or decision.pattern is None:
-            return None
-        end = last_end(decision.selection)
-        return end if end <= now else None
-
-    def _validity(self, sets: SafeSets, selection: Selection, now: float) -> Validity:
-        """Return how long sets committed by now [s] last."""
+    def _validity(self, played: Played, selection: Selection, now: float) -> Validity:
+        """Return how long a set that has been played by now [s] lasts."""
         until = self._confirmed_until(selection)
-        return Validity.started(sets.valid_for, confirmed_until=until, now=now)
+        return Validity.started(_shortest(played.layers), confirmed_until=until, now=now)
 
     def _note(self, change: Change, time: float) -> None:
         """Note when the first change since the last decision arrived."""
@@ -428,13 +350,18 @@ class Decider:
             self._triggered_at = time
 
 
-def _room_from(decision: Decision | None) -> float:
-    """Return when [s] the amplifiers have room for a decision."""
-    if decision is None:
-        return -math.inf
-    if decision.held_until is not None:
-        return decision.held_until
-    return -math.inf if decision.sets is None else decision.sets.room_from
+def _shortest(played: Mapping[str, Sequence[LayerSet]]) -> float:
+    """Return the time [s] after the commit when the first amplifier ends its vibration by itself.
+
+    Infinite where none does.
+    """
+    times = [
+        _VALID_FOR.from_wire(one.valid_for)
+        for layers in played.values()
+        for one in layers
+        if one.valid_for and is_vibrating(one)
+    ]
+    return min(times, default=math.inf)
 
 
 def _is_due(moment: float | None, now: float) -> bool:

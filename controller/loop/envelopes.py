@@ -1,165 +1,125 @@
-"""Envelopes of a pattern in the slots of amplifiers, and whether the wires load them in time.
+"""How many knots of an onset the wires carry in time, and envelopes as shapes of amplifiers.
 
-The onset and the ending of a channel have a slot each, the same for every pattern: a set takes its
-envelopes with it, so a slot may be reloaded while they play. The last value of an envelope, the
-pattern itself or silence, belongs to the command and is not among the knots on the wire.
-
-A touch waits for its onset only. Endings follow once the onset is over: the same tones again, which
-changes nothing that is felt, now with their endings.
+A set takes its onset and its ending with it, so a touch waits for them. The knots that fit are
+arithmetic from the wires, done once when the amplifiers are open. An onset of fewer knots follows
+the same curve in longer steps, which keeps quiet fingers quieter than a ramp does down to a single
+knot; an ending is sent whole or not at all. The last value of an envelope, the pattern itself or
+silence, is that of the command and not among the knots on the wire.
 """
 
+import cmath
+import math
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import dataclass
 
-from drivers.command import Envelope, Knot
-from drivers.protocol.messages import Capabilities
-from drivers.protocol.wire_times import WireTimes
+import numpy as np
+
+from drivers.contents import Shape
+from drivers.host.amplifier import Amplifier
+from drivers.host.line import Line
+from drivers.protocol.table import MAX_WORDS, QUANTITIES
 from model.rig.rig import Rig
-from model.table.pattern import Pattern
-from model.transients.envelope import KNOT_STEP
+from model.transients.envelope import KNOT_STEP, BaseEnvelope, Envelopes
 from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
 
-MAX_LOADING_TIME = 0.010
-"""How long [s] loading envelopes may delay a touch: a delay that varies by more is noticed between
-presses, and a click of 40 ms must not wait as long as it lasts."""
+MAX_SET_TIME = 0.010
+"""How long [s] a set may take on its wire, so that its onset does not delay a touch."""
 
-SHAPING_TIME, EXCHANGE_TIME = 0.004, 0.0005
-"""What shaping an onset takes [s], and an exchange beside its time on the wire: both measured."""
-
-# Levels have steps of 1e-4 on the wire; smaller digits are rounding errors of the knot search.
-_DIGITS = 9
+_LAYER_WORDS, _COMMAND_WORDS, _ENVELOPE_WORDS, _KNOT_WORDS = 3, 4, 2, 2
+_PART_WORDS = 3  # of a message: session, token, part
+_STEP = QUANTITIES["envelope_step"]
+_DIGITS = 9  # of a level
+_LEAST_ONSET = 5  # knots that an ending must leave
 
 
 @dataclass(frozen=True, slots=True)
 class EnvelopeSupport:
-    """Supported envelopes: onsets, endings, both or none."""
+    """Knots of an onset and of an ending that every channel may have; 0: ramps."""
 
-    onsets: bool
-    endings: bool
-
-    def __bool__(self) -> bool:
-        """Whether there are any."""
-        return self.onsets or self.endings
+    onset_knots: int
+    ending_knots: int = 0
 
 
-RAMPS_ONLY = EnvelopeSupport(onsets=False, endings=False)
+RAMPS_ONLY = EnvelopeSupport(0)
 """Support of ramps only."""
 
 
-class OpenAmplifier(Protocol):
-    """The part of an open amplifier that decides what it can play."""
-
-    @property
-    def capabilities(self) -> Capabilities:
-        """Its reported capabilities."""
-
-    @property
-    def bus(self) -> str | None:
-        """Name of the bus that it shares, None without one."""
-
-    @property
-    def wire_times(self) -> WireTimes:
-        """Durations on its wire."""
-
-
-def envelope_support(
-    rig: Rig, amplifiers: Mapping[str, OpenAmplifier], *, max_loading_time: float
-) -> EnvelopeSupport:
-    """Return what all amplifiers, by name, can play and load within `max_loading_time` [s].
-
-    A touch waits while its onset is shaped and loaded; endings are loaded while it vibrates.
-    """
-    if max_loading_time <= 0:
-        return RAMPS_ONLY
-    return EnvelopeSupport(
-        onsets=_fits(
-            rig,
-            amplifiers,
-            knots=ONSET_KNOTS - 1,
-            slots=1,
-            max_loading_time=max_loading_time - SHAPING_TIME,
-        ),
-        endings=_fits(
-            rig, amplifiers, knots=ENDING_KNOTS - 1, slots=2, max_loading_time=max_loading_time
-        ),
-    )
+def envelope_support(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> EnvelopeSupport:
+    """Return what all open amplifiers, by name, play, and their wires carry within 10 ms."""
+    wired: dict[str, int] = defaultdict(int)
+    for channel in rig.wiring.values():
+        wired[channel.amplifier] += 1
+    by_line: dict[Line, list[str]] = defaultdict(list)
+    for name in wired:
+        by_line[amplifiers[name].line].append(name)
+    carried = [_knots_on(line, [wired[name] for name in names]) for line, names in by_line.items()]
+    carried += [
+        _knots_in(amplifiers[name].capabilities["set_words"], [count])
+        for name, count in wired.items()
+    ]
+    each = min(map(_knots_of, (amplifiers[name] for name in wired)), default=0)
+    knots, onset, ending = max(min(carried, default=0), 0), ONSET_KNOTS - 1, ENDING_KNOTS - 1
+    if each < ending or knots < ending + _LEAST_ONSET:
+        ending = 0
+    return EnvelopeSupport(min(knots - ending, each, onset), ending)
 
 
-def onset_slots(rig: Rig) -> dict[str, int]:
-    """Return the slot of every ERA's onset, by its name; from 1 on every amplifier."""
-    counts: dict[str, int] = defaultdict(int)
-    slots = {}
-    for name, channel in rig.wiring.items():
-        counts[channel.amplifier] += 1
-        slots[name] = counts[channel.amplifier]
-    return slots
+def _knots_of(amplifier: Amplifier) -> int:
+    """Return how many knots an envelope of an amplifier may have, in the steps of the model."""
+    can = amplifier.capabilities
+    low, high = (_STEP.from_wire(can[f"envelope_step_{end}"]) for end in ("min", "max"))
+    return int(can["knots"]) if low <= KNOT_STEP <= high else 0
 
 
-def ending_slots(rig: Rig) -> dict[str, int]:
-    """Return the slot of every ERA's ending, by its name, after those of the onsets."""
-    wired = _wired(rig)
+def _knots_on(line: Line, channels: list[int]) -> int:
+    """Return the knots of each channel that a line carries in time, for its amplifiers' sets."""
+    takes = line.wire.transit(MAX_WORDS)
+    if takes <= 0:
+        return int(QUANTITIES["knots"].maximum)
+    return _knots_in(int(MAX_WORDS * MAX_SET_TIME / takes), channels)
+
+
+def _knots_in(words: int, channels: list[int]) -> int:
+    """Return the knots of each channel for which a number of words suffices."""
+    parts = -(-words // MAX_WORDS)
+    heads = len(channels) * _LAYER_WORDS + max(parts, len(channels)) * _PART_WORDS
+    each = _COMMAND_WORDS + 2 * _ENVELOPE_WORDS
+    return int((words - heads - sum(channels) * each) // (_KNOT_WORDS * sum(channels)))
+
+
+def thinned(envelopes: Envelopes, *, knots: int) -> Envelopes:
+    """Return envelopes by ERA with at most so many knots beside the last value."""
+    return {name: _thinned(envelope, knots + 1) for name, envelope in envelopes.items()}
+
+
+def shapes_of(envelopes: Envelopes | None, rig: Rig) -> dict[str, Shape]:
+    """Return envelopes as shapes, by ERA, with levels of full stroke; none without any."""
     return {
-        name: slot + wired[rig.wiring[name].amplifier] for name, slot in onset_slots(rig).items()
+        name: _shape(envelope, rig.era(name).stroke) for name, envelope in (envelopes or {}).items()
     }
 
 
-def wire_envelopes(pattern: Pattern, rig: Rig) -> dict[str, tuple[Envelope, ...]]:
-    """Return the envelopes of a pattern to load, by amplifier; an empty tuple without any."""
-    loads: dict[str, list[Envelope]] = {name: [] for name in rig.amplifiers}
-    for shapes, slots in (
-        (pattern.onset, onset_slots(rig)),
-        (pattern.ending, ending_slots(rig)),
-    ):
-        for name, envelope in (shapes or {}).items():
-            stroke = rig.era(name).stroke
-            loads[rig.wiring[name].amplifier].append(
-                Envelope(
-                    slot=slots[name],
-                    step=envelope.step,
-                    knots=tuple(_knot(value / stroke) for value in envelope.knots[:-1]),
-                )
-            )
-    return {name: tuple(several) for name, several in loads.items()}
+def _thinned(envelope: BaseEnvelope, steps: int) -> BaseEnvelope:
+    """Return an envelope over the same time in at most so many steps, of whole wire steps."""
+    count = len(envelope.knots)
+    if count <= steps:
+        return envelope
+    step = math.ceil(round(envelope.duration * _STEP.per_unit) / steps) / _STEP.per_unit
+    times = np.minimum(step * np.arange(1, steps + 1), envelope.duration)
+    knots = tuple(complex(value) for value in envelope.amplitude(times))
+    return BaseEnvelope(envelope.frequency, envelope.start, knots, step)
 
 
-def _knot(value: complex) -> Knot:
-    """Return the knot of a complex amplitude in strokes, its level rounded."""
-    knot = Knot.from_phasor(value)
-    return replace(knot, level=round(knot.level, _DIGITS))
+def _shape(envelope: BaseEnvelope, stroke: float) -> Shape:
+    return Shape(envelope.step, tuple(_rounded(value / stroke) for value in envelope.knots[:-1]))
 
 
-def _wired(rig: Rig) -> dict[str, int]:
-    """Count the wired channels of each amplifier."""
-    counts = dict.fromkeys(rig.amplifiers, 0)
-    for channel in rig.wiring.values():
-        counts[channel.amplifier] += 1
-    return counts
+def _rounded(value: complex) -> complex:
+    """Return a level without the rounding errors of the knot search, which may exceed 1."""
+    return cmath.rect(round(abs(value), _DIGITS), cmath.phase(value))
 
 
-def _fits(
-    rig: Rig,
-    amplifiers: Mapping[str, OpenAmplifier],
-    *,
-    knots: int,
-    slots: int,
-    max_loading_time: float,
-) -> bool:
-    """Whether every amplifier plays an envelope of this many knots per ERA and loads it in time.
-
-    slots: per channel.
-    """
-    busy: dict[str, float] = defaultdict(float)
-    for name, wired in _wired(rig).items():
-        amplifier = amplifiers[name]
-        caps = amplifier.capabilities
-        if not (
-            caps.envelope_knots >= knots
-            and caps.envelope_slots >= slots * wired
-            and caps.envelope_step_min <= KNOT_STEP <= caps.envelope_step_max
-        ):
-            return False
-        loading = amplifier.wire_times.loading(knots) + EXCHANGE_TIME
-        busy[amplifier.bus or name] += wired * loading
-    return max(busy.values(), default=0.0) <= max_loading_time
+def duration_of(shape: Shape | None) -> float:
+    """Return how long a shape takes [s]; 0 for none."""
+    return 0.0 if shape is None else shape.step * (len(shape.knots) + 1)

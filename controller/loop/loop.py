@@ -6,26 +6,27 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import ParamSpec
 
-from controller.group.amplifier_group import AmplifierGroup, GroupState
-from controller.group.guards import check_watchdogs, make_guards
-from controller.group.synchronized_play import Played
 from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
 from controller.loop.decision import RELEASE_RAMP, Decider, Decision
-from controller.loop.envelopes import MAX_LOADING_TIME
 from controller.loop.intent import BuzzNewestContact, IntentSource
+from controller.loop.lines import Lines
 from controller.loop.observer import Observer, applied_by, silenced_by
-from controller.loop.routing import commands_by_era
-from controller.loop.safe_sets import SafeSets
+from controller.loop.plate_set import PlateSet
 from controller.sources.contacts import Change
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import TouchFrame, TouchSource
 from drivers import clock
-from drivers.amplifier import WATCHDOG, Amplifier
-from drivers.command import DriveCommand
-from drivers.errors import CommandError, DriverError, LinkError
-from drivers.guard import Guard
-from drivers.operation.silence import StopOutcome
-from drivers.operation.watchdog import HEARTBEAT
+from drivers.errors import (
+    CommandError,
+    CommandRefused,
+    DriverError,
+    LinkDegraded,
+    LinkError,
+    Preempted,
+)
+from drivers.host.amplifier import WATCHDOG, Amplifier, Stopped
+from drivers.host.group import Group, GroupState, Played
+from drivers.host.timing import HEARTBEAT
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -45,14 +46,14 @@ _P = ParamSpec("_P")
 class Controller:
     """Drives the amplifiers of a rig from touch sources: open, arm, run, close.
 
-    table: for this rig; amplifiers by name, not yet open. Starts disarmed: contacts are followed
-    but nothing is sent. The loop sends the heartbeat itself after it has run, so that the watchdogs
-    of the amplifiers trip when it hangs.
+    table: for this rig; lines: makes the lines to its amplifiers, anew for each opening; urls and
+    expected serial numbers by amplifier name. Starts disarmed: contacts are followed but nothing is
+    sent. The loop sends the heartbeat itself after it has run, so that the watchdogs of the
+    amplifiers trip when it hangs.
 
     intent_source: by default the newest contact buzzes where it is. timing: shapes the patterns of
     the table, ramps only without it. drive_mode: None for the best that the amplifiers can play.
-    max_loading_time [s]: how long loading envelopes may delay a touch, 0 for ramps only.
-    is_supervised: whether amplifiers without a watchdog are driven. watchdog [s]: of armed ones.
+    connected: called with all amplifiers when their lines are open. watchdog [s]: of armed ones.
     """
 
     def __init__(
@@ -60,39 +61,54 @@ class Controller:
         rig: Rig,
         table: LocalizationTable,
         *,
-        amplifiers: Mapping[str, Amplifier],
+        lines: Callable[[], Lines],
+        urls: Mapping[str, str] | None = None,
+        serial_numbers: Mapping[str, str] | None = None,
         sources: Sequence[TouchSource] = (),
         observer: Observer | None = None,
         intent_source: IntentSource | None = None,
         timing: Timing | None = None,
         drive_mode: str | None = None,
-        max_loading_time: float = MAX_LOADING_TIME,
-        is_supervised: bool = False,
+        connected: Callable[[Mapping[str, Amplifier]], None] = lambda amplifiers: None,
         watchdog: float = WATCHDOG,
     ) -> None:
-        if amplifiers.keys() != rig.amplifiers.keys():
-            raise InputError(
-                f"amplifiers must be those of the rig ({', '.join(sorted(rig.amplifiers))}), got "
-                f"{', '.join(sorted(amplifiers)) or 'none'}"
-            )
         self._rig = rig
         self._table = table
-        self._is_supervised = is_supervised
-        self._amplifiers = amplifiers
-        self._group = AmplifierGroup(amplifiers, watchdog=watchdog)
+        self._urls = dict(rig.amplifiers if urls is None else urls)
+        if self._urls.keys() != rig.amplifiers.keys():
+            raise InputError(
+                f"amplifiers must be those of the rig ({', '.join(sorted(rig.amplifiers))}), got "
+                f"{', '.join(sorted(self._urls)) or 'none'}"
+            )
+        self._make_lines = lines
+        self._lines_if_open: Lines | None = None
+        self._serial_numbers = dict(serial_numbers or {})
+        self._connected = connected
+        self._watchdog = watchdog
+        self._group = Group({}, watchdog=watchdog)
+        self._missing: frozenset[str] = frozenset()
+        self._known: dict[str, Amplifier] = {}
         self._sources = sources
         self._observer = observer or Observer()
         self._intent_source = intent_source or BuzzNewestContact()
         self._timing = timing
         self._drive_mode = drive_mode
-        self._max_loading_time = max_loading_time if timing is not None else 0.0
         self._rejects = RejectCounter(_logger)
         self._decider_if_open: Decider | None = None
-        self._guards: Mapping[str, Guard] = {}
         self._wake = asyncio.Event()
         self._changed_at: float | None = None  # s; until all changes are decided
         self._heartbeat_due = 0.0
         self._expiry: asyncio.TimerHandle | None = None
+
+    @property
+    def amplifiers(self) -> Mapping[str, Amplifier]:
+        """Amplifiers by name, as identified last; empty before."""
+        return self._known
+
+    @property
+    def group(self) -> Group:
+        """All amplifiers together."""
+        return self._group
 
     @property
     def group_state(self) -> GroupState:
@@ -103,6 +119,11 @@ class Controller:
     def degraded(self) -> tuple[str, ...]:
         """Names of amplifiers that do not reply but may still play; nothing new is played then."""
         return self._group.degraded
+
+    @property
+    def missing(self) -> frozenset[str]:
+        """Names of amplifiers whose loss, or absence, has closed all others."""
+        return self._missing
 
     @property
     def is_preparing(self) -> bool:
@@ -122,11 +143,6 @@ class Controller:
         return self._drive_mode or [*DRIVE_MODES][-1]
 
     @property
-    def ramp_only_reason(self) -> str | None:
-        """Why touches start along plain ramps now though the amplifiers play envelopes."""
-        return self._decider.ramp_only_reason(clock.now()) if self._decider_if_open else None
-
-    @property
     def rejected_touches(self) -> Mapping[str, int]:
         """Number of touches that could not be contacts, by reason."""
         return self._rejects.counts
@@ -144,33 +160,47 @@ class Controller:
     async def open(self) -> None:
         """Open every amplifier, or none, and prepare what they can play; all stay disarmed.
 
-        Raises LinkError, CommandError, also for one without a watchdog, and InputError for a wired
-        channel that its amplifier does not have or a drive mode that one cannot play.
+        An amplifier that was open before must have the serial number that it had, and keeps the
+        vibrations that its limits over time count. Raises LinkError, CommandError, and InputError
+        for a wired channel that its amplifier does not have or a drive mode that one cannot play.
         """
-        await self._group.open()
+        lines = self._lines_if_open = self._make_lines()
         try:
-            if not self._is_supervised:
-                check_watchdogs(self._amplifiers)
-            self._guards = make_guards(self._rig, self._amplifiers, self._guards)
+            amplifiers = {name: await self._amplifier(lines, name) for name in self._urls}
+            self._connected(amplifiers)
+            self._group = Group(amplifiers, watchdog=self._watchdog)  # a stop reaches them now
+            await self._group.open()
+            for name, amplifier in amplifiers.items():
+                self._serial_numbers[name] = amplifier.identity["serial_number"]
+                if name in self._known:
+                    amplifier.ledger.go_on_from(self._known[name].ledger)
+                self._known[name] = amplifier
             decider = Decider(
                 self._rig,
                 self._table,
-                guards=self._guards,
                 capabilities=playback_capabilities(
-                    self._rig,
-                    self._amplifiers,
-                    drive_mode=self._drive_mode,
-                    max_loading_time=self._max_loading_time,
+                    self._rig, amplifiers, drive_mode=self._drive_mode
                 ),
                 intent_source=self._intent_source,
                 timing=self._timing,
-                max_loading_time=self._max_loading_time,
             )
             decider.prepare()
         except BaseException:
-            await self._group.close({})
+            await self._close()
             raise
+        self._missing = frozenset()
         self._decider_if_open = decider
+
+    async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
+        """Open the line of an amplifier; raises LinkError, CommandError."""
+        serial_number = self._serial_numbers.get(name)
+        try:
+            return await lines.amplifier(
+                self._urls[name], self._rig.limits, name=name, serial_number=serial_number
+            )
+        except LinkError:
+            self._missing = frozenset({name})
+            raise
 
     async def arm(self) -> None:
         """Switch the high voltage on, so that touches are felt; `run` must run or start at once."""
@@ -185,9 +215,11 @@ class Controller:
         """Ramp to silence, then switch the high voltage off."""
         await self._group.disarm()
 
-    async def stop(self) -> Mapping[str, StopOutcome]:
-        """Quick-stop every amplifier; latched until `clear`; returns the outcome of each."""
-        return await self._group.stop()
+    async def stop(self) -> Mapping[str, Stopped]:
+        """Quick-stop every amplifier; latched until `clear`; returns what became of each."""
+        stopped = await self._group.stop()
+        unknown = Stopped(False, -math.inf, "the amplifier is not connected")
+        return {name: stopped.get(name, unknown) for name in self._urls}
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone; nothing arms by itself."""
@@ -195,10 +227,21 @@ class Controller:
 
     async def close(self) -> None:
         """Ramp to zero in 50 ms, confirm it by reading back, disarm and close; ends `run`."""
-        decider = self._decider_if_open
-        silence = decider.silence(ramp=CLOSING_RAMP).sets if decider else {}
+        await self._close()
+
+    async def _close(self) -> None:
         self._wake.set()
-        await self._group.close(silence)
+        if self._lines_if_open is not None and self._group.lost_by:
+            self._missing = frozenset(self._group.lost_by)
+        try:
+            await self._group.close(CLOSING_RAMP)
+        finally:
+            await self._close_lines()
+
+    async def _close_lines(self) -> None:
+        lines, self._lines_if_open = self._lines_if_open, None
+        if lines is not None:
+            await lines.close()
 
     async def run(self) -> None:
         """Run the loop until `close` or cancellation; raises LinkError when an amplifier is lost.
@@ -226,20 +269,15 @@ class Controller:
         now = clock.now()
         expired = self._decider.expire(now)
         decision = self._decider.decide(now)
-        is_aborted = False
         try:
-            if self.group_state is GroupState.ARMED and decision is not None:
-                if decision.pattern is not None and self._group.degraded:
-                    self._decider.forget()  # decided again once all amplifiers reply
-                else:
-                    ready_at = now if decision.sets is None else max(now, decision.sets.ready_at)
-                    load_until = ready_at + self._max_loading_time
-                    is_aborted = not await self._execute(decision, load_until=load_until)
-            elif self.group_state is GroupState.ARMED and not self._group.degraded:
-                await self._renew(now)
-            # The set may be incomplete then: the next cycle silences it, before the heartbeat.
-            if self._is_heartbeat_due and not is_aborted and await self._group.heartbeat():
-                self._heartbeat_due = clock.now() + HEARTBEAT
+            if self.group_state is GroupState.ARMED:
+                await self._send(decision, now)
+                # Not after a set that was given up: the next cycle silences it first.
+                if self._is_heartbeat_due:
+                    await self._group.beat()
+                    self._heartbeat_due = clock.now() + HEARTBEAT
+        except (Preempted, LinkDegraded):
+            pass  # what plays is unknown, and decided anew
         except LinkError as error:
             self._report(self._observer.link_lost, str(error))
             raise
@@ -307,73 +345,90 @@ class Controller:
         self._expiry = None
         self._follow(self._decider.expire(clock.now()))
 
-    async def _execute(self, decision: Decision, *, load_until: float) -> bool:
-        """Send the sets of a decision and report the outcome; raises DriverError.
+    async def _send(self, decision: Decision | None, now: float) -> None:
+        """Send what was decided, or prolong what plays; raises DriverError."""
+        if decision is None:
+            if not self._group.degraded:
+                await self._renew(now)
+        elif decision.pattern is not None and self._group.degraded:
+            self._decider.forget()  # decided again once all amplifiers reply
+        else:
+            await self._execute(decision)
 
-        False if silence came in between. load_until [s]: when envelopes must be loaded.
-        """
-        commands: Mapping[str, DriveCommand] = {}
-        sent_at = None
-        if decision.sets is not None:
-            played = await self._play(
-                decision.sets, is_pattern=decision.pattern is not None, load_until=load_until
-            )
-            if played is not None and played.loading_time is not None:
-                self._decider.note_loading_time(
-                    played.loading_time, now=clock.now(), is_late=played.is_late
-                )
-            if played is not None and played.is_late:
-                plain = self._decider.without_onset(decision)
-                if plain is None:
-                    return True
-                return await self._execute(plain, load_until=load_until)
-            if played is None:
-                return False
-            commands, sent_at = commands_by_era(played.achieved, self._rig), played.sent_at
-            self._decider.confirm(commands, now=clock.now(), sent_at=sent_at)
-        if decision.refusal is not None:
-            self._report(self._observer.refused, decision.refusal)
-        if decision.adds_endings_only:
-            return True  # what is felt stays the same
-        if decision.pattern is not None and sent_at is not None:
+    async def _execute(self, decision: Decision) -> None:
+        """Send the set of a decision and report the outcome; raises DriverError."""
+        played, sent_at = None, None
+        if decision.set is not None:
+            try:
+                played, sent_at = await self._play(decision.set)
+            except Preempted:
+                raise
+            except CommandRefused as error:
+                if self.group_state is not GroupState.ARMED:
+                    raise
+                plain = self._decider.without_shapes(decision)
+                if plain is not None:
+                    _logger.info("loop: plain ramps instead of envelopes: %s", error)
+                    await self._execute(plain)
+                else:
+                    await self._execute(self._decider.refused(decision, error))
+                return
+        if played is not None and decision.pattern is not None and sent_at is not None:
+            drive = self._decider.confirm(played, now=clock.now())
             applied = applied_by(
                 decision,
                 decision.pattern,
-                commands=commands,
+                drive=drive,
                 sent_at=sent_at,
                 # Bases do not follow a ramp of the voltage as is predicted.
                 timing=None if self._rig.voltage else self._timing,
             )
             self._report(self._observer.pattern_applied, applied)
-        else:
-            silenced = silenced_by(decision, sent_at=sent_at, now=clock.now())
-            self._report(self._observer.silenced, silenced)
-        return True
+            return
+        if decision.refusal is not None:
+            self._report(self._observer.refused, decision.refusal)
+        silenced = silenced_by(decision, sent_at=sent_at, now=clock.now())
+        self._report(self._observer.silenced, silenced)
 
     async def _renew(self, now: float) -> None:
         """Prolong the playback if due; raises DriverError."""
-        sets = self._decider.renewal(now)
-        if sets is not None and await self._play(sets, is_pattern=True) is not None:
-            self._decider.confirm_renewal(sets, now=clock.now())
-
-    async def _play(
-        self, sets: SafeSets, *, is_pattern: bool, load_until: float = math.inf
-    ) -> Played | None:
-        """Play sets on all amplifiers; None if silence came in between."""
-        played = None
+        found = self._decider.renewal(now)
+        if found is None:
+            return
         try:
-            if self._group.is_set_incomplete and is_pattern:
-                # Silence an incomplete set before the next pattern.
-                silence = self._decider.silence(ramp=RELEASE_RAMP, before=sets)
-                if await self._group.play(silence.sets) is None:
-                    return None
-            played = await self._group.play(
-                sets.sets, envelopes=sets.envelopes, load_until=load_until
+            played, _ = await self._play(found)
+        except Preempted:
+            raise
+        except CommandRefused as error:
+            if self.group_state is not GroupState.ARMED:
+                raise
+            _logger.debug("loop: vibration not renewed: %s", error)
+            self._decider.refuse_renewal(error.until)
+        else:
+            if played is not None:
+                self._decider.confirm_renewal(played, now=clock.now())
+
+    async def _play(self, found: PlateSet) -> tuple[Played | None, float]:
+        """Play a set on all amplifiers; what plays, and when [s] it was sent."""
+        is_known = False
+        try:
+            if found.is_silence:
+                sent_at = await self._group.silence(found.ramp)
+                is_known = True
+                return None, sent_at
+            if self._group.is_set_incomplete:
+                await self._group.silence(RELEASE_RAMP)  # before the next pattern
+            played = await self._group.apply(
+                {name: [layer] for name, layer in found.layers.items()}
             )
+            is_known = True
+            return played, played.sent_at
+        except CommandRefused as error:
+            is_known = self.group_state is GroupState.ARMED and not isinstance(error, Preempted)
+            raise
         finally:
-            if played is None:  # the playback is unknown now
+            if not is_known:
                 self._decider.forget()
-        return played
 
     async def _listen(self, source: TouchSource) -> None:
         """Run a source; report one that fails, and leave its contacts to time out."""

@@ -1,13 +1,13 @@
 """Reports of the control loop to a demo, a log or a dashboard."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
 from controller.loop.decision import Decision
+from controller.loop.routing import Drive
 from controller.loop.selection import Prediction
 from controller.sources.contacts import Change, Contact
-from drivers.command import DriveCommand
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.timing import Timing
@@ -28,7 +28,7 @@ class Applied:
     targets: tuple[Prediction, ...]
     quiet: tuple[Contact, ...]
     pattern: Pattern
-    drive: Mapping[str, DriveCommand]
+    drive: Drive
     latency: float
     time: float
     from_rest: bool = True
@@ -56,8 +56,7 @@ class Silenced:
     """All channels are silent, for a reason; latency and time [s].
 
     targets: contacts for which a pattern was requested. latency: up to the last byte of the
-    command, None if none was needed. late [s]: how long after its time a vibration was ended, None
-    where the amplifiers end it themselves.
+    command, None if none was needed.
     """
 
     contacts: tuple[Contact, ...]
@@ -65,14 +64,13 @@ class Silenced:
     reason: str
     latency: float | None
     time: float
-    late: float | None = None
 
 
 def applied_by(
     decision: Decision,
     pattern: Pattern,
     *,
-    commands: Mapping[str, DriveCommand],
+    drive: Drive,
     sent_at: float,
     timing: Timing | None,
 ) -> Applied:
@@ -82,11 +80,11 @@ def applied_by(
         targets=decision.selection.predictions,
         quiet=decision.selection.quiet,
         pattern=pattern,
-        drive=commands,
+        drive=drive,
         latency=sent_at - decision.triggered_at,
         time=sent_at,
         from_rest=decision.from_rest,
-        settled_after=0.0 if decision.sets is None else decision.sets.settled_after,
+        settled_after=0.0 if decision.set is None else decision.set.settled_after,
         lasts=all(target.pulse is None for _, target in decision.selection.targets),
         question=decision.selection.question,
         timing=timing,
@@ -95,14 +93,12 @@ def applied_by(
 
 def silenced_by(decision: Decision, *, sent_at: float | None, now: float) -> Silenced:
     """Report a decision for silence; sent_at [s]: of its last byte, None if nothing was sent."""
-    due = decision.ends_due
     return Silenced(
         contacts=decision.contacts,
         targets=tuple(contact for contact, _ in decision.selection.targets),
         reason=decision.refusal or decision.selection.reason or "",
         latency=None if sent_at is None else sent_at - decision.triggered_at,
         time=now,
-        late=None if sent_at is None or due is None else sent_at - due,
     )
 
 

@@ -1,43 +1,46 @@
-"""Routing of excitations [m, rad] to command sets by the wiring of the rig.
+"""Routing of excitations [m, rad] to layers of amplifiers by the wiring of the rig.
 
-`sim/bench/bench.py` translates back by the same wiring.
+`sim/bench` translates back by the same wiring.
 """
 
+import cmath
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from operator import attrgetter
 
-from controller.loop.envelopes import ending_slots, onset_slots
-from drivers.command import CommandSet, DriveCommand
-from drivers.protocol.messages import Achieved
+from controller.loop.envelopes import shapes_of
+from drivers.contents import Layer, Tone
+from drivers.protocol.sets import LayerSet
+from drivers.protocol.table import QUANTITIES
 from model.errors import InputError
-from model.rig.rig import Rig
+from model.rig.rig import Channel, Rig
 from model.transients.envelope import Envelopes
-from model.vibration.excitation import Excitation, Tone
+from model.vibration import excitation as physics
 
-_CHANNEL = attrgetter("channel")
+LAYER = 0
+"""The one layer that is used."""
+
+Drive = Mapping[str, Tone]
+"""What ERAs play, by name, without silent ones."""
+
+_FREQUENCY, _LEVEL, _PHASE = (QUANTITIES[name] for name in ("frequency", "level", "phase"))
 
 
 def route(
-    excitation: Excitation,
+    excitation: physics.Excitation,
     rig: Rig,
     *,
-    token: int,
     ramp: float,
-    playing: Mapping[str, DriveCommand] | None = None,
-    onset: Envelopes | None = None,
+    playing: Drive | None = None,
     valid_for: float = 0.0,
-) -> dict[str, CommandSet]:
-    """Return a command set for every amplifier of the rig, by name, all under one token.
+) -> dict[str, Layer]:
+    """Return a layer for every amplifier of the rig, by name.
 
-    Every wired channel has a command: level = amplitude / stroke, phase in degrees within
-    (-180, 180], level 0 for an ERA that is not driven. ramp [s]: lengthened to the rig's slew
-    limit, on all amplifiers alike. playing: what each ERA plays now (`commands_by_era`); a
-    frequency keeps its phase if all its ERAs play it already. onset: envelopes in the slots of
-    `controller.loop.envelopes`; one may lead an ERA that is not driven to silence. valid_for [s]:
-    of the sets. All other limits belong to the guard. Raises InputError for an ERA that the rig
-    does not have.
+    Every wired channel has a tone: level = amplitude / stroke, phase in degrees within (-180, 180],
+    level 0 for an ERA that is not driven. ramp [s]: lengthened to the rig's slew limit, on all
+    amplifiers alike. playing: what each ERA plays now (`tones_by_era`); a frequency keeps its phase
+    if all its ERAs play it already. valid_for [s]: of the layers. All other limits belong to the
+    ledgers of the amplifiers. Raises InputError for an ERA that the rig does not have.
     """
     unknown = sorted(excitation.keys() - rig.wiring.keys())
     if unknown:
@@ -48,102 +51,82 @@ def route(
     restarted = _restarted(excitation, playing or {})
     strokes = {era.name: era.stroke for era in rig.eras}
     drive = {
-        name: _drive(excitation.get(name), rig, channel.number, strokes[name], restarted=restarted)
+        name: _tone(excitation.get(name), rig, channel.number, strokes[name], restarted=restarted)
         for name, channel in rig.wiring.items()
     }
-    if onset:
-        slots = onset_slots(rig)
-        for name, envelope in onset.items():
-            drive[name] = replace(drive[name], frequency=envelope.frequency, onset=slots[name])
     max_rise = max((_rise(drive[name], (playing or {}).get(name)) for name in drive), default=0.0)
     min_ramp = max_rise / rig.limits.slew
-    ramp = min_ramp if min_ramp > ramp else ramp  # the guard refuses NaN
-    return _sets(drive, rig, token=token, ramp=ramp, valid_for=valid_for)
+    ramp = min_ramp if min_ramp > ramp else ramp  # ledgers refuse NaN
+    wired: dict[str, list[Tone]] = {name: [] for name in rig.amplifiers}
+    for name, channel in rig.wiring.items():
+        wired[channel.amplifier].append(drive[name])
+    return {
+        name: Layer(LAYER, tuple(tones), ramp=ramp, valid_for=valid_for)
+        for name, tones in wired.items()
+    }
 
 
-def _rise(command: DriveCommand, before: DriveCommand | None) -> float:
+def _rise(tone: Tone, before: Tone | None) -> float:
     """Return the highest rise of a level: from rest, or through zero to another phase."""
-    if before is None or not command.level or before.frequency != command.frequency:
-        return command.level
-    return command.level + before.level
+    if before is None or not tone.level or before.frequency != tone.frequency:
+        return tone.level
+    return tone.level + before.level
 
 
-def commands_by_era(
-    played: Mapping[str, Achieved | CommandSet], rig: Rig
-) -> dict[str, DriveCommand]:
-    """Return what each ERA plays, by name, from what amplifiers play; without silent ones."""
+def shaped(
+    layers: Mapping[str, Layer], rig: Rig, *, onset: Envelopes | None, ending: Envelopes | None
+) -> dict[str, Layer]:
+    """Return layers with shaped onsets and endings, which are by ERA.
+
+    An onset may lead an ERA that is not driven to silence.
+    """
+    onsets, endings = shapes_of(onset, rig), shapes_of(ending, rig)
+    eras = {channel: era for era, channel in rig.wiring.items()}
+    found = {}
+    for name, layer in layers.items():
+        tones = []
+        for tone in layer.tones:
+            era = eras[Channel(name, tone.channel)]
+            if onset and era in onset:
+                tone = replace(tone, frequency=onset[era].frequency)
+            tones.append(replace(tone, onset=onsets.get(era), ending=endings.get(era)))
+        found[name] = replace(layer, tones=tuple(tones))
+    return found
+
+
+def tones_by_era(played: Mapping[str, Sequence[LayerSet]], rig: Rig) -> dict[str, Tone]:
+    """Return what each ERA plays, by name, from layers of amplifiers; without silent ones."""
     playing = {
         (amplifier, command.channel): command
-        for amplifier, several in played.items()
-        for command in several.commands
+        for amplifier, layers in played.items()
+        for one in layers
+        for command in one.commands
         if command.level > 0
     }
     return {
-        name: playing[channel.amplifier, channel.number]
+        name: Tone(
+            channel.number,
+            _FREQUENCY.from_wire(command.frequency),
+            _LEVEL.from_wire(command.level),
+            _PHASE.from_wire(command.phase),
+        )
         for name, channel in rig.wiring.items()
-        if (channel.amplifier, channel.number) in playing
+        if (command := playing.get((channel.amplifier, channel.number))) is not None
     }
 
 
-def continues_any_tone(excitation: Excitation, playing: Mapping[str, DriveCommand]) -> bool:
+def phasor_of(tone: Tone) -> complex:
+    """Return the complex level of a tone."""
+    return cmath.rect(tone.level, math.radians(tone.phase))
+
+
+def continues_any_tone(excitation: physics.Excitation, playing: Drive) -> bool:
     """Whether any tone of an excitation continues what ERAs play now."""
     restarted = _restarted(excitation, playing)
     return any(tone.frequency not in restarted for tone in excitation.values())
 
 
-def route_with_endings(
-    playing: Mapping[str, DriveCommand],
-    rig: Rig,
-    *,
-    token: int,
-    ramp: float,
-    ending: Envelopes,
-) -> dict[str, CommandSet]:
-    """Return the sets, by amplifier, that continue what ERAs play and add endings."""
-    drive = {name: _silent(channel.number, rig) for name, channel in rig.wiring.items()}
-    slots = ending_slots(rig)
-    for name, command in playing.items():
-        slot = slots[name] if name in ending else 0
-        drive[name] = replace(command, keep_phase=True, onset=0, ending=slot)
-    return _sets(drive, rig, token=token, ramp=ramp)
-
-
-def route_to_silence(rig: Rig, *, token: int, ramp: float) -> dict[str, CommandSet]:
-    """Return the sets, by amplifier, that silence all ERAs along their endings.
-
-    ramp [s]: for those without an ending.
-    """
-    drive = {
-        name: replace(_silent(channel.number, rig), skip_ending=False)
-        for name, channel in rig.wiring.items()
-    }
-    return _sets(drive, rig, token=token, ramp=ramp)
-
-
-def _sets(
-    drive: Mapping[str, DriveCommand],
-    rig: Rig,
-    *,
-    token: int,
-    ramp: float,
-    valid_for: float = 0.0,
-) -> dict[str, CommandSet]:
-    """Return the command set of every amplifier, by name, from the command of every ERA."""
-    wired: dict[str, list[DriveCommand]] = {name: [] for name in rig.amplifiers}
-    for name, channel in rig.wiring.items():
-        wired[channel.amplifier].append(drive[name])
-    return {
-        name: CommandSet(
-            token=token,
-            commands=tuple(sorted(commands, key=_CHANNEL)),
-            ramp=ramp,
-            valid_for=valid_for,
-        )
-        for name, commands in wired.items()
-    }
-
-
-def _restarted(excitation: Excitation, playing: Mapping[str, DriveCommand]) -> set[float]:
+def _restarted(excitation: physics.Excitation, playing: Drive) -> set[float]:
     """Return the frequencies [Hz] that restart at the commit, because an ERA joins them.
 
     All ERAs of one frequency must count its phase from one moment, or their field differs.
@@ -155,13 +138,17 @@ def _restarted(excitation: Excitation, playing: Mapping[str, DriveCommand]) -> s
     }
 
 
-def _drive(
-    tone: Tone | None, rig: Rig, number: int, stroke: float, *, restarted: set[float]
-) -> DriveCommand:
-    """Return the command of a channel for the tone of its ERA, of a stroke [m]."""
+def _tone(
+    tone: physics.Tone | None, rig: Rig, number: int, stroke: float, *, restarted: set[float]
+) -> Tone:
+    """Return what a channel plays for the tone of its ERA, of a stroke [m].
+
+    A channel that falls silent while others play skips its ending, which belongs to all ERAs
+    together.
+    """
     if tone is None:
-        return _silent(number, rig)
-    return DriveCommand(
+        return Tone(number, rig.limits.frequency_min, 0.0, skip_ending=True)
+    return Tone(
         channel=number,
         frequency=tone.frequency,
         level=tone.amplitude / stroke,
@@ -170,19 +157,8 @@ def _drive(
     )
 
 
-def _silent(number: int, rig: Rig) -> DriveCommand:
-    """Return the command that silences a channel along the ramp.
-
-    Silent channels also have a frequency on every wire; this one is always allowed. Endings belong
-    to all ERAs together, so a channel that falls silent while others play skips its own.
-    """
-    return DriveCommand(
-        channel=number, frequency=rig.limits.frequency_min, level=0.0, skip_ending=True
-    )
-
-
 def _wrapped_degrees(phase: float) -> float:
     """Convert a phase [rad] to degrees within (-180, 180]."""
-    # Not finite stays so; the guard refuses it.
+    # Not finite stays so; the ledger refuses it.
     degrees = math.degrees(math.remainder(phase, math.tau)) if math.isfinite(phase) else phase
     return 180.0 if degrees == -180.0 else degrees

@@ -110,11 +110,10 @@ def _question(
         softer_db=tuple(level - each for each in levels),
         drive_mode=capabilities.drive_mode,
         playable=capabilities.playable,
-        eras_at_most=capabilities.eras_at_most,
         frequencies=common_band(
             [target.band for _, target in targets], frequencies, playable=capabilities.frequencies
         )[0],
-        envelopes=capabilities.envelope_support.onsets and not is_short(targets),
+        envelopes=capabilities.envelope_support.onset_knots > 0 and not is_short(targets),
         loads=() if all(load == 1 for load in loads) else loads,
     )
 

@@ -64,13 +64,14 @@ def valid_for(selection: Selection, *, confirmed_until: float, now: float) -> fl
     return min(unlimited, max(left)) if left and len(left) == len(pulses) else unlimited
 
 
-def first_end(selection: Selection) -> float:
-    """Return when [s] the first pulse ends; infinite without any."""
+def first_lasts(selection: Selection, now: float) -> float:
+    """Return how long [s] from a time [s] the first pulse lasts; infinite without any."""
     pulses = [target.pulse for _, target in selection.targets]
-    return min((pulse.end for pulse in pulses if pulse is not None), default=math.inf)
-
-
-def last_end(selection: Selection) -> float:
-    """Return when [s] the last pulse ends; infinite where a target has none."""
-    pulses = [target.pulse for _, target in selection.targets]
-    return max((math.inf if pulse is None else pulse.end for pulse in pulses), default=math.inf)
+    return min(
+        (
+            pulse.duration if pulse.started_at is None else pulse.end - now
+            for pulse in pulses
+            if pulse is not None
+        ),
+        default=math.inf,
+    )

@@ -10,7 +10,7 @@ from drivers import clock
 from drivers.budget import COMMIT_DELAY
 from drivers.contents import Layer, is_silence
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout, Preempted
-from drivers.host.comparison import achieved_problem, name_of
+from drivers.host.comparison import MAX_CONTRADICTIONS, achieved_problem, name_of
 from drivers.host.dialogue import Dialogue, Staged
 from drivers.host.identification import check_capabilities, check_identity
 from drivers.host.jobs import Priority
@@ -144,7 +144,7 @@ class Amplifier(Dialogue):
 
         status = await self.line.submit(self, Priority.ARM, "Arm", values, make=make)
         self.session, self.feeding.watchdog = session, watchdog
-        self._contradictions = 0
+        self._contradictions = self._misachieved = 0
         self.ledger.forget()
         return status
 
@@ -210,7 +210,7 @@ class Amplifier(Dialogue):
     async def read_achieved(self, one: LayerSet) -> LayerSet:
         """Read what plays of a layer of the set committed last; the ledger goes on with it.
 
-        Raises CommandRefused where it contradicts the set, and a status did so before.
+        Raises CommandRefused where it contradicts the set, as that of the last one did.
         """
         values = await self._request("GetAchieved", {"layer": one.layer}, Priority.SET)
         commands = tuple(
@@ -219,10 +219,13 @@ class Amplifier(Dialogue):
         )
         achieved = replace(one, commands=commands)
         problem = achieved_problem(one, achieved, self.capabilities)
-        if problem is not None:
-            self.note_contradiction(problem, self._time())
-        else:
+        if problem is None:
+            self._misachieved = 0
             self.ledger.achieved(achieved, values["token"])
+            return achieved
+        self._misachieved += 1
+        if self._misachieved >= MAX_CONTRADICTIONS:
+            raise self.contradicted(problem)
         return achieved
 
     async def silence(self, ramp: float) -> Values:
@@ -263,10 +266,13 @@ class Amplifier(Dialogue):
 
         It is identified anew: one that has lost its supply since counts its latches from 1 again.
         """
-        shown, status = self.latch, await self.identify(timeout=REPLY_TIMEOUT)
+        before, shown = self.silences, self.latch
+        status = await self.identify(timeout=REPLY_TIMEOUT)
         if latch is None:
             has_restarted = shown is None or is_newer_token(shown, status["latch"])
             latch = status["latch"] if has_restarted else shown
+        if before != self.silences:
+            raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
         return await self._request("Clear", {"latch": latch}, Priority.CLEAR)
 
     async def stop(

@@ -69,6 +69,8 @@ class Dialogue:
         self._admitted: Staged | None = None
         self._contradictions = 0
         self._contradicted_at = -math.inf
+        self._was_unfed = False  # the status of the last contradiction
+        self._misachieved = 0  # sets in a row that were achieved as another
         self._other_host_at = -math.inf  # when it was heard last
         self._are_several = False  # two amplifiers have replied since this was reset
         line.members[address] = self
@@ -207,8 +209,11 @@ class Dialogue:
         fed = MESSAGES[name].feeds
         problem = problem_of(status, self._ledger, self.feeding, sent_at=sent_at, now=now, fed=fed)
         if problem is None:
-            self._contradictions, self._contradicted_at = 0, -math.inf
+            # A status after a request that feeds says nothing of how the watchdog runs down.
+            if not (fed and self._was_unfed):
+                self._contradictions, self._contradicted_at = 0, -math.inf
         else:
+            self._was_unfed = not fed
             self.note_contradiction(problem, now)
 
     def note_contradiction(self, problem: str, now: float) -> None:
@@ -217,10 +222,14 @@ class Dialogue:
             return
         self._contradictions, self._contradicted_at = self._contradictions + 1, now
         if self._contradictions >= MAX_CONTRADICTIONS:
-            raise CommandRefused(
-                f"amplifier {self.name} contradicts its requests: {problem}; look for a derated or "
-                "broken channel, an exchanged cable or firmware, then clear and arm again"
-            )
+            raise self.contradicted(problem)
+
+    def contradicted(self, problem: str) -> CommandRefused:
+        """Return the error of contradictions in a row."""
+        return CommandRefused(
+            f"amplifier {self.name} contradicts its requests: {problem}; look for a derated or "
+            "broken channel, an exchanged cable or firmware, then clear and arm again"
+        )
 
     def _driven_by_another(self) -> LinkError:
         return LinkError(f"amplifier {self.name} is driven by another host; end that one first")

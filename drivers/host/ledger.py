@@ -60,6 +60,11 @@ class Ledger:
         self.playback = playback_of(self.capabilities)
         self.lag, self._doubt = 0.0, None
 
+    def go_on_from(self, earlier: "Ledger") -> None:
+        """Count the vibrations of an earlier ledger of the same limits, as after a reconnection."""
+        if self.limits == earlier.limits:
+            self._budget = earlier._budget
+
     def admit(
         self, layers: Sequence[Layer], now: float, *, delay: float = COMMIT_DELAY
     ) -> tuple[LayerSet, ...]:

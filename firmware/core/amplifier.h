@@ -1,29 +1,28 @@
 // SPDX-License-Identifier: MIT
 //
-// The amplifier, whatever its wire: states, session, watchdog, sets, faults, and its samples.
+// The amplifier, whatever its wire: states, session, watchdog, layers, faults, and its samples.
 //
-// Every request is a function; it takes effect with the next sample. `amplifier_sample` makes that
-// sample and is the only clock: what waits, waits a number of samples. Nothing here knows the board;
-// its main loop (loop.c) hands over what is measured and takes samples and `high_voltage`.
+// Requests take effect with the next sample (wire/messages.c reads them). `amplifier_sample` makes
+// that sample; `amplifier_time` says what real time it is, which ends watchdog, vibrations and sets
+// that wait for a commit even where no samples are made. Nothing here knows the board; its main loop
+// (loop.c) hands over what is measured and takes samples and `high_voltage`.
 
 #ifndef AMPLIFIER_H
 #define AMPLIFIER_H
 
 #include "channel.h"
 
-struct set {
-    uint16_t token, ramp, valid_for;
-    uint8_t count;
-    struct command commands[CHANNELS_MAX];
-};
-
-struct shapes { // the envelopes of one command, copied when it is staged
-    struct envelope onset, ending;
+struct layer {
+    uint16_t token, ramp, valid_for; // of the set that plays
+    struct timer ends;
+    uint32_t waits; // samples until the set that waits starts; 0: none waits
+    uint16_t waiting_token, waiting_count;
+    uint16_t waiting[STREAM_WORDS];
 };
 
 struct fault_record {
     uint8_t fault, channel;
-    uint64_t at; // sample
+    uint64_t at; // us
 };
 
 // Outcome of a request: refused or not, and the channel at fault.
@@ -41,41 +40,50 @@ struct measured {
     uint8_t channel; // of the cause
 };
 
+struct amplifier;
+// Called with the words of an Event, at every change of state.
+typedef void amplifier_notify(const struct amplifier *amplifier, const struct words *event);
+
 struct amplifier {
     const char *serial_number; // at most 32 bytes
-    struct measured measured; // of the board
+    amplifier_notify *notify;  // or null
+    struct measured measured;  // of the board
     // For the board: whether the high voltage is on.
     bool high_voltage;
+    uint32_t slack; // us by which samples may come late
 
     enum state state;
     enum fault fault;
-    uint8_t fault_channel;
-    uint8_t latch;
-    uint16_t session, ended_session; // 0: none
-    uint64_t now;                    // samples since power-up
-    uint32_t watchdog, watchdog_left; // samples
-
-    struct set active, staged;        // token 0: none
-    uint32_t valid_left, staged_left; // samples until they end; 0: nothing waits
-    const struct set *answered;      // the set staged or played last
-    struct shapes staged_shapes[CHANNELS_MAX];
-    struct envelope slots[ENVELOPE_SLOTS];
-
+    uint16_t latch;
+    uint16_t session;  // held while armed, or the one that ended last; 0: none
+    uint64_t sample;   // samples since power-up
+    uint64_t now;      // us
+    uint64_t now_at;   // sample before which it was that time
+    uint16_t watchdog; // ms
+    struct timer fed;
+    uint16_t committed; // token of the set committed last; 0: none
+    bool is_limited;    // the sum of a channel was, since the last status
+    struct intake intake;
+    struct layer layers[LAYERS];
     struct channel channels[CHANNELS_MAX];
     struct fault_record faults[FAULTS_KEPT]; // newest first
     uint8_t fault_count;
 };
 
-void amplifier_init(struct amplifier *amplifier, const char *serial_number);
+void amplifier_init(struct amplifier *amplifier, const char *serial_number,
+                    amplifier_notify *notify);
+
+// As without supply: silent at once and disarmed; faults, latch and session are remembered.
+void amplifier_restart(struct amplifier *amplifier);
 
 // Make the next sample of every channel, and let one sample's time pass.
 void amplifier_sample(struct amplifier *amplifier, int16_t samples[CHANNELS_MAX]);
 
-// The same in units of 2^-30 of full stroke, whatever SQUARE_LAW.
+// The same in units of 2^-30 of full level, whatever SQUARE_LAW.
 void amplifier_forces(struct amplifier *amplifier, int32_t forces[CHANNELS_MAX]);
 
-// Let time pass without samples, for a converter that was late: what waits ends sooner by as much.
-void amplifier_late(struct amplifier *amplifier, uint32_t samples);
+// Hand over real time [us], which never goes back: what was due by then has ended.
+void amplifier_time(struct amplifier *amplifier, uint64_t now);
 
 // Enter the fault reaction, whether the high voltage is on or not.
 void amplifier_fail(struct amplifier *amplifier, enum fault fault, uint8_t channel);
@@ -83,37 +91,26 @@ void amplifier_fail(struct amplifier *amplifier, enum fault fault, uint8_t chann
 // Hand over what the board measures; an open interlock or another cause of a fault acts at once.
 void amplifier_measured(struct amplifier *amplifier, struct measured measured);
 
-// Requests. Times are in milliseconds, ramps of Stop and Disarm are clipped.
-struct verdict amplifier_arm(struct amplifier *amplifier, uint16_t watchdog, uint16_t session);
+// Requests that are allowed in this state, and of this session. Times are in milliseconds.
+void amplifier_arm(struct amplifier *amplifier, uint16_t session, uint16_t watchdog);
 void amplifier_disarm(struct amplifier *amplifier, uint16_t ramp);
 void amplifier_stop(struct amplifier *amplifier, uint16_t ramp);
-struct verdict amplifier_clear(struct amplifier *amplifier, uint8_t latch);
-struct verdict amplifier_ping(struct amplifier *amplifier, uint16_t session);
-// Whether SetAddress may give a new address, 1 to `highest`; the line takes it, and the board keeps it.
-struct verdict amplifier_readdress(const struct amplifier *amplifier, uint16_t address,
-                                   uint8_t highest);
-// Whether a text without its length is this amplifier's serial number.
-bool amplifier_is_named(const struct amplifier *amplifier, const uint8_t *text, uint16_t length);
-struct verdict amplifier_stage(struct amplifier *amplifier, uint16_t session, const struct set *set);
-struct verdict amplifier_commit(struct amplifier *amplifier, uint16_t session, uint16_t token);
-struct verdict amplifier_apply(struct amplifier *amplifier, uint16_t session, const struct set *set);
-struct verdict amplifier_load(struct amplifier *amplifier, uint8_t slot, const struct envelope *envelope);
+void amplifier_silence(struct amplifier *amplifier, uint16_t ramp);
+enum nak amplifier_clear(struct amplifier *amplifier, uint16_t latch);
+void amplifier_feed(struct amplifier *amplifier);
+// Play the staged set under its token.
+void amplifier_play(struct amplifier *amplifier);
 
-// Add a command to a set that is being received; refused for a channel that does not exist or
-// occurs twice, so that a set never holds more commands than there are channels.
-struct verdict set_add(struct set *set, const struct command *command);
-
-// What Status and FaultList report beside the fields above.
-uint8_t amplifier_flags(const struct amplifier *amplifier);
+// Time of the next sample [us].
+uint64_t amplifier_now(const struct amplifier *amplifier);
+// Token of a layer that plays, 0 of a silent one.
+uint16_t amplifier_token(const struct amplifier *amplifier, uint8_t layer);
+// Milliseconds that the watchdog has left, rounded.
 uint16_t amplifier_watchdog_left(const struct amplifier *amplifier);
-uint32_t amplifier_fault_age(const struct amplifier *amplifier, uint8_t number);
 
-// Between the files of the core.
-extern const struct verdict ACCEPTED;
-struct verdict refused(enum nak nak);
-struct verdict session_check(const struct amplifier *amplifier, uint16_t session);
-void watchdog_feed(struct amplifier *amplifier);
-void sets_sample(struct amplifier *amplifier);
-void settle(struct amplifier *amplifier);
+// Between the files of the core: what is due in the layers after a sample, and in real time.
+void layers_sample(struct amplifier *amplifier);
+void layers_time(struct amplifier *amplifier);
+void layers_silence(struct amplifier *amplifier, uint16_t ramp);
 
 #endif

@@ -12,9 +12,12 @@ enum line { LINE_SERIAL, LINE_MODBUS, LINE_CAN };
 
 // Time and samples.
 
-// Samples that are due since the last call: the one clock, which should be that of the converter.
+// Real time [us], of another clock than the converter's: it ends watchdog and vibrations even where
+// no samples are taken.
+uint64_t board_microseconds(void);
+// Samples that are due since the last call, by the clock of the converter.
 uint32_t board_samples_due(void);
-// Hand the next sample of every channel to the converter; 32767 is full stroke.
+// Hand the next sample of every channel to the converter; 32767 is full level.
 void board_output(const int16_t samples[CHANNELS_MAX]);
 // Go on sending; then sleep until a sample is due or a byte has arrived.
 void board_wait(void);
@@ -40,7 +43,7 @@ enum fault board_fault(uint8_t *channel);
 // Who it is.
 
 const char *board_serial_number(void); // unique, at most 32 bytes of UTF-8; never changes
-// Of this amplifier on a line: on serial and Modbus 1 to 247, on CAN 1 to 63. 1 until one is stored.
+// Of this amplifier on a line: on serial and Modbus 1 to 247, on CAN 1 to 127. 1 until one is stored.
 uint8_t board_address(enum line line);
 // Keep an address that a host has set, also without supply.
 void board_store_address(enum line line, uint8_t address);

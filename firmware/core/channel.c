@@ -3,159 +3,143 @@
 #include "channel.h"
 #include "sine.h"
 
-#include <stddef.h>
-
-static bool is_silent(const struct command *command)
+static bool plays_in(const struct voice *voice, uint8_t layer)
 {
-    return command->level == 0 && command->onset == 0;
+    return voice->is_playing && voice->layer == layer && !voice->has_ended;
 }
 
-// Keep phase applies to what the channel plays, unless that falls silent, at exactly this frequency.
-static bool keeps_phase(const struct channel *channel, const struct command *command)
+// A place for another voice: one that is silent, else that of the fade that ends first. There are
+// as many more places than voices as one set can cut short.
+static struct voice *place(struct channel *channel)
 {
-    const struct voice *voice = &channel->voices[channel->newest];
-    return (command->flags & KEEP_PHASE) != 0 && voice_lasts(voice) &&
-           voice->frequency == command->frequency;
+    struct voice *first = &channel->voices[0];
+    for (unsigned i = 0; i < VOICES_KEPT; i++) {
+        struct voice *voice = &channel->voices[i];
+        if (!voice->is_playing)
+            return voice;
+        if (voice->level == 0 &&
+            (first->level > 0 || voice_samples_left(voice) < voice_samples_left(first)))
+            first = voice;
+    }
+    return first;
 }
 
-// The first voice that does not sound; VOICES if all do.
-static uint8_t free_voice(const struct channel *channel)
+static bool is_older(const struct voice *voice, const struct voice *than)
 {
-    uint8_t number = 0;
-    while (number < VOICES && channel->voices[number].is_sounding)
-        number++;
-    return number;
+    return voice->since < than->since ||
+           (voice->since == than->since && voice->number < than->number);
 }
 
-bool channel_has_room(const struct channel *channel, const struct command *command, uint16_t ramp)
+// Cut the oldest fades short where more voices last than there are.
+static void keep_within(struct channel *channel, uint64_t sample)
 {
-    bool needs_no_voice = is_silent(command) || (keeps_phase(channel, command) && command->onset);
-    return needs_no_voice || free_voice(channel) < VOICES || ramp == 0;
+    for (;;) {
+        struct voice *oldest = NULL;
+        unsigned lasting = 0;
+        for (unsigned i = 0; i < VOICES_KEPT; i++) {
+            struct voice *voice = &channel->voices[i];
+            if (!voice->is_playing || !voice_outlasts(voice, SHORTENED_FADE_MS))
+                continue;
+            lasting++;
+            if (voice->has_ended && (oldest == NULL || is_older(voice, oldest)))
+                oldest = voice;
+        }
+        if (lasting <= VOICES || oldest == NULL)
+            return;
+        voice_fade(oldest, SHORTENED_FADE_MS, sample);
+    }
 }
 
-static void fall_all(struct channel *channel, uint16_t ramp)
+void channel_play(struct channel *channel, uint8_t layer, const struct command *command,
+                  uint16_t ramp, uint64_t sample)
 {
-    for (uint8_t i = 0; i < VOICES; i++)
-        voice_fall(&channel->voices[i], ramp);
-}
-
-static void fall_others(struct channel *channel, uint16_t ramp)
-{
-    for (uint8_t i = 0; i < VOICES; i++)
-        if (i != channel->newest)
-            voice_fall(&channel->voices[i], ramp);
-}
-
-static struct voice *begin_voice(struct channel *channel, const struct command *command,
-                                 struct complex amplitude, uint16_t ramp)
-{
-    bool is_kept = keeps_phase(channel, command);
-    uint32_t angle = channel->voices[channel->newest].angle;
-    fall_all(channel, ramp);
-    channel->newest = free_voice(channel);
-    struct voice *voice = &channel->voices[channel->newest];
-    voice_begin(voice, command->frequency, amplitude, command->onset ? 0 : ramp);
-    if (is_kept)
-        voice->angle = angle;
-    return voice;
-}
-
-static void play_onset(struct channel *channel, const struct command *command, uint16_t ramp,
-                       const struct envelope *onset)
-{
-    static const struct complex silence = {0, 0};
-    struct voice *voice = &channel->voices[channel->newest];
-    if (keeps_phase(channel, command))
-        fall_others(channel, ramp);
-    else
-        voice = begin_voice(channel, command, silence, ramp);
-    voice_walk(voice, onset, amplitude_of(command->level, command->phase));
-}
-
-void channel_play(struct channel *channel, const struct command *command, uint16_t ramp,
-                  const struct envelope *onset, const struct envelope *ending)
-{
-    if (is_silent(command)) {
-        if (command->flags & SKIP_ENDING)
-            channel_quiet(channel, ramp);
+    bool is_driven = command != NULL && (command->level > 0 || command->has_onset);
+    struct voice *continued = NULL;
+    for (unsigned i = 0; i < VOICES_KEPT; i++) {
+        struct voice *voice = &channel->voices[i];
+        if (!plays_in(voice, layer))
+            continue;
+        if (is_driven && command->keep_phase && voice->frequency == command->frequency)
+            continued = voice;
+        else if (is_driven || (command != NULL && command->skip_ending))
+            voice_fade(voice, ramp, sample);
         else
-            channel_end(channel, ramp);
-        return;
+            voice_end(voice, ramp, sample);
     }
-    if (onset != NULL)
-        play_onset(channel, command, ramp, onset);
-    else
-        begin_voice(channel, command, amplitude_of(command->level, command->phase), ramp);
-    channel->has_command = true;
-    channel->ramp = ramp;
-    channel->ending.knots = 0;
-    if (ending != NULL)
-        channel->ending = *ending;
-}
-
-void channel_end(struct channel *channel, uint16_t ramp)
-{
-    static const struct complex silence = {0, 0};
-    struct voice *voice = &channel->voices[channel->newest];
-    if (channel->has_command && channel->ending.knots > 0 && voice->is_sounding) {
-        fall_others(channel, ramp);
-        voice_walk(voice, &channel->ending, silence);
-    } else {
-        fall_all(channel, ramp);
+    if (is_driven) {
+        if (continued == NULL) {
+            continued = place(channel);
+            voice_begin(continued, layer, command->frequency, channel->begun++);
+        }
+        voice_lead(continued, command, ramp, sample);
     }
-    channel->has_command = false;
+    keep_within(channel, sample);
 }
 
-void channel_quiet(struct channel *channel, uint16_t ramp)
+void channel_silence(struct channel *channel, uint16_t ramp, uint64_t sample)
 {
-    fall_all(channel, ramp);
-    channel->has_command = false;
+    for (unsigned i = 0; i < VOICES_KEPT; i++)
+        if (channel->voices[i].is_playing)
+            voice_fade(&channel->voices[i], ramp, sample);
 }
 
-bool channel_is_sounding(const struct channel *channel)
+const struct voice *channel_voice(const struct channel *channel, uint8_t layer)
 {
-    for (uint8_t i = 0; i < VOICES; i++)
-        if (channel->voices[i].is_sounding)
-            return true;
-    return false;
+    for (unsigned i = 0; i < VOICES_KEPT; i++)
+        if (plays_in(&channel->voices[i], layer))
+            return &channel->voices[i];
+    return NULL;
+}
+
+void channel_stop_silent(struct channel *channel)
+{
+    for (unsigned i = 0; i < VOICES_KEPT; i++)
+        voice_stop_if_silent(&channel->voices[i]);
+}
+
+bool channel_is_silent(const struct channel *channel)
+{
+    for (unsigned i = 0; i < VOICES_KEPT; i++)
+        if (channel->voices[i].is_playing)
+            return false;
+    return true;
+}
+
+// Magnitude of a sum of amplitudes, in units of 2^-30 of full level.
+static uint64_t magnitude(int64_t re, int64_t im)
+{
+    re /= VOICES_KEPT; // so that the squares fit
+    im /= VOICES_KEPT;
+    return (uint64_t)square_root((uint64_t)(re * re) + (uint64_t)(im * im)) * VOICES_KEPT;
 }
 
 uint16_t channel_level(const struct channel *channel)
 {
-    if (!channel_is_sounding(channel))
-        return 0;
-    int64_t size = 0;
-    for (uint8_t i = 0; i < VOICES; i++)
-        size += voice_size(&channel->voices[i]);
-    int64_t level = (size * FULL_STROKE + ONE / 2) / ONE;
-    if (level < 1)
-        return 1;
-    return level > FULL_STROKE ? FULL_STROKE : (uint16_t)level;
+    uint64_t size = 0;
+    bool is_counted[VOICES_KEPT] = {false};
+    for (unsigned i = 0; i < VOICES_KEPT; i++) {
+        int64_t re = 0, im = 0;
+        for (unsigned j = i; j < VOICES_KEPT; j++) { // those of one frequency interfere
+            const struct voice *voice = &channel->voices[j];
+            if (is_counted[j] || !voice->is_playing ||
+                voice->frequency != channel->voices[i].frequency)
+                continue;
+            struct complex pointer = voice_pointer(voice);
+            re += pointer.re;
+            im += pointer.im;
+            is_counted[j] = true;
+        }
+        size += magnitude(re, im);
+    }
+    uint64_t level = (size * LEVEL_PER_UNIT + ONE / 2) / ONE;
+    return level > LEVEL_PER_UNIT ? LEVEL_PER_UNIT : (uint16_t)level;
 }
 
-// The voltage u = sqrt((1 + force) / 2): its square is half the full one, the bias, and half the
-// force, so that nothing beats and there is no harmonic, whatever the voices play together.
-static int16_t voltage_of(int32_t force)
-{
-    return (int16_t)square_root((uint64_t)(force + INT16_MAX) * INT16_MAX / 2);
-}
-
-int32_t channel_force(struct channel *channel)
+int64_t channel_sum(struct channel *channel)
 {
     int64_t sum = 0;
-    for (uint8_t i = 0; i < VOICES; i++)
-        sum += voice_sample(&channel->voices[i]);
-    if (sum > ONE)
-        return ONE;
-    return sum < -ONE ? -ONE : (int32_t)sum;
-}
-
-int16_t sample_of(int32_t force)
-{
-    int32_t value = (force + (1 << 14)) >> 15;
-    if (value > INT16_MAX)
-        value = INT16_MAX;
-    if (value < -INT16_MAX)
-        value = -INT16_MAX;
-    return SQUARE_LAW ? voltage_of(value) : (int16_t)value;
+    for (unsigned i = 0; i < VOICES_KEPT; i++)
+        if (channel->voices[i].is_playing)
+            sum += voice_sample(&channel->voices[i]);
+    return sum;
 }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 //
-// What this amplifier is and can do: edit this file for another product. It is all that GetCaps,
-// the capability registers and the capability objects report.
+// What this amplifier is and can do: edit this file for another product. It is all that GetCaps
+// reports.
 
 #ifndef CONFIG_H
 #define CONFIG_H
@@ -15,34 +15,47 @@
 
 #define VENDOR "ERA haptics"
 #define PRODUCT "Example firmware"
-#define FIRMWARE_VERSION "1.0"
+#define FIRMWARE_VERSION "2.0"
 
+// Memory goes with channels, layers, voices, knots and the words of a set: 1 to 16 channels, 4 to 16
+// layers, at least 8 voices of each channel and 512 words.
+#ifndef CHANNELS
 #define CHANNELS 4
+#endif
 #define CHANNELS_MAX CHANNELS // a constant, for memory
+#ifdef SMALLEST
+#define LAYERS 4
+#define VOICES 8
+#define STREAM_WORDS 512
+#else
+#define LAYERS 8
+#define VOICES 16
+#define STREAM_WORDS 1024 // of a set
+#endif
+#define ENVELOPE_KNOTS 32
+
 #define SAMPLE_RATE 16000 // per second and channel; a multiple of 1000
 #define SAMPLES_PER_MS (SAMPLE_RATE / 1000)
 
-// Watchdog, staging, valid_for, phase, broadcast, interlock, address; it sends no events.
-#define FEATURES 0x093E
+// 1: the serial line is shared with other amplifiers (RS-485), so that events are not sent there.
+#define SERIAL_IS_SHARED 0
+#define FEATURES (FEATURE_EVENTS | FEATURE_INTERLOCK | FEATURE_ADDRESS)
 
-#define FREQUENCY_MIN (20 * FREQUENCY_PER_HZ)
-#define FREQUENCY_MAX (2000 * FREQUENCY_PER_HZ) // at most a quarter of the sample rate
-#define LEVEL_MAX FULL_STROKE
-#define VOICES 2 // oscillators of a channel, 2 to 255
+#define FREQUENCY_MIN (20 * FREQUENCY_PER_UNIT)
+#define FREQUENCY_MAX (2000 * FREQUENCY_PER_UNIT) // at most a quarter of the sample rate
+#define LEVEL_MAX WIRE_LEVEL_MAX
 // 1: samples are voltages of an electrostatic actuator, whose force goes with their square: the
 // root of a bias plus the summed force of the voices. 0: samples are forces.
 #ifndef SQUARE_LAW
 #define SQUARE_LAW 0
 #endif
-#define WATCHDOG_MIN 100
-#define WATCHDOG_MAX 2000
-
-#define ENVELOPE_SLOTS 16
-#define ENVELOPE_KNOTS 32
+#define RAMP_MAX WIRE_RAMP_MAX
+#define WATCHDOG_MIN WIRE_WATCHDOG_MIN
+#define WATCHDOG_MAX WIRE_WATCHDOG_MAX
 #define ENVELOPE_STEP_MIN 10
-#define ENVELOPE_STEP_MAX 1000
+#define ENVELOPE_STEP_MAX WIRE_ENVELOPE_STEP_MAX
 
-#define FAULTS_KEPT 8
+#define FAULTS_KEPT 16
 
 #endif
 

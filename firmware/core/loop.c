@@ -18,9 +18,8 @@ static struct slcan slcan;
 static uint32_t samples_to_measuring;
 static uint8_t stored[3]; // addresses, of each line
 
-// Of a longer time in which the processor could not make samples (a program or an emulator may stand
-// still) only this passes: the watchdog watches the host, not what held up the processor.
-#define SAMPLES_LATE_MAX (50 * SAMPLES_PER_MS)
+// After a longer time every watchdog has expired, and every ramp ended.
+#define SAMPLES_LATE_MAX ((WATCHDOG_MAX + RAMP_MAX) * SAMPLES_PER_MS)
 
 static void send_can(const struct can_frame *frame)
 {
@@ -30,11 +29,22 @@ static void send_can(const struct can_frame *frame)
         board_write(LINE_CAN, (const uint8_t *)line, length);
 }
 
+static void notify(const struct amplifier *changed, const struct words *event)
+{
+    uint8_t line[SERIAL_STUFFED_MAX + 2];
+    (void)changed;
+    uint16_t length = serial_event(&serial, event, line);
+    if (length > 0)
+        board_write(LINE_SERIAL, line, length);
+    can_event(&node, event);
+}
+
 void loop_init(void)
 {
     for (int line = LINE_SERIAL; line <= LINE_CAN; line++)
         stored[line] = board_address((enum line)line);
-    amplifier_init(&amplifier, board_serial_number());
+    amplifier_init(&amplifier, board_serial_number(), notify);
+    amplifier_time(&amplifier, board_microseconds());
     serial_init(&serial, &amplifier, stored[LINE_SERIAL]);
     modbus_init(&modbus, &amplifier, stored[LINE_MODBUS]);
     rtu_init(&rtu, &modbus);
@@ -53,20 +63,24 @@ static void measure(void)
 
 void loop_samples(void)
 {
-    int16_t samples[CHANNELS];
+    int16_t samples[CHANNELS_MAX];
+    uint64_t now = board_microseconds();
     uint32_t due = board_samples_due();
-    for (due = due > SAMPLES_LATE_MAX ? SAMPLES_LATE_MAX : due; due > 0; due--) {
+    due = due > SAMPLES_LATE_MAX ? SAMPLES_LATE_MAX : due;
+    uint64_t span = (uint64_t)due * 1000000 / SAMPLE_RATE;
+    amplifier_time(&amplifier, now > span ? now - span : 0); // of the first one
+    for (; due > 0; due--) {
         if (samples_to_measuring-- == 0) { // every millisecond
             samples_to_measuring = SAMPLES_PER_MS - 1;
             measure();
         }
         amplifier_sample(&amplifier, samples);
         board_output(samples);
-        board_high_voltage(amplifier.high_voltage);
     }
+    amplifier_time(&amplifier, now);
+    board_high_voltage(amplifier.high_voltage);
 }
 
-// What a request changed must reach the board, and its measurements the reply.
 static void send(enum line line, const uint8_t *reply, uint16_t length)
 {
     board_high_voltage(amplifier.high_voltage);
@@ -126,5 +140,5 @@ void loop_once(void)
     serve_can();
     store(LINE_SERIAL, serial.address);
     store(LINE_MODBUS, modbus.unit);
-    store(LINE_CAN, node.next_number);
+    store(LINE_CAN, node.number);
 }

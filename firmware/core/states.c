@@ -3,91 +3,106 @@
 // States, session, watchdog, stops and faults.
 
 #include "amplifier.h"
+#include "sine.h"
 
 #include <string.h>
 
-const struct verdict ACCEPTED = {NAK_NONE, NO_CHANNEL};
+#define SAFETY_RAMP 5 // ms; of the watchdog, of faults, and of what an Arm still finds playing
 
-struct verdict refused(enum nak nak)
+// Beyond full level by more than a step.
+#define LIMIT (ONE + ONE / LEVEL_PER_UNIT)
+
+static void enter(struct amplifier *amplifier, enum state state, uint8_t channel)
 {
-    struct verdict verdict = {nak, NO_CHANNEL};
-    return verdict;
+    if (state == amplifier->state)
+        return;
+    amplifier->state = state;
+    if (state == OPERATION_ENABLED)
+        amplifier->high_voltage = true;
+    if (amplifier->notify != NULL) {
+        struct words event = {EVENT_WORDS, {(uint16_t)state, (uint16_t)amplifier->fault, channel,
+                                            amplifier->latch}};
+        amplifier->notify(amplifier, &event);
+    }
 }
 
-void amplifier_init(struct amplifier *amplifier, const char *serial_number)
+void amplifier_init(struct amplifier *amplifier, const char *serial_number,
+                    amplifier_notify *notify)
 {
     memset(amplifier, 0, sizeof *amplifier);
     amplifier->serial_number = serial_number;
+    amplifier->notify = notify;
     amplifier->state = SWITCH_ON_DISABLED;
-    amplifier->fault_channel = NO_CHANNEL;
-    amplifier->answered = &amplifier->active;
 }
 
-static bool is_sounding(const struct amplifier *amplifier)
+void amplifier_restart(struct amplifier *amplifier)
+{
+    layers_silence(amplifier, 0);
+    intake_drop(&amplifier->intake);
+    timer_stop(&amplifier->fed);
+    amplifier->committed = 0;
+    amplifier->high_voltage = amplifier->is_limited = false;
+    amplifier->fault = FAULT_NONE;
+    enter(amplifier, SWITCH_ON_DISABLED, NO_CHANNEL);
+}
+
+static bool is_silent(const struct amplifier *amplifier)
 {
     for (unsigned i = 0; i < CHANNELS; i++)
-        if (channel_is_sounding(&amplifier->channels[i]))
-            return true;
-    return false;
-}
-
-// Every channel falls silent along a ramp; endings are skipped.
-static void quiet(struct amplifier *amplifier, uint16_t ramp)
-{
-    for (unsigned i = 0; i < CHANNELS; i++)
-        channel_quiet(&amplifier->channels[i], ramp);
-}
-
-static void leave_operation(struct amplifier *amplifier, enum state next)
-{
-    if (amplifier->state == OPERATION_ENABLED) {
-        amplifier->ended_session = amplifier->session;
-        amplifier->session = 0;
-        amplifier->watchdog_left = 0;
-        amplifier->staged_left = 0;
-        amplifier->valid_left = 0;
-    }
-    amplifier->state = next;
+        if (!channel_is_silent(&amplifier->channels[i]))
+            return false;
+    return true;
 }
 
 static void next_latch(struct amplifier *amplifier)
 {
-    amplifier->latch = amplifier->latch == 255 ? 1 : amplifier->latch + 1;
+    amplifier->latch = amplifier->latch == UINT16_MAX ? 1 : (uint16_t)(amplifier->latch + 1);
 }
 
 // Once silent: what only waited for that.
-void settle(struct amplifier *amplifier)
+static void settle(struct amplifier *amplifier)
 {
-    if (amplifier->state == OPERATION_ENABLED || is_sounding(amplifier))
+    if (amplifier->state == OPERATION_ENABLED || !is_silent(amplifier))
         return;
     amplifier->high_voltage = false;
     if (amplifier->state == SWITCHED_ON)
-        amplifier->state = SWITCH_ON_DISABLED;
+        enter(amplifier, SWITCH_ON_DISABLED, NO_CHANNEL);
     if (amplifier->state == FAULT_REACTION_ACTIVE)
-        amplifier->state = FAULT;
+        enter(amplifier, FAULT, NO_CHANNEL);
+}
+
+void amplifier_silence(struct amplifier *amplifier, uint16_t ramp)
+{
+    layers_silence(amplifier, ramp);
+    intake_drop(&amplifier->intake);
+}
+
+// Silence, then the state that follows.
+static void leave(struct amplifier *amplifier, enum state next, uint16_t ramp, uint8_t channel)
+{
+    amplifier_silence(amplifier, ramp);
+    timer_stop(&amplifier->fed);
+    enter(amplifier, next, channel);
+    settle(amplifier);
 }
 
 void amplifier_fail(struct amplifier *amplifier, enum fault fault, uint8_t channel)
 {
-    leave_operation(amplifier, FAULT_REACTION_ACTIVE);
+    struct fault_record record = {(uint8_t)fault, channel, amplifier_now(amplifier)};
     amplifier->fault = fault;
-    amplifier->fault_channel = channel;
     next_latch(amplifier);
     memmove(&amplifier->faults[1], &amplifier->faults[0],
             (FAULTS_KEPT - 1) * sizeof amplifier->faults[0]);
-    amplifier->faults[0].fault = (uint8_t)fault;
-    amplifier->faults[0].channel = channel;
-    amplifier->faults[0].at = amplifier->now;
+    amplifier->faults[0] = record;
     if (amplifier->fault_count < FAULTS_KEPT)
         amplifier->fault_count++;
-    quiet(amplifier, SAFETY_RAMP);
-    settle(amplifier);
+    leave(amplifier, FAULT_REACTION_ACTIVE, SAFETY_RAMP, channel);
 }
 
 void amplifier_measured(struct amplifier *amplifier, struct measured measured)
 {
     amplifier->measured = measured;
-    if (!amplifier->high_voltage || amplifier->fault != FAULT_NONE)
+    if (amplifier->state < SWITCHED_ON || amplifier->state > QUICK_STOP_ACTIVE)
         return;
     if (measured.is_interlock_open)
         amplifier_fail(amplifier, FAULT_INTERLOCK, NO_CHANNEL);
@@ -102,110 +117,80 @@ static bool is_cause_gone(const struct amplifier *amplifier)
     return amplifier->measured.cause == FAULT_NONE;
 }
 
-void watchdog_feed(struct amplifier *amplifier)
+void amplifier_feed(struct amplifier *amplifier)
 {
-    amplifier->watchdog_left = amplifier->watchdog;
+    if (amplifier->state == OPERATION_ENABLED)
+        timer_start(&amplifier->fed, amplifier->watchdog, amplifier->now);
 }
 
-struct verdict session_check(const struct amplifier *amplifier, uint16_t session)
+void amplifier_arm(struct amplifier *amplifier, uint16_t session, uint16_t watchdog)
 {
-    if (amplifier->state != OPERATION_ENABLED)
-        return refused(NAK_WRONG_STATE);
-    return session == amplifier->session ? ACCEPTED : refused(NAK_WRONG_SESSION);
-}
-
-struct verdict amplifier_arm(struct amplifier *amplifier, uint16_t watchdog, uint16_t session)
-{
-    if (watchdog < WATCHDOG_MIN || watchdog > WATCHDOG_MAX || session == 0)
-        return refused(NAK_BAD_VALUE);
-    if (amplifier->state > OPERATION_ENABLED || amplifier->measured.is_interlock_open)
-        return refused(NAK_WRONG_STATE);
-    if (amplifier->state == OPERATION_ENABLED) {
-        if (session != amplifier->session)
-            return refused(NAK_WRONG_SESSION);
-    } else {
-        if (session == amplifier->ended_session)
-            return refused(NAK_WRONG_SESSION);
-        amplifier->state = OPERATION_ENABLED;
-        amplifier->session = session;
-        amplifier->high_voltage = true;
-        amplifier->active.token = 0;
-        quiet(amplifier, SAFETY_RAMP);
-    }
-    amplifier->watchdog = (uint32_t)watchdog * SAMPLES_PER_MS;
-    watchdog_feed(amplifier);
-    return ACCEPTED;
+    amplifier->watchdog = watchdog;
+    if (amplifier->state == OPERATION_ENABLED) // the same again: its reply was lost
+        return;
+    amplifier_silence(amplifier, SAFETY_RAMP);
+    amplifier->committed = 0;
+    amplifier->session = session;
+    enter(amplifier, OPERATION_ENABLED, NO_CHANNEL);
 }
 
 void amplifier_disarm(struct amplifier *amplifier, uint16_t ramp)
 {
-    if (amplifier->state == OPERATION_ENABLED)
-        leave_operation(amplifier, SWITCHED_ON);
-    quiet(amplifier, ramp > RAMP_MAX ? RAMP_MAX : ramp);
-    settle(amplifier);
+    enum state next = amplifier->state == OPERATION_ENABLED ? SWITCHED_ON : amplifier->state;
+    leave(amplifier, next, ramp > RAMP_MAX ? RAMP_MAX : ramp, NO_CHANNEL);
 }
 
 void amplifier_stop(struct amplifier *amplifier, uint16_t ramp)
 {
+    bool is_kept = amplifier->state == NOT_READY || amplifier->state >= QUICK_STOP_ACTIVE;
     next_latch(amplifier);
-    if (amplifier->state < QUICK_STOP_ACTIVE)
-        leave_operation(amplifier, QUICK_STOP_ACTIVE);
-    quiet(amplifier, ramp > RAMP_MAX ? RAMP_MAX : ramp);
-    settle(amplifier);
+    leave(amplifier, is_kept ? amplifier->state : QUICK_STOP_ACTIVE,
+          ramp > RAMP_MAX ? RAMP_MAX : ramp, NO_CHANNEL);
 }
 
-struct verdict amplifier_clear(struct amplifier *amplifier, uint8_t latch)
+enum nak amplifier_clear(struct amplifier *amplifier, uint16_t latch)
 {
     if (amplifier->state != QUICK_STOP_ACTIVE && amplifier->state != FAULT)
-        return ACCEPTED;
+        return NAK_NONE;
     if (latch != amplifier->latch)
-        return refused(NAK_WRONG_LATCH);
-    if (is_sounding(amplifier) || (amplifier->state == FAULT && !is_cause_gone(amplifier)))
-        return ACCEPTED; // too early: nothing changes, as the status shows
-    amplifier->state = SWITCH_ON_DISABLED;
+        return NAK_WRONG_LATCH;
+    if (!is_silent(amplifier) || (amplifier->state == FAULT && !is_cause_gone(amplifier)))
+        return NAK_NONE; // too early: nothing changes, as the status shows
     amplifier->fault = FAULT_NONE;
-    amplifier->fault_channel = NO_CHANNEL;
-    return ACCEPTED;
-}
-
-struct verdict amplifier_ping(struct amplifier *amplifier, uint16_t session)
-{
-    if (amplifier->state != OPERATION_ENABLED)
-        return ACCEPTED;
-    if (session != amplifier->session)
-        return refused(NAK_WRONG_SESSION);
-    watchdog_feed(amplifier);
-    return ACCEPTED;
-}
-
-struct verdict amplifier_readdress(const struct amplifier *amplifier, uint16_t address,
-                                   uint8_t highest)
-{
-    if (!(FEATURES & FEATURE_ADDRESS))
-        return refused(NAK_UNKNOWN_TYPE);
-    if (address < 1 || address > highest)
-        return refused(NAK_BAD_VALUE);
-    return amplifier->state == SWITCH_ON_DISABLED ? ACCEPTED : refused(NAK_WRONG_STATE);
-}
-
-bool amplifier_is_named(const struct amplifier *amplifier, const uint8_t *text, uint16_t length)
-{
-    return length == strlen(amplifier->serial_number) &&
-           memcmp(text, amplifier->serial_number, length) == 0;
+    enter(amplifier, SWITCH_ON_DISABLED, NO_CHANNEL);
+    return NAK_NONE;
 }
 
 void amplifier_forces(struct amplifier *amplifier, int32_t forces[CHANNELS_MAX])
 {
+    for (unsigned i = 0; i < CHANNELS; i++) {
+        int64_t sum = channel_sum(&amplifier->channels[i]);
+        amplifier->is_limited |= sum > LIMIT || sum < -LIMIT;
+        forces[i] = sum > ONE ? ONE : sum < -ONE ? -ONE : (int32_t)sum;
+    }
+    amplifier->sample++;
+    layers_sample(amplifier);
     for (unsigned i = 0; i < CHANNELS; i++)
-        forces[i] = channel_force(&amplifier->channels[i]);
-    amplifier->now++;
+        channel_stop_silent(&amplifier->channels[i]);
     settle(amplifier);
-    if (amplifier->state != OPERATION_ENABLED)
-        return;
-    sets_sample(amplifier);
-    amplifier->watchdog_left--;
-    if (amplifier->watchdog_left == 0)
+    if (timer_sample(&amplifier->intake.life))
+        intake_drop(&amplifier->intake);
+    if (timer_sample(&amplifier->fed))
         amplifier_fail(amplifier, FAULT_WATCHDOG, NO_CHANNEL);
+}
+
+// The voltage u = sqrt((1 + force) / 2): its square is half the full one, the bias, and half the
+// force, so that nothing beats and there is no harmonic, whatever the voices play together.
+static int16_t voltage_of(int32_t force)
+{
+    return (int16_t)square_root((uint64_t)(force + INT16_MAX) * INT16_MAX / 2);
+}
+
+static int16_t sample_of(int32_t force)
+{
+    int32_t value = (force + (1 << 14)) >> 15;
+    value = value > INT16_MAX ? INT16_MAX : value < -INT16_MAX ? -INT16_MAX : value;
+    return SQUARE_LAW ? voltage_of(value) : (int16_t)value;
 }
 
 void amplifier_sample(struct amplifier *amplifier, int16_t samples[CHANNELS_MAX])
@@ -217,33 +202,24 @@ void amplifier_sample(struct amplifier *amplifier, int16_t samples[CHANNELS_MAX]
         samples[i] = is_on ? sample_of(forces[i]) : 0;
 }
 
-static void shorten(uint32_t *left, uint32_t samples)
+void amplifier_time(struct amplifier *amplifier, uint64_t now)
 {
-    if (*left > 0) // the last one ends with the next sample
-        *left = *left > samples ? *left - samples : 1;
+    if (now > amplifier->now)
+        amplifier->now = now;
+    amplifier->now_at = amplifier->sample;
+    if (timer_is_late(&amplifier->fed, amplifier->now, amplifier->slack))
+        amplifier_fail(amplifier, FAULT_WATCHDOG, NO_CHANNEL);
+    if (timer_is_late(&amplifier->intake.life, amplifier->now, amplifier->slack))
+        intake_drop(&amplifier->intake);
+    layers_time(amplifier);
 }
 
-void amplifier_late(struct amplifier *amplifier, uint32_t samples)
+uint64_t amplifier_now(const struct amplifier *amplifier)
 {
-    shorten(&amplifier->watchdog_left, samples);
-    shorten(&amplifier->valid_left, samples);
-    shorten(&amplifier->staged_left, samples);
-}
-
-uint8_t amplifier_flags(const struct amplifier *amplifier)
-{
-    return (uint8_t)((amplifier->high_voltage ? HIGH_VOLTAGE_ON : 0) |
-                     (amplifier->measured.is_interlock_open ? INTERLOCK_OPEN : 0));
+    return amplifier->now + (amplifier->sample - amplifier->now_at) * 1000000 / SAMPLE_RATE;
 }
 
 uint16_t amplifier_watchdog_left(const struct amplifier *amplifier)
 {
-    uint16_t left = (uint16_t)(amplifier->watchdog_left / SAMPLES_PER_MS);
-    return left == 0 && amplifier->watchdog_left > 0 ? 1 : left;
-}
-
-uint32_t amplifier_fault_age(const struct amplifier *amplifier, uint8_t number)
-{
-    uint64_t age = (amplifier->now - amplifier->faults[number].at) / SAMPLES_PER_MS;
-    return age > UINT32_MAX ? UINT32_MAX : (uint32_t)age;
+    return (uint16_t)((amplifier->fed.samples + SAMPLES_PER_MS / 2) / SAMPLES_PER_MS);
 }

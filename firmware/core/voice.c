@@ -3,125 +3,159 @@
 #include "voice.h"
 #include "sine.h"
 
-static int32_t present_gain(const struct voice *voice)
+#define PHASE_TURN (360 * PHASE_PER_UNIT)
+#define WHOLE (UINT64_C(1) << 32)
+
+static struct complex amplitude_of(uint16_t level, int16_t phase)
 {
-    switch (voice->gain) {
-    case GAIN_RISING:
-        return raised_cosine(voice->along);
-    case GAIN_FALLING:
-        return times(voice->gain_from, ONE - raised_cosine(voice->along));
-    default:
-        return ONE;
-    }
+    uint32_t turn = (uint32_t)(phase < 0 ? phase + PHASE_TURN : phase);
+    uint32_t angle = (uint32_t)(((uint64_t)turn << 32) / PHASE_TURN);
+    int32_t size = (int32_t)(((int64_t)level * ONE) / LEVEL_PER_UNIT);
+    struct complex amplitude = {times(size, cosine(angle)), times(size, sine(angle))};
+    return amplitude;
 }
 
-static struct complex present_amplitude(const struct voice *voice)
+// Progress per sample of what takes so many tenths of a millisecond, rounded up, so that the end
+// comes with the last sample and not one later.
+static uint32_t stride_of(uint32_t tenths)
 {
-    return voice->walk.is_walking ? walk_now(&voice->walk) : voice->amplitude;
+    uint64_t tenth_samples = (uint64_t)tenths * SAMPLES_PER_MS;
+    uint64_t stride = tenth_samples > 0 ? (10 * WHOLE + tenth_samples - 1) / tenth_samples : 0;
+    return stride > UINT32_MAX ? UINT32_MAX : (uint32_t)stride;
 }
 
-void voice_begin(struct voice *voice, uint16_t frequency, struct complex amplitude, uint16_t ramp)
+static int32_t between(int32_t from, int32_t to, int32_t way)
 {
-    voice->is_sounding = true;
+    return (int32_t)(from + ((((int64_t)to - from) * way) >> 30));
+}
+
+static struct complex present(const struct voice *voice)
+{
+    if (voice->stride == 0)
+        return voice->to;
+    int32_t way = voice->path.knots > 0 ? (int32_t)(voice->along >> 2) : raised_cosine(voice->along);
+    struct complex amplitude = {between(voice->from.re, voice->to.re, way),
+                                between(voice->from.im, voice->to.im, way)};
+    return amplitude;
+}
+
+static struct complex target(const struct voice *voice, uint8_t knot)
+{
+    if (knot == voice->path.knots)
+        return amplitude_of(voice->level, voice->phase);
+    return amplitude_of(voice->path.knot[knot].level, voice->path.knot[knot].phase);
+}
+
+void voice_stop_if_silent(struct voice *voice)
+{
+    if (voice->stride == 0 && voice->level == 0)
+        voice->is_playing = false;
+}
+
+// shape: null for a ramp.
+static void send(struct voice *voice, const struct envelope *shape, uint16_t ramp, uint16_t level,
+                 int16_t phase, uint64_t sample)
+{
+    voice->from = present(voice);
+    voice->level = level;
+    voice->phase = level > 0 ? phase : 0;
+    voice->since = sample;
+    voice->path.knots = 0;
+    if (shape != NULL)
+        voice->path = *shape;
+    voice->along = 0;
+    voice->stride = stride_of(shape != NULL ? shape->step : 10u * ramp);
+    voice->to = target(voice, 0);
+    voice->next = 1;
+    voice_stop_if_silent(voice);
+}
+
+void voice_begin(struct voice *voice, uint8_t layer, uint16_t frequency, uint32_t number)
+{
+    static const struct complex silence = {0, 0};
+    const uint64_t rate = (uint64_t)SAMPLE_RATE * FREQUENCY_PER_UNIT;
+    voice->is_playing = true;
+    voice->layer = layer;
+    voice->has_ended = false;
     voice->frequency = frequency;
     voice->angle = 0;
-    voice->pace = (uint32_t)((((uint64_t)frequency << 32) + SAMPLE_RATE * FREQUENCY_PER_HZ / 2) /
-                             (SAMPLE_RATE * FREQUENCY_PER_HZ));
-    voice->amplitude = amplitude;
-    voice->walk.is_walking = false;
-    voice->gain = ramp > 0 ? GAIN_RISING : GAIN_STEADY;
-    voice->along = 0;
-    voice->stride = ramp > 0 ? stride_of(ramp * 10u) : 0;
+    voice->pace = (uint32_t)((frequency * WHOLE + rate / 2) / rate);
+    voice->to = silence;
+    voice->stride = 0;
+    voice->number = number;
 }
 
-void voice_walk(struct voice *voice, const struct envelope *path, struct complex final)
+void voice_lead(struct voice *voice, const struct command *command, uint16_t ramp, uint64_t sample)
 {
-    int32_t gain = present_gain(voice);
-    struct complex from = present_amplitude(voice);
-    from.re = times(from.re, gain);
-    from.im = times(from.im, gain);
-    voice->gain = GAIN_STEADY;
-    voice->amplitude = final;
-    walk_begin(&voice->walk, path, from, final);
+    send(voice, command->has_onset ? &command->onset : NULL, ramp, command->level, command->phase,
+         sample);
+    voice->has_ending = command->has_ending;
+    if (command->has_ending)
+        voice->ending = command->ending;
 }
 
-static bool walks_to_silence(const struct voice *voice)
+bool voice_outlasts(const struct voice *voice, uint16_t milliseconds)
 {
-    return voice->walk.is_walking && voice->walk.final.re == 0 && voice->walk.final.im == 0;
+    return voice->level > 0 || voice_samples_left(voice) > (uint32_t)milliseconds * SAMPLES_PER_MS;
 }
 
-// The least stride that gets a gain from `along` to its end within so many samples.
-static uint32_t stride_within(uint32_t samples)
+void voice_fade(struct voice *voice, uint16_t ramp, uint64_t sample)
 {
-    return (uint32_t)(((UINT64_C(1) << 32) + samples - 1) / samples);
+    voice->has_ended = true;
+    if (voice_outlasts(voice, ramp))
+        send(voice, NULL, ramp, 0, 0, sample);
 }
 
-static uint32_t ramp_samples_left(const struct voice *voice)
+void voice_end(struct voice *voice, uint16_t ramp, uint64_t sample)
 {
-    return (uint32_t)(((UINT64_C(1) << 32) - voice->along + voice->stride - 1) / voice->stride);
-}
-
-void voice_fall(struct voice *voice, uint16_t ramp)
-{
-    uint32_t samples = (uint32_t)ramp * SAMPLES_PER_MS;
-    if (!voice->is_sounding)
-        return;
-    if (samples == 0) {
-        voice->is_sounding = false;
+    if (voice->has_ended || !voice->has_ending) {
+        voice_fade(voice, ramp, sample);
         return;
     }
-    if (voice->gain == GAIN_FALLING && ramp_samples_left(voice) <= samples)
+    voice->has_ended = true;
+    send(voice, &voice->ending, ramp, 0, 0, sample);
+}
+
+uint32_t voice_samples_left(const struct voice *voice)
+{
+    if (voice->stride == 0)
+        return 0;
+    uint64_t left = (uint64_t)(voice->path.knots + 1 - voice->next) * WHOLE + WHOLE - voice->along;
+    return (uint32_t)((left + voice->stride - 1) / voice->stride);
+}
+
+static void move_on(struct voice *voice)
+{
+    uint32_t before = voice->along;
+    if (voice->stride == 0)
         return;
-    // An envelope that ends sooner is left for a ramp that ends with it.
-    if (walks_to_silence(voice) && walk_samples_left(&voice->walk) < samples)
-        samples = walk_samples_left(&voice->walk);
-    voice->gain_from = present_gain(voice);
-    voice->amplitude = present_amplitude(voice);
-    voice->walk.is_walking = false;
-    voice->gain = GAIN_FALLING;
-    voice->along = 0;
-    voice->stride = stride_within(samples);
-}
-
-bool voice_lasts(const struct voice *voice)
-{
-    return voice->is_sounding && voice->gain != GAIN_FALLING && !walks_to_silence(voice);
-}
-
-static void move_gain(struct voice *voice)
-{
     voice->along += voice->stride;
-    if (voice->along >= voice->stride)
+    if (voice->along >= before)
         return;
-    if (voice->gain == GAIN_FALLING)
-        voice->is_sounding = false;
-    voice->gain = GAIN_STEADY;
+    if (voice->next > voice->path.knots) { // the end of the last line
+        voice->stride = 0;
+        return;
+    }
+    voice->from = voice->to;
+    voice->to = target(voice, voice->next);
+    voice->next++;
 }
 
 int32_t voice_sample(struct voice *voice)
 {
-    if (!voice->is_sounding)
-        return 0;
-    struct complex amplitude = present_amplitude(voice);
+    struct complex amplitude = present(voice);
     int32_t value = times(amplitude.re, sine(voice->angle)) +
                     times(amplitude.im, cosine(voice->angle));
-    if (voice->gain != GAIN_STEADY) {
-        value = times(value, present_gain(voice));
-        move_gain(voice);
-    }
-    if (voice->walk.is_walking) {
-        bool is_last = walks_to_silence(voice);
-        walk_step(&voice->walk);
-        if (is_last && !voice->walk.is_walking)
-            voice->is_sounding = false;
-    }
     voice->angle += voice->pace;
+    move_on(voice);
     return value;
 }
 
-int32_t voice_size(const struct voice *voice)
+struct complex voice_pointer(const struct voice *voice)
 {
-    if (!voice->is_sounding)
-        return 0;
-    return times(magnitude(present_amplitude(voice)), present_gain(voice));
+    struct complex amplitude = present(voice);
+    int32_t re = cosine(voice->angle), im = sine(voice->angle);
+    struct complex turned = {times(amplitude.re, re) - times(amplitude.im, im),
+                             times(amplitude.re, im) + times(amplitude.im, re)};
+    return turned;
 }

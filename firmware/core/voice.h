@@ -1,45 +1,65 @@
 // SPDX-License-Identifier: MIT
 //
-// A voice: one oscillator with a complex amplitude and a gain.
+// A voice: one oscillator with a complex amplitude, level x exp(i phase), that stands still or is on
+// its way.
 //
-// The amplitude stands still or walks along an envelope; the gain stands still, rises or falls
-// along a raised cosine. A channel has at least two voices, so that one can fade out while another
-// fades in. The work for a sample is the same however many requests have arrived.
+// It goes along straight lines through the knots of an envelope, a step each, or without knots along
+// a raised cosine; so nothing jumps. The work for a sample is the same however many requests have
+// arrived.
 
 #ifndef VOICE_H
 #define VOICE_H
 
-#include "envelope.h"
+#include "set.h"
 
-enum gain { GAIN_STEADY, GAIN_RISING, GAIN_FALLING };
-
-struct voice {
-    bool is_sounding;
-    uint16_t frequency;
-    uint32_t angle, pace;       // of the oscillator, and its step per sample
-    struct complex amplitude;   // unless walking
-    struct walk walk;
-    enum gain gain;
-    int32_t gain_from;          // where a falling gain began
-    uint32_t along, stride;     // position on the ramp of the gain
+struct complex {
+    int32_t re, im; // in units of 2^-30 of full level
 };
 
-// Begin at t = 0 with an amplitude, along a ramp [ms].
-void voice_begin(struct voice *voice, uint16_t frequency, struct complex amplitude, uint16_t ramp);
+struct voice {
+    bool is_playing;
+    uint8_t layer;
+    bool has_ended;           // it falls silent, and nothing continues it
+    uint16_t frequency;
+    uint16_t level;           // to which it leads; its phase, 0 without a level
+    int16_t phase;
+    uint32_t angle, pace;     // of the oscillator, and its step per sample
+    struct complex from, to;  // ends of the present line
+    uint32_t along, stride;   // position on it, a whole turn being its end; stride 0: it stands at `to`
+    uint8_t next;             // knot behind this line; path.knots: the final amplitude
+    struct envelope path;     // its way; without knots a raised cosine
+    bool has_ending;
+    struct envelope ending;   // how it falls silent by itself
+    uint64_t since;           // sample at which it was sent on its way
+    uint32_t number;          // of voices, in the order of their beginnings
+};
 
-// Move the amplitude along an envelope, from the present amplitude to a final one.
-void voice_walk(struct voice *voice, const struct envelope *path, struct complex final);
+// Begin in a layer at t = 0, silent.
+void voice_begin(struct voice *voice, uint8_t layer, uint16_t frequency, uint32_t number);
 
-// Fall silent along a ramp [ms] from the present amplitude; sooner than before, or not at all.
-void voice_fall(struct voice *voice, uint16_t ramp);
+// Send it from its present amplitude to the tone of a command: along its onset, or a ramp [ms].
+void voice_lead(struct voice *voice, const struct command *command, uint16_t ramp, uint64_t sample);
 
-// Whether it sounds and does not fall silent.
-bool voice_lasts(const struct voice *voice);
+// Let it fall silent along a ramp [ms], or as it does if that is sooner.
+void voice_fade(struct voice *voice, uint16_t ramp, uint64_t sample);
 
-// Value at this sample in units of 2^-30 of full stroke; then move on by one sample.
+// Let it fall silent along its ending, or along a ramp [ms] without one.
+void voice_end(struct voice *voice, uint16_t ramp, uint64_t sample);
+
+// Stop it where it stands at level 0. At the end of its way that is left to the caller, since a set that
+// waited for that end may continue it.
+void voice_stop_if_silent(struct voice *voice);
+
+// Samples until it stands still.
+uint32_t voice_samples_left(const struct voice *voice);
+
+// Whether it is not silent within a time [ms] by itself.
+bool voice_outlasts(const struct voice *voice, uint16_t milliseconds);
+
+// Value at this sample in units of 2^-30 of full level; then move on by one sample.
 int32_t voice_sample(struct voice *voice);
 
-// Present size in units of 2^-30 of full stroke.
-int32_t voice_size(const struct voice *voice);
+// Its present amplitude, turned by the angle of its oscillator: those of one frequency add up.
+struct complex voice_pointer(const struct voice *voice);
 
 #endif

@@ -3,13 +3,13 @@
 // Mutated frames for every codec: `era-fuzz COUNT [SEED]`, built with the sanitizers of addresses and
 // of undefined behaviour, which end it at the first fault.
 //
-// A frame begins as one that a host sends, with random values. Some of its bytes are changed, added or
-// taken away; then most get a good checksum again, so that they are not stopped there. Between frames
-// time passes, so that watchdog, fades and envelopes run. After each frame what every status must
-// keep is checked.
+// A frame begins as one that a host sends, with random words. Some of its bytes are changed, added or
+// taken away; then nearly all get a good checksum again, so that they are not stopped there. Between
+// frames time passes, so that watchdog, fades and envelopes run. After each frame what every status
+// must keep is checked.
 
-#include "amplifier.h"
 #include "crc.h"
+#include "messages.h"
 #include "modbus_rtu.h"
 #include "serial.h"
 #include "slcan.h"
@@ -18,10 +18,9 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define HOST 127 // on CAN
-
 static struct amplifier amplifier;
 static uint64_t seed = 1;
+static unsigned long mutated, events;
 
 static uint32_t any(uint32_t below)
 {
@@ -39,27 +38,40 @@ static void require(int condition, const char *what)
     }
 }
 
+static void notify(const struct amplifier *changed, const struct words *event)
+{
+    require(changed == &amplifier && event->count == EVENT_WORDS, "event");
+    events++;
+}
+
 static void check_amplifier(void)
 {
     int16_t samples[CHANNELS];
-    for (uint32_t left = any(64) == 0 ? any(20000) : any(200); left > 0; left--)
+    uint32_t passed = any(64) == 0 ? any(5000) : any(100);
+    for (uint32_t left = passed; left > 0; left--)
         amplifier_sample(&amplifier, samples);
+    amplifier_time(&amplifier, amplifier.now + (any(256) ? passed * 125 / 2 : any(3000000)));
+    bool is_armed = amplifier.state == OPERATION_ENABLED;
     require(amplifier.state >= SWITCH_ON_DISABLED && amplifier.state <= FAULT, "state");
     require(amplifier.state != READY_TO_SWITCH_ON, "state");
-    require((amplifier.state == OPERATION_ENABLED) == (amplifier.watchdog_left > 0), "watchdog");
-    require((amplifier.state == OPERATION_ENABLED) == (amplifier.session > 0), "session");
+    require(is_armed == (amplifier.fed.samples > 0), "watchdog");
+    require(!is_armed || amplifier.session > 0, "session");
+    require(amplifier.intake.count <= STREAM_WORDS, "set");
     for (unsigned i = 0; i < CHANNELS; i++) {
+        unsigned lasting = 0;
+        for (unsigned j = 0; j < VOICES_KEPT; j++)
+            lasting += amplifier.channels[i].voices[j].is_playing &&
+                       voice_outlasts(&amplifier.channels[i].voices[j], SHORTENED_FADE_MS);
+        require(lasting <= VOICES, "voices");
         uint16_t level = channel_level(&amplifier.channels[i]);
-        require(level <= FULL_STROKE, "level");
-        require(amplifier.high_voltage || level == 0, "sound without high voltage");
+        require(level <= LEVEL_MAX, "level");
+        require(amplifier.high_voltage || level == 0, "level without high voltage");
     }
 }
 
-static unsigned long mutated;
-
 // Half of all frames stay whole, so that mutated ones meet an amplifier that plays. Of the others
 // change, add or take away some bytes; return the new length.
-static uint16_t mutate(uint8_t *bytes, uint16_t length, uint16_t longest)
+static uint16_t mutate(uint8_t *bytes, uint16_t length, uint16_t length_max)
 {
     if (any(2))
         return length;
@@ -76,7 +88,7 @@ static uint16_t mutate(uint8_t *bytes, uint16_t length, uint16_t longest)
                 bytes[at] ^= (uint8_t)(1u << any(8));
             break;
         case 2:
-            if (length < longest) {
+            if (length < length_max) {
                 memmove(bytes + at + 1, bytes + at, length - at);
                 bytes[at] = (uint8_t)any(256);
                 length++;
@@ -95,109 +107,104 @@ static uint16_t mutate(uint8_t *bytes, uint16_t length, uint16_t longest)
 // Mutated frames alone would seldom bring it back to where it plays.
 static void arm_again(void)
 {
+    struct words reply;
+    uint16_t session = (uint16_t)(1 + amplifier.session % 3), watchdog = 300;
+    uint16_t arm[ARM_WORDS] = {session, watchdog};
     amplifier_stop(&amplifier, 0);
     amplifier_clear(&amplifier, amplifier.latch);
-    amplifier.ended_session = 0;
-    amplifier_arm(&amplifier, WATCHDOG_MAX, any(2) ? HOST : (uint16_t)(1 + any(3)));
+    message_handle(&amplifier, MESSAGE_ARM, arm, ARM_WORDS, &reply);
 }
 
-static uint8_t *put_u16(uint8_t *at, uint32_t value)
+static uint16_t some_token(void)
 {
-    at[0] = (uint8_t)value;
-    at[1] = (uint8_t)(value >> 8);
-    return at + 2;
+    return (uint16_t)(amplifier.committed + (any(4) ? 1 : any(3)));
 }
 
-static uint32_t some_token(void)
+static uint16_t some_phase(void)
 {
-    return (amplifier.active.token + any(3)) & 0xFFFF;
+    return (uint16_t)(any(36000) - 18000u);
 }
 
-static uint32_t some_session(void)
+static void put_envelope(struct words *words)
 {
-    return amplifier.state == OPERATION_ENABLED && any(8) ? amplifier.session : any(4);
-}
-
-static uint8_t *put_set(uint8_t *at)
-{
-    uint8_t count = (uint8_t)any(CHANNELS + 2);
-    at = put_u16(put_u16(put_u16(at, some_token()), any(1100)), any(4) ? 0 : any(300));
-    *at++ = count;
-    for (uint8_t i = 0; i < count; i++) {
-        *at++ = i;
-        *at = (uint8_t)any(8);
-        int has_slots = *at++ & 4;
-        at = put_u16(put_u16(put_u16(at, 400 + any(4)), any(10001)), any(36000) - 18000u);
-        if (has_slots) {
-            *at++ = (uint8_t)any(3);
-            *at++ = (uint8_t)any(3);
-        }
-    }
-    return at;
-}
-
-static uint8_t *put_envelope(uint8_t *at)
-{
-    uint8_t knots = (uint8_t)any(ENVELOPE_KNOTS + 2);
-    *at++ = (uint8_t)(1 + any(3));
-    at = put_u16(at, 10 + any(200));
-    *at++ = knots;
-    for (uint8_t i = 0; i < knots; i++)
-        at = put_u16(put_u16(at, any(10001)), any(36000) - 18000u);
-    return at;
-}
-
-// The serial number of the amplifier.
-static uint8_t *put_name(uint8_t *at)
-{
-    memcpy(at, "FUZZ-1", 6);
-    return at + 6;
-}
-
-static uint8_t *put_payload(uint8_t *at, uint8_t type)
-{
-    switch (type) {
-    case 3: // Arm
-        return put_u16(put_u16(at, 100 + any(1900)), some_session());
-    case 5: // Stage
-    case 7: // Apply
-        return put_set(put_u16(at, some_session()));
-    case 6: // Commit
-        return put_u16(put_u16(at, some_session()), some_token());
-    case 4: // Disarm
-    case 8: // Stop
-        return put_u16(at, any(100));
-    case 11: // Clear
-        *at = amplifier.latch;
-        return at + 1;
-    case 12: // Ping
-        return put_u16(at, some_session());
-    case 13:
-        return put_envelope(at);
-    case 15:
-        return put_name(put_u16(at, any(4) | 6 << 8));
-    default:
-        return at;
+    uint16_t knots = (uint16_t)(any(8) ? any(4) : any(ENVELOPE_KNOTS + 2));
+    put(words, knots);
+    put(words, (uint16_t)(9 + any(200)));
+    for (; knots > 0; knots--) {
+        put(words, (uint16_t)any(10001));
+        put(words, some_phase());
     }
 }
 
-// Requests that arm and play come more often than those that end it.
-static uint8_t some_type(void)
+static void put_layer(struct words *words)
 {
-    static const uint8_t TYPES[] = {1, 2, 3, 3, 3, 4, 5, 5, 6, 6, 7, 7, 7, 7, 8, 9, 10, 11, 11,
-                                    12, 12, 13, 13, 14, 15, 30, 31};
-    return TYPES[any(sizeof TYPES)];
+    uint32_t count = any(CHANNELS + 1), flags = any(8) ? 0 : any(4);
+    put(words, (uint16_t)(any(LAYERS) << LAYER_LAYER_SHIFT | flags << LAYER_RENEW_SHIFT | count));
+    put(words, (uint16_t)any(100));
+    put(words, (uint16_t)(any(4) ? 0 : any(300)));
+    for (uint32_t i = 0; i < count; i++) {
+        uint32_t bits = any(4) ? 4 * any(4) : any(16);
+        put(words, (uint16_t)(i << COMMAND_CHANNEL_SHIFT | bits));
+        put(words, (uint16_t)(400 + any(4)));
+        put(words, (uint16_t)any(3000));
+        put(words, some_phase());
+        if (FIELD_OF(bits, COMMAND_ONSET))
+            put_envelope(words);
+        if (FIELD_OF(bits, COMMAND_ENDING))
+            put_envelope(words);
+    }
+}
+
+// The next request of a host; return its type. Those that arm and play come more often.
+static uint8_t some_request(struct words *words)
+{
+    static const uint8_t TYPES[] = {1, 2, 3, 4, 5, 5, 5, 5, 5, 5, 5, 6, 6, 6, 7, 8, 9, 10,
+                                    11, 12, 12, 13, 14, 15, 16, 17, 18, 30, 31};
+    uint8_t type = TYPES[any(sizeof TYPES)];
+    bool is_longer = any(16) == 0;
+    words->count = 0;
+    if (type == MESSAGE_ARM || (type >= MESSAGE_SET && type <= MESSAGE_SILENCE) ||
+        type == MESSAGE_PING)
+        put(words, any(16) ? amplifier.session : (uint16_t)any(4));
+    if (type == MESSAGE_SET || type == MESSAGE_COMMIT)
+        put(words, some_token());
+    if (type == MESSAGE_SET) {
+        uint32_t parts = any(4) ? 1 : 1 + any(4);
+        put(words, (uint16_t)(any(parts) << SET_INDEX_SHIFT | parts << SET_PARTS_SHIFT | (any(4) > 0)));
+        for (uint32_t layers = any(4); layers > 0; layers--)
+            put_layer(words);
+    } else if (type == MESSAGE_ARM) {
+        put(words, (uint16_t)(100 + any(1900)));
+    } else if (type == MESSAGE_DISARM || type == MESSAGE_SILENCE || type == MESSAGE_STOP) {
+        put(words, (uint16_t)any(100));
+    } else if (type == MESSAGE_CLEAR) {
+        put(words, amplifier.latch);
+    } else if (type == MESSAGE_GET_ACHIEVED) {
+        put(words, (uint16_t)any(LAYERS + 1));
+    } else if (type == MESSAGE_SET_ADDRESS) {
+        put(words, (uint16_t)any(4));
+        put_text(words, amplifier.serial_number);
+    }
+    if (is_longer)
+        put(words, (uint16_t)any(65536));
+    return type;
 }
 
 static void fuzz_serial(struct serial *serial)
 {
     uint8_t frame[400], line[420];
-    uint8_t *at = frame;
-    *at++ = some_type();
-    *at++ = 2;
-    *at++ = any(8) ? 1 : 0;
-    at = put_payload(put_u16(at, any(65536)), frame[0]);
-    uint16_t length = mutate(frame, (uint16_t)(at - frame), 300), code = 0, out = 1;
+    struct words words;
+    uint8_t type = some_request(&words);
+    uint16_t length = 5, code = 0, out = 1;
+    frame[0] = type;
+    frame[1] = any(32) ? PROTOCOL_VERSION : (uint8_t)any(4);
+    frame[2] = any(8) ? 1 : 0;
+    frame[3] = frame[4] = (uint8_t)any(256);
+    for (uint16_t i = 0; i < words.count; i++) {
+        frame[length++] = (uint8_t)words.words[i];
+        frame[length++] = (uint8_t)(words.words[i] >> 8);
+    }
+    length = mutate(frame, length, 300);
     uint32_t crc = any(8) ? crc32_of(frame, length) : any(65536);
     for (int i = 0; i < 4; i++)
         frame[length++] = (uint8_t)(crc >> 8 * i);
@@ -226,66 +233,23 @@ static uint8_t *put_register(uint8_t *at, uint32_t value)
     return at + 2;
 }
 
-// The registers of a block of the page, from its tag or its first field on; return their number.
-static uint16_t put_block(uint8_t *at, uint16_t *address)
-{
-    static const uint16_t WORDS[] = {15, 15, 15, 0, 2, 128, 1};
-    static const uint16_t FIRST[] = {2, 10, 12, 16, 16, 16, 102, 182};
-    uint8_t *begin = at;
-    uint32_t block = any(8), token = some_token();
-    *address = FIRST[block];
-    switch (block) {
-    case 0:
-        at = put_register(put_register(at, WORDS[any(7)]), 100 + any(1900));
-        at = put_register(put_register(put_register(at, any(100)), some_session()), amplifier.latch);
-        break;
-    case 3:
-    case 4:
-        at = put_register(put_register(at, any(3) ? token : 0), some_session());
-        at = put_register(put_register(put_register(at, token), any(100)), any(4) ? 0 : any(300));
-        for (uint32_t i = 4 * any(CHANNELS + 1); i > 0; i--)
-            at = put_register(at, any(4) ? 400 + any(2) : any(65536) & 0xFC03);
-        break;
-    case 6: {
-        uint32_t knots = any(34);
-        at = put_register(put_register(put_register(at, 1 + any(3)), 10 + any(200)), knots);
-        for (uint32_t i = 2 * knots; i > 0; i--)
-            at = put_register(at, any(10001));
-        break;
-    }
-    case 7:
-        memset(at, 0, 34);
-        put_name(put_register(at, any(4)));
-        at += 34;
-        break;
-    default:
-        at = put_register(at, some_session());
-        if (block == 5)
-            at = put_register(put_register(begin, token), some_session());
-    }
-    return (uint16_t)((at - begin) / 2);
-}
-
 static void fuzz_modbus(struct rtu *rtu)
 {
-    static const uint8_t FUNCTIONS[] = {3, 4, 16, 16, 16, 23, 23, 23, 43, 6};
+    static const uint8_t FUNCTIONS[] = {3, 4, 16, 16, 16, 16, 43, 6};
     uint8_t frame[300], *at = frame + 2;
-    uint16_t address;
+    struct words words;
     frame[0] = any(8) ? 1 : 0;
     frame[1] = FUNCTIONS[any(sizeof FUNCTIONS)];
-    if (frame[1] == 23)
-        at = put_register(put_register(at, any(2) ? 1000 + any(1000) : any(65536)), 1 + any(126));
-    if (frame[1] == 16 || frame[1] == 23) {
-        uint16_t count = put_block(at + 5, &address);
-        at = put_register(put_register(at, address), count);
-        *at++ = (uint8_t)(2 * count);
-        at += 2 * count;
-    } else if (frame[1] == 43) {
-        *at++ = 14;
-        *at++ = (uint8_t)any(6);
-        *at++ = (uint8_t)any(4);
+    if (frame[1] == 16) {
+        uint8_t type = some_request(&words);
+        at = put_register(put_register(at, type * 256u), words.count + 1u);
+        *at++ = (uint8_t)(2 * words.count + 2);
+        at = put_register(at, any(65536));
+        for (uint16_t i = 0; i < words.count; i++)
+            at = put_register(at, words.words[i]);
     } else {
-        at = put_register(put_register(at, any(2500)), any(130));
+        uint32_t address = any(4) ? any(20) * 256 + 128 : any(2) ? 1065 + any(70) : any(65536);
+        at = put_register(put_register(at, address), any(130));
     }
     uint16_t length = mutate(frame, (uint16_t)(at - frame), 254);
     uint16_t crc = any(8) ? crc16_of(frame, length) : (uint16_t)any(65536);
@@ -298,6 +262,9 @@ static void fuzz_modbus(struct rtu *rtu)
 }
 
 static unsigned long frames_sent;
+static struct slcan *slcan_under_test;
+static struct can_frame outgoing[SEGMENTS_MAX + 1];
+static unsigned outgoing_count;
 
 static void frame_sent(const struct can_frame *frame)
 {
@@ -305,59 +272,63 @@ static void frame_sent(const struct can_frame *frame)
     frames_sent++;
 }
 
-static uint64_t some_command(uint8_t channel, uint8_t sequence)
+static void frame_queued(const struct can_frame *frame)
 {
-    return (400 + any(4)) | (uint64_t)any(10001) << 16 | (uint64_t)any(18000) << 32 |
-           (uint64_t)any(8) << 48 | (uint64_t)channel << 52 | (uint64_t)sequence << 56;
+    require(outgoing_count <= SEGMENTS_MAX, "frames");
+    outgoing[outgoing_count++] = *frame;
 }
 
-// The next frame of a host: mostly a set in pieces, of one sequence number for some frames.
-static struct can_frame some_frame(uint8_t sequence)
+static void send_line(struct can_frame frame, bool may_mutate)
 {
-    static const uint16_t IDS[] = {0x481, 0x481, 0x481, 0x201, 0x301, 0x401, 0x501, 0x681, 0x681,
-                                   0x601, 0x601, 0x601, 0x77F, 0x480, 0x000};
-    struct can_frame frame = {IDS[any(sizeof IDS / sizeof IDS[0])], 8, {0}};
-    uint64_t data = (uint64_t)any(UINT32_MAX) << 32 | any(UINT32_MAX);
-    if (frame.id == 0x481 || frame.id == 0x480) { // an order
-        uint32_t action = any(8), first = some_token();
-        first = action == 4 ? HOST : action == 7 ? amplifier.latch : first;
-        data = first | (uint64_t)any(100) << 16 | (uint64_t)(action == 4 ? 2000 : 0) << 32 |
-               (uint64_t)action << 48 | (uint64_t)any(3) << 51 |
-               (uint64_t)(frame.id == 0x480 ? 0 : sequence) << 56;
-    } else if (frame.id >= 0x201 && frame.id <= 0x501) {
-        data = some_command((uint8_t)((frame.id - 0x201) >> 8), sequence);
-    } else if (frame.id == 0x681) {
-        data = any(3) | (uint64_t)any(3) << 6 | (uint64_t)sequence << 56;
-    } else if (frame.id == 0x601 && any(2)) { // objects of the page
-        data = (data & ~UINT64_C(0xFFFFFF00)) | (uint64_t)(0x2000 + any(0x40)) << 8;
-    } else if (frame.id == 0x77F) {
-        frame.length = 1;
-    } else if (frame.id == 0x000) { // mostly start
-        frame.length = 2;
-        data = any(8) ? 1 : 128 + any(3);
-    }
-    for (unsigned i = 0; i < 8; i++)
-        frame.data[i] = (uint8_t)(data >> 8 * i);
-    return frame;
+    char line[SLCAN_LINE_MAX + 8];
+    if (may_mutate)
+        frame.length = (uint8_t)mutate(frame.data, frame.length, 8);
+    uint16_t length = slcan_format(&frame, line);
+    if (may_mutate && any(4) == 0)
+        length = mutate((uint8_t *)line, length, sizeof line);
+    for (uint16_t i = 0; i < length; i++)
+        slcan_byte(slcan_under_test, (uint8_t)line[i]);
 }
 
+// A request in frames of a host, or a frame to the objects or of network management.
 static void fuzz_can(struct slcan *slcan)
 {
-    static uint8_t sequence = 1;
-    if (slcan->node->consumer == 0) // reset
-        slcan->node->consumer = (uint32_t)HOST << 16;
-    char line[SLCAN_LINE_MAX + 8];
-    if (any(4) == 0)
-        sequence = (uint8_t)(1 + sequence % 255);
-    struct can_frame frame = some_frame(sequence);
-    frame.length = (uint8_t)mutate(frame.data, frame.length, 8);
-    uint16_t length = slcan_format(&frame, line);
-    if (any(8) == 0)
-        length = mutate((uint8_t *)line, length, sizeof line);
+    static struct can_node host; // its frames become those of a host
+    static uint8_t number = 1;
+    struct words words;
+    slcan_under_test = slcan;
     slcan_byte(slcan, 'O');
     slcan_byte(slcan, '\r');
-    for (uint16_t i = 0; i < length; i++)
-        slcan_byte(slcan, (uint8_t)line[i]);
+    if (any(4) == 0) {
+        static const uint16_t IDS[] = {0x000, 0x000, 0x601, 0x601, 0x601, 0x601, 0x701};
+        struct can_frame frame = {IDS[any(sizeof IDS / sizeof IDS[0])], 8, {0}};
+        for (unsigned i = 0; i < 8; i++)
+            frame.data[i] = (uint8_t)any(256);
+        if (frame.id == 0) { // mostly start
+            frame.length = 2;
+            frame.data[0] = any(8) ? 1 : (uint8_t)(128 + any(3));
+            frame.data[1] = 0;
+        } else if (any(2)) { // objects that there are
+            frame.data[1] = (uint8_t)any(4);
+            frame.data[2] = 0x20;
+            frame.data[3] = (uint8_t)any(32);
+        }
+        send_line(frame, true);
+    } else {
+        uint8_t type = some_request(&words);
+        bool is_broadcast = any(8) == 0;
+        number = (uint8_t)(any(16) ? 1u + number % 255u : any(256));
+        host.send = frame_queued;
+        host.number = is_broadcast ? 0 : 1;
+        outgoing_count = 0;
+        bool may_mutate = any(2);
+        can_send_message(&host, is_broadcast ? 0 : number, type, &words);
+        for (unsigned i = 0; i < outgoing_count; i++) {
+            struct can_frame *frame = &outgoing[any(32) ? i : any(outgoing_count)];
+            frame->id = (uint16_t)(0x200 + host.number);
+            send_line(*frame, may_mutate && any(4) == 0);
+        }
+    }
     can_time(slcan->node);
 }
 
@@ -371,7 +342,7 @@ int main(int count, char **arguments)
     unsigned long played[3] = {0, 0, 0}, frames = count > 1 ? strtoul(arguments[1], NULL, 10) : 20000;
     if (count > 2)
         seed = strtoull(arguments[2], NULL, 10);
-    amplifier_init(&amplifier, "FUZZ-1");
+    amplifier_init(&amplifier, "FUZZ-1", notify);
     serial_init(&serial, &amplifier, 1);
     modbus_init(&modbus, &amplifier, 1);
     rtu_init(&rtu, &modbus);
@@ -381,23 +352,23 @@ int main(int count, char **arguments)
         for (mutated = 0; mutated < frames;) {
             if (amplifier.state != OPERATION_ENABLED && any(4) == 0)
                 arm_again();
-            uint16_t token = amplifier.active.token;
-            serial.address = modbus.unit = node.next_number = 1; // a SetAddress may have moved them
+            uint16_t token = amplifier.committed;
+            serial.address = modbus.unit = node.number = 1; // a SetAddress may have moved them
             if (codec == 0)
                 fuzz_serial(&serial);
             else if (codec == 1)
                 fuzz_modbus(&rtu);
             else
                 fuzz_can(&slcan);
-            played[codec] += amplifier.active.token != token && amplifier.active.token != 0;
+            played[codec] += amplifier.committed != token && amplifier.committed != 0;
             check_amplifier();
         }
     }
-    printf("%lu mutated frames for each codec, and as many whole ones:\n"
+    printf("%lu mutated frames for each codec, and as many whole ones; %lu events:\n"
            "  serial discarded %lu, and played %lu sets\n"
            "  Modbus discarded %lu, and played %lu sets\n"
            "  CAN sent %lu frames, and played %lu sets\n",
-           frames, (unsigned long)serial.discarded, played[0], (unsigned long)rtu.discarded,
-           played[1], frames_sent, played[2]);
+           frames, events, (unsigned long)serial.discarded, played[0],
+           (unsigned long)rtu.discarded, played[1], frames_sent, played[2]);
     return 0;
 }

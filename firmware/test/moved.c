@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: MIT
 //
 // A board in memory, whose clock stands still until its caller moves it: the amplifier as a shared
-// library. One amplifier at a time; the caller brings what arrives and fetches what is sent.
+// library. One amplifier at a time; the caller brings what arrives and fetches what is sent and
+// played.
 
 #include "board.h"
 #include "loop.h"
@@ -12,6 +13,7 @@
 #define LINES 3
 #define RING 8192 // bytes
 #define STEP 1000 // us; between two turns of the loop
+#define SAMPLES_MAX (1 << 21)
 
 static struct {
     uint8_t arrived[RING], sent[RING];
@@ -20,6 +22,8 @@ static struct {
 } lines[LINES];
 static struct mbap connection;
 static uint64_t now, samples_counted; // us, and those made of them
+static int16_t samples_made[SAMPLES_MAX];
+static uint32_t samples_length; // of all channels, not fetched yet
 static bool is_high_voltage, is_interlock_open;
 static uint8_t addresses[LINES];
 
@@ -29,6 +33,7 @@ void moved_begin(void)
     memset(addresses, 1, sizeof addresses);
     connection.length = 0;
     now = samples_counted = 0;
+    samples_length = 0;
     is_interlock_open = false;
     loop_init();
 }
@@ -39,6 +44,23 @@ void moved_to(uint64_t time)
         now = time - now > STEP ? now + STEP : time;
         loop_once();
     }
+}
+
+// Let time pass while the loop stands still, and the converter takes nothing where it does, too.
+void moved_stall(uint64_t time, bool is_converter_still)
+{
+    if (is_converter_still)
+        samples_counted += (time - now) * SAMPLE_RATE / 1000000;
+    now = time;
+}
+
+// The samples that were made since the last call, the channels one after another; return how many.
+uint32_t moved_samples(int16_t samples[SAMPLES_MAX])
+{
+    uint32_t length = samples_length;
+    memcpy(samples, samples_made, length * sizeof samples[0]);
+    samples_length = 0;
+    return length;
 }
 
 void moved_interlock(bool is_open)
@@ -73,15 +95,13 @@ static void send_frame(int line, const uint8_t *frame, uint16_t length)
 void moved_receive_tcp(const uint8_t *bytes, uint32_t length)
 {
     loop_samples();
-    for (uint32_t at = 0; at < length;) {
-        uint32_t room = MBAP_FRAME_MAX - connection.length, left = length - at;
-        uint32_t part = left < room ? left : room;
-        memcpy(connection.received + connection.length, bytes + at, part);
-        connection.length = (uint16_t)(connection.length + part);
-        at += part;
-        mbap_take(&connection, loop_modbus(), send_frame, LINE_MODBUS);
-    }
+    mbap_take(&connection, bytes, (uint16_t)length, loop_modbus(), 1, send_frame, LINE_MODBUS);
     loop_once();
+}
+
+uint64_t board_microseconds(void)
+{
+    return now;
 }
 
 uint32_t board_samples_due(void)
@@ -93,7 +113,10 @@ uint32_t board_samples_due(void)
 
 void board_output(const int16_t samples[CHANNELS])
 {
-    (void)samples;
+    if (samples_length + CHANNELS > SAMPLES_MAX)
+        return;
+    memcpy(samples_made + samples_length, samples, CHANNELS * sizeof samples[0]);
+    samples_length += CHANNELS;
 }
 
 void board_wait(void)

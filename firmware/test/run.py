@@ -1,9 +1,9 @@
 """Prove the firmware: `python firmware/test/run.py [--long] [--no-tests]`, by `make firmware-test`.
 
-Runs its tests, conformance on every wire among them, and mutated frames under sanitizers (20 000
-for each codec; a million with --long). Prints the sizes of core and wires for a Cortex-M3, and says
-so where its compiler is not installed, which is a failure in CI. --no-tests: after `make test`,
-which has run them.
+Runs its tests, and mutated frames under sanitizers (20 000 for each codec; a million with --long).
+Prints the sizes of core and wires for a Cortex-M3, as configured and with the least of all, and
+says so where its compiler is not installed, which is a failure in CI. --no-tests: after `make
+test`, which has run them.
 """
 
 import os
@@ -26,7 +26,8 @@ def main() -> None:
     if not shutil.which("arm-none-eabi-gcc"):
         print("left out: bare metal; it needs gcc-arm-none-eabi and libnewlib-arm-none-eabi")
         sys.exit(os.environ.get("CI") == "true")
-    run("arm-none-eabi-size", "-t", *sorted((OUT / "cortex-m3").rglob("*.o")))
+    for part in ("cortex-m3", "smallest"):
+        run("arm-none-eabi-size", "-t", *sorted((OUT / part).rglob("*.o")))
 
 
 def run(*command: str | Path, cwd: Path | None = None) -> None:

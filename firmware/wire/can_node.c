@@ -1,42 +1,44 @@
 // SPDX-License-Identifier: MIT
 
 #include "can.h"
+#include "messages.h"
 
 #include <string.h>
 
-enum nmt_command { START = 1, STOP = 2, ENTER_PRE_OPERATIONAL = 128, RESET_NODE, RESET_COMMUNICATION };
+enum nmt_command { START = 1, LEAVE = 2, ENTER_PRE_OPERATIONAL = 128, RESET_NODE, RESET_COMMUNICATION };
 
 // Functions: identifiers without the number of the node.
 #define NMT 0x000
 #define EMERGENCY 0x080
-#define ANSWER 0x180
-#define COMMAND 0x200 // to 0x500, of channels 0 to 3
-#define ORDER 0x480
+#define REQUEST 0x200 // without a node: a broadcast
 #define SDO_REQUEST 0x600
-#define SLOTS 0x680
 #define HEARTBEAT 0x700
 
 #define HEARTBEAT_INTERVAL 50 // ms, until object 1017 is written
+#define LEAVING_RAMP 5        // ms
 
-void can_send(struct can_node *node, uint16_t function, uint64_t data, uint8_t length)
+void can_send(struct can_node *node, uint16_t function, const uint8_t *data, uint8_t length)
 {
     struct can_frame frame = {(uint16_t)(function + node->number), length, {0}};
-    for (unsigned i = 0; i < 8; i++)
-        frame.data[i] = (uint8_t)(data >> 8 * i);
+    memcpy(frame.data, data, length);
     node->send(&frame);
+}
+
+static void send_heartbeat(struct can_node *node, enum nmt nmt)
+{
+    uint8_t state = (uint8_t)nmt;
+    node->heartbeat_at = node->amplifier->now;
+    can_send(node, HEARTBEAT, &state, 1);
 }
 
 static void boot(struct can_node *node)
 {
-    node->number = node->next_number;
+    memset(&node->requests, 0, sizeof node->requests);
+    node->requests.is_numbered = true;
     node->nmt = NMT_PRE_OPERATIONAL;
     node->heartbeat_interval = HEARTBEAT_INTERVAL;
-    node->heartbeat_at = node->amplifier->now;
-    node->seen_state = node->amplifier->state;
-    node->seen_fault = node->amplifier->fault;
-    node->collection.is_open = false;
-    node->sdo.transfer = SDO_IDLE;
-    can_send(node, HEARTBEAT, NMT_BOOT_UP, 1);
+    node->sdo.is_uploading = false;
+    send_heartbeat(node, NMT_BOOT_UP);
 }
 
 void can_init(struct can_node *node, struct amplifier *amplifier, uint8_t number,
@@ -44,8 +46,9 @@ void can_init(struct can_node *node, struct amplifier *amplifier, uint8_t number
 {
     memset(node, 0, sizeof *node);
     node->amplifier = amplifier;
-    node->next_number = number;
+    node->number = number;
     node->send = send;
+    node->broadcasts.has_ended = true;
     boot(node);
 }
 
@@ -62,41 +65,27 @@ static uint16_t error_code(enum fault fault)
     return CODES[fault];
 }
 
-static bool is_fault_state(enum state state)
+void can_event(struct can_node *node, const struct words *event)
 {
-    return state == FAULT_REACTION_ACTIVE || state == FAULT;
+    uint16_t state = event->words[EVENT_STATE], fault = event->words[EVENT_FAULT];
+    bool is_faulty = fault != FAULT_NONE;
+    if (node->nmt == NMT_OPERATIONAL)
+        can_send_message(node, 0, MESSAGE_EVENT, event);
+    if ((is_faulty || node->was_faulty) && node->nmt != NMT_STOPPED) {
+        uint16_t code = error_code((enum fault)fault);
+        uint8_t data[8] = {(uint8_t)code, (uint8_t)(code >> 8),
+                           can_error_register((enum fault)fault), (uint8_t)(state | fault << 4),
+                           (uint8_t)event->words[EVENT_CHANNEL]};
+        can_send(node, EMERGENCY, data, 8);
+    }
+    node->was_faulty = is_faulty;
 }
 
-// Report a change of state or fault: an emergency to, within or from a fault, else an answer that
-// answers nothing.
-void can_report_change(struct can_node *node)
-{
-    const struct amplifier *amplifier = node->amplifier;
-    enum state state = amplifier->state, before = node->seen_state;
-    enum fault fault = amplifier->fault;
-    uint64_t both = (uint64_t)state | (uint64_t)fault << 4;
-    if (state == before && fault == node->seen_fault)
-        return;
-    node->seen_state = state;
-    node->seen_fault = fault;
-    if (node->nmt == NMT_STOPPED)
-        return;
-    if (is_fault_state(state) || is_fault_state(before))
-        can_send(node, EMERGENCY,
-                 error_code(fault) | (uint64_t)can_error_register(fault) << 16 | both << 24 |
-                     (uint64_t)amplifier->fault_channel << 32,
-                 8);
-    else if (node->nmt == NMT_OPERATIONAL)
-        can_send(node, ANSWER, both << 16 | (uint64_t)NO_CHANNEL << 24, 8);
-}
-
+// Leave the state in which it receives requests: its host would be deaf to what plays.
 static void leave_operational(struct can_node *node, enum nmt next)
 {
-    // It would no longer receive its host.
     if (node->amplifier->state == OPERATION_ENABLED)
-        amplifier_stop(node->amplifier, SAFETY_RAMP);
-    can_report_change(node);
-    node->collection.is_open = false;
+        amplifier_stop(node->amplifier, LEAVING_RAMP);
     node->nmt = next;
 }
 
@@ -106,15 +95,14 @@ static void manage(struct can_node *node, uint8_t command)
     case START:
         node->nmt = NMT_OPERATIONAL;
         break;
-    case STOP:
+    case LEAVE:
         leave_operational(node, NMT_STOPPED);
         break;
     case ENTER_PRE_OPERATIONAL:
         leave_operational(node, NMT_PRE_OPERATIONAL);
         break;
     case RESET_NODE: // like a loss of supply
-        amplifier_init(node->amplifier, node->amplifier->serial_number);
-        node->consumer = 0;
+        amplifier_restart(node->amplifier);
         boot(node);
         break;
     case RESET_COMMUNICATION:
@@ -126,54 +114,60 @@ static void manage(struct can_node *node, uint8_t command)
     }
 }
 
-static void receive_pdo(struct can_node *node, uint16_t function, uint64_t data)
+// Carry a message out; its reply goes to a numbered one.
+static void handle(struct can_node *node, const struct can_assembly *message)
 {
-    switch (function) {
-    case ORDER:
-        can_order(node, data, false);
-        break;
-    case SLOTS:
-        can_slots(node, data);
-        break;
-    case COMMAND:
-    case COMMAND + 0x100:
-    case COMMAND + 0x200:
-    case COMMAND + 0x300:
-        can_command(node, (uint8_t)((function - COMMAND) >> 8), data);
-        break;
-    default:
-        break;
+    struct words reply = {0};
+    struct verdict verdict = {NAK_NONE, NO_CHANNEL};
+    uint8_t type = message->type;
+    uint16_t address = message->words[SET_ADDRESS_ADDRESS];
+    bool is_moving = type == MESSAGE_SET_ADDRESS && message->count > 0;
+    if (type == MESSAGE_HELLO)
+        message_identity(&reply, node->amplifier);
+    else if (is_moving && address > NODE_MAX)
+        verdict.nak = NAK_BAD_VALUE;
+    else
+        verdict = message_handle(node->amplifier, type, message->words, message->count, &reply);
+    is_moving = is_moving && verdict.nak == NAK_NONE && address != node->number;
+    if (verdict.nak != NAK_NONE) {
+        message_nak(&reply, type, verdict);
+        type = MESSAGE_NAK;
+    }
+    if (message->is_numbered)
+        can_send_message(node, message->number, type, &reply);
+    if (is_moving) {
+        node->number = (uint8_t)address;
+        boot(node);
     }
 }
 
 void can_receive(struct can_node *node, const struct can_frame *frame)
 {
     uint16_t function = (uint16_t)(frame->id - node->number);
-    uint64_t data = u64_at(frame->data);
+    uint64_t now = node->amplifier->now;
     if (frame->id == NMT) {
         if (frame->length == 2 && (frame->data[1] == 0 || frame->data[1] == node->number))
             manage(node, frame->data[0]);
-    } else if (frame->id == HEARTBEAT + HOST_OF(node)) {
-        if (frame->length == 1 && HOST_OF(node) != 0)
-            amplifier_ping(node->amplifier, HOST_OF(node));
     } else if (frame->length != 8) {
         return; // discarded
-    } else if (function == SDO_REQUEST && node->nmt != NMT_STOPPED) {
-        can_sdo_receive(node, frame->data);
-    } else if (frame->id == ORDER && node->nmt == NMT_OPERATIONAL) {
-        can_order(node, data, true);
-    } else if (node->nmt == NMT_OPERATIONAL) {
-        receive_pdo(node, function, data);
+    } else if (function == SDO_REQUEST) {
+        if (node->nmt != NMT_STOPPED)
+            can_sdo_receive(node, frame->data);
+    } else if (node->nmt != NMT_OPERATIONAL) {
+        return; // until it is identified
+    } else if (frame->id == REQUEST) {
+        if (can_assemble(&node->broadcasts, frame->data, now) &&
+            message_is_broadcast(node->broadcasts.type))
+            handle(node, &node->broadcasts);
+    } else if (function == REQUEST) {
+        if (can_assemble(&node->requests, frame->data, now))
+            handle(node, &node->requests);
     }
 }
 
 void can_time(struct can_node *node)
 {
-    uint64_t interval = (uint64_t)node->heartbeat_interval * SAMPLES_PER_MS;
-    can_report_change(node);
-    can_expire(node);
-    if (interval > 0 && node->amplifier->now - node->heartbeat_at >= interval) {
-        node->heartbeat_at = node->amplifier->now;
-        can_send(node, HEARTBEAT, node->nmt, 1);
-    }
+    uint64_t interval = (uint64_t)node->heartbeat_interval * 1000;
+    if (interval > 0 && node->amplifier->now - node->heartbeat_at >= interval)
+        send_heartbeat(node, node->nmt);
 }

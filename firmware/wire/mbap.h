@@ -18,8 +18,9 @@ struct mbap {
 
 typedef void mbap_send(int to, const uint8_t *frame, uint16_t length);
 
-// Carry out the whole frames that have arrived; send the replies `to` the connection. What is no
-// frame is discarded with all that came with it.
-void mbap_take(struct mbap *mbap, struct modbus *modbus, mbap_send *send, int to);
+// Take bytes, and carry out the frames that they complete, for several units; send the replies `to`
+// the connection. What is no frame is discarded with all that came with it.
+void mbap_take(struct mbap *mbap, const uint8_t *bytes, uint16_t length, struct modbus units[],
+               unsigned count, mbap_send *send, int to);
 
 #endif

@@ -1,31 +1,29 @@
 // SPDX-License-Identifier: MIT
 
 #include "modbus.h"
-#include "modbus_registers.h"
+#include "messages.h"
 
 #include <string.h>
 
-enum function {
-    READ_HOLDING = 3,
-    READ_INPUT = 4,
-    WRITE = 16,
-    WRITE_AND_READ = 23
-};
+enum function { READ_HOLDING = 3, READ_INPUT = 4, WRITE = 16 };
+enum exception { ILLEGAL_FUNCTION = 1, ILLEGAL_ADDRESS = 2, ILLEGAL_VALUE = 3 };
 
 #define EXCEPTION 0x80 // bit of the function
-enum exception { ILLEGAL_FUNCTION = 1, ILLEGAL_ADDRESS = 2, ILLEGAL_VALUE = 3, FAILURE = 4, BUSY = 6 };
-
 #define READ_MAX 125
 #define WRITE_MAX 123
+#define BOX 256        // registers of a message
+#define REPLY 128      // offset of its reply: tag, result, words
+#define REPLY_HEAD 2
+#define AREA_MAX (REPLY_HEAD + WORDS_MAX)
+#define IDENTITY 1065  // tag, versions, texts
+#define TEXT_REGISTERS 16
+#define IDENTITY_REGISTERS (2 + TEXTS * TEXT_REGISTERS)
 
 void modbus_init(struct modbus *modbus, struct amplifier *amplifier, uint8_t unit)
 {
     memset(modbus, 0, sizeof *modbus);
     modbus->amplifier = amplifier;
     modbus->unit = unit;
-    modbus->refusal = ACCEPTED;
-    modbus->control[1] = 250; // watchdog, ms
-    modbus->control[2] = 5;   // ramp, ms
 }
 
 static uint16_t u16_at(const uint8_t *bytes)
@@ -33,189 +31,153 @@ static uint16_t u16_at(const uint8_t *bytes)
     return (uint16_t)(bytes[0] << 8 | bytes[1]);
 }
 
-static void put_u16(uint8_t *bytes, uint16_t value)
+static bool is_known(uint16_t type)
 {
-    bytes[0] = (uint8_t)(value >> 8);
-    bytes[1] = (uint8_t)value;
+    return type >= MESSAGE_GET_CAPS && type < MODBUS_BOXES;
 }
 
-static uint16_t exception(uint8_t *reply, uint8_t function, enum exception code)
+// What is read as it is at that moment, so that any master can look.
+static bool is_present(uint16_t type)
 {
-    reply[0] = function | EXCEPTION;
-    reply[1] = (uint8_t)code;
+    return type == MESSAGE_GET_CAPS || type == MESSAGE_GET_STATUS || type == MESSAGE_GET_FAULTS;
+}
+
+// Carry out a message; return the result: 0, or code and channel of the refusal.
+static uint16_t execute(struct modbus *modbus, uint8_t type, const uint16_t *words, uint16_t count,
+                        struct words *reply)
+{
+    struct verdict verdict = message_handle(modbus->amplifier, type, words, count, reply);
+    if (verdict.nak != NAK_NONE)
+        return (uint16_t)(verdict.nak << 8 | verdict.channel);
+    if (type == MESSAGE_SET_ADDRESS)
+        modbus->next_unit = (uint8_t)words[SET_ADDRESS_ADDRESS];
+    return 0;
+}
+
+// The message that is written: its type, and its tag and words; an exception, or 0.
+static int read_write(const uint8_t *pdu, uint16_t length, uint8_t *type, uint16_t *words,
+                      uint16_t *count)
+{
+    if (length < 6)
+        return ILLEGAL_VALUE;
+    uint16_t address = u16_at(pdu + 1);
+    *count = u16_at(pdu + 3);
+    if (*count < 1 || *count > WRITE_MAX || pdu[5] != 2 * *count || length != 6 + 2 * *count)
+        return ILLEGAL_VALUE;
+    if (address % BOX != 0 || !is_known(address / BOX) || *count > 1 + WORDS_MAX)
+        return ILLEGAL_ADDRESS;
+    *type = (uint8_t)(address / BOX);
+    for (uint16_t i = 0; i < *count; i++)
+        words[i] = u16_at(pdu + 6 + 2 * i);
+    return 0;
+}
+
+static int write_box(struct modbus *modbus, const uint8_t *pdu, uint16_t length)
+{
+    uint16_t words[1 + WORDS_MAX], count;
+    uint8_t type;
+    struct words reply;
+    int exception = read_write(pdu, length, &type, words, &count);
+    if (exception != 0)
+        return exception;
+    uint16_t result = execute(modbus, type, words + 1, (uint16_t)(count - 1), &reply);
+    modbus->replies[type].tag = words[0];
+    modbus->replies[type].result = result;
+    modbus->replies[type].count = result == 0 && !is_present(type) ? reply.count : 0;
+    memcpy(modbus->replies[type].words, reply.words,
+           modbus->replies[type].count * sizeof reply.words[0]);
+    return 0;
+}
+
+// The registers of a reply, with zeros behind it.
+static void read_reply(struct modbus *modbus, uint8_t type, uint16_t area[AREA_MAX])
+{
+    struct words reply = {0};
+    area[0] = modbus->replies[type].tag;
+    area[1] = modbus->replies[type].result;
+    if (!is_present(type)) {
+        reply.count = modbus->replies[type].count;
+        memcpy(reply.words, modbus->replies[type].words, reply.count * sizeof reply.words[0]);
+    } else if (area[1] == 0) {
+        area[1] = execute(modbus, type, NULL, 0, &reply);
+    }
+    if (is_present(type)) // a refusal is read once
+        modbus->replies[type].result = 0;
+    for (uint16_t i = 0; i < WORDS_MAX; i++)
+        area[REPLY_HEAD + i] = i < reply.count ? reply.words[i] : 0;
+}
+
+static void read_identity(const struct modbus *modbus, uint16_t area[AREA_MAX])
+{
+    area[0] = 0;
+    area[1] = 1 << PROTOCOL_VERSION;
+    for (uint16_t i = 0; i < TEXTS * TEXT_REGISTERS; i++) {
+        const char *text = message_text(modbus->amplifier, i / TEXT_REGISTERS);
+        size_t size = strlen(text), at = 2u * (i % TEXT_REGISTERS);
+        uint8_t high = at < size ? (uint8_t)text[at] : 0;
+        uint8_t low = at + 1 < size ? (uint8_t)text[at + 1] : 0;
+        area[2 + i] = (uint16_t)(high << 8 | low);
+    }
+}
+
+// Read registers; an exception, or 0.
+static int read_registers(struct modbus *modbus, uint16_t address, uint16_t count, uint8_t *reply)
+{
+    uint16_t type = address / BOX, area[AREA_MAX], first = IDENTITY, size = IDENTITY_REGISTERS;
+    bool is_reply = address % BOX >= REPLY && is_known(type);
+    if (is_reply) {
+        first = (uint16_t)(type * BOX + REPLY);
+        size = AREA_MAX;
+    }
+    if (address < first || address + count > first + size)
+        return ILLEGAL_ADDRESS;
+    if (is_reply)
+        read_reply(modbus, (uint8_t)type, area);
+    else
+        read_identity(modbus, area);
+    for (uint16_t i = 0; i < count; i++) {
+        uint16_t word = area[address - first + i];
+        reply[2 + 2 * i] = (uint8_t)(word >> 8);
+        reply[3 + 2 * i] = (uint8_t)word;
+    }
+    if (type == MESSAGE_SET_ADDRESS && modbus->replies[type].result == 0 && modbus->next_unit > 0)
+        modbus->unit = modbus->next_unit;
+    return 0;
+}
+
+uint16_t modbus_request(struct modbus *modbus, const uint8_t *pdu, uint16_t length,
+                        uint8_t reply[MODBUS_PDU_MAX])
+{
+    int exception = ILLEGAL_FUNCTION;
+    uint16_t size = 5, count = length == 5 ? u16_at(pdu + 3) : 0;
+    if (length > 0 && pdu[0] == WRITE) {
+        exception = write_box(modbus, pdu, length);
+        if (exception == 0)
+            memcpy(reply, pdu, size); // function, address and count
+    } else if (length > 0 && (pdu[0] == READ_HOLDING || pdu[0] == READ_INPUT)) {
+        exception = count < 1 || count > READ_MAX
+                        ? ILLEGAL_VALUE
+                        : read_registers(modbus, u16_at(pdu + 1), count, reply);
+        reply[0] = pdu[0];
+        reply[1] = (uint8_t)(2 * count);
+        size = (uint16_t)(2 + 2 * count);
+    }
+    if (exception == 0)
+        return size;
+    reply[0] = (length > 0 ? pdu[0] : 0) | EXCEPTION;
+    reply[1] = (uint8_t)exception;
     return 2;
 }
 
-static enum exception exception_of(enum nak nak)
+void modbus_broadcast(struct modbus *modbus, const uint8_t *pdu, uint16_t length)
 {
-    switch (nak) {
-    case NAK_UNKNOWN_TYPE:
-        return ILLEGAL_FUNCTION;
-    case NAK_WRONG_STATE:
-    case NAK_WRONG_SESSION:
-    case NAK_WRONG_LATCH:
-    case NAK_FADING:
-        return FAILURE;
-    case NAK_BUSY:
-        return BUSY;
-    default:
-        return ILLEGAL_VALUE;
-    }
-}
-
-static bool is_range(uint16_t address, uint16_t count)
-{
-    return address + count <= REGISTERS_END;
-}
-
-static uint16_t read_registers(const struct modbus *modbus, uint8_t function, uint16_t address,
-                               uint16_t count, uint8_t *reply)
-{
-    reply[0] = function;
-    reply[1] = (uint8_t)(2 * count);
-    for (uint16_t i = 0; i < count; i++)
-        put_u16(&reply[2 + 2 * i], modbus_read(modbus, (uint16_t)(address + i)));
-    return (uint16_t)(2 + 2 * count);
-}
-
-// Write a block from its tag or its first field on; return 0, or an exception.
-static int write_block(struct modbus *modbus, uint16_t address, const uint8_t *bytes, uint16_t count)
-{
-    static const uint16_t BLOCKS[] = {CONTROL_AT, HEARTBEAT_AT, SET_AT, ENVELOPE_AT};
-    uint16_t values[WRITE_MAX];
-    for (uint16_t i = 0; i < count; i++)
-        values[i] = u16_at(bytes + 2 * i);
-    if (address == LOOK_AT && count == 1) {
-        modbus->tag = values[0];
-        return 0;
-    }
-    struct verdict verdict = refused(NAK_BAD_VALUE);
-    int code = ILLEGAL_ADDRESS;
-    uint16_t tag = 0;
-    for (unsigned i = 0; i < sizeof BLOCKS / sizeof BLOCKS[0]; i++) {
-        uint16_t skipped = address == BLOCKS[i] ? 0 : TAG_BEFORE;
-        if (address + skipped != BLOCKS[i] || count < skipped)
-            continue;
-        if (skipped > 0)
-            modbus->tag = tag = values[0];
-        verdict = modbus_write(modbus, BLOCKS[i], values + skipped, (uint16_t)(count - skipped));
-        if (verdict.nak == NAK_NONE)
-            return 0;
-        code = exception_of(verdict.nak);
-    }
-    modbus->refusal = verdict;
-    modbus->refused_tag = tag;
-    return code;
-}
-
-static uint16_t write_request(struct modbus *modbus, const uint8_t *pdu, uint16_t length,
-                              uint8_t *reply)
-{
-    uint16_t address = u16_at(pdu + 1), count = u16_at(pdu + 3);
-    if (count < 1 || count > WRITE_MAX || pdu[5] != 2 * count || length != 6 + 2 * count)
-        return exception(reply, WRITE, ILLEGAL_VALUE);
-    int code = write_block(modbus, address, pdu + 6, count);
-    if (code != 0)
-        return exception(reply, WRITE, (enum exception)code);
-    memcpy(reply, pdu, 5);
-    return 5;
-}
-
-static uint16_t write_and_read_request(struct modbus *modbus, const uint8_t *pdu, uint16_t length,
-                                       uint8_t *reply)
-{
-    uint16_t from = u16_at(pdu + 1), wanted = u16_at(pdu + 3);
-    uint16_t address = u16_at(pdu + 5), count = u16_at(pdu + 7);
-    if (wanted < 1 || wanted > READ_MAX || count < 1 || count > WRITE_MAX - 2 ||
-        pdu[9] != 2 * count || length != 10 + 2 * count)
-        return exception(reply, WRITE_AND_READ, ILLEGAL_VALUE);
-    if (!is_range(from, wanted))
-        return exception(reply, WRITE_AND_READ, ILLEGAL_ADDRESS);
-    int code = write_block(modbus, address, pdu + 10, count);
-    if (code != 0)
-        return exception(reply, WRITE_AND_READ, (enum exception)code);
-    return read_registers(modbus, WRITE_AND_READ, from, wanted, reply);
-}
-
-static uint16_t read_request(struct modbus *modbus, const uint8_t *pdu, uint16_t length,
-                             uint8_t *reply)
-{
-    uint16_t address = u16_at(pdu + 1), count = u16_at(pdu + 3);
-    if (length != 5 || count < 1 || count > READ_MAX)
-        return exception(reply, pdu[0], ILLEGAL_VALUE);
-    if (!is_range(address, count))
-        return exception(reply, pdu[0], ILLEGAL_ADDRESS);
-    return read_registers(modbus, pdu[0], address, count, reply);
-}
-
-// Take a unit number, from a write of the whole address block that names this amplifier.
-static void take_unit(struct modbus *modbus, const uint8_t *registers)
-{
-    uint8_t length = SERIAL_NUMBER_MAX; // without the zeros behind it
-    while (length > 0 && registers[1 + length] == 0)
-        length--;
-    uint16_t unit = u16_at(registers);
-    if (amplifier_is_named(modbus->amplifier, registers + 2, length) &&
-        amplifier_readdress(modbus->amplifier, unit, ADDRESS_MAX).nak == NAK_NONE)
-        modbus->unit = (uint8_t)unit;
-}
-
-// To all units: a Commit, Stop or SetAddress is carried out, anything else ignored.
-static void broadcast(struct modbus *modbus, const uint8_t *pdu, uint16_t length, uint8_t *reply)
-{
-    uint16_t address = u16_at(pdu + 1), count = u16_at(pdu + 3);
-    uint16_t first = SET_AT, fields = 2;
-    if (address == ADDRESS_AT || address == ADDRESS_AT - TAG_BEFORE) {
-        if (address + count == ADDRESS_AT + ADDRESS_FIELDS && pdu[5] == 2 * count &&
-            length == 6 + 2 * count)
-            take_unit(modbus, pdu + 6 + 2 * (ADDRESS_AT - address));
+    uint16_t words[1 + WORDS_MAX], count;
+    uint8_t type;
+    struct words reply;
+    if (length == 0 || pdu[0] != WRITE || read_write(pdu, length, &type, words, &count) != 0 ||
+        !message_is_broadcast(type))
         return;
-    }
-    if (address == CONTROL_AT || address == CONTROL_AT - TAG_BEFORE) {
-        uint16_t word = (uint16_t)(6 + 2 * (CONTROL_AT - address));
-        if (length < word + 2 || u16_at(pdu + word) != 2)
-            return;
-        first = CONTROL_AT;
-        fields = CONTROL_FIELDS;
-    }
-    if (address + count == first + fields || first == CONTROL_AT)
-        write_request(modbus, pdu, length, reply);
-}
-
-// Length of the shortest request of a function, so that its numbers can be read.
-static uint16_t shortest(uint8_t function)
-{
-    switch (function) {
-    case READ_HOLDING:
-    case READ_INPUT:
-        return 5;
-    case WRITE:
-        return 6;
-    case WRITE_AND_READ:
-        return 10;
-    default:
-        return 1;
-    }
-}
-
-uint16_t modbus_request(struct modbus *modbus, uint8_t unit, const uint8_t *pdu, uint16_t length,
-                        uint8_t reply[MODBUS_PDU_MAX])
-{
-    if (unit == MODBUS_BROADCAST && length >= shortest(WRITE) && pdu[0] == WRITE)
-        broadcast(modbus, pdu, length, reply);
-    if (unit != modbus->unit || length == 0)
-        return 0;
-    if (length < shortest(pdu[0]))
-        return exception(reply, pdu[0], ILLEGAL_VALUE);
-    switch (pdu[0]) {
-    case READ_HOLDING:
-    case READ_INPUT:
-        return read_request(modbus, pdu, length, reply);
-    case WRITE:
-        return write_request(modbus, pdu, length, reply);
-    case WRITE_AND_READ:
-        return write_and_read_request(modbus, pdu, length, reply);
-    default:
-        return exception(reply, pdu[0], ILLEGAL_FUNCTION);
-    }
+    if (execute(modbus, type, words + 1, (uint16_t)(count - 1), &reply) == 0 &&
+        type == MESSAGE_SET_ADDRESS)
+        modbus->unit = modbus->next_unit;
 }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 //
-// Modbus: functions 3, 4, 16 and 23 on the registers of the amplifier (docs/reference/
-// wire-modbus.md). The same for RTU and TCP: what is between unit and checksum, the PDU.
+// Modbus: function 16 writes a message into its box of registers, 3 and 4 read its reply. The same
+// for RTU and TCP: what is between unit and checksum, the PDU.
 
 #ifndef MODBUS_H
 #define MODBUS_H
@@ -9,28 +9,27 @@
 #include "amplifier.h"
 
 #define MODBUS_PDU_MAX 253
-#define MODBUS_BROADCAST 0
 
-#define CONTROL_FIELDS 5
-#define SET_FIELDS (5 + 4 * 16)
-#define ENVELOPE_FIELDS (3 + 2 * ENVELOPE_KNOTS)
-#define ADDRESS_FIELDS (1 + SERIAL_NUMBER_MAX / 2)
+// Words of the longer of the replies that are kept: Status and Achieved.
+#define MODBUS_KEPT (STATUS_WORDS + COMMAND_WORDS * CHANNELS_MAX + LAYERS)
+#define MODBUS_BOXES (MESSAGE_GET_READING + 1)
 
 struct modbus {
     struct amplifier *amplifier;
-    uint8_t unit;
-    uint16_t tag; // of the last write, even if that was refused
-    // What was written last, and not refused, by block.
-    uint16_t control[CONTROL_FIELDS], heartbeat, set[SET_FIELDS], envelope[ENVELOPE_FIELDS];
-    // Why a write was refused last.
-    struct verdict refusal;
-    uint16_t refused_tag;
+    uint8_t unit, next_unit; // 0: none was set
+    struct {
+        uint16_t tag, result, count;
+        uint16_t words[MODBUS_KEPT];
+    } replies[MODBUS_BOXES];
 };
 
 void modbus_init(struct modbus *modbus, struct amplifier *amplifier, uint8_t unit);
 
-// Carry out a request to a unit; return the length of the reply's PDU, 0 for no reply.
-uint16_t modbus_request(struct modbus *modbus, uint8_t unit, const uint8_t *pdu, uint16_t length,
+// Carry out a request; return the length of the reply's PDU.
+uint16_t modbus_request(struct modbus *modbus, const uint8_t *pdu, uint16_t length,
                         uint8_t reply[MODBUS_PDU_MAX]);
+
+// Carry out a request to all units of a line, which has no reply.
+void modbus_broadcast(struct modbus *modbus, const uint8_t *pdu, uint16_t length);
 
 #endif

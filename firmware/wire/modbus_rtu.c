@@ -6,6 +6,9 @@
 #include <string.h>
 
 #define CRC_SIZE 2
+#define BROADCAST 0
+#define WRITE 16   // the function whose length varies
+#define COUNT_AT 6 // of its byte that says how many follow
 
 void rtu_init(struct rtu *rtu, struct modbus *modbus)
 {
@@ -22,20 +25,11 @@ void rtu_byte(struct rtu *rtu, uint8_t byte)
 // Length of the request that begins here, 0 if that is not known yet.
 static uint16_t expected_length(const uint8_t *frame, uint16_t length)
 {
-    uint16_t count_at; // of the byte that tells how many follow
     if (length < 2)
         return 0;
-    switch (frame[1]) {
-    case 16:
-        count_at = 6;
-        break;
-    case 23:
-        count_at = 10;
-        break;
-    default:
+    if (frame[1] != WRITE)
         return 6 + CRC_SIZE;
-    }
-    return length > count_at ? (uint16_t)(count_at + 1 + frame[count_at] + CRC_SIZE) : 0;
+    return length > COUNT_AT ? (uint16_t)(COUNT_AT + 1 + frame[COUNT_AT] + CRC_SIZE) : 0;
 }
 
 static bool has_good_crc(const uint8_t *frame, uint16_t length)
@@ -48,12 +42,14 @@ static bool has_good_crc(const uint8_t *frame, uint16_t length)
 
 static uint16_t request_received(struct rtu *rtu, uint16_t length)
 {
-    uint8_t unit = rtu->received[0];
-    uint16_t size = modbus_request(rtu->modbus, unit, rtu->received + 1,
-                                   (uint16_t)(length - 1 - CRC_SIZE), rtu->reply + 1);
-    if (size == 0)
+    const uint8_t *pdu = rtu->received + 1;
+    uint16_t pdu_length = (uint16_t)(length - 1 - CRC_SIZE);
+    if (rtu->received[0] == BROADCAST)
+        modbus_broadcast(rtu->modbus, pdu, pdu_length);
+    if (rtu->received[0] != rtu->modbus->unit)
         return 0;
-    rtu->reply[0] = unit;
+    rtu->reply[0] = rtu->received[0];
+    uint16_t size = modbus_request(rtu->modbus, pdu, pdu_length, rtu->reply + 1);
     uint16_t crc = crc16_of(rtu->reply, (uint16_t)(size + 1));
     rtu->reply[size + 1] = (uint8_t)crc;
     rtu->reply[size + 2] = (uint8_t)(crc >> 8);

@@ -4,8 +4,8 @@
 //
 // Give every byte to `rtu_byte`, and call `rtu_silence` again and again with the time since the last
 // one. What has a good checksum when 3.5 characters of silence have passed is a request. Else its
-// function tells how long it is: the rest may follow after a pause of up to 40 ms, and several that
-// came while nobody looked are told apart. A request that follows half of another is understood.
+// function says how long it is: the rest may follow after a pause of up to 20 ms, and several that
+// came while nobody looked are separated. A request that follows half of another is understood.
 
 #ifndef MODBUS_RTU_H
 #define MODBUS_RTU_H
@@ -14,7 +14,7 @@
 
 #define RTU_FRAME_MAX 256
 #define RTU_SILENCE 1750         // us; between frames, at 19200 baud and above
-#define RTU_LONGEST_PAUSE 40000  // us; within a frame
+#define RTU_LONGEST_PAUSE 20000  // us; within a frame
 
 struct rtu {
     struct modbus *modbus;

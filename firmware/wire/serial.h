@@ -10,8 +10,7 @@
 
 #include "amplifier.h"
 
-#define SERIAL_PAYLOAD_MAX 240
-#define SERIAL_FRAME_MAX (5 + SERIAL_PAYLOAD_MAX + 4)
+#define SERIAL_FRAME_MAX (5 + 2 * WORDS_MAX + 4)
 #define SERIAL_STUFFED_MAX (SERIAL_FRAME_MAX + 1)
 
 struct serial {
@@ -21,6 +20,7 @@ struct serial {
     uint16_t received_length;
     bool is_overlong;
     uint32_t discarded; // frames
+    uint16_t events;    // sent
     uint8_t reply[SERIAL_STUFFED_MAX + 2];
 };
 
@@ -28,5 +28,9 @@ void serial_init(struct serial *serial, struct amplifier *amplifier, uint8_t add
 
 // Take a byte; return the length of the reply, or 0 for none.
 uint16_t serial_byte(struct serial *serial, uint8_t byte);
+
+// Write an Event as a frame, where no other amplifier is on the line; return its length.
+uint16_t serial_event(struct serial *serial, const struct words *event,
+                      uint8_t line[SERIAL_STUFFED_MAX + 2]);
 
 #endif

@@ -26,7 +26,7 @@ from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Motion, terms_of
 from registry.voltage import Law
-from sim.amplifier.sensor_messages import SensedAmplifier
+from sim.amplifier.contract import Amplifier
 from sim.bench.bench_amplifier import AmplifierMaker, BenchAmplifier
 from sim.bench.placement import Placement
 from sim.bench.reading import ToneReader
@@ -73,7 +73,7 @@ class Bench:
         now: float,
         sample_rate: float = SAMPLE_RATE,
         imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
-        make_amplifier: AmplifierMaker = SensedAmplifier,
+        make_amplifier: AmplifierMaker = Amplifier,
     ) -> None:
         imperfections.check(rig)
         self.rig = rig

@@ -16,7 +16,7 @@ from sim.plant.fingers import KEPT, Position
 from sim.plant.imperfections import Imperfections
 from sim.plant.sampled import SampledPlant
 
-_MAX_LAG = 0.06  # s; of the samples' clock, which leaves out what is late by more than 50 ms
+_MAX_LAG = 0.06  # s; of the samples' clock
 
 
 class FirmwareBench(Bench):

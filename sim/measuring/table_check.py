@@ -6,8 +6,8 @@ from contextlib import ExitStack, contextmanager, suppress
 
 import numpy as np
 
-from drivers.blocking import BlockingAmplifier
-from drivers.command import DriveCommand
+from drivers.by_hand.blocking import BlockingAmplifier
+from drivers.contents import Tone
 from drivers.errors import DriverError, LinkError
 from model.arrays import FloatArray
 from model.errors import InputError
@@ -89,7 +89,7 @@ def _recorder(
         (name,) = {channel.amplifier for channel in desk.rig.wiring.values()}
         amplifier = stack.enter_context(
             BlockingAmplifier(
-                settings.url, limits=desk.rig.limits, voltage=desk.rig.voltage_of(name)
+                settings.url, limits=desk.rig.limits, is_output=bool(desk.rig.voltage_of(name))
             )
         )
         amplifier.arm()
@@ -97,11 +97,11 @@ def _recorder(
 
         def by_amplifier(promise: Promise) -> FloatArray:
             seconds = _SETTLING + _WINDOW
-            commands = commands_of(desk.rig, promise.pattern.excitation)
+            tones = tones_of(desk.rig, promise.pattern.excitation)
             count = round(seconds * card.rate)
             try:
                 playing = thread.submit(
-                    amplifier.play, commands, duration=seconds + _SETTLING, ramp=_RAMP
+                    amplifier.play, tones, duration=seconds + _SETTLING, ramp=_RAMP
                 )
                 heard = card.run(np.zeros((count, 0)))
                 playing.result()
@@ -158,10 +158,10 @@ def _by_card(card: SoundCard, desk: Desk, pattern: Pattern, level: float) -> Flo
     )
 
 
-def commands_of(rig: Rig, excitation: Excitation) -> list[DriveCommand]:
-    """Commands of the channels of a rig's one amplifier."""
+def tones_of(rig: Rig, excitation: Excitation) -> list[Tone]:
+    """Tones of the channels of a rig's one amplifier."""
     return [
-        DriveCommand(
+        Tone(
             rig.wiring[name].number,
             tone.frequency,
             tone.amplitude / rig.era(name).stroke,

@@ -14,11 +14,8 @@ from pathlib import Path
 from drivers import clock
 from drivers.operation.garbage_collection import no_long_collections
 from model.rig.rig import Rig
-from sim.amplifier.contract import Amplifier
-from sim.amplifier.sensor_messages import SensedAmplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time
-from sim.bench.simulated_device import SimulatedDevice
 from sim.control.context import SimulationContext
 from sim.control.server import control_socket
 from sim.far_ends.wire_assignment import WireAssignment
@@ -45,7 +42,7 @@ class Simulation:
     imperfections: in what the bench differs from the rig; sample_rate [Hz]: of sensors and fingers;
     control: path of the control socket; record: file for the readings of the whole run; until_eof:
     end with standard input; firmware: in the place of the simulated amplifiers; links: to their
-    pseudo-terminals; protocol: 2 or 3, which they speak.
+    pseudo-terminals.
     """
 
     rig: Rig
@@ -60,7 +57,6 @@ class Simulation:
     until_eof: bool = False
     firmware: Path | None = None
     links: Mapping[str, Path] = field(default_factory=dict)
-    protocol: int = 2
 
 
 async def run_simulation(
@@ -101,8 +97,7 @@ def _make_bench(simulation: Simulation, *, now: float) -> Bench:
     if simulation.firmware is not None:
         return FirmwareBench(rig, now=now, imperfections=imperfections)
     rate = simulation.sample_rate
-    make = Amplifier if simulation.protocol == 3 else SensedAmplifier
-    return Bench(rig, now=now, sample_rate=rate, imperfections=imperfections, make_amplifier=make)
+    return Bench(rig, now=now, sample_rate=rate, imperfections=imperfections)
 
 
 async def _serve(
@@ -138,9 +133,8 @@ async def _open_devices(
     stack: contextlib.AsyncExitStack, simulation: Simulation, context: SimulationContext
 ) -> None:
     """Put a simulated amplifier on each wire."""
-    make = AmplifierDevice if simulation.protocol == 3 else SimulatedDevice
     devices = [
-        make(
+        AmplifierDevice(
             context.bench,
             name,
             address=simulation.wires[name].address or number,

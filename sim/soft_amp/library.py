@@ -15,8 +15,8 @@ ENGINE = "engine.so"
 _HERE = Path(__file__).parent
 _FOLDERS = (_HERE / "firmware", _HERE.parents[1] / "firmware")  # of a wheel, of a checkout
 _PARTS = ("core", "wire", "ports/sound")
-_CORE = ("capabilities", "channel", "envelope", "sets", "sine", "states", "voice")
-_WIRE = ("crc", "modbus", "modbus_registers", "serial", "serial_messages")
+_CORE = ("channel", "layers", "set", "sine", "states", "voice")
+_WIRE = ("crc", "mbap", "messages", "modbus", "serial")
 _FLAGS = (
     "-std=c99",
     "-O2",

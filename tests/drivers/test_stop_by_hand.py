@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-
 from controller.group.amplifier_group import AmplifierGroup
 from controller.group.quick_stops import QuickStops
+
 from drivers import amp_actions
 from drivers.amplifier import Amplifier
 from drivers.protocol.messages import AmplifierState, GetStatus, Reply, Request, Status, Stop

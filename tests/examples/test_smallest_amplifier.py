@@ -51,9 +51,9 @@ async def played(program: Path, test: Callable[[Group, Amplifier], Awaitable[Non
     lines = Lines()
     try:
         host = await lines.amplifier(f"serial://{os.ttyname(near)}", LIMITS, name="smallest")
-        group = Group({"smallest": host})
+        group = Group({"smallest": host}, watchdog=2.0)
         await group.open()
-        await group.arm(2.0)
+        await group.arm()
         await test(group, host)
         await group.stop()
     finally:
@@ -202,7 +202,7 @@ async def test_stop_is_confirmed_and_cleared_by_its_latch(program: Path) -> None
             await host.clear(host.latch + 1)
         await group.clear()
         group._draw = lambda low, high: host.session + 1
-        await group.arm(2.0)
+        await group.arm()
         await group.apply({"smallest": [Layer(0, (tone(1, 0.5),), 0.0)]})
         assert (await host.read_status())["levels"] == [0, 5000]
 

@@ -1,6 +1,8 @@
 """The firmware's programs, each built once where a test needs it."""
 
 import shutil
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -23,6 +25,21 @@ def firmware(compiled: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def replaying(compiled: Path) -> Path:
-    """That folder, with the program that plays scripts."""
-    return build_firmware(compiled, "era-replay")
+def moved(compiled: Path) -> Callable[..., Path]:
+    """The folder of the library on a moved clock, built with options of the compiler."""
+
+    @cache
+    def build(*options: str) -> Path:
+        flags = ("-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all", *options)
+        folder = compiled / "-".join(
+            ["moved", *(each.strip("-").replace("=", "") for each in options)]
+        )
+        return build_firmware(folder, "era-moved.so", f"CFLAGS={' '.join(flags)}")
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def replaying(moved: Callable[..., Path]) -> Path:
+    """That folder, of the firmware as it is."""
+    return moved()

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.loop.envelopes import ending_slots, onset_slots, wire_envelopes
-from firmware_script import RATE, Script, apply, arm, command, load, replay
+from firmware_script import Script, Shape, apply, arm, command, replay
 from model.arrays import FloatArray
 from model.finger.felt_band import felt_part
 from model.finger.fingertip import fingertip_points, fingertip_weights
@@ -21,7 +20,8 @@ from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.timing import Timing
 from model.transients.base_motion import Term
-from model.transients.envelope import shaped
+from model.transients.envelope import BaseEnvelope, shaped
+from moved_firmware import RATE
 from paper_table import smooth_rig, smooth_table
 from sim.plant.fingers import Record
 from sim.plant.plant import Plant
@@ -48,30 +48,31 @@ class Played:
     exact: FloatArray
 
 
+def shape_of(envelope: BaseEnvelope | None, stroke: float) -> Shape | None:
+    """Step [ms] and knots of an envelope of a base motion, but for its final amplitude."""
+    if envelope is None:
+        return None
+    values = [value / stroke for value in envelope.knots[:-1]]
+    return envelope.step * 1000, [(abs(v), math.degrees(cmath.phase(v))) for v in values]
+
+
 def script_of(pattern: Pattern, rig: Rig) -> Script:
-    """Load the envelopes, arm, and play the pattern until it ends by itself."""
-    (envelopes,) = wire_envelopes(pattern, rig).values()
-    loads = [
-        load(each.slot, each.step * 1000, *((knot.level, knot.phase) for knot in each.knots))
-        for each in envelopes
-    ]
-    onsets, endings = onset_slots(rig), ending_slots(rig)
+    """Arm, and play the pattern until it ends by itself."""
+    onsets, endings = pattern.onset or {}, pattern.ending or {}
     commands = []
-    for name in (pattern.onset or {}).keys() | (pattern.ending or {}).keys():
-        tone = pattern.excitation.get(name)
-        degrees = math.degrees(math.remainder(tone.phase, math.tau)) if tone else 0.0
+    for name in onsets.keys() | endings.keys():
+        tone, stroke = pattern.excitation.get(name), rig.era(name).stroke
         commands.append(
             command(
                 rig.wiring[name].number,
-                (pattern.onset or pattern.ending or {})[name].frequency,
-                tone.amplitude / rig.era(name).stroke if tone else 0.0,
-                degrees if degrees < 179.995 else -180.0,
-                onset=onsets[name] if name in (pattern.onset or {}) else 0,
-                ending=endings[name] if name in (pattern.ending or {}) else 0,
+                (onsets or endings)[name].frequency,
+                tone.amplitude / stroke if tone else 0.0,
+                math.degrees(tone.phase) if tone else 0.0,
+                onset=shape_of(onsets.get(name), stroke),
+                ending=shape_of(endings.get(name), stroke),
             )
         )
-    set_ = apply(1, *commands, valid_for_ms=round(END - COMMIT))
-    return [*((0.0, each) for each in loads), (COMMIT, arm()), (COMMIT, set_)]
+    return [(COMMIT, arm()), (COMMIT, apply(1, *commands, valid_for_ms=round(END - COMMIT)))]
 
 
 @pytest.fixture(scope="module")

@@ -1,32 +1,39 @@
-"""The samples that the firmware synthesizes, against the formulas of the wire page."""
+"""The samples that the firmware synthesizes, against the formulas of docs/decisions/0061."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from firmware_programs import build_firmware
 from firmware_script import (
-    KEEP_PHASE,
+    COMMIT,
+    DISARM,
+    GET_STATUS,
     NAK,
     PER_MS,
-    RATE,
+    PING,
     SESSION,
+    SET,
+    SET_REPLY,
+    STOP,
     Script,
     apply,
     arm,
     command,
-    load,
+    layer,
+    play,
     replay,
     request,
     stuffed,
     unstuffed,
 )
 from model.arrays import FloatArray
+from moved_firmware import RATE, SERIAL, MovedFirmware
 
-TOLERANCE = 6e-5  # of full stroke: two steps of a 16-bit sample, and phases over seconds
-DISARM, GET_STATUS = 4, 9
-BAD_TOKEN, STOP, FADING = 6, 8, 12
+TOLERANCE = 6e-5  # of full level: two steps of a 16-bit sample, and phases over seconds
+BAD_TOKEN, INCOMPLETE = 6, 12
+FLAGS, LIMITED = 2, 4  # of a status
 
 
 def seconds(count: int) -> FloatArray:
@@ -49,7 +56,7 @@ def test_channels_start_together_with_their_phases(replaying: Path) -> None:
     tones = [(110.0, 0.2, 0.0), (250.05, 1.0, -90.0), (20.0, 0.5, 179.99), (1999.95, 0.7, 12.34)]
     set_ = apply(513, *(command(n, *each) for n, each in enumerate(tones)))
     samples, _ = replay(
-        replaying, [(10, arm()), (50, set_), (1900, request(2)), (1500, arm())], 3000
+        replaying, [(10, arm()), (50, set_), (1500, arm()), (1900, request(2))], 3000
     )
     assert not samples[: 50 * PER_MS].any()
     playing = samples[50 * PER_MS :]
@@ -88,10 +95,9 @@ def test_sets_cross_fade_along_raised_cosines(replaying: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def square_law(replaying: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The firmware of electrostatic actuators; skipped where `replaying` is."""
-    folder = tmp_path_factory.mktemp("square_law")
-    return build_firmware(folder, "era-replay", "CFLAGS=-O0 -DSQUARE_LAW=1")
+def square_law(moved: Callable[..., Path]) -> Path:
+    """The firmware of electrostatic actuators."""
+    return moved("-DSQUARE_LAW=1")
 
 
 @pytest.mark.long
@@ -115,8 +121,8 @@ def test_square_of_voltages_is_the_summed_force(replaying: Path, square_law: Pat
 @pytest.mark.parametrize(
     ("watchdog_ms", "last"),
     [
-        (2000, (60, request(DISARM, bytes([20, 0])))),
-        (2000, (60, request(STOP, bytes([20, 0])))),
+        (2000, (60, request(DISARM, 20))),
+        (2000, (60, request(STOP, 20))),
         (100, (60, request(GET_STATUS))),  # its watchdog expires: a fault
     ],
     ids=["disarmed", "stopped", "fault"],
@@ -134,19 +140,52 @@ def test_bias_is_there_only_under_high_voltage(
     assert not voltages[130 * PER_MS :].any()
 
 
-def test_third_voice_is_refused_and_changes_nothing(replaying: Path) -> None:
-    """A set that comes while a channel cross-fades is refused with FADING; silence is not."""
+def test_oldest_fade_ends_sooner_where_no_voice_is_free(replaying: Path) -> None:
+    """With 16 voices, the 17th tone that lasts cuts the fade that began first, within 2 ms."""
+    script: list[tuple[float, bytes]] = [(0, arm()), (1, apply(1, command(0, 100, 0.5)))]
+    for token in range(2, 18):  # each a millisecond after the other, which fades over 100 ms
+        script.append((token, apply(token, command(0, 100 + token, 0.001), ramp_ms=100)))
+    samples, _ = replay(replaying, script, 30)
+    t = seconds(len(samples))
+    fading = falling(t - 0.002, 0.1)
+    cut = fading[17 * PER_MS] * falling(t - 0.017, 0.002)
+    level = np.where(t < 0.001, 0, np.where(t < 0.017, fading, cut))
+    # The others rise to 0.001 at the most.
+    assert np.abs(samples[:, 0] - level * tone(t - 0.001, 100, 0.5)).max() < 0.002
+
+
+def test_layers_add_up_within_full_level(replaying: Path) -> None:
+    """Two layers of one commit start together; one that is not named plays on, to the sample."""
     script: Script = [
         (0, arm()),
-        (0, apply(1, command(0, 100, 0.5))),
-        (100, apply(2, command(0, 130, 0.4), ramp_ms=40)),
+        (10, play(1, layer(0, command(0, 100, 0.8)), layer(3, command(0, 250, 0.6, 90)))),
+        (60, request(GET_STATUS)),
+        (60, play(2, layer(3, ramp_ms=20))),
+        (100, request(GET_STATUS)),
+        (100, request(GET_STATUS)),
     ]
-    third = (120, apply(3, command(0, 160, 0.4), command(1, 160, 0.4), ramp_ms=10))
-    samples, replies = replay(replaying, [*script, third], 200)
-    assert replies[-1] == (NAK, bytes([7, FADING, 0]))
-    assert np.array_equal(samples, replay(replaying, script, 200)[0])
-    _, replies = replay(replaying, [*script, (120, apply(3, ramp_ms=10))], 200)
-    assert replies[-1][0] == 0x87
+    samples, replies = replay(replaying, script, 150)
+    t = seconds(len(samples)) - 0.01
+    both = tone(t, 100, 0.8) + tone(t, 250, 0.6, 90) * falling(t - 0.05, 0.02)
+    expected = np.where(t < 0, 0, np.clip(both, -1, 1))
+    assert np.abs(samples[:, 0] - expected).max() < TOLERANCE
+    flags = [words[FLAGS] for kind, words in replies if kind == 0x80 | GET_STATUS]
+    assert [each & LIMITED for each in flags] == [LIMITED, LIMITED, 0]
+
+
+def test_set_waits_for_the_onsets_of_its_layer(replaying: Path) -> None:
+    """With *after* it starts where the onset ends, its t from there."""
+    onset = (5.0, [(0.2, 0.0)])
+    script: Script = [
+        (0, arm()),
+        (0, apply(1, command(0, 100, 0.4, onset=onset))),
+        (3, play(2, layer(0, command(0, 130, 0.3), ramp_ms=4, after=True))),
+    ]
+    samples, _ = replay(replaying, script, 40)
+    t = seconds(len(samples))
+    level = np.interp(t, [0, 0.005, 0.01], [0, 0.2, 0.4]) * falling(t - 0.01, 0.004)
+    second = np.where(t < 0.01, 0, tone(t - 0.01, 130, 0.3) * (1 - falling(t - 0.01, 0.004)))
+    assert np.abs(samples[:, 0] - level * tone(t, 100, 1) - second).max() < TOLERANCE
 
 
 def test_keep_phase_changes_the_level_alone(replaying: Path) -> None:
@@ -154,7 +193,7 @@ def test_keep_phase_changes_the_level_alone(replaying: Path) -> None:
     script: Script = [
         (0, arm()),
         (7, apply(1, command(0, 123.45, 0.5))),
-        (100, apply(2, command(0, 123.45, 0.25, flags=KEEP_PHASE), ramp_ms=20)),
+        (100, apply(2, command(0, 123.45, 0.25, keep_phase=True), ramp_ms=20)),
     ]
     samples, _ = replay(replaying, script, 200)
     t = seconds(len(samples))
@@ -169,7 +208,7 @@ def test_channel_that_falls_silent_keeps_no_phase(replaying: Path) -> None:
         (0, arm()),
         (7, apply(1, command(0, 123.45, 0.5))),
         (100, apply(2, ramp_ms=40)),
-        (110, apply(3, command(0, 123.45, 0.25, flags=KEEP_PHASE), ramp_ms=40)),
+        (110, apply(3, command(0, 123.45, 0.25, keep_phase=True), ramp_ms=40)),
     ]
     samples, _ = replay(replaying, script, 200)
     t = seconds(len(samples))
@@ -182,25 +221,24 @@ def test_interrupted_ending_ends_when_it_would(replaying: Path) -> None:
     """By a set with a longer ramp, silent or not; a silent one plays no ending again."""
     for others in ((), (command(1, 110, 0.2),)):
         script: Script = [
-            (0, load(6, 10, (0.4, 0.0))),
             (0, arm()),
-            (0, apply(1, command(0, 90, 0.4, ending=6))),
+            (0, apply(1, command(0, 90, 0.4, ending=(10, [(0.4, 0.0)])))),
             (50, apply(2)),
             (60, apply(3, *others, ramp_ms=100)),
         ]
         samples, _ = replay(replaying, script, 100)
         t = seconds(len(samples))
-        expected = tone(t, 90, 0.4) * falling(t - 0.06, 0.01)
+        ending = np.interp(t, [0.05, 0.06, 0.07], [0.4, 0.4, 0.0])
+        expected = tone(t, 90, 1.0) * np.where(t < 0.05, 0.4, ending)
         assert np.abs(samples[:, 0] - expected).max() < TOLERANCE
 
 
 def test_ending_plays_amid_an_onset_to_level_zero(replaying: Path) -> None:
     """From the present amplitude along straight lines, whatever the ramp of the silent set."""
+    onset = (10, [(0.4, 0.0), (0.4, 0.0)])
     script: Script = [
-        (0, load(5, 10, (0.4, 0.0), (0.4, 0.0))),
-        (0, load(6, 10, (0.2, 0.0))),
         (0, arm()),
-        (0, apply(1, command(0, 90, 0.0, onset=5, ending=6))),
+        (0, apply(1, command(0, 90, 0.0, onset=onset, ending=(10, [(0.2, 0.0)])))),
         (15, apply(2, ramp_ms=100)),
     ]
     samples, _ = replay(replaying, script, 60)
@@ -209,26 +247,48 @@ def test_ending_plays_amid_an_onset_to_level_zero(replaying: Path) -> None:
     assert np.abs(samples[:, 0] - tone(t, 90, 1) * level).max() < TOLERANCE
 
 
-def test_same_token_with_another_order_or_ending_is_another_set(replaying: Path) -> None:
-    """An Apply with active_token is refused with BAD_TOKEN then, and confirmed otherwise."""
-    first, second = command(0, 100, 0.5, ending=1), command(1, 130, 0.4)
-    other_ending = command(0, 100, 0.5, ending=2)
-    script = [(0, arm()), (0, load(1, 1, (0.4, 0))), (0, load(2, 1, (0.3, 0)))]
-    sets = ((first, second), (first, second), (second, first), (other_ending, second))
-    _, replies = replay(replaying, [*script, *((10, apply(1, *each)) for each in sets)], 30)
-    refused = (NAK, bytes([7, BAD_TOKEN, 255]))
-    assert [kind for kind, _ in replies[-4:-2]] == [0x87, 0x87]
-    assert replies[-2:] == [refused, refused]
+def test_token_is_played_once(replaying: Path) -> None:
+    """A set under the token that plays is confirmed and has no effect; an older one is refused."""
+    script = [(0, arm()), (0, apply(7, command(0, 100, 0.5)))]
+    again = [(10, apply(7, command(0, 100, 0.2))), (10, apply(6, command(0, 100, 0.2)))]
+    samples, replies = replay(replaying, [*script, *again], 30)
+    assert replies[-2:] == [(SET_REPLY, (7, 0b101, 0)), (NAK, (SET, BAD_TOKEN, 255))]
+    assert np.array_equal(samples, replay(replaying, script, 30)[0])
+
+
+def test_set_comes_in_parts_in_any_order(replaying: Path) -> None:
+    """Cut amid a command: the missing part is named, and what is not whole is not committed."""
+    words = layer(0, command(0, 100, 0.5), command(1, 130, 0.4))
+    first, second = [SESSION, 7, 0 << 8 | 2 << 1, *words[:5]], [SESSION, 7, 1 << 8 | 2 << 1]
+    script = [
+        (0, arm()),
+        (10, request(SET, *second, *words[5:])),
+        (11, request(COMMIT, SESSION, 7)),
+        (12, request(SET, *first)),
+        (13, request(COMMIT, SESSION, 7)),
+    ]
+    samples, replies = replay(replaying, script, 50)
+    assert replies[1] == (SET_REPLY, (7, 0b100, 0))
+    assert replies[2] == (NAK, (COMMIT, INCOMPLETE, 255))
+    assert replies[3] == (SET_REPLY, (7, 0b110, 0))
+    t = seconds(len(samples)) - 0.013
+    for channel, each in enumerate([tone(t, 100, 0.5), tone(t, 130, 0.4)]):
+        assert np.abs(samples[:, channel] - np.where(t < 0, 0, each)).max() < TOLERANCE
 
 
 def test_envelopes_move_along_straight_lines(replaying: Path) -> None:
     """An onset from zero over two knots to the level, the ending to silence by valid_for."""
     onset, ending = [(0.1, 90.0), (1.0, -0.01)], [(0.3, -120.0)]
     script: Script = [
-        (0, load(5, 12.5, *onset)),
-        (0, load(6, 7.3, *ending)),
         (0, arm()),
-        (3, apply(1, command(2, 110, 0.2, 30, onset=5, ending=6), valid_for_ms=60)),
+        (
+            3,
+            apply(
+                1,
+                command(2, 110, 0.2, 30, onset=(12.5, onset), ending=(7.3, ending)),
+                valid_for_ms=60,
+            ),
+        ),
     ]
     samples, _ = replay(replaying, script, 100)
     t = seconds(len(samples)) - 0.003
@@ -247,11 +307,11 @@ def test_brake_goes_on_from_the_present_amplitude(replaying: Path, ramp_ms: int)
 
     Amid a ramp of 100 ms that is half of its level.
     """
+    brake = (10, [(0.5, -180.0)])
     script: Script = [
-        (0, load(1, 10, (0.5, -180.0))),
         (0, arm()),
         (0, apply(1, command(0, 90, 0.4, 20), ramp_ms=ramp_ms)),
-        (50, apply(2, command(0, 90, 0, flags=KEEP_PHASE, onset=1), ramp_ms=500)),
+        (50, apply(2, command(0, 90, 0, keep_phase=True, onset=brake), ramp_ms=500)),
     ]
     samples, _ = replay(replaying, script, 100)
     t = seconds(len(samples))
@@ -265,13 +325,13 @@ def test_brake_goes_on_from_the_present_amplitude(replaying: Path, ramp_ms: int)
 
 def test_watchdog_silences_to_the_sample(replaying: Path) -> None:
     """It trips at its time after the last request of the session, and fades over 5 ms."""
-    ping = request(12, SESSION.to_bytes(2, "little"))
+    ping = request(PING, SESSION)
     script: Script = [
         (0, arm(100)),
         (0, apply(1, command(3, 200, 1.0, 90))),
         (60, ping),
-        (90, request(9)),
-        (100, request(12, bytes([1, 0]))),
+        (90, request(GET_STATUS)),
+        (100, request(PING, 1)),
     ]
     samples, _ = replay(replaying, script, 200)
     t = seconds(len(samples))
@@ -285,12 +345,38 @@ def test_shorter_stop_ends_sooner_and_a_longer_one_changes_nothing(replaying: Pa
     script: Script = [
         (0, arm()),
         (0, apply(1, command(0, 150, 0.8))),
-        (100, request(STOP, bytes([100, 0]))),
-        (140, request(STOP, bytes([20, 0]))),
-        (150, request(STOP, bytes([200, 0]))),
+        (100, request(STOP, 100)),
+        (140, request(STOP, 20)),
+        (150, request(STOP, 200)),
     ]
     samples, _ = replay(replaying, script, 200)
     t = seconds(len(samples))
     at_140 = falling(np.array([0.04]), 0.1)[0]
     gain = np.where(t < 0.14, falling(t - 0.1, 0.1), at_140 * falling(t - 0.14, 0.02))
     assert np.abs(samples[:, 0] - gain * tone(t, 150, 0.8)).max() < TOLERANCE
+
+
+@pytest.mark.parametrize("is_converter_still", [False, True])
+def test_stalled_loop_is_silent_as_soon_as_it_runs(
+    replaying: Path, *, is_converter_still: bool
+) -> None:
+    """A watchdog of 0.25 s and a stall of 1.2 s, with and without samples meanwhile.
+
+    The watchdog is real time: samples that were due end 0.255 s after it was fed, and where the
+    converter stood still no more than 5 ms are made.
+    """
+    firmware = MovedFirmware(replaying)
+    for frame in (arm(250), apply(1, command(0, 100, 0.5, 90))):
+        firmware.receive(SERIAL, frame)
+    firmware.move(0.1)
+    firmware.samples()
+    firmware.stall(1.3, is_converter_still=is_converter_still)
+    firmware.move(1.4)
+    samples = firmware.samples()[:, 0]
+    first = 0.0 if is_converter_still else 0.15
+    t = seconds(len(samples))
+    gain = falling(t - first, 0.005)
+    assert np.abs(samples - gain * tone(t + 0.1, 100, 0.5, 90)).max() < TOLERANCE
+    firmware.receive(SERIAL, request(GET_STATUS))
+    status = unstuffed(firmware.sent(SERIAL).split(b"\0")[-2])
+    assert (status[5], status[7]) == (7, 1)  # FAULT, of the watchdog

@@ -19,7 +19,6 @@ from daemon_process import (
     playing,
     run_era,
 )
-from drivers.protocol.messages import AmplifierState
 from model.table.file import save_table
 from patient_daemon import PROGRAM
 
@@ -48,7 +47,7 @@ async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> 
         _, log = await other.communicate()
         assert b"Traceback" not in log
         assert (await era.status()).state == "OPERATION_ENABLED"
-        await until(lambda: any(far.device.status().levels))
+        await until(lambda: any(far.summary().levels))
 
 
 async def test_commands_control_daemon(tmp_path: Path) -> None:
@@ -80,7 +79,7 @@ async def test_commands_control_daemon(tmp_path: Path) -> None:
         assert (status, json.loads(out)["state"]) == (0, "QUICK_STOP_ACTIVE")
         status, out, _ = await run_era("clear", *where)
         assert (status, out.partition(":")[0]) == (0, "READY_TO_SWITCH_ON")
-        assert far.device.status().state is AmplifierState.SWITCH_ON_DISABLED
+        assert far.summary().state == "SWITCH_ON_DISABLED"
         arming = await asyncio.create_subprocess_exec(
             *(ERA, "arm", "--lease", "1", *map(str, where)),
             stdout=asyncio.subprocess.PIPE,
@@ -187,7 +186,7 @@ async def test_check_reads_files_without_amplifier(
     async with far_end(tmp_path) as far:
         save_table(daemon_table(), tmp_path / "table.npz")
         path = write_daemon(tmp_path, {"main": far.url}, "table: table.npz\n")
-        assert (await check(path), far.device.status().token) == (0, 0)
+        assert (await check(path), far.summary().token) == (0, 0)
         assert str(path) in capsys.readouterr().out
         (tmp_path / "table.npz").write_bytes(b"no table")
         assert await check(path) == 2

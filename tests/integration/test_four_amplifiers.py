@@ -15,20 +15,20 @@ from pathlib import Path
 import pytest
 
 import model
-from controller.group.amplifier_group import GroupState
 from controller.loop.loop import Controller
 from controller.sources.touch import Touch, TouchFrame
-from drivers.amplifier import Amplifier
 from drivers.errors import DriverError
-from drivers.registry import open_backend
+from drivers.host.group import GroupState
+from drivers.opening import Lines
 from long_form import in_turn
 from memory_machine import live_in_memory
 from model.fem.mesh import Mesh
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.vibration.excitation import Tone
+from sim.amplifier.contract import Amplifier
+from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
-from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wires
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
@@ -58,8 +58,8 @@ ARRANGED = {
 MAX_SKEW = 1e-3  # s; of several links, docs/reference/several-amplifiers.md
 OWN = 0.250 + 0.010  # s; an amplifier's watchdog and its ramp
 ALL = (
-    OWN + 0.050 + 3 * 0.030 + 0.010
-)  # s; and a heartbeat, a request sent three times, and its stop
+    OWN + 2 * 0.050 + 3 * 0.030 + 0.010
+)  # s; and two heartbeats, a request sent three times, and its stop
 LEVEL = 0.2
 
 
@@ -69,7 +69,7 @@ class FourAmplifiers:
 
     rig: Rig
     bench: Bench
-    devices: Mapping[str, SimulatedDevice]
+    devices: Mapping[str, AmplifierDevice]
     controller: Controller
 
     async def hold(self, seconds: float) -> None:
@@ -84,7 +84,7 @@ class FourAmplifiers:
         """Level of each channel now, by amplifier."""
         now = asyncio.get_running_loop().time()
         self.bench.advance(now)
-        return {name: each.status(now).levels for name, each in self.bench.amplifiers.items()}
+        return {name: each.summary(now).levels for name, each in self.bench.amplifiers.items()}
 
     def starts(self) -> dict[str, set[float]]:
         """When each amplifier began to play what it plays now [s]."""
@@ -104,9 +104,9 @@ async def four_amplifiers(wires: Mapping[str, Wire]) -> AsyncIterator[FourAmplif
     live_in_memory()
     rig = load_rig(Path(model.__file__).parents[1] / "examples" / "table.yaml")
     rig = replace(rig, mesh=Mesh(4, 4, rig.plate.length, rig.plate.width))
-    bench = Bench(rig, now=loop.time())
+    bench = Bench(rig, now=loop.time(), make_amplifier=Amplifier)
     devices = {
-        name: SimulatedDevice(bench, name, address=number)
+        name: AmplifierDevice(bench, name, address=number)
         for number, name in enumerate(rig.amplifiers, 1)
     }
     table = OneTable(rig.plate)
@@ -115,8 +115,7 @@ async def four_amplifiers(wires: Mapping[str, Wire]) -> AsyncIterator[FourAmplif
         for number, era in enumerate(rig.eras)
     }
     async with open_wires(wires, [*devices.values()]) as urls:
-        amplifiers = {name: Amplifier(open_backend(url)) for name, url in urls.items()}
-        controller = Controller(rig, table, amplifiers=amplifiers)
+        controller = Controller(rig, table, lines=Lines, urls=urls)
         await controller.open()
         running = asyncio.create_task(controller.run())
         await controller.arm()

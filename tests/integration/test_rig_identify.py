@@ -17,8 +17,9 @@ from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from rig_files import TWO_AMPLIFIERS, write_rig
+from rig_on_wire import far_side
 from virtual_loop import run_virtual
-from wires import WIRES, far_side
+from wires import WIRES
 
 PORT = "serial:///dev/memory0?baud=921600"
 """Where the first far end on a serial line in memory is."""

@@ -18,11 +18,12 @@ from long_form import shortly
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from model.vibration.direct import direct_responder
+from rig_on_wire import FarSide, far_side
 from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.far_ends.can_bus.sensor_objects import SensorObjects
 from sim.sensors.accelerometer import Accelerometer, Accelerometers
 from virtual_loop import run_virtual
-from wires import WIRES, FarSide, far_side, patient
+from wires import WIRES, patient
 
 PLACE = (0.11, 0.07)  # m; of an accelerometer
 PLAYED = (DriveCommand(1, 110.0, 0.2, 40.0), DriveCommand(3, 173.5, 0.3, -75.0))

@@ -15,6 +15,7 @@ from drivers.registry import open_backend
 from long_form import shortly
 from memory_machine import live_in_memory
 from paper_table import smooth_rig
+from sim.amplifier.sensor_messages import SensedAmplifier
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wires
@@ -39,7 +40,7 @@ def test_voltage_over_a_wire(kind: str, law: str) -> None:
 
     async def play() -> None:
         live_in_memory()
-        bench = Bench(rig, now=clock.now())
+        bench = Bench(rig, now=clock.now(), make_amplifier=SensedAmplifier)
         device = SimulatedDevice(bench, "main")
         async with open_wires({"main": Wire(kind)}, [device]) as urls:
             amplifier = Amplifier(open_backend(urls["main"], rig.voltage_of("main")))

@@ -1,8 +1,8 @@
-"""A controller between a table and amplifiers of our own, which obey and remember."""
+"""A controller between a table and simulated amplifiers, which obey and remember."""
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -12,18 +12,14 @@ import numpy as np
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer, Silenced
 from controller.sources.touch import Touch, TouchFrame, TouchSource
-from drivers.amplifier import Amplifier
-from drivers.backend import Backend
-from drivers.command import CommandSet
-from drivers.protocol.messages import (
-    AmplifierEvent,
-    AmplifierState,
-    Apply,
-    Reply,
-    Request,
-    Status,
-)
-from drivers.protocol.wire_times import WireTimes
+from drivers.contents import Tone as Played
+from drivers.errors import LinkError
+from drivers.host.amplifier import Amplifier as Host
+from drivers.host.line import Line
+from drivers.host.serial_wire import SerialWire
+from drivers.protocol.records import Values
+from drivers.protocol.sets import LayerSet, unpack_layers
+from drivers.protocol.table import NO_CHANNEL, QUANTITIES
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
@@ -34,98 +30,213 @@ from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
 from registry.limits import GuardLimits
-from sim.amplifier.amplifier import VOICES, SimulatedAmplifier
-from stub_wire_times import StubWireTimes
+from sim.amplifier.contract import Amplifier
+from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 FINGER = (1, 0.5, 0.5)
 OTHER = (2, 0.9, 0.9)
+ENABLED, STOPPED, DISARMED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE", "SWITCH_ON_DISABLED"
 
 
-class FarEnd(Backend):
-    """A simulated amplifier without envelopes that remembers everything it was asked, and when.
+@dataclass(frozen=True)
+class Sent:
+    """A set that was committed, or a silence: when [s], ramp and valid_for [s], and its tones."""
 
-    The last byte leaves at once, the reply takes `delay` [s]. `answer` may override any reply.
+    time: float
+    token: int
+    ramp: float
+    valid_for: float = 0.0
+    commands: tuple[Played, ...] = ()
+    renew: bool = False
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether nothing plays after it."""
+        return not self.renew and not any(each.level or each.onset for each in self.commands)
+
+
+def _sent(one: LayerSet, token: int, time: float) -> Sent:
+    def tone(command: Any) -> Played:
+        return Played(
+            command.channel,
+            QUANTITIES["frequency"].from_wire(command.frequency),
+            QUANTITIES["level"].from_wire(command.level),
+            QUANTITIES["phase"].from_wire(command.phase),
+            command.keep_phase,
+            command.skip_ending,
+            command.onset,
+            command.ending,
+        )
+
+    return Sent(
+        time,
+        token,
+        QUANTITIES["ramp"].from_wire(one.ramp),
+        QUANTITIES["valid_for"].from_wire(one.valid_for),
+        tuple(map(tone, one.commands)),
+        one.renew,
+    )
+
+
+class FarEnd:
+    """A simulated amplifier, on a line of its own, that remembers everything it was asked.
+
+    A request arrives at once unless it is deaf, its reply takes `delay` [s], and is not sent if it
+    is mute. `answer` may override any reply, or raise Refusal. attempts [s]: to open a line to it.
+    Without envelopes unless knots are given.
     """
 
-    def __init__(self, channels: int = 2, voices: int = VOICES) -> None:
-        self.asked: list[tuple[float, Request]] = []
-        self.delay = self.commit_takes = 0.0
-        self.amplifier = SimulatedAmplifier("any", channels=channels, voices=voices)
-        self.amplifier.capabilities = replace(
-            self.amplifier.capabilities, frequency_max=600.0, envelope_knots=0, envelope_slots=0
-        )
-        self.answer: Callable[[Request], Reply | None] = lambda request: None
-        self.is_open = False
-        self.report: Callable[[AmplifierEvent], None] = lambda event: None
-        self._last_sent_at = 0.0
+    is_blocked = False
 
-    def listen(
-        self, on_event: Callable[[AmplifierEvent], None], on_loss: Callable[[str], None]
-    ) -> None:
-        """Keep the callback of events, for tests to call."""
-        self.report = on_event
+    def __init__(self, channels: int = 2, knots: int = 0, baud: int = 0) -> None:
+        self.asked: list[tuple[float, str, Values]] = []
+        self.delay = 0.0
+        self.is_mute = self.is_deaf = self.is_open = self._is_cut = False
+        self.attempts: list[float] = []
+        self.answer: Callable[[str, Values], Values | None] = lambda name, values: None
+        self.amplifier = Amplifier("any", channels=channels)
+        highest = QUANTITIES["frequency"].to_wire(600.0)
+        self.amplifier.capabilities.update(frequency_max=highest, knots=knots)
+        self.obey = self.amplifier.handle
+        self.amplifier.handle = self._handle  # type: ignore[method-assign]
+        self._baud = baud
+        self._line: Line | None = None
+        self._end: SerialAmplifiers | None = None
+        self._parts: dict[int, dict[int, Any]] = {}
+        self._sent: list[Sent] = []
 
-    async def open(self) -> None:
-        """Always succeeds."""
+    def connect(self) -> Line:
+        """Open a line to it; raises LinkError while it is cut."""
+        self.attempts.append(asyncio.get_running_loop().time())
+        if self._is_cut:
+            raise LinkError("wire cut")
+        self._end = SerialAmplifiers({1: self.amplifier}, self._reply)
+        self._line = Line(SerialWire(self._baud, sequence=0), self, "line")
         self.is_open = True
+        return self._line
 
-    async def close(self) -> None:
-        """As asked."""
+    @property
+    def line(self) -> Line:
+        """Its open line."""
+        assert self._line is not None
+        return self._line
+
+    def cut(self) -> None:
+        """Cut its line, until `mend`."""
+        self._is_cut = True
+        self.line.lose("wire cut")
+
+    def mend(self) -> None:
+        """Let it be opened again."""
+        self._is_cut = False
+
+    def report(self, **event: int) -> None:
+        """Let its host hear of an event."""
+        self.line.members[1].note_event({"channel": NO_CHANNEL, "latch": 0, **event})
+
+    def close(self) -> None:
+        """Close its line."""
+        if self._line is not None:
+            self._line.lose("closed")
         self.is_open = False
 
-    @property
-    def last_sent_at(self) -> float:
-        """On the loop's clock [s]."""
-        return self._last_sent_at
+    def write(self, data: bytes) -> None:
+        """Send bytes of the host."""
+        loop = asyncio.get_running_loop()
+        assert self._end is not None
+        if self.is_deaf:
+            return
+        loop.call_soon(lambda: self._end.receive(data, loop.time()))  # type: ignore[union-attr]
 
-    @property
-    def wire_times(self) -> WireTimes:
-        """A commit is said to take `commit_takes` [s]."""
-        return StubWireTimes(self.commit_takes)
+    def poll(self) -> None:
+        """All that has come was handed over."""
 
-    async def exchange(self, request: Request, *, timeout: float) -> Reply:
-        """Remember, wait, answer."""
-        self._last_sent_at = asyncio.get_running_loop().time()
-        self.asked.append((self._last_sent_at, request))
-        await asyncio.sleep(self.delay)
-        return self.answer(request) or self.obey(request)
+    def _reply(self, data: bytes) -> None:
+        if not self.is_mute:
+            asyncio.get_running_loop().call_later(self.delay, self._arrived, self.line, data)
 
-    def obey(self, request: Request) -> Reply:
-        """What the simulated amplifier answers."""
-        return self.amplifier.handle(request, asyncio.get_running_loop().time())
+    def _arrived(self, line: Line, data: bytes) -> None:
+        if line.loss is None:
+            line.received(data)
 
-    def status(self) -> Status:
+    def _handle(self, name: str, values: Values, now: float) -> Values:
+        self.asked.append((now, name, values))
+        self._note(name, values, now)
+        answer = self.answer(name, values)
+        return self.obey(name, values, now) if answer is None else answer
+
+    def _note(self, name: str, values: Values, now: float) -> None:
+        if name == "Silence":
+            self._sent.append(Sent(now, 0, QUANTITIES["ramp"].from_wire(values["ramp"])))
+        if name == "Set":
+            several = self._parts.setdefault(values["token"], {})
+            several[values["index"]] = values["stream"]
+            if values["now"] and len(several) == values["parts"]:
+                self._commit(values["token"], now)
+        if name == "Commit":
+            self._commit(values["token"], now)
+
+    def _commit(self, token: int, now: float) -> None:
+        several = self._parts.pop(token, {})
+        stream = [word for index in sorted(several) for word in several[index]]
+        self._sent += [_sent(one, token, now) for one in unpack_layers(stream)]
+
+    def status(self) -> Values:
         """What it reports now."""
         now = asyncio.get_running_loop().time()
         self.amplifier.tick(now)
         return self.amplifier.status(now)
 
     @property
-    def state(self) -> AmplifierState:
+    def state(self) -> str:
         """Its state now."""
-        return self.status().state
+        self.status()
+        return self.amplifier.state
 
     @property
     def levels(self) -> tuple[float, ...]:
         """Its levels now."""
-        return self.status().levels
+        return tuple(self.status()["levels"])
 
     @property
     def token(self) -> int:
-        """Token of the set that plays."""
-        return self.status().token
+        """Token of the layer that plays."""
+        return int(self.status()["tokens"][0])
 
-    def sets(self) -> list[CommandSet]:
-        """All sets that were to be applied."""
-        return [request.command_set for _, request in self.asked if isinstance(request, Apply)]
+    def sets(self) -> list[Sent]:
+        """All sets that were committed, and silences, in order."""
+        return self._sent
 
-    def requests(self, *kinds: type[Request]) -> list[Request]:
-        """What was asked, of some kinds."""
-        return [request for _, request in self.asked if isinstance(request, kinds)]
+    def requests(self, *names: str) -> list[Values]:
+        """What was asked, of some names."""
+        return [values for _, name, values in self.asked if name in names]
 
-    def times(self, kind: type[Request]) -> list[float]:
+    def names(self, since: int = 0) -> list[str]:
+        """Names of all that was asked from a number on."""
+        return [name for _, name, _ in self.asked[since:]]
+
+    def times(self, *names: str) -> list[float]:
         """When something was asked [s]."""
-        return [time for time, request in self.asked if isinstance(request, kind)]
+        return [time for time, name, _ in self.asked if name in names]
+
+
+class BenchLines:
+    """The lines of far ends by URL."""
+
+    def __init__(self, far_ends: Mapping[str, Any]) -> None:
+        self._far_ends = far_ends
+
+    async def amplifier(
+        self, url: str, limits: GuardLimits, *, name: str, serial_number: str | None = None
+    ) -> Host:
+        """Return the amplifier of this name, on a new line."""
+        line = self._far_ends[name].connect()
+        return Host(line, 1, limits, name=name, serial_number=serial_number)
+
+    async def close(self) -> None:
+        """Close all lines."""
+        for far_end in self._far_ends.values():
+            far_end.close()
 
 
 class Table:
@@ -221,7 +332,7 @@ class Bench:
         """The first amplifier."""
         return self.far_ends[0]
 
-    def states(self) -> set[AmplifierState]:
+    def states(self) -> set[str]:
         """The states of all amplifiers."""
         return {far_end.state for far_end in self.far_ends}
 
@@ -254,7 +365,6 @@ def make_bench(
     sources: Sequence[TouchSource] = (),
     observer: Observer | None = None,
     channels: int = 2,
-    voices: int = VOICES,
     far_ends: list[Any] | None = None,
     rate: float = math.inf,
     on_time: float = math.inf,
@@ -265,15 +375,16 @@ def make_bench(
     rate [1/s], on_time [s]: limits of the rig; options: as a `Controller` takes them.
     """
     names = amplifiers or ("main",)
-    far_ends = far_ends or [FarEnd(channels, voices) for _ in names]
+    far_ends = far_ends or [FarEnd(channels) for _ in names]
     reports = Reports()
     rig = _rig(*names)
     rig = replace(rig, limits=replace(rig.limits, rate=rate, on_time=on_time))
     table = Table({"SW": Tone(110.0, 20e-6, math.pi / 2)}, rig.plate)
+    by_name = dict(zip(names, far_ends, strict=True))
     controller = Controller(
         rig,
         table,
-        amplifiers={n: Amplifier(far_end) for n, far_end in zip(names, far_ends, strict=True)},
+        lines=lambda: BenchLines(by_name),
         sources=sources,
         observer=observer or reports.observer(),
         **options,

@@ -23,8 +23,9 @@ from controller.daemon.socket_lock import SocketLock
 from model.rig.file import load_rig
 from model.table.table import LocalizationTable
 from rig_files import write_rig
+from rig_on_wire import FarSide, far_side
 from small_table import small_table
-from wires import WIRES, FarSide, far_side
+from wires import WIRES
 
 PATIENCE = 180.0  # s; generous, for a loaded machine
 PLACE = (0.1, 0.1)
@@ -111,10 +112,16 @@ async def daemon_at(
     lock = SocketLock(config.socket)
     log = LogThread(folder / "log")
     handler = LogHandler(log)
-    daemon = Daemon(config, daemon_table(), log=log, manager=ServiceManager({}), dashboard=None)
     # Daemon, amplifier and test share a process, which a busy machine delays; here the watchdog is
     # the longest of the protocol, since no test of this bench lets it expire.
-    daemon._controller._group._watchdog = 2.0
+    daemon = Daemon(
+        config,
+        daemon_table(),
+        log=log,
+        manager=ServiceManager({}),
+        dashboard=None,
+        watchdog=2.0,
+    )
     task = asyncio.create_task(daemon.run(lock))
     logging.getLogger().addHandler(handler)
     try:
@@ -147,7 +154,7 @@ async def holding(
     task = asyncio.create_task(repeat())
     try:
         if far is not None:
-            await until(lambda: any(far.device.status().levels))
+            await until(lambda: any(far.summary().levels))
         yield
     finally:
         task.cancel()

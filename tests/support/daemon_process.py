@@ -29,7 +29,7 @@ from daemon_bench import (
 )
 from journal import Journal, loudness
 from model.table.file import save_table
-from wires import FarSide
+from rig_on_wire import FarSide
 
 ERA = Path(sys.executable).with_name("era")
 STARTING = 180.0  # s; for a loaded machine

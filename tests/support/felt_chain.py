@@ -24,21 +24,21 @@ from controller.effects.player import EffectPlayer
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer
 from drivers import clock
-from drivers.amplifier import Amplifier
-from drivers.registry import open_backend
+from drivers.opening import Lines
 from heard import SENSORS, Heard, hear
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
+from sim.amplifier.contract import Amplifier as SimulatedAmplifier
+from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
-from sim.bench.simulated_device import SimulatedDevice
 from sim.control.context import SimulationContext
 from sim.control.operations import carry_out
 from sim.far_ends.wires import Wire, open_wires
+from sim.listening.witness import Witness
 from sim.plant.imperfections import draw_imperfections
 from sim.witness.violation import Violation
-from sim.witness.witness import Witness
 from touch_stream import Stream
 from virtual_loop import run_virtual
 from witness_config import witness_config
@@ -100,16 +100,15 @@ class Chain:
     async def _play(self, stream: Stream) -> Played:
         live_in_memory()
         async with self._far_end() as urls:
-            amplifiers = {name: Amplifier(open_backend(url)) for name, url in urls.items()}
             controller = Controller(
                 self.rig,
                 self.table,
-                amplifiers=amplifiers,
+                lines=Lines,
+                urls=urls,
                 intent_source=EffectPlayer(SurfaceLayout(effects=default_effects(LEVEL_DB_SL))),
                 timing=Timing(self.table),
                 observer=Observer(pattern_applied=self._applied),
                 drive_mode=self.drive_mode,
-                max_loading_time=TOUCH_WAIT,
             )
             self._events: list[Notification] = []
             self._polls: list[tuple[float, list[float]]] = []
@@ -141,9 +140,14 @@ class Chain:
         if self.wires is None:
             yield {"main": f"sim://{quote(str(self.rig_file))}?control=control"}
             return
-        bench = Bench(self.truth, now=clock.now(), imperfections=draw_imperfections(self.truth))
+        bench = Bench(
+            self.truth,
+            now=clock.now(),
+            imperfections=draw_imperfections(self.truth),
+            make_amplifier=SimulatedAmplifier,
+        )
         devices = {
-            name: SimulatedDevice(bench, name, address=number)
+            name: AmplifierDevice(bench, name, address=number)
             for number, name in enumerate(bench.amplifiers, start=1)
         }
         wires = {name: Wire(kind, speed=SPEEDS.get(kind)) for name, kind in self.wires.items()}

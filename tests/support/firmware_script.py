@@ -1,27 +1,26 @@
-"""Scripts for the firmware: serial frames at given samples, and the samples that it makes of them.
+"""Scripts for the firmware: serial frames at given times, and the samples that it makes of them.
 
-Frames are packed here from the wire page, without the project's codec.
+Frames are packed here from docs/decisions/0061, without the project's codec.
 """
 
 import struct
-import subprocess
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from model.arrays import FloatArray
+from moved_firmware import RATE, SERIAL, MovedFirmware
 
-RATE = 16000  # samples per second
 PER_MS = RATE // 1000
-CHANNELS = 4
 SESSION = 9
-FULL_STROKE = 32767  # of a sample
-
-HELLO, ARM, APPLY, LOAD_ENVELOPE = 1, 3, 7, 13
+ARM, DISARM, SET, COMMIT, STOP, GET_STATUS, PING = 3, 4, 5, 6, 8, 9, 12
+PART = 117  # words
 NAK = 0x9F
-KEEP_PHASE, SHAPED = 1, 4
+SET_REPLY = 0x85
+
+Words = list[int]
+Shape = tuple[float, Sequence[tuple[float, float]]]
+"""An envelope: step [ms], and knots of level and phase [degrees]."""
 
 
 def stuffed(frame: bytes) -> bytes:
@@ -39,15 +38,20 @@ def unstuffed(data: bytes) -> bytes:
     return frame[:-1]
 
 
-def request(kind: int, payload: bytes = b"") -> bytes:
-    """A request to address 1; kind: the type of its message."""
-    frame = struct.pack("<BBBH", kind, 2, 1, 7) + payload
+def request(kind: int, *words: int) -> bytes:
+    """A request to address 1; kind: the number of its message."""
+    frame = struct.pack(f"<BBBH{len(words)}H", kind, 3, 1, 7, *words)
     return stuffed(frame + struct.pack("<I", zlib.crc32(frame)))
 
 
 def arm(watchdog_ms: int = 2000) -> bytes:
     """An Arm of the session."""
-    return request(ARM, struct.pack("<HH", watchdog_ms, SESSION))
+    return request(ARM, SESSION, watchdog_ms)
+
+
+def _polar(level: float, phase: float) -> Words:
+    hundredths = (round(100 * phase) + 18000) % 36000 - 18000
+    return [round(10000 * level), hundredths & 0xFFFF]
 
 
 def command(
@@ -56,56 +60,64 @@ def command(
     level: float,
     phase: float = 0.0,
     *,
-    flags: int = 0,
-    onset: int = 0,
-    ending: int = 0,
-) -> bytes:
-    """A command: frequency [Hz], level in full strokes, phase [degrees]."""
-    numbers = round(frequency * 20), round(level * 10000), round(phase * 100)
-    if not (onset or ending):
-        return struct.pack("<BBHHh", channel, flags, *numbers)
-    return struct.pack("<BBHHhBB", channel, flags | SHAPED, *numbers, onset, ending)
+    keep_phase: bool = False,
+    skip_ending: bool = False,
+    onset: Shape | None = None,
+    ending: Shape | None = None,
+) -> Words:
+    """A command: frequency [Hz], level in full levels, phase [degrees]."""
+    flags = keep_phase << 3 | skip_ending << 2 | (onset is not None) << 1 | (ending is not None)
+    words = [channel << 4 | flags, round(20 * frequency), *_polar(level, phase)]
+    for shape in (onset, ending):
+        if shape is not None:
+            step, knots = shape
+            words += [len(knots), round(10 * step)]
+            words += [word for knot in knots for word in _polar(*knot)]
+    return words
 
 
-def apply(token: int, *commands: bytes, ramp_ms: int = 0, valid_for_ms: int = 0) -> bytes:
-    """An Apply of these commands."""
-    head = struct.pack("<HHHHB", SESSION, token, ramp_ms, valid_for_ms, len(commands))
-    return request(APPLY, head + b"".join(commands))
+def layer(
+    number: int, *commands: Words, ramp_ms: int = 0, valid_for_ms: int = 0, after: bool = False
+) -> Words:
+    """A layer of a set with these commands."""
+    head = [number << 7 | after << 6 | len(commands), ramp_ms, valid_for_ms]
+    return head + [word for each in commands for word in each]
 
 
-def load(slot: int, step_ms: float, *knots: tuple[float, float]) -> bytes:
-    """A LoadEnvelope; knots: level and phase [degrees]."""
-    packed = (struct.pack("<Hh", round(10000 * a), round(100 * b)) for a, b in knots)
-    head = struct.pack("<BHB", slot, round(step_ms * 10), len(knots))
-    return request(LOAD_ENVELOPE, head + b"".join(packed))
+def play(token: int, *layers: Words) -> bytes:
+    """A set that plays at once, in as many parts as it needs."""
+    words = [word for each in layers for word in each]
+    parts = [words[at : at + PART] for at in range(0, len(words), PART)]
+    return b"".join(
+        request(SET, SESSION, token, index << 8 | len(parts) << 1 | 1, *part)
+        for index, part in enumerate(parts)
+    )
+
+
+def apply(token: int, *commands: Words, ramp_ms: int = 0, valid_for_ms: int = 0) -> bytes:
+    """A set of layer 0 that plays at once."""
+    return play(token, layer(0, *commands, ramp_ms=ramp_ms, valid_for_ms=valid_for_ms))
 
 
 Script = Sequence[tuple[float, bytes]]
 """Requests by time [ms]."""
 
 
-def _text(script: Script, until_ms: float) -> bytes:
-    lines = [*script, (until_ms, request(HELLO))]
-    return b"".join(
-        b"%d %s\n" % (round(at * PER_MS), frame.hex().upper().encode()) for at, frame in lines
-    )
-
-
-def _samples(path: Path) -> FloatArray:
-    """Samples (n, channels) in full strokes."""
-    return np.fromfile(path, "<i2").reshape(-1, CHANNELS) / FULL_STROKE
-
-
 def replay(
     folder: Path, script: Script, until_ms: float
-) -> tuple[FloatArray, list[tuple[int, bytes]]]:
-    """The samples of a script on this machine, and type and payload of each reply but the last."""
-    path = folder / "samples"
-    done = subprocess.run(
-        [folder / "era-replay", "--pipe", "--samples", path],
-        input=_text(script, until_ms),
-        stdout=subprocess.PIPE,
-        check=True,
-    )
-    frames = [unstuffed(part) for part in done.stdout.split(b"\0") if part]
-    return _samples(path), [(frame[0], frame[5:-4]) for frame in frames[:-1]]
+) -> tuple[FloatArray, list[tuple[int, tuple[int, ...]]]]:
+    """The samples of a script, and type and words of each reply; events are left out."""
+    firmware = MovedFirmware(folder)
+    sent = b""
+    for at, frame in script:
+        firmware.move(at / 1000)
+        firmware.receive(SERIAL, frame)
+        sent += firmware.sent(SERIAL)
+    firmware.move(until_ms / 1000)
+    frames = [unstuffed(part) for part in (sent + firmware.sent(SERIAL)).split(b"\0") if part]
+    replies = [
+        (frame[0], struct.unpack(f"<{len(frame[5:-4]) // 2}H", frame[5:-4]))
+        for frame in frames
+        if frame[0] & 0x80
+    ]
+    return firmware.samples(), replies

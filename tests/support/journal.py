@@ -3,43 +3,38 @@
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 from daemon_bench import until
-from drivers.protocol.messages import (
-    AmplifierState,
-    Apply,
-    Arm,
-    Commit,
-    Disarm,
-    LoadEnvelope,
-    Nak,
-    Ping,
-    Reply,
-    Request,
-    Stage,
-    Stop,
-)
-from wires import FarSide
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import unpack_layers
+from rig_on_wire import FarSide
 
-FEEDING = (Ping, Apply, Commit, Stage, LoadEnvelope, Arm, Disarm, Stop)
+FEEDING = ("Ping", "Set", "Commit", "Silence", "Arm", "Disarm", "Stop")
 """What a host that is alive sends while something may play."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """A request that an amplifier got at a time [s], its answer, and its levels thereafter."""
+    """A request that an amplifier got at a time [s], and its levels thereafter.
+
+    is_refused: whether it refused the request.
+    """
 
     time: float
     amplifier: str
-    request: Request
-    reply: Reply
+    name: str
+    values: Values
+    is_refused: bool
     levels: tuple[float, ...]
 
     @property
     def raises(self) -> bool:
-        """Whether it lets something play that asks for more than silence."""
-        sets = (self.request,) if isinstance(self.request, Apply | Stage) else ()
-        return any(command.level > 0 for one in sets for command in one.command_set.commands)
+        """Whether it is a set, of one part, that asks for more than silence."""
+        if self.name != "Set" or self.values["parts"] > 1:
+            return self.name == "Set"
+        layers = unpack_layers(self.values["stream"])
+        return any(command.is_driven for one in layers for command in one.commands)
 
 
 class Journal:
@@ -50,12 +45,17 @@ class Journal:
         self._far = far
         exchange = far.bench.exchange
 
-        def noted(amplifier: str, request: Request, *, now: float) -> Reply:
-            reply = exchange(amplifier, request, now=now)
-            at = far.bench.time
-            levels = far.bench.amplifiers[amplifier].status(at).levels
-            self.entries.append(Asked(at, amplifier, request, reply, levels))
-            return reply
+        def noted(amplifier: str, name: str, values: Values, *, now: float) -> Any:
+            is_refused = False
+            try:
+                return exchange(amplifier, name, values, now=now)
+            except Refusal:
+                is_refused = True
+                raise
+            finally:
+                at = far.bench.time
+                levels = far.bench.amplifiers[amplifier].summary(at).levels
+                self.entries.append(Asked(at, amplifier, name, values, is_refused, levels))
 
         far.bench.exchange = noted  # type: ignore[method-assign]
 
@@ -77,37 +77,30 @@ class Journal:
         return max(
             entry.time
             for entry in self.entries
-            if entry.amplifier == amplifier
-            and isinstance(entry.request, FEEDING)
-            and not isinstance(entry.reply, Nak)
+            if entry.amplifier == amplifier and entry.name in FEEDING and not entry.is_refused
         )
 
     def widest_gap(self, since: float, until: float) -> float:
         """The longest time [s] between two signs of life in a window."""
-        times = [e.time for e in self.since(since) if isinstance(e.request, FEEDING)]
+        times = [e.time for e in self.since(since) if e.name in FEEDING]
         moments = [since, *(time for time in times if time <= until), until]
         return max(later - earlier for earlier, later in pairwise(moments))
 
 
 def energised(far: FarSide) -> list[str]:
     """The amplifiers that are enabled now, or on their way out of it, or still audible."""
-    statuses = {name: device.status() for name, device in far.devices.items()}
-    alive = (
-        AmplifierState.OPERATION_ENABLED,
-        AmplifierState.SWITCHED_ON,
-        AmplifierState.FAULT_REACTION_ACTIVE,
-    )
-    return [name for name, one in statuses.items() if one.state in alive or any(one.levels)]
+    summaries = {name: far.summary(name) for name in far.devices}
+    alive = ("OPERATION_ENABLED", "SWITCHED_ON", "FAULT_REACTION_ACTIVE")
+    return [name for name, one in summaries.items() if one.state in alive or any(one.levels)]
 
 
 def silent_from(far: FarSide) -> float:
     """When [s] every channel of every amplifier is silent, or was; -inf where none ever played."""
-    for device in far.devices.values():
-        device.status()
+    far.summary()
     outputs = (output for one in far.bench.amplifiers.values() for output in one.outputs)
     return max((tone.silent_from for output in outputs for tone in output), default=-math.inf)
 
 
 def loudness(far: FarSide) -> float:
     """The highest level of any channel now."""
-    return max(max(device.status().levels) for device in far.devices.values())
+    return max(max(far.summary(name).levels) for name in far.devices)

@@ -32,12 +32,12 @@ from daemon_process import (
     NotServing,
     daemon_process,
 )
-from drivers.protocol.messages import AmplifierState
 from journal import Journal, energised, loudness
 from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
+from rig_on_wire import far_side
 from sim.far_ends.wires import Wire
-from wires import WIRES, far_side
+from wires import WIRES
 
 READY = "READY_TO_SWITCH_ON"
 LIMIT = WATCHDOG + REACTION  # s; on the amplifier's clock, from its last sign of life
@@ -141,7 +141,7 @@ async def _kill(wire: str, daemon: DaemonProcess, journal: Journal) -> Kill:
         max((end - fed for end, fed in ends), default=None),
         max((end - dead for end, _ in ends), default=None),
         len(journal.since(dead)),
-        sum(far.devices[name].status().state is AmplifierState.FAULT for name in alive),
+        sum(far.summary(name).state == "FAULT" for name in alive),
         loudness(far),
     )
 

@@ -34,8 +34,9 @@ from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from rig_files import write_rig
+from rig_on_wire import FarSide, far_side
 from virtual_sockets import VirtualSocketsLoop
-from wires import WIRES, FarSide, far_side
+from wires import WIRES
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -118,7 +119,7 @@ class LearningBench:
         while clock.now() < end:
             await self.era.touch(list(places))
             await asyncio.sleep(0.05)
-        is_playing = any(self.far.device.status().levels)
+        is_playing = any(self.far.summary().levels)
         self.far.bench.advance(clock.now())
         felt = self.far.bench.felt(clock.now() - _FELT, clock.now())
         *quiet, target = [

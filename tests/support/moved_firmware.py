@@ -1,100 +1,64 @@
-"""The firmware in this process, on the clock of a virtual loop: nothing of it takes real time."""
+"""The firmware in this process, on a clock that its caller moves: nothing of it takes real time."""
 
-import asyncio
 import ctypes
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
 from pathlib import Path
 
-from drivers import clock
-from sim.transport.pseudo_terminal import make_terminal
-from wires import patient
+import numpy as np
 
-WIRES = ("serial", "modbus+rtu", "can+slcan", "modbus+tcp")
-"""The firmware's lines in their order, and Modbus over TCP."""
+from model.arrays import FloatArray
 
-_MODBUS = 1  # the line of its replies
-_TURN = 0.001  # s; between two turns of its loop
+RATE = 16000
+"""Samples per second and channel."""
+
+SERIAL, MODBUS, CAN, TCP = range(4)
+"""Its lines; TCP: Modbus over TCP, whose replies come from MODBUS."""
+
+_FULL = 32767  # of a sample
 _RING = 8192  # bytes
+_SAMPLES = 1 << 21
 
 
 class MovedFirmware:
-    """The library `era-moved.so` in a folder: one amplifier, whose clock begins now."""
+    """The library `era-moved.so` in a folder: one amplifier, whose clock begins at 0.
 
-    def __init__(self, folder: Path) -> None:
+    channels: with which it was built.
+    """
+
+    def __init__(self, folder: Path, *, channels: int = 4) -> None:
         self._library = ctypes.CDLL(str(folder / "era-moved.so"))
         self._library.moved_to.argtypes = [ctypes.c_uint64]
+        self._library.moved_stall.argtypes = [ctypes.c_uint64, ctypes.c_bool]
         self._sent = ctypes.create_string_buffer(_RING)
-        self._began = clock.now()
+        self._made = np.empty(_SAMPLES, np.int16)
+        self._channels = channels
         self._library.moved_begin()
 
-    def follow(self) -> None:
-        """Move its clock to that of the loop."""
-        self._library.moved_to(round((clock.now() - self._began) * 1e6))
+    def move(self, time: float) -> None:
+        """Move its clock to a time [s]."""
+        self._library.moved_to(round(time * 1e6))
+
+    def stall(self, time: float, *, is_converter_still: bool) -> None:
+        """Let its loop stand still until a time [s], and its converter take nothing meanwhile."""
+        self._library.moved_stall(round(time * 1e6), is_converter_still)
 
     def receive(self, line: int, data: bytes) -> None:
         """Take bytes that arrive on a line now."""
-        self.follow()
-        self._library.moved_receive(line, data, len(data))
-
-    def receive_tcp(self, data: bytes) -> None:
-        """Take bytes that arrive now over the connection of Modbus TCP."""
-        self.follow()
-        self._library.moved_receive_tcp(data, len(data))
+        if line == TCP:
+            self._library.moved_receive_tcp(data, len(data))
+        else:
+            self._library.moved_receive(line, data, len(data))
 
     def sent(self, line: int) -> bytes:
         """Return what it has sent on a line since the last call."""
-        length = self._library.moved_sent(line, self._sent)
+        length = self._library.moved_sent(MODBUS if line == TCP else line, self._sent)
         return self._sent.raw[:length]
 
+    def samples(self) -> FloatArray:
+        """Return the samples since the last call, (n, channels) in full levels."""
+        pointer = self._made.ctypes.data_as(ctypes.c_void_p)
+        length = self._library.moved_samples(pointer)
+        return self._made[:length].reshape(-1, self._channels) / _FULL
 
-class _Connection(asyncio.Protocol):
-    """The only connection of Modbus TCP."""
-
-    def __init__(self, firmware: MovedFirmware) -> None:
-        self._firmware = firmware
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
-
-    def data_received(self, data: bytes) -> None:
-        self._firmware.receive_tcp(data)
-        if reply := self._firmware.sent(_MODBUS):
-            self._transport.write(reply)
-
-
-@asynccontextmanager
-async def moved_firmware(folder: Path, wire: str) -> AsyncIterator[str]:
-    """Run the firmware on a wire of a loop that lives in memory; yield its URL."""
-    firmware, loop = MovedFirmware(folder), asyncio.get_running_loop()
-    if wire == "modbus+tcp":
-        server = await loop.create_server(lambda: _Connection(firmware), "127.0.0.1", 0)
-        turning = loop.create_task(_turn(firmware, lambda: None))
-        url = f"modbus+tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}/1"
-    else:
-        line = WIRES.index(wire)
-
-        def receive(data: bytes) -> None:
-            firmware.receive(line, data)
-            send()
-
-        def send() -> None:
-            if data := firmware.sent(line):
-                terminal.write(data)
-
-        terminal = make_terminal(receive)
-        turning = loop.create_task(_turn(firmware, send))
-        url = patient(f"{wire}://{terminal.port}{'#1' if wire == 'can+slcan' else ''}")
-    try:
-        yield url
-    finally:
-        turning.cancel()
-
-
-async def _turn(firmware: MovedFirmware, send: Callable[[], None]) -> None:
-    """Let its loop turn each millisecond."""
-    while True:
-        await asyncio.sleep(_TURN)
-        firmware.follow()
-        send()
+    def set_interlock(self, *, is_open: bool) -> None:
+        """Open or close its interlock."""
+        self._library.moved_interlock(is_open)

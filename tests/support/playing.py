@@ -3,21 +3,23 @@
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from drivers.amplifier import Amplifier
-from drivers.command import CommandSet, DriveCommand
-from drivers.guard import Guard, GuardLimits
-from drivers.registry import open_backend
+from drivers.contents import Layer, Tone
+from drivers.host.amplifier import Amplifier
+from drivers.opening import Lines
+from registry.limits import GuardLimits
+
+SESSION = 9
 
 
 @asynccontextmanager
-async def playing(url: str, command: DriveCommand, *, watchdog: float) -> AsyncIterator[Amplifier]:
-    """Open, arm and play without a ramp; watchdog [s]. Replies may take 5 s on a busy machine."""
-    amplifier = Amplifier(open_backend(url), reply_timeout=5.0)
-    await amplifier.open()
+async def playing(url: str, tone: Tone, *, watchdog: float) -> AsyncIterator[Amplifier]:
+    """Open, arm and play without a ramp; watchdog [s]: of which it falls silent after this."""
+    lines = Lines()
     try:
-        await amplifier.arm(watchdog)
-        guard = Guard(GuardLimits(40, 500, 1), amplifier.capabilities)
-        await amplifier.apply(guard.check(CommandSet(1, (command,), ramp=0.0, valid_for=0.0)))
+        amplifier = await lines.amplifier(url, GuardLimits(40, 500, 1), name=url)
+        await amplifier.open()
+        await amplifier.arm(SESSION, watchdog)
+        await amplifier.stage(1, [Layer(0, (tone,), ramp=0.0)], now=True)
         yield amplifier
     finally:
-        await amplifier.close()
+        await lines.close()

@@ -6,27 +6,28 @@ the level is measured at the finger's points of the plate, from the moment its a
 
 import asyncio
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
+import pytest
 
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
+from controller.loop.envelopes import RAMPS_ONLY
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer
 from controller.sources.touch import Touch, TouchFrame
-from drivers.amplifier import Amplifier
-from drivers.protocol.messages import Reply, Request
-from drivers.registry import open_backend
+from drivers.opening import Lines
+from drivers.protocol.records import Values
 from memory_machine import live_in_memory
 from model.arrays import FloatArray
 from model.finger.perception import detection_threshold
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
+from sim.amplifier.contract import Amplifier
+from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
-from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wires
 from sim.faults.fault_window import Faults
 from virtual_loop import run_virtual
@@ -82,29 +83,33 @@ class Felt:
 
 @dataclass
 class Pressed:
-    """A layout on a rig and its table behind a wire; options: as a `Controller` takes them."""
+    """A layout on a rig and its table behind a wire; along plain ramps unless it is shaped."""
 
     rig: Rig
     table: LocalizationTable
     layout: SurfaceLayout
     wire: str
     resting: Sequence[Position] = ()
-    options: dict[str, Any] = field(default_factory=dict)
+    is_shaped: bool = True
 
     def press(self, *ways: Callable[[float], Position], held: float = 0.15) -> list[list[Felt]]:
         """Press for a time [s] along each way, the position [m] by the time since the press.
 
         Returns what starts at each press, each up to where the finger moves on.
         """
-        return run_virtual(self._run(ways, held))
+        with pytest.MonkeyPatch.context() as patched:
+            if not self.is_shaped:
+                plain = "controller.loop.capabilities.envelope_support"
+                patched.setattr(plain, lambda rig, amplifiers: RAMPS_ONLY)
+            return run_virtual(self._run(ways, held))
 
     async def _run(
         self, ways: Sequence[Callable[[float], Position]], held: float
     ) -> list[list[Felt]]:
         loop = asyncio.get_running_loop()
         live_in_memory()
-        self._bench = Bench(self.rig, now=loop.time())
-        device = SimulatedDevice(
+        self._bench = Bench(self.rig, now=loop.time(), make_amplifier=Amplifier)
+        device = AmplifierDevice(
             self._bench, "main", address=1, faults=Faults(begin=loop.time(), seed=1)
         )
         self._watch(device)
@@ -113,11 +118,11 @@ class Pressed:
             self._controller = Controller(
                 self.rig,
                 self.table,
-                amplifiers={"main": Amplifier(open_backend(urls["main"]))},
+                lines=Lines,
+                urls=urls,
                 intent_source=EffectPlayer(self.layout),
                 timing=Timing(self.table),
                 observer=Observer(pattern_applied=lambda applied: self._reports.append(applied)),
-                **self.options,
             )
             self._starts: list[float] = []
             self._reports: list[Applied] = []
@@ -138,18 +143,18 @@ class Pressed:
             device.close()
         return felt
 
-    def _watch(self, device: SimulatedDevice) -> None:
+    def _watch(self, device: AmplifierDevice) -> None:
         """Note when a tone starts."""
-        obey, bench = device.exchange, self._bench
+        obey, bench = device.handle, self._bench
 
-        def exchange(request: Request) -> Reply | None:
-            reply = obey(request)
+        def handle(name: str, values: Values, now: float) -> Values:
+            reply = obey(name, values, now)
             outputs = bench.amplifiers["main"].outputs
             origins = {tone.origin for each in outputs for tone in each if tone.is_lasting}
             self._starts += sorted(origins - {*self._starts})
             return reply
 
-        device.exchange = exchange  # type: ignore[method-assign]
+        device.handle = handle  # type: ignore[method-assign]
 
     async def _hold(
         self, seconds: float, way: Callable[[float], Position] | None, number: int

@@ -16,6 +16,7 @@ from functools import cache
 from typing import Any, TextIO
 
 from controller.group.amplifier_group import GroupState
+
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer
 from controller.sources.touch import Touch, TouchFrame
@@ -28,6 +29,7 @@ from memory_machine import live_in_memory
 from model.rig.rig import Channel, Rig
 from model.table.table import LocalizationTable
 from paper_plate import make_paper_rig
+from sim.amplifier.sensor_messages import SensedAmplifier
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wires
@@ -144,7 +146,7 @@ class _Run:
         loop.set_exception_handler(self._unhandled)
         self.machine = live_in_memory()
         self.rig = make_soak_rig(self.plan.amplifiers)
-        self.bench = Bench(self.rig, now=loop.time())
+        self.bench = Bench(self.rig, now=loop.time(), make_amplifier=SensedAmplifier)
         self.contacts = SourceContacts()
         self.arm_requests = 0
         self.is_ending = False

@@ -1,7 +1,6 @@
 """A sound card without sound: a JACK server, and a client that captures what is played to it."""
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
@@ -118,15 +117,3 @@ def until(is_true: Any, *, timeout: float = START) -> None:
     while not is_true():
         assert time.monotonic() < end
         time.sleep(0.01)
-
-
-def conformance(url: str) -> dict[str, Any]:
-    """The report of the reading checks."""
-    done = subprocess.run(
-        [ERA, "amp", "conformance", url, "--json"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    report: dict[str, Any] = json.loads(done.stdout)
-    return report

@@ -1,4 +1,4 @@
-"""A host that plays 1 kHz at level 0.5 on every channel of an amplifier of voltage, until killed.
+"""A host that plays 1 kHz at level 0.5 on every channel of a linear amplifier, until killed.
 
     python tests/support/steady_host.py URL CHANNELS
 
@@ -6,32 +6,42 @@ Each channel is 30 degrees ahead of the one before. It prints `armed`. The ampli
 long as the protocol allows, since a busy machine may hold it up.
 """
 
+import asyncio
 import sys
 
-from drivers.blocking import BlockingAmplifier
-from drivers.command import DriveCommand
-from drivers.guard import GuardLimits
-from patient_daemon import WATCHDOG
-from registry.voltage import VoltageDrive
+from drivers.contents import Layer, Tone
+from drivers.host.amplifier import Amplifier
+from drivers.host.group import Group
+from drivers.opening import Lines
+from drivers.protocol.table import QUANTITIES
+from registry.limits import GuardLimits
 
-FLAT = VoltageDrive(response=((30.0, 1.0, 0.0), (2000.0, 1.0, 0.0)), frequencies=(40.0, 1000.0))
 LIMITS = GuardLimits(40, 1000, 1.0)
-DURATION = 60.0  # s
+WATCHDOG = QUANTITIES["watchdog"].high  # s
+_BEAT = 0.1  # s
 
 
-def main(url: str, channels: int) -> None:
+async def linear_amplifier(lines: Lines, url: str) -> Amplifier:
+    """The amplifier of a URL, whose full level is its output; nothing is sent."""
+    opened = await lines.amplifier(url, LIMITS, name="a")
+    return Amplifier(opened.line, opened.address, LIMITS, name="a", is_output=True)
+
+
+async def main(url: str, channels: int) -> None:
     """Acknowledge a fault, arm and play."""
-    with BlockingAmplifier(url, limits=LIMITS, voltage=dict.fromkeys(range(channels), FLAT)) as amp:
-        amp.clear()
-        amp.arm(WATCHDOG)
-        sys.stdout.write("armed\n")
-        sys.stdout.flush()
-        tones = [
-            DriveCommand(channel=n, frequency=1000, level=0.5, phase=30 * n)
-            for n in range(channels)
-        ]
-        amp.play(tones, duration=DURATION)
+    amplifier = await linear_amplifier(Lines(), url)
+    group = Group({"a": amplifier})
+    await group.open()
+    await group.clear()
+    await group.arm(WATCHDOG)
+    sys.stdout.write("armed\n")
+    sys.stdout.flush()
+    tones = (Tone(n, 1000.0, 0.5, (30.0 * n + 180) % 360 - 180) for n in range(channels))
+    await group.apply({"a": [Layer(0, tuple(tones))]})
+    while True:
+        await group.beat()
+        await asyncio.sleep(_BEAT)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]))
+    asyncio.run(main(sys.argv[1], int(sys.argv[2])))

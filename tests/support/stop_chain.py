@@ -30,6 +30,7 @@ from drivers.protocol.messages import (
 from drivers.registry import open_backend
 from memory_machine import live_in_memory
 from registry.limits import GuardLimits
+from sim.amplifier.sensor_messages import SensedAmplifier
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wires
@@ -176,7 +177,7 @@ async def stop_chain(
     live_in_memory()
     names = ("west", "east")[:amplifiers]
     rig = make_rig(names, GuardLimits(40.0, 500.0, 0.5))
-    bench = Bench(rig, now=loop.time())
+    bench = Bench(rig, now=loop.time(), make_amplifier=SensedAmplifier)
     devices = [
         SimulatedDevice(
             bench,

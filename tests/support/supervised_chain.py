@@ -12,21 +12,21 @@ from controller.daemon.supervisor import Supervisor
 from controller.loop.loop import Controller
 from controller.loop.observer import Observer
 from controller.sources.touch import Touch, TouchFrame
-from drivers.amplifier import Amplifier
-from drivers.protocol.messages import Reply, Request
-from drivers.registry import open_backend
-from lies import Lie
+from drivers.opening import Lines
+from drivers.protocol.records import Values
 from memory_machine import live_in_memory
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Tone
 from registry.limits import GuardLimits
-from shaped_link import Shapes
+from sim.amplifier.contract import Amplifier
+from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
-from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import open_wires
 from stop_chain import WIRES
+from straight_shapes import Shapes
 from witnessed_chain import STROKE, OneTable, make_rig
+from word_lies import Lie
 
 ENABLED = DaemonState.OPERATION_ENABLED
 LEVELS = {"SW": 0.2, "NE": 0.4}
@@ -60,7 +60,7 @@ class SupervisedChain:
     supervisor: Supervisor
     controller: Controller
     bench: Bench
-    devices: list[SimulatedDevice]
+    devices: list[AmplifierDevice]
     table: Changing
     causes: list[str] = field(default_factory=list)
     number: int = 0
@@ -101,19 +101,18 @@ class SupervisedChain:
     def lie(self, lie: Lie, name: str) -> None:
         """Let an amplifier answer every request with this lie from now on."""
         device = next(device for device in self.devices if device.name == name)
-        exchange = device.exchange
+        obey = device.handle
 
-        def exchanging(request: Request) -> Reply | None:
-            reply = exchange(request)
-            return None if reply is None else lie(reply)
+        def handle(asked: str, values: Values, now: float) -> Values:
+            return lie(asked, obey(asked, values, now))
 
-        device.exchange = exchanging  # type: ignore[method-assign]
+        device.handle = handle  # type: ignore[method-assign]
 
     def levels(self) -> Mapping[str, tuple[float, ...]]:
         """What the amplifiers play now."""
         now = asyncio.get_running_loop().time()
         self.bench.advance(now)
-        return {name: each.status(now).levels for name, each in self.bench.amplifiers.items()}
+        return {name: each.summary(now).levels for name, each in self.bench.amplifiers.items()}
 
 
 @asynccontextmanager
@@ -124,13 +123,11 @@ async def supervised_chain(
     loop = asyncio.get_running_loop()
     live_in_memory()
     rig = make_rig(names, GuardLimits(40.0, 500.0, 0.5))
-    bench = Bench(rig, now=loop.time())
-    devices = [SimulatedDevice(bench, name, address=at) for at, name in enumerate(names, 1)]
+    bench = Bench(rig, now=loop.time(), make_amplifier=Amplifier)
+    devices = [AmplifierDevice(bench, name, address=at) for at, name in enumerate(names, 1)]
     async with open_wires(dict.fromkeys(names, WIRES[wire]), devices) as urls:
-        amplifiers = {name: Amplifier(open_backend(url)) for name, url in urls.items()}
         causes: list[str] = []
         supervisor = Supervisor(
-            amplifiers,
             state_changed=[
                 lambda _, new: causes.append(new.cause) if "FAULT" in new.state.name else None
             ],
@@ -141,7 +138,9 @@ async def supervised_chain(
         controller = Controller(
             rig,
             table,
-            amplifiers=amplifiers,
+            lines=Lines,
+            urls=urls,
+            connected=supervisor.connected,
             observer=supervisor.observe(Observer()),
             timing=Shapes() if shaped else None,
         )

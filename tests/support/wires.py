@@ -13,6 +13,7 @@ from drivers.command import CommandSet, DriveCommand
 from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from model.rig.rig import Channel, Rig
 from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.amplifier.sensor_messages import SensedAmplifier
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wire
@@ -80,7 +81,7 @@ class FarSide:
 @asynccontextmanager
 async def far_side(wire: Wire, rig: Rig, *, seed: int = 0) -> AsyncIterator[FarSide]:
     """The amplifiers of a rig behind a wire, without faults until a test injects them."""
-    bench = Bench(rig, now=clock.now())
+    bench = Bench(rig, now=clock.now(), make_amplifier=SensedAmplifier)
     devices: Sequence[SimulatedDevice] = [
         SimulatedDevice(bench, name, address=number, faults=Faults(begin=clock.now(), seed=seed))
         for number, name in enumerate(bench.amplifiers, start=1)

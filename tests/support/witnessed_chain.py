@@ -32,6 +32,7 @@ from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
 from registry.limits import GuardLimits
+from sim.amplifier.sensor_messages import SensedAmplifier
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wire
@@ -287,7 +288,7 @@ async def _play(
     machine = live_in_memory()
     between = Between(machine)
     rig = make_rig(names, limits)
-    bench = Bench(rig, now=loop.time())
+    bench = Bench(rig, now=loop.time(), make_amplifier=SensedAmplifier)
     devices = [
         SimulatedDevice(bench, name, address=number)
         for number, name in enumerate(bench.amplifiers, 1)

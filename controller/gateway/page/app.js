@@ -226,9 +226,8 @@ const HANDLERS = {
   amplifiers({ amplifiers }) {
     showAmplifiers(at("amplifiers"), amplifiers, overlay.rig?.eras ?? []);
   },
-  latency({ latency_ms, ramp_only_reason }) {
+  latency({ latency_ms }) {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
-    at("plain").textContent = ramp_only_reason ? `Plain ramps instead of shaped onsets: ${ramp_only_reason}` : "";
   },
   plate({ state, cause, remedy, robust, alarms }) {
     const isBad = robust || state === "failed" || state === "restarting";

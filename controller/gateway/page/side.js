@@ -28,7 +28,7 @@ function ageText(seconds) {
 
 // eras: of the rig, for the names of the channels.
 function tile(amplifier, eras) {
-  const { name, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost, closed_with_lost, amplifier_class } = amplifier;
+  const { name, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost, closed_with_lost } = amplifier;
   const isFaulty = fault && fault !== "NONE";
   const made = element("article", undefined, lost || isFaulty ? "tile bad" : "tile");
   const title = element("h3");
@@ -50,8 +50,6 @@ function tile(amplifier, eras) {
   const add = (key, value) => list.append(element("dt", key), element("dd", value));
   if (temperature_c !== null) add("Temperature", `${fixed(temperature_c)} °C`);
   add("High voltage", high_voltage === null ? "unknown" : high_voltage_v === null ? (high_voltage ? "on" : "off") : `${fixed(high_voltage_v)} V`);
-  if (amplifier_class === "C") add("Class", "C: no watchdog, plays on without the daemon");
-  else if (amplifier_class) add("Class", amplifier_class);
   add("Last reply", reply_age_s === null ? "none" : `${ageText(reply_age_s)} ago`);
   made.append(list);
   return made;

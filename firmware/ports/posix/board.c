@@ -20,7 +20,7 @@
 
 #define LINES 3
 
-static int lines_in[LINES] = {-1, -1, -1}, lines_out[LINES];
+static int lines[LINES] = {-1, -1, -1};
 static uint8_t received[LINES][512];
 static ssize_t received_length[LINES], received_at[LINES];
 static uint64_t heard_at[LINES];
@@ -34,9 +34,14 @@ static FILE *samples_file;
 static uint64_t started_at; // us
 static uint64_t samples_counted;
 
+uint64_t board_microseconds(void)
+{
+    return microseconds() - started_at;
+}
+
 uint32_t board_samples_due(void)
 {
-    uint64_t due = (microseconds() - started_at) * SAMPLE_RATE / 1000000 - samples_counted;
+    uint64_t due = board_microseconds() * SAMPLE_RATE / 1000000 - samples_counted;
     samples_counted += due;
     return due > UINT32_MAX ? UINT32_MAX : (uint32_t)due;
 }
@@ -51,7 +56,7 @@ void board_wait(void)
 {
     struct pollfd watched[LINES + 1 + TCP_WATCHED];
     for (int i = 0; i < LINES; i++) {
-        watched[i].fd = lines_in[i];
+        watched[i].fd = lines[i];
         watched[i].events = POLLIN;
     }
     watched[LINES].fd = ends_with_input ? STDIN_FILENO : -1;
@@ -70,11 +75,9 @@ int board_read(enum line line)
     if (received_at[line] == received_length[line]) {
         received_at[line] = 0;
         received_length[line] = 0;
-        if (lines_in[line] >= 0)
-            received_length[line] = read(lines_in[line], received[line], sizeof received[line]);
+        if (lines[line] >= 0)
+            received_length[line] = read(lines[line], received[line], sizeof received[line]);
         if (received_length[line] <= 0) {
-            if (received_length[line] == 0 && lines_in[line] == STDIN_FILENO)
-                exit(0);
             received_length[line] = 0;
             return -1;
         }
@@ -86,7 +89,7 @@ int board_read(enum line line)
 void board_write(enum line line, const uint8_t *bytes, uint16_t length)
 {
     // What a full line does not take is lost, as on a wire that nobody reads.
-    if (write(lines_out[line], bytes, length) < 0)
+    if (write(lines[line], bytes, length) < 0)
         return;
 }
 
@@ -163,7 +166,7 @@ static void usage(const char *program)
 {
     fprintf(stderr,
             "usage: %s [--addresses FILE] [--serial] [--modbus-rtu] [--modbus-tcp PORT] [--slcan]\n"
-            "       [--pipe] [--samples FILE] [--serial-number TEXT] [--until-eof]\n",
+            "       [--samples FILE] [--serial-number TEXT] [--until-eof]\n",
             program);
     exit(2);
 }
@@ -172,7 +175,7 @@ static void usage(const char *program)
 static void open_line(enum line line, const char *scheme, const char *separator)
 {
     const char *path;
-    lines_in[line] = lines_out[line] = open_terminal(&path);
+    lines[line] = open_terminal(&path);
     printf("%s%s", scheme, path);
     if (addresses[line] != 1 || line == LINE_CAN)
         printf("%s%u", separator, addresses[line]);
@@ -193,9 +196,6 @@ void board_open(int count, char **arguments)
             printf("modbus+tcp://127.0.0.1:%d/%u\n", port, addresses[LINE_MODBUS]);
         } else if (strcmp(option, "--slcan") == 0) {
             open_line(LINE_CAN, "can+slcan://", "#");
-        } else if (strcmp(option, "--pipe") == 0) {
-            lines_in[LINE_SERIAL] = STDIN_FILENO;
-            lines_out[LINE_SERIAL] = STDOUT_FILENO;
         } else if (strcmp(option, "--until-eof") == 0) {
             ends_with_input = true;
         } else if (strcmp(option, "--samples") == 0 && value != NULL) {

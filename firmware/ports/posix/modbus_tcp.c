@@ -46,9 +46,8 @@ static void send_frame(int connection, const uint8_t *frame, uint16_t length)
 static void take(struct modbus *modbus, struct host *host)
 {
     for (;;) {
-        struct mbap *mbap = &host->mbap;
-        ssize_t size = recv(host->connection, mbap->received + mbap->length,
-                            sizeof mbap->received - mbap->length, 0);
+        uint8_t bytes[MBAP_FRAME_MAX];
+        ssize_t size = recv(host->connection, bytes, sizeof bytes, 0);
         if (size < 0 && (errno == EAGAIN || errno == EINTR))
             return;
         if (size <= 0) {
@@ -56,9 +55,8 @@ static void take(struct modbus *modbus, struct host *host)
             host->connection = 0;
             return;
         }
-        mbap->length = (uint16_t)(mbap->length + size);
         loop_samples();
-        mbap_take(mbap, modbus, send_frame, host->connection);
+        mbap_take(&host->mbap, bytes, (uint16_t)size, modbus, 1, send_frame, host->connection);
     }
 }
 

@@ -6,7 +6,6 @@
 //     --modbus-rtu          serve Modbus RTU on a pseudo-terminal; prints its URL
 //     --modbus-tcp PORT     serve Modbus TCP on 127.0.0.1, 0 being any port; prints its URL
 //     --slcan               serve CAN as text on a pseudo-terminal; prints its URL
-//     --pipe                serve it on standard input and output (for scripts, see test/replay.c)
 //     --samples FILE        write the samples: 16-bit integers, the channels one after another
 //     --serial-number TEXT  of the amplifier
 //     --until-eof           end with standard input

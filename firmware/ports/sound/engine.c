@@ -13,14 +13,13 @@
 #include <unistd.h>
 
 #define SOFT_START 10    // ms
-#define LATE_MAX 50      // ms that count against watchdogs, of one time without samples
 #define SLACK 2          // blocks by which samples may come later than their time
 #define REQUESTS_MAX 16  // pieces carried out before a block, so that its work is bounded
-#define HEADER 7         // of Modbus TCP
-#define ANY_UNIT 255
 #define ENDING_RAMP 5    // ms
 
 struct sound_format sound_format;
+
+static struct engine *notifying; // the engine of this process
 
 uint64_t engine_microseconds(void)
 {
@@ -29,18 +28,22 @@ uint64_t engine_microseconds(void)
     return (uint64_t)now.tv_sec * 1000000 + (uint64_t)now.tv_nsec / 1000;
 }
 
+static void notify(const struct amplifier *amplifier, const struct words *event);
+
 int engine_init(struct engine *engine, const struct sound_settings *settings,
                 struct counters *counters)
 {
     memset(engine, 0, sizeof *engine);
+    notifying = engine;
     engine->settings = *settings;
     engine->counters = counters;
     engine->amplifiers = settings->channels > CHANNELS_MAX ? 2 : 1;
     sound_format.rate = settings->rate;
     sound_format.channels = (uint8_t)(settings->channels / engine->amplifiers);
-    double most = settings->law == LAW_SQUARE ? 2 * settings->limit * settings->limit - 1
-                                              : settings->limit;
-    sound_format.level_max = (uint16_t)lround(most * FULL_STROKE);
+    sound_format.is_shared = engine->amplifiers > 1;
+    double highest = settings->law == LAW_SQUARE ? 2 * settings->limit * settings->limit - 1
+                                                 : settings->limit;
+    sound_format.level_max = (uint16_t)lround(highest * LEVEL_PER_UNIT);
     if (pipe(engine->wake) < 0 || fcntl(engine->wake[0], F_SETFL, O_NONBLOCK) < 0 ||
         fcntl(engine->wake[1], F_SETFL, O_NONBLOCK) < 0)
         return -1;
@@ -48,7 +51,8 @@ int engine_init(struct engine *engine, const struct sound_settings *settings,
         char *name = engine->serial_numbers[i];
         snprintf(name, sizeof engine->serial_numbers[i], i == 0 ? "%.30s" : "%.30s-2",
                  settings->serial_number);
-        amplifier_init(&engine->amplifier[i], name);
+        amplifier_init(&engine->amplifier[i], name, notify);
+        amplifier_time(&engine->amplifier[i], engine_microseconds());
         modbus_init(&engine->modbus[i], &engine->amplifier[i], (uint8_t)(i + 1));
         if (settings->is_recovering)
             amplifier_fail(&engine->amplifier[i], FAULT_INTERNAL, NO_CHANNEL);
@@ -59,56 +63,73 @@ int engine_init(struct engine *engine, const struct sound_settings *settings,
 
 // Requests and replies.
 
-static bool reply(struct engine *engine, const struct record *request, const uint8_t *head,
-                  uint16_t head_length, const uint8_t *bytes, uint16_t length)
+static bool reply(struct engine *engine, const struct record *request, const uint8_t *bytes,
+                  uint16_t length)
 {
     struct record *record = ring_free(&engine->replies);
     if (record == NULL) // a host that does not read loses replies
         return false;
     record->connection = request->connection;
     record->generation = request->generation;
-    record->length = (uint16_t)(head_length + length);
-    if (head_length > 0)
-        memcpy(record->bytes, head, head_length);
-    memcpy(record->bytes + head_length, bytes, length);
+    record->length = length;
+    memcpy(record->bytes, bytes, length);
     ring_push(&engine->replies);
     return true;
+}
+
+static void wake(struct engine *engine)
+{
+    if (write(engine->wake[1], "", 1) < 0)
+        return; // the pipe is full: the thread of the lines has enough to wake up for
+}
+
+// Send an Event to the host of the serial line.
+static void notify(const struct amplifier *amplifier, const struct words *event)
+{
+    uint8_t line[SERIAL_STUFFED_MAX + 2];
+    (void)amplifier;
+    uint16_t length =
+        notifying->has_host
+            ? serial_event(&notifying->serial[notifying->host.connection][0], event, line)
+            : 0;
+    if (length > 0 && reply(notifying, &notifying->host, line, length))
+        wake(notifying);
 }
 
 static bool serve_serial(struct engine *engine, const struct record *request)
 {
     struct serial *serial = engine->serial[request->connection];
     bool has_replied = false;
+    if (request->length == 0) {
+        engine->host = *request;
+        engine->has_host = true;
+    }
     for (unsigned i = 0; i < engine->amplifiers && request->length == 0; i++) // a new host
         serial_init(&serial[i], &engine->amplifier[i], (uint8_t)(i + 1));
     for (uint16_t at = 0; at < request->length; at++)
         for (unsigned i = 0; i < engine->amplifiers; i++) {
             uint16_t length = serial_byte(&serial[i], request->bytes[at]);
             if (length > 0)
-                has_replied |= reply(engine, request, NULL, 0, serial[i].reply, length);
+                has_replied |= reply(engine, request, serial[i].reply, length);
         }
     return has_replied;
 }
 
-// A whole frame of Modbus TCP: transaction u16, protocol u16, length u16, unit u8, PDU.
+static void send_frame(int connection, const uint8_t *frame, uint16_t length)
+{
+    (void)connection;
+    reply(notifying, notifying->answering, frame, length);
+}
+
 static bool serve_modbus(struct engine *engine, const struct record *request)
 {
-    if (request->length < HEADER)
-        return false;
-    bool has_replied = false;
-    uint8_t unit = request->bytes[6] == ANY_UNIT ? 1 : request->bytes[6];
-    for (unsigned i = 0; i < engine->amplifiers; i++) {
-        uint8_t pdu[MODBUS_PDU_MAX], head[HEADER];
-        uint16_t length = modbus_request(&engine->modbus[i], unit, request->bytes + HEADER,
-                                         (uint16_t)(request->length - HEADER), pdu);
-        if (length == 0)
-            continue;
-        memcpy(head, request->bytes, HEADER);
-        head[4] = (uint8_t)((length + 1) >> 8);
-        head[5] = (uint8_t)(length + 1);
-        has_replied |= reply(engine, request, head, HEADER, pdu, length);
-    }
-    return has_replied;
+    struct mbap *mbap = &engine->mbap[request->connection];
+    if (request->length == 0) // a new host
+        mbap->length = 0;
+    engine->answering = request;
+    mbap_take(mbap, request->bytes, request->length, engine->modbus, engine->amplifiers, send_frame,
+              request->connection);
+    return true;
 }
 
 static void serve(struct engine *engine)
@@ -124,8 +145,8 @@ static void serve(struct engine *engine)
         COUNT(engine->counters->requests, 1);
         ring_pop(&engine->requests);
     }
-    if (has_replied && write(engine->wake[1], "", 1) < 0)
-        return; // the pipe is full: the thread of the lines has enough to wake up for
+    if (has_replied)
+        wake(engine);
 }
 
 // Time and faults.
@@ -145,24 +166,14 @@ static bool has_too_many_gaps(const struct engine *engine)
     return engine->counters->frames - then < engine->settings.rate;
 }
 
-// The earlier of the sample clock and of time: samples that come late shorten what waits.
+// Say what time it is; samples may come later than that by what the device asks for at once.
 static void keep_time(struct engine *engine, uint32_t frames)
 {
     uint64_t now = engine_microseconds();
-    double rate = engine->settings.rate, slack = SLACK * (double)frames;
-    double passed = engine->rendered_at == 0
-                        ? frames
-                        : (double)(now - engine->rendered_at) * rate / 1e6;
-    engine->rendered_at = now;
-    engine->clock_ahead += passed - frames;
-    if (engine->clock_ahead < -slack)
-        engine->clock_ahead = -slack;
-    if (engine->clock_ahead <= slack)
-        return;
-    double late = engine->clock_ahead - slack, most = LATE_MAX * rate / 1000;
-    engine->clock_ahead = slack;
-    for (unsigned i = 0; i < engine->amplifiers; i++)
-        amplifier_late(&engine->amplifier[i], (uint32_t)(late < most ? late : most));
+    for (unsigned i = 0; i < engine->amplifiers; i++) {
+        engine->amplifier[i].slack = (uint32_t)(SLACK * UINT64_C(1000000) * frames / SAMPLE_RATE);
+        amplifier_time(&engine->amplifier[i], now);
+    }
 }
 
 static void measure(struct engine *engine)

@@ -13,7 +13,7 @@
 
 #include "amplifier.h"
 #include "counters.h"
-#include "modbus.h"
+#include "mbap.h"
 #include "ring.h"
 #include "serial.h"
 
@@ -41,11 +41,13 @@ struct engine {
     char serial_numbers[AMPLIFIERS_MAX][33];
     struct serial serial[CONNECTIONS][AMPLIFIERS_MAX];
     struct modbus modbus[AMPLIFIERS_MAX];
+    struct mbap mbap[CONNECTIONS];
     struct ring requests, replies;
+    const struct record *answering; // the request whose replies are made
     int wake[2];                 // pipe to the thread of the lines: a reply waits
     uint32_t risen[AMPLIFIERS_MAX]; // samples of the soft start
-    double clock_ahead;          // samples by which time is ahead of the samples made
-    uint64_t rendered_at;        // us, 0: never
+    bool has_host;               // of the serial line
+    struct record host;          // with which it came
     uint64_t gaps_at[GAPS_MAX];  // frames at the last ones
     uint32_t gap_count;
     uint32_t wants_stream, has_stream; // handing over to the sound thread and that it is done

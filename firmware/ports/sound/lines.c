@@ -15,9 +15,7 @@
 #include <unistd.h>
 
 #define PRIORITY 4     // SCHED_RR, below that of sound threads
-#define PIECE 250      // bytes of the serial protocol in a record
-#define HEADER 7       // of Modbus TCP
-#define FRAME_MAX (HEADER + MODBUS_PDU_MAX)
+#define PIECE 250      // bytes in a record
 #define WAIT 100       // ms
 #define SILENT_RATE 1  // ms between samples that nobody hears
 #define WATCHED (CONNECTIONS + 3)
@@ -25,7 +23,7 @@
 static struct line {
     int connection; // -1: none
     uint32_t generation;
-    uint8_t received[FRAME_MAX];
+    uint8_t received[PIECE];
     uint16_t length;
 } lines[CONNECTIONS];
 
@@ -61,28 +59,9 @@ static void close_host(struct line *line)
     line->connection = -1;
 }
 
-// Pass on the whole frames of Modbus TCP. What is no frame is discarded with all that came with it.
-static void take_frames(struct line *line)
-{
-    while (line->length >= HEADER) {
-        uint16_t following = (uint16_t)(line->received[4] << 8 | line->received[5]);
-        uint16_t size = (uint16_t)(6 + following);
-        if (line->received[2] != 0 || line->received[3] != 0 || following < 2 ||
-            following > MODBUS_PDU_MAX + 1) {
-            line->length = 0;
-            return;
-        }
-        if (line->length < size || !pass_on(line, line->received, size))
-            return;
-        line->length = (uint16_t)(line->length - size);
-        memmove(line->received, line->received + size, line->length);
-    }
-}
-
 static void take(struct line *line)
 {
-    bool is_serial = engine->settings.protocol == SERIAL_PROTOCOL;
-    uint16_t room = (uint16_t)((is_serial ? PIECE : FRAME_MAX) - line->length);
+    uint16_t room = (uint16_t)(PIECE - line->length);
     ssize_t size = 0;
     if (room > 0) {
         size = read(line->connection, line->received + line->length, room);
@@ -95,9 +74,7 @@ static void take(struct line *line)
         }
         line->length = (uint16_t)(line->length + size);
     }
-    if (!is_serial)
-        take_frames(line);
-    else if (pass_on(line, line->received, line->length))
+    if (pass_on(line, line->received, line->length))
         line->length = 0;
 }
 

@@ -9,34 +9,38 @@
 struct sound_format {
     uint32_t rate;      // samples per second, a multiple of 1000
     uint8_t channels;   // of each amplifier
-    uint16_t level_max; // 0.0001 of full stroke
+    bool is_shared;     // two amplifiers are on the line
+    uint16_t level_max; // 0.0001 of full level
 };
 extern struct sound_format sound_format;
 
 #define VENDOR "ERA haptics"
 #define PRODUCT "Software amplifier"
-#define FIRMWARE_VERSION "1.0"
+#define FIRMWARE_VERSION "2.0"
 
 #define CHANNELS (sound_format.channels)
 #define CHANNELS_MAX 16
+#define LAYERS 8
+#define VOICES 16
+#define STREAM_WORDS 4096
+#define ENVELOPE_KNOTS 32
+
 #define SAMPLE_RATE (sound_format.rate)
 #define SAMPLES_PER_MS (SAMPLE_RATE / 1000)
 
-#define FEATURES 0x019E // watchdog, staging, valid_for, phase, voltage, broadcast
+#define SERIAL_IS_SHARED (sound_format.is_shared)
+#define FEATURES (FEATURE_OUTPUT | FEATURE_EVENTS)
 
-#define FREQUENCY_MIN (20 * FREQUENCY_PER_HZ)
-#define FREQUENCY_MAX (2000 * FREQUENCY_PER_HZ)
+#define FREQUENCY_MIN (20 * FREQUENCY_PER_UNIT)
+#define FREQUENCY_MAX (2000 * FREQUENCY_PER_UNIT)
 #define LEVEL_MAX (sound_format.level_max)
-#define VOICES 8
 #define SQUARE_LAW 0 // the law is applied to what amplifier_forces makes
-#define WATCHDOG_MIN 100
-#define WATCHDOG_MAX 2000
-
-#define ENVELOPE_SLOTS 16
-#define ENVELOPE_KNOTS 32
+#define RAMP_MAX WIRE_RAMP_MAX
+#define WATCHDOG_MIN WIRE_WATCHDOG_MIN
+#define WATCHDOG_MAX WIRE_WATCHDOG_MAX
 #define ENVELOPE_STEP_MIN 10
-#define ENVELOPE_STEP_MAX 1000
+#define ENVELOPE_STEP_MAX WIRE_ENVELOPE_STEP_MAX
 
-#define FAULTS_KEPT 8
+#define FAULTS_KEPT 16
 
 #endif

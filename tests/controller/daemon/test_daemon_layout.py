@@ -62,7 +62,7 @@ async def test_daemon_plays_effects_by_region_and_by_name(
         await era.touch([])
         async with holding(era, ON_QUIET):
             await until(lambda: [each.effect for each in view.contact_statuses()] == [None])
-            await until(lambda: not any(bench.far.device.status().levels))
+            await until(lambda: not any(bench.far.summary().levels))
             assert (await era.status()).silence_reason
             for effect, place, level in (
                 ("alert", ON_PAD, None),  # no finger there
@@ -92,7 +92,7 @@ async def test_click_ends_on_wire_while_finger_rests(tmp_path: Path) -> None:
     async with ready_daemon(tmp_path, "layout: layout.yaml\n") as (bench, era):
         await era.arm("me", lease_s=60)
         async with holding(era, ON_PAD, far=bench.far):
-            await until(lambda: not any(bench.far.device.status().levels))
+            await until(lambda: not any(bench.far.summary().levels))
             await until(lambda: bench.daemon._publisher.view.silenced)
             assert len((await era.status()).contacts) == 1
 

@@ -16,12 +16,14 @@ import pytest
 from controller.daemon.fault_dumps import write_dump
 from controller.daemon.latency import LatencyStatistics
 from controller.daemon.log import JsonFormatter, LogHandler, LogThread, RateLimitFilter
-from controller.daemon.message_recorder import MessageRecord, MessageRecorder, RecordedBackend
+from controller.daemon.message_recorder import MessageRecord, MessageRecorder
 from controller.daemon.service_manager import ServiceManager
-from controller_bench import FarEnd
-from drivers.backend import Backend
-from drivers.protocol.messages import AmplifierState, Arm, Fault, Status, Stop
+from controller_bench import BenchLines, FarEnd
+from drivers.errors import LinkTimeout
+from registry.limits import GuardLimits
 from virtual_loop import in_virtual_time
+
+LIMITS = GuardLimits(40.0, 500.0, 1.0)
 
 
 def record(message: str, line: int = 1, **extra: object) -> logging.LogRecord:
@@ -212,11 +214,10 @@ def test_service_manager_may_be_missing() -> None:
 def test_dump_is_json_lines_for_owner_only(tmp_path: Path) -> None:
     """The cause first, then each message with its content by name; only the newest files stay."""
     folder = tmp_path / "new" / "folder"
-    status = Status(AmplifierState.FAULT, Fault.ARC, 7, False, 25.0, 0.0, (0.5, 0.0), 0.0)
     records = [
-        MessageRecord(1.5, "main", "out", Arm(watchdog=0.25, session=9)),
-        MessageRecord(1.6, "main", "in", status),
-        MessageRecord(1.7, "main", "none", "LinkTimeout: no reply"),
+        MessageRecord(1.5, "main", "out", "Arm", {"watchdog": 250, "session": 9}),
+        MessageRecord(1.6, "main", "in", "Reply", {"state": 6, "levels": [5000, 0]}),
+        MessageRecord(1.7, "main", "none", "no reply"),
     ]
     for _ in range(4):
         path = write_dump(folder, records, cause="arc\nx", keep=2)
@@ -224,10 +225,9 @@ def test_dump_is_json_lines_for_owner_only(tmp_path: Path) -> None:
     head, *lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
     assert head["cause"] == "arc\nx"
     where = {"time_s": 1.5, "link": "main", "way": "out"}
-    assert lines[0] == {**where, "message": "Arm", "content": {"watchdog": 0.25, "session": 9}}
-    content = lines[1]["content"]
-    assert (content["state"], content["fault"], content["levels"]) == ("FAULT", "ARC", [0.5, 0.0])
-    assert lines[2]["content"] == "LinkTimeout: no reply"
+    assert lines[0] == {**where, "message": "Arm", "content": {"watchdog": 250, "session": 9}}
+    assert lines[1]["content"] == {"state": 6, "levels": [5000, 0]}
+    assert (lines[2]["way"], lines[2]["message"]) == ("none", "no reply")
     assert len(list(folder.iterdir())) == 2
 
 
@@ -244,23 +244,39 @@ def test_latency_percentiles_are_values_that_occurred() -> None:
     assert sum(counts.values()) == summary.count == 1000
 
 
-def test_recorded_backend_forwards_every_member() -> None:
-    """A member that were not forwarded would have the default of the base class."""
-    members = {name for name in vars(Backend) if not name.startswith("_")}
-    assert members <= vars(RecordedBackend).keys()
+@in_virtual_time
+async def test_messages_are_recorded_by_amplifier() -> None:
+    """Requests and replies by name, with their values; what has no reply, too."""
+    far_end, recorder = FarEnd(), MessageRecorder()
+    host = await BenchLines({"main": far_end}).amplifier("", LIMITS, name="main")
+    recorder.follow({"main": host})
+    await host.open()
+    far_end.is_mute = True
+    with pytest.raises(LinkTimeout):
+        await host.read_status()
+    found = [(each.direction, each.message) for each in recorder.records()]
+    assert found[:5] == [
+        *(("open", ""), ("out", "Hello"), ("in", "Reply"), ("out", "GetCaps"), ("in", "Reply")),
+    ]
+    assert found[-2:] == [("out", "GetStatus"), ("none", "no reply")]
+    assert {each.link for each in recorder.records()} == {"main"}
 
 
 @in_virtual_time
 async def test_failing_recorder_prevents_no_stop() -> None:
-    """The wire gets the Stop, and the caller its reply."""
+    """The wire gets the Stop, and the caller its outcome."""
 
     class FailingRecorder(MessageRecorder):
-        def add(self, link: str, way: str, what: object) -> None:
-            raise MemoryError
+        fails = False
 
-    far_end = FarEnd()
-    backend = RecordedBackend(far_end, "main", FailingRecorder())
-    await backend.open()
-    reply = await backend.exchange(Stop(ramp=0.005), timeout=1.0)
-    assert isinstance(reply, Status)
-    assert far_end.requests(Stop)
+        def add(self, link: str, direction: str, message: str, content: object = "") -> None:
+            if self.fails:
+                raise MemoryError
+
+    far_end, recorder = FarEnd(), FailingRecorder()
+    host = await BenchLines({"main": far_end}).amplifier("", LIMITS, name="main")
+    recorder.follow({"main": host})
+    await host.open()
+    recorder.fails = True
+    assert (await host.stop()).is_confirmed
+    assert far_end.requests("Stop")

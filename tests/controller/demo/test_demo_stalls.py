@@ -5,8 +5,7 @@ import contextlib
 
 from controller.demo.run import keep_armed, noting_refusals
 from controller.loop.observer import Observer
-from controller_bench import running
-from drivers.protocol.messages import AmplifierState
+from controller_bench import ENABLED, running
 from virtual_loop import in_virtual_time
 
 
@@ -21,9 +20,9 @@ async def test_amplifiers_are_armed_again_after_a_stall() -> None:
             keep_armed(bench.controller, refused, recovered=lambda: recovered.append(clock()))
         )
         bench.far_end.amplifier.tick(clock() + 3.0)
-        assert bench.far_end.state is AmplifierState.FAULT
+        assert bench.far_end.state == "FAULT"
         await asyncio.sleep(1.0)
-        assert bench.far_end.state is AmplifierState.OPERATION_ENABLED
+        assert bench.far_end.state == ENABLED
         assert len(recovered) == 1
         bench.touch((1, 0.5, 0.5))
         await asyncio.sleep(0.05)

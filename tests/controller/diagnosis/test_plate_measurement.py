@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,11 +15,9 @@ from controller.diagnosis.plate_measurement import (
 )
 from controller.diagnosis.plate_sensors import PlateSensor
 from controller.diagnosis.tone_player import TonePlayer
-from drivers.amplifier import Amplifier
 from drivers.errors import CommandError, CommandRefused
-from drivers.protocol.messages import AmplifierState, Reading, ReadingState, SensorReading
-from drivers.protocol.messages import ToneReading as Heard
-from drivers.registry import open_backend
+from drivers.host.sensors import Reading, SensorReading, measure_tones
+from drivers.opening import Lines
 from memory_machine import live_in_memory
 from model.errors import InputError
 from model.identification.forward import Sensor
@@ -31,12 +29,13 @@ from model.structure.point_load import PointLoad
 from model.table.build import build_table
 from model.table.question import Question
 from model.vibration.direct import direct_responder
-from sim.amplifier.amplifier import SimulatedAmplifier
+from rig_on_wire import FarSide, far_side
+from sim.amplifier.contract import Amplifier
 from sim.bench import bench
 from sim.bench.sensing import PlateSensor as SimulatedSensor
 from sim.sensors.accelerometer import Accelerometer, Accelerometers
 from virtual_loop import run_virtual
-from wires import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers, patient
+from wires import SHARED_WIRES, WIRES, on_two_amplifiers
 
 NOISE = 0.01  # m/s²/sqrt(Hz), of each foot: a thousandth of what it hears in a reading
 FINGERS = (
@@ -89,11 +88,6 @@ def noisy_feet(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "_feet", noisy)
 
 
-def amplifiers_of(far: FarSide) -> Mapping[str, Amplifier]:
-    """The amplifiers of a far side, by name, not yet open."""
-    return {name: Amplifier(open_backend(patient(url))) for name, url in far.urls.items()}
-
-
 async def measured(
     rig: Rig,
     far: FarSide,
@@ -102,13 +96,14 @@ async def measured(
     on_step: Callable[[int, int], None] = lambda done, of: None,
 ) -> PlateMeasurement:
     """Measure a rig at a far side; then all its amplifiers are silent and disarmed."""
-    amplifiers = amplifiers_of(far)
     try:
-        return await PlateSelfMeasurement(rig, amplifiers, is_quick=is_quick, on_step=on_step).run()
+        return await PlateSelfMeasurement(
+            rig, Lines, far.urls, is_quick=is_quick, on_step=on_step
+        ).run()
     finally:
         far.silent_from()
         for each in far.bench.amplifiers.values():
-            assert each.state is AmplifierState.SWITCH_ON_DISABLED
+            assert each.state == "SWITCH_ON_DISABLED"
             assert not any(output for output in each.outputs)
 
 
@@ -116,11 +111,11 @@ async def contrasts(rig: Rig, far: FarSide, known: Rig) -> list[float]:
     """Contrast [dB] of a known rig's patterns at pairs of fingers, measured in time."""
     sensors = Accelerometers(far.bench)
     table = build_table(known, frequencies=TONES, drive_mode="phased")
-    player = TonePlayer(rig, amplifiers := amplifiers_of(far))
-    (amplifier,) = amplifiers.values()
+    player = TonePlayer(rig, Lines, far.urls)
     found = []
     try:
         await player.open()
+        (amplifier,) = player.amplifiers.values()
         await player.arm()
         for target, quiet in FINGERS:
             sensors.place([Accelerometer("T", *target), Accelerometer("Q", *quiet)])
@@ -130,9 +125,9 @@ async def contrasts(rig: Rig, far: FarSide, known: Rig) -> list[float]:
                 await asyncio.sleep(0.05)
                 await player.heartbeat()
             (frequency,) = {command.frequency for command in plays.values()}
-            reading = await amplifier.measure([frequency], 0.1)
+            reading = await measure_tones(amplifier, [frequency], 0.1)
             await player.heartbeat()
-            one, other = (each.tones[0].amplitude for each in reading.sensors[-2:])
+            one, other = (each.tones[0][0] for each in reading.sensors[-2:])
             found.append(20 * math.log10(one / other))
     finally:
         await player.close()
@@ -266,7 +261,7 @@ def test_amplifier_without_sensors_is_refused(
         async with far_side(WIRES["serial"], truth) as far:
             await measured(rig, far)
 
-    monkeypatch.setattr(SimulatedAmplifier, "attach", lambda amplifier, sensing: None)
+    monkeypatch.setattr(Amplifier, "attach", lambda amplifier, sensing: None)
     with pytest.raises(CommandError, match="amplifier main must measure"):
         run_virtual(run())
 
@@ -289,9 +284,8 @@ def test_velocity_and_displacement_become_acceleration(derivatives: int) -> None
     """Of 0.1 mm at 100 Hz, read as m/s², m/s or m: 39.5 m/s², in antiphase to the displacement."""
     omega = 2 * math.pi * 100
     amplitude, phase = 1e-4 * omega ** (2 - derivatives), 90.0 * (2 - derivatives)
-    reading = Reading(
-        1, ReadingState.COMPLETE, sensors=(SensorReading((Heard(amplitude, phase),)),)
-    )
+    heard = SensorReading(is_overloaded=False, tones=((amplitude, phase),))
+    reading = Reading(1, "COMPLETE", 0.0, 0.0, 7, 1, (heard,))
     sensor = PlateSensor("main", 0, Sensor("SW", "SW"), derivatives, 1000.0)
     (found,) = sensor.accelerations(reading, np.array([100.0]))
     assert found == pytest.approx(-39.478, rel=1e-4)

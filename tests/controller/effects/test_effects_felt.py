@@ -69,12 +69,12 @@ def table() -> LocalizationTable:
 
 
 @cache
-def pressed(case: Case, wire: str, **options: float) -> list[Felt]:
+def pressed(case: Case, wire: str, *, is_shaped: bool = True) -> list[Felt]:
     """What equal presses feel."""
     where = "on_move" if case.effect.is_for_motion else "on_press"
     region = Region("all", Circle(*CENTRE, 0.06), **{where: "it"})
     layout = SurfaceLayout((region,), {"it": case.effect}, elsewhere=None)
-    chain = Pressed(smooth_rig(), table(), layout, wire, options=dict(options))
+    chain = Pressed(smooth_rig(), table(), layout, wire, is_shaped=is_shaped)
     presses = chain.press(*[case.way] * PRESSES.get(wire, FEW), held=case.held)
     assert all(len(each) == 1 for each in presses)
     return [felt for (felt,) in presses]
@@ -112,5 +112,5 @@ def test_effect_is_felt_as_promised_and_alike_at_every_press(name: str, wire: st
 def test_no_effect_starts_more_than_10_ms_later_than_along_a_plain_ramp(wire: str) -> None:
     """The slowest press by default, against the slowest without shaped onsets."""
     shaped = pressed(CASES["buzz"], wire)
-    plain = pressed(replace(CASES["buzz"], held=0.15), wire, max_loading_time=0.0)
+    plain = pressed(replace(CASES["buzz"], held=0.15), wire, is_shaped=False)
     assert max(felt.delay for felt in shaped) - max(felt.delay for felt in plain) <= 0.010

@@ -81,7 +81,7 @@ def test_check_says_what_the_plate_behind_a_wire_makes_felt(effect: Effect, rest
         layout,
         "serial",
         resting=() if touch.resting is None else (touch.resting,),
-        options={"max_loading_time": 0.0},
+        is_shaped=False,
     )
     ((felt,),) = chain.press(lambda since: touch.at, held=0.42)
     assert touch.frequencies == (felt.frequency,)

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import pytest
 
@@ -26,6 +26,7 @@ class Taking:
     """A controller that keeps what it answers by."""
 
     drive_mode = "switched"
+    amplifiers: ClassVar[dict[str, object]] = {}
 
     def __init__(self) -> None:
         self.taken: list[LocalizationTable] = []
@@ -113,7 +114,6 @@ async def opened(folder: Path) -> tuple[Learning, Taking]:
         small_table(),
         None,
         folder / "learned.npz",
-        amplifiers={},
         controller=cast(Controller, taking),
     )
     learning.open()

@@ -1,57 +1,55 @@
-"""Capabilities of the open amplifiers, and envelopes that their wires load in time."""
+"""Capabilities of the open amplifiers together, and the knots that their wires carry in time."""
 
+import cmath
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
 
 from controller.loop.capabilities import playback_capabilities
-from controller.loop.envelopes import (
-    EnvelopeSupport,
-    ending_slots,
-    envelope_support,
-    onset_slots,
-    wire_envelopes,
-)
-from drivers.command import Envelope as WireEnvelope
-from drivers.command import Knot
-from drivers.protocol.messages import Capabilities, Feature
-from drivers.protocol.wire_times import WireTimes
+from controller.loop.envelopes import EnvelopeSupport, envelope_support, shapes_of, thinned
+from drivers.host.ledger import Ledger
+from drivers.protocol.records import Values
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
 from model.structure.material import Material
 from model.structure.plate import Plate
-from model.table.pattern import Pattern
 from model.transients.envelope import BaseEnvelope
-from model.vibration.excitation import Tone
 from registry.limits import GuardLimits
-from sim.amplifier.amplifier import capabilities
-from stub_wire_times import StubWireTimes
+from sim.amplifier.contract import capabilities
 
-FINE = capabilities(4)
-BOTH, ONSETS, ENDINGS = (
-    EnvelopeSupport(True, True),
-    EnvelopeSupport(True, False),
-    EnvelopeSupport(False, True),
-)
+LIMITS = GuardLimits(40.0, 500.0, 0.8)
 
 
 @dataclass
+class Wire:
+    """A wire on which a word takes a time [s]."""
+
+    word: float
+
+    def transit(self, words: int) -> float:
+        """In proportion to the words."""
+        return words * self.word
+
+
+@dataclass(eq=False)
+class Line:
+    """A line with a wire."""
+
+    wire: Wire = field(default_factory=lambda: Wire(0.0))
+
+
 class Opened:
-    """An amplifier that takes a time [s] for each knot."""
+    """An amplifier with some capabilities of its own."""
 
-    capabilities: Capabilities = FINE
-    bus: str | None = None
-    knot_time: float = 0.0
-
-    @property
-    def wire_times(self) -> WireTimes:
-        """In proportion to the knots."""
-        return StubWireTimes(knot_takes=self.knot_time)
+    def __init__(self, line: Line | None = None, **changed: int) -> None:
+        self.line = line or Line()
+        self.capabilities: Values = {**capabilities(4), **changed}
+        self.ledger = Ledger(LIMITS, self.capabilities)
 
 
 def rig() -> Rig:
@@ -65,134 +63,124 @@ def rig() -> Rig:
         ),
         wiring={"A": Channel("left", 3), "C": Channel("right", 0), "B": Channel("left", 1)},
         amplifiers={"left": "fake://", "right": "fake://"},
-        limits=GuardLimits(40.0, 500.0, 0.8),
+        limits=LIMITS,
     )
+
+
+def both(left: Opened | None = None, right: Opened | None = None) -> Mapping[str, Any]:
+    """The two amplifiers of the rig."""
+    return {"left": left or Opened(), "right": right or Opened()}
 
 
 @pytest.mark.parametrize(
     ("steps", "mode"),
     [
-        ([(1e-4, 0.01), (1e-4, 0.01)], "phased"),
-        ([(1e-4, 0.01), (1e-4, 180.0)], "signed"),
-        ([(1e-4, 360.0), (1e-4, 0.01)], "graded"),
-        ([(1e-4, 0.01), (1.0, 0.01)], "switched"),
+        ([(1, 1), (1, 1)], "phased"),
+        ([(1, 1), (1, 18_000)], "signed"),
+        ([(10_000, 1), (1, 1)], "switched"),
     ],
 )
 def test_capabilities_choose_the_best_common_drive_mode(
-    steps: list[tuple[float, float]], mode: str
+    steps: list[tuple[int, int]], mode: str
 ) -> None:
-    """By the steps of level and phase [degrees] of each amplifier."""
-    left, right = (
-        Opened(replace(FINE, level_step=level, phase_step=phase)) for level, phase in steps
-    )
-    capabilities = playback_capabilities(rig(), {"left": left, "right": right})
-    assert capabilities.drive_mode == mode
-    assert capabilities.playable[-1] == mode
-
-
-@pytest.mark.parametrize(
-    ("left", "right", "is_coherent"),
-    [
-        (Feature(0), Feature(0), True),
-        (Feature.PHASE, Feature(0), False),
-        (Feature(0), Feature.STAGING, False),
-        (Feature.VALID_FOR | Feature.WATCHDOG | Feature.BROADCAST, Feature(0), True),
-    ],
-)
-def test_capabilities_need_phases_and_a_common_start(
-    left: Feature, right: Feature, is_coherent: bool
-) -> None:
-    """Else one ERA plays at a time; of what each amplifier lacks."""
-    each = {
-        name: Opened(replace(FINE, features=FINE.features & ~lacking))
-        for name, lacking in (("left", left), ("right", right))
-    }
-    capabilities = playback_capabilities(rig(), each)
-    assert (capabilities.playable == ("switched",)) is not is_coherent
-    assert capabilities.eras_at_most == (2 if is_coherent else 1)
+    """By the steps of level (1e-4) and phase (0.01 degrees) of each amplifier."""
+    left, right = (Opened(level_step=level, phase_step=phase) for level, phase in steps)
+    found = playback_capabilities(rig(), both(left, right))
+    assert found.drive_mode == mode
+    assert found.playable[-1] == mode
 
 
 def test_capabilities_refuse_an_unplayable_drive_mode() -> None:
     """With those that can be played."""
-    plain = {name: Opened(replace(FINE, phase_step=360.0)) for name in ("left", "right")}
+    plain = both(Opened(phase_step=18_000), Opened(phase_step=18_000))
     assert playback_capabilities(rig(), plain, drive_mode="switched").drive_mode == "switched"
-    with pytest.raises(InputError, match=r"switched, graded.*phased"):
+    with pytest.raises(InputError, match=r"switched, graded, signed.*phased"):
         playback_capabilities(rig(), plain, drive_mode="phased")
 
 
+def test_capabilities_refuse_a_channel_that_is_not_there() -> None:
+    """ERA A is wired to channel 3 of an amplifier that has two."""
+    with pytest.raises(InputError, match=r"ERA A .*0 to 1 on amplifier left, got 3; .*rig file"):
+        playback_capabilities(rig(), both(Opened(channels=2)))
+
+
 def test_capabilities_are_the_tightest_limits() -> None:
-    """Of the rig and all amplifiers."""
-    left = Opened(replace(FINE, frequency_min=50.0, level_max=0.5))
-    right = Opened(replace(FINE, frequency_max=300.0))
-    capabilities = playback_capabilities(rig(), {"left": left, "right": right})
-    assert capabilities.frequencies == (50.0, 300.0)
-    assert capabilities.max_amplitudes == pytest.approx({"A": 5e-5, "B": 1e-4, "C": 8e-5})
+    """Of the rig and all amplifiers: 50 Hz and half of full level, and 300 Hz."""
+    left = Opened(frequency_min=1000, level_max=5000)
+    found = playback_capabilities(rig(), both(left, Opened(frequency_max=6000)))
+    assert found.frequencies == (50.0, 300.0)
+    assert found.max_amplitudes == pytest.approx({"A": 5e-5, "B": 1e-4, "C": 8e-5})
 
 
 @pytest.mark.parametrize(
-    ("left", "right", "expected"),
+    ("words", "is_shared", "expected"),
     [
-        (Opened(), Opened(), BOTH),
-        # An onset has 20 knots on the wire, an ending 7; the left amplifier has two of each.
-        (Opened(knot_time=0.015 / 40), Opened(), BOTH),
-        (Opened(knot_time=0.0151 / 40), Opened(), ENDINGS),
-        (Opened(knot_time=0.0191 / 14), Opened(), EnvelopeSupport(False, False)),
-        # Two amplifiers on one wire wait for each other, on two they do not.
-        (Opened(knot_time=0.35e-3), Opened(knot_time=0.35e-3), BOTH),
-        (Opened(FINE, "bus", 0.35e-3), Opened(FINE, "bus", 0.35e-3), ENDINGS),
-        (Opened(replace(FINE, envelope_knots=19)), Opened(), ENDINGS),
-        (Opened(), Opened(replace(FINE, envelope_knots=6)), EnvelopeSupport(False, False)),
-        (Opened(replace(FINE, envelope_slots=3)), Opened(), ONSETS),
-        (Opened(replace(FINE, envelope_slots=1)), Opened(), EnvelopeSupport(False, False)),
-        (Opened(replace(FINE, envelope_step_min=0.01)), Opened(), EnvelopeSupport(False, False)),
+        (10_000, False, (20, 7)),
+        (25 + 4 * 27, False, (20, 7)),
+        (25 + 4 * 26, False, (19, 7)),
+        (22 + 4 * 12, False, (5, 7)),
+        (22 + 4 * 11, False, (11, 0)),
+        (22 + 4 * 1, False, (1, 0)),
+        (22 + 3, False, (0, 0)),
+        (0, False, (0, 0)),
+        (36 + 6 * 12, True, (5, 7)),
+        (36 + 6 * 11, True, (11, 0)),
     ],
 )
-def test_envelope_support_needs_capability_and_loading_time(
-    left: Opened, right: Opened, expected: EnvelopeSupport
+def test_envelopes_have_as_many_knots_as_wires_carry(
+    words: int, is_shared: bool, expected: tuple[int, int]
 ) -> None:
-    """Knots, slots and steps of every amplifier, and 20 ms for every wire.
+    """So many words in 10 ms, on a wire for each amplifier, or on one for both.
 
-    Of these 0.5 ms for each exchange, and 4 ms for shaping an onset.
+    By hand: two channels on the left have 22 words of heads, 3 more beyond 120 words, and 4 words
+    for each knot; with the third channel 36 and 6. An ending has 7 knots, an onset at least 5.
     """
-    assert (
-        envelope_support(rig(), {"left": left, "right": right}, max_loading_time=0.020) == expected
-    )
+    lines = [Line(Wire(0.010 / (words + 0.5))) for _ in range(2)]
+    left, right = (Opened(lines[0 if is_shared else number]) for number in range(2))
+    assert envelope_support(rig(), both(left, right)) == EnvelopeSupport(*expected)
 
 
-def test_envelope_support_is_empty_without_loading_time() -> None:
-    """However fast the wire is."""
-    assert not envelope_support(rig(), {"left": Opened(), "right": Opened()}, max_loading_time=0.0)
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({"knots": 19}, (19, 7)),
+        ({"knots": 6}, (6, 0)),
+        ({"knots": 0}, (0, 0)),
+        ({"envelope_step_min": 100}, (0, 0)),
+        ({"set_words": 22 + 4 * 20}, (13, 7)),
+    ],
+)
+def test_envelopes_need_capabilities(changed: dict[str, int], expected: tuple[int, int]) -> None:
+    """Knots, steps of 5 ms and words of a set, of every amplifier."""
+    found = envelope_support(rig(), both(Opened(**changed)))
+    assert found == EnvelopeSupport(*expected)
 
 
-def test_wire_envelopes_by_hand() -> None:
-    """Levels in strokes, phases in degrees, without the last knot; a slot each, onsets first."""
-    pattern = Pattern(
-        {"A": Tone(110.0, 5e-5)},
-        0.02,
-        20.0,
-        None,
-        None,
-        onset={
+def test_shapes_by_hand() -> None:
+    """Levels in strokes, without the last knot."""
+    found = shapes_of(
+        {
             "B": BaseEnvelope(110.0, 0, (1e-4j, -2e-4, 0)),
             "A": BaseEnvelope(110.0, 0, (2e-5, 5e-5)),
         },
-        ending={"A": BaseEnvelope(110.0, 5e-5, (-1e-5j, 0))},
+        rig(),
     )
-    assert onset_slots(rig()) == {"A": 1, "B": 2, "C": 1}
-    assert ending_slots(rig()) == {"A": 3, "B": 4, "C": 2}
-    loads = wire_envelopes(pattern, rig())
-    assert loads["right"] == ()
-    close: Callable[[float], Any] = pytest.approx
-    assert loads["left"] == (
-        WireEnvelope(2, 0.005, (Knot(close(0.5), close(90.0)), Knot(close(1.0), close(180.0)))),
-        WireEnvelope(1, 0.005, (Knot(close(0.2), 0.0),)),
-        WireEnvelope(3, 0.005, (Knot(close(0.1), close(-90.0)),)),
-    )
+    assert found["A"].knots == (pytest.approx(0.2),)
+    assert found["B"].step == 0.005
+    assert found["B"].knots == (pytest.approx(0.5j), pytest.approx(-1.0))
 
 
-def test_wire_envelopes_round_full_stroke_to_one() -> None:
-    """A rounding error above it would be refused by the guard."""
-    full = complex(1e-4 * math.cos(1.0), 1e-4 * math.sin(1.0)) * (1 + 1e-12)
-    pattern = Pattern({}, 0.02, 20.0, None, None, onset={"A": BaseEnvelope(110.0, 0, (full, 0))})
-    ((envelope,), _) = wire_envelopes(pattern, rig()).values()
-    assert envelope.knots[0].level == 1.0
+def test_shapes_round_full_stroke_to_one() -> None:
+    """A rounding error above it would be refused by the ledger."""
+    full = cmath.rect(1e-4 * (1 + 1e-12), 1.0)
+    (knot,) = shapes_of({"A": BaseEnvelope(110.0, 0, (full, 0))}, rig())["A"].knots
+    assert abs(knot) <= 1.0 + math.ulp(1.0)
+
+
+def test_thinned_envelope_follows_the_same_lines() -> None:
+    """Six steps of 5 ms become three of 10, whose knots are those of before."""
+    line = BaseEnvelope(110.0, 0, (1.0, 2.0, 4.0, 5.0, 7.0, 6.0))
+    (found,) = thinned({"A": line}, knots=2).values()
+    assert (found.step, found.knots) == (0.01, (2.0, 5.0, 6.0))
+    (whole,) = thinned({"A": line}, knots=5).values()
+    assert whole is line

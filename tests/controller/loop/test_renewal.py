@@ -8,21 +8,15 @@ import pytest
 
 from controller.sources.contacts import Change, ContactTracker
 from controller.sources.touch import Touch, TouchFrame
-from controller_bench import FINGER, Bench, running
-from drivers.command import CommandSet
-from drivers.protocol.messages import Apply
+from controller_bench import FINGER, Bench, Sent, running
 from virtual_loop import in_virtual_time
 
 PROMISED = 0.001  # s; rounding of times
 
 
-def vibrations(bench: Bench) -> list[tuple[float, CommandSet]]:
+def vibrations(bench: Bench) -> list[tuple[float, Sent]]:
     """When each set that vibrates was sent [s], and the set."""
-    return [
-        (time, request.command_set)
-        for time, request in bench.far_end.asked
-        if isinstance(request, Apply) and not request.command_set.is_silent
-    ]
+    return [(each.time, each) for each in bench.far_end.sets() if not each.is_silent]
 
 
 def frame(*touches: Touch, timeout: float) -> TouchFrame:
@@ -32,9 +26,9 @@ def frame(*touches: Touch, timeout: float) -> TouchFrame:
 
 @in_virtual_time
 async def test_vibration_is_renewed_while_its_contact_is_confirmed() -> None:
-    """Each set lasts two seconds and is followed before its end by one that continues its tones.
+    """It lasts two seconds, and before its end its time begins anew, without any command.
 
-    They differ in nothing that is felt, and no other pattern is reported.
+    No other pattern is reported.
     """
     async with running() as bench:
         await bench.hold(FINGER, seconds=10.0)
@@ -42,13 +36,11 @@ async def test_vibration_is_renewed_while_its_contact_is_confirmed() -> None:
         (first, *later) = [each for _, each in sent]
         assert 9 <= len(later) <= 10
         assert {each.valid_for for _, each in sent} == {2.0}
+        assert not first.renew
         for each in later:
+            assert each.renew
             assert each.token not in (first.token, 0)
-            for command, again in zip(first.commands, each.commands, strict=True):
-                assert again.keep_phase == (command.level > 0)
-                assert (again.channel, again.frequency, again.level, again.phase) == (
-                    *(command.channel, command.frequency, command.level, command.phase),
-                )
+            assert each.commands == ()
         assert max(b - a for (a, _), (b, _) in pairwise(sent)) < 1.1
         assert len(bench.reports.applied) == 1
         await asyncio.sleep(0.2)

@@ -4,9 +4,10 @@ import math
 
 import pytest
 
-from controller.loop.routing import commands_by_era, route
-from drivers.command import CommandSet, DriveCommand
-from drivers.protocol.messages import Achieved
+from controller.loop.routing import route, tones_by_era
+from drivers.contents import Layer
+from drivers.contents import Tone as Played
+from drivers.protocol.sets import Command, LayerSet
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
@@ -36,30 +37,14 @@ RIG = Rig(
 
 def test_route_by_hand() -> None:
     """20 of 100 µm is level 0.2, 20 of 50 is 0.4; pi/2 is 90°; other channels are silent."""
-    sets = route(
-        {"SW": Tone(110.0, 20e-6, math.pi / 2), "SE": Tone(250.0, 20e-6)}, RIG, token=7, ramp=0.02
+    layers = route(
+        {"SW": Tone(110.0, 20e-6, math.pi / 2), "SE": Tone(250.0, 20e-6)}, RIG, ramp=0.02
     )
-    assert sets == {
-        "left": CommandSet(
-            token=7,
-            commands=(
-                DriveCommand(channel=0, frequency=40.0, level=0.0, skip_ending=True),
-                DriveCommand(
-                    channel=1,
-                    frequency=110.0,
-                    level=pytest.approx(0.2),
-                    phase=pytest.approx(90.0),
-                ),
-            ),
-            ramp=0.02,
-            valid_for=0.0,
-        ),
-        "right": CommandSet(
-            token=7,
-            commands=(DriveCommand(channel=0, frequency=250.0, level=pytest.approx(0.4)),),
-            ramp=0.02,
-            valid_for=0.0,
-        ),
+    played = Played(1, 110.0, pytest.approx(0.2), pytest.approx(90.0))
+    silent = Played(0, 40.0, 0.0, skip_ending=True)
+    assert layers == {
+        "left": Layer(0, (played, silent), ramp=0.02),
+        "right": Layer(0, (Played(0, 250.0, pytest.approx(0.4)),), ramp=0.02),
     }
 
 
@@ -77,14 +62,14 @@ def test_route_by_hand() -> None:
 )
 def test_route_wraps_phases(radians: float, degrees: float) -> None:
     """Phases lie above -180° and up to 180°."""
-    command = route({"SE": Tone(100.0, 1e-6, radians)}, RIG, token=1, ramp=0)["right"].commands[0]
+    command = route({"SE": Tone(100.0, 1e-6, radians)}, RIG, ramp=0)["right"].tones[0]
     assert command.phase == pytest.approx(degrees)
     assert -180 < command.phase <= 180
 
 
 def test_route_applies_no_limits() -> None:
-    """More than full stroke and NaN reach the guard unchanged."""
-    over = route({"SE": Tone(1e9, 1e-4, math.nan)}, RIG, token=1, ramp=0)["right"].commands[0]
+    """More than full stroke and NaN reach the ledger unchanged."""
+    over = route({"SE": Tone(1e9, 1e-4, math.nan)}, RIG, ramp=0)["right"].tones[0]
     assert over.frequency == 1e9
     assert over.level == pytest.approx(2.0)
     assert math.isnan(over.phase)
@@ -93,7 +78,7 @@ def test_route_applies_no_limits() -> None:
 def test_route_refuses_an_unknown_era() -> None:
     """A pattern of another rig is refused as a whole."""
     with pytest.raises(InputError, match="got NW"):
-        route({"SW": Tone(100.0, 1e-6), "NW": Tone(100.0, 1e-6)}, RIG, token=1, ramp=0)
+        route({"SW": Tone(100.0, 1e-6), "NW": Tone(100.0, 1e-6)}, RIG, ramp=0)
 
 
 @pytest.mark.parametrize(
@@ -110,21 +95,25 @@ def test_route_refuses_an_unknown_era() -> None:
 )
 def test_route_keeps_phase_only_if_all_eras_continue(wanted: Excitation, kept: set[str]) -> None:
     """A frequency restarts if an ERA joins it."""
-    playing = {name: DriveCommand(0, 110.0, 0.5) for name in ("SW", "SE")}
-    sets = route(wanted, RIG, token=1, ramp=0, playing=playing)
-    drive = commands_by_era(sets, RIG)
-    assert {name for name, command in drive.items() if command.keep_phase} == kept
-    first = route(wanted, RIG, token=1, ramp=0)
-    assert not any(command.keep_phase for each in first.values() for command in each.commands)
+    playing = {name: Played(0, 110.0, 0.5) for name in ("SW", "SE")}
+    layers = route(wanted, RIG, ramp=0, playing=playing)
+    assert {
+        name
+        for name, channel in RIG.wiring.items()
+        for tone in layers[channel.amplifier].tones
+        if tone.channel == channel.number and tone.keep_phase
+    } == kept
+    first = route(wanted, RIG, ramp=0)
+    assert not any(tone.keep_phase for each in first.values() for tone in each.tones)
 
 
 def test_drive_of_eras_by_hand() -> None:
     """What each ERA plays, without silent ones."""
     achieved = {
-        "left": Achieved(7, (DriveCommand(0, 40.0, 0.0), DriveCommand(1, 110.01, 0.1999))),
-        "right": Achieved(7, (DriveCommand(0, 250.0, 0.4),)),
+        "left": [LayerSet(0, 20, 0, (Command(0, 800, 0, 0), Command(1, 2201, 1999, -9000)))],
+        "right": [LayerSet(0, 20, 0, (Command(0, 5000, 4000, 0),))],
     }
-    assert commands_by_era(achieved, RIG) == {
-        "SW": DriveCommand(1, 110.01, 0.1999),
-        "SE": DriveCommand(0, 250.0, 0.4),
+    assert tones_by_era(achieved, RIG) == {
+        "SW": Played(1, 110.05, 0.1999, -90.0),
+        "SE": Played(0, 250.0, 0.4),
     }

@@ -90,7 +90,7 @@ def table() -> Table:
 def test_selector_keeps_other_contacts_quiet(table: Table) -> None:
     """The question has the target's level, and drive modes and band of the amplifiers."""
     contacts = (at(1, 0.1), at(2, 0.2), at(3, 0.25))
-    shaped = replace(CAPABILITIES, envelope_support=replace(RAMPS_ONLY, onsets=True))
+    shaped = replace(CAPABILITIES, envelope_support=replace(RAMPS_ONLY, onset_knots=20))
     Selector(table).select(contacts, wanting(c3=17.0), shaped)
     assert table.asked.pop().envelopes
     selection = Selector(table).select(contacts, wanting(c3=17.0), CAPABILITIES)

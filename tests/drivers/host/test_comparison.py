@@ -66,8 +66,8 @@ async def test_ledger_goes_on_with_what_was_achieved(kind: str) -> None:
         commit(made, token, time)
 
     far.playback.commit = rounded  # type: ignore[method-assign]
-    staged = await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.58),), 0.001)]})
-    achieved = await host.read_achieved(staged["a"].layers[0])
+    played = await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.58),), 0.001)]})
+    achieved = await host.read_achieved(played.layers["a"][0])
     assert achieved.commands[0].level == 6000
     with pytest.raises(CommandRefused):
         await group.apply({"a": [Layer(1, (Tone(0, 150.0, 0.41),), 0.001)]})

@@ -51,7 +51,7 @@ def test_commits_arrive_together_on_lines_of_any_speed_that_are_busy(
     async def run() -> None:
         ends = [timed_line(name, each) for name, each in zip(names, "ab", strict=True)]
         hosts = {name: host for end in ends for name, host in end.hosts.items()}
-        group = Group(hosts, draw=lambda low, high: 77)
+        group = Group(hosts, watchdog=1.0, draw=lambda low, high: 77)
         await group.open()
         await group.arm()
         ends[1].outward = lambda name, data: [(0.009 if name == "GetStatus" else 0.0002, data)]
@@ -75,7 +75,7 @@ def test_line_that_is_busy_for_too_long_commits_nothing() -> None:
     async def run() -> None:
         ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
         hosts = {name: host for end in ends for name, host in end.hosts.items()}
-        group = Group(hosts, draw=lambda low, high: 77)
+        group = Group(hosts, watchdog=1.0, draw=lambda low, high: 77)
         await group.open()
         await group.arm()
         ends[1].outward = lambda name, data: [] if name == "GetStatus" else [(0.0002, data)]

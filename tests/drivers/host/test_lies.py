@@ -14,7 +14,7 @@ import pytest
 from drivers.codec.can_bus.frame import CanFrame
 from drivers.codec.can_bus.segments import PACKED, pack_frames
 from drivers.contents import Layer, Tone
-from drivers.errors import DriverError
+from drivers.errors import DriverError, LinkDegraded
 from drivers.host.group import Group
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import MESSAGES
@@ -275,13 +275,15 @@ def test_line_that_lies_has_no_effect_but_counts(kind: str, lie: str) -> None:
         group, end = await armed(kind)
         await group.apply({"a": [LOUD]})
         end.outward = WIRE_LIES[lie](kind)
+        has_failed = False
         try:
             for level in (0.4, 0.3, 0.2):
                 await group.apply({"a": [Layer(0, (Tone(0, 100.0, level),), 0.001)]})
                 await asyncio.sleep(0.02)
                 assert end.levels("a") == [level, 0.0]
                 await group.beat()
-            has_failed = False
+        except LinkDegraded:  # armed, but nothing new is played until it replies
+            pass
         except DriverError:
             has_failed = True
         assert group.is_armed is not has_failed

@@ -52,9 +52,9 @@ async def test_group_plays_over_a_wire_and_stops(
             for number in far.amplifiers
         }
         assert len({each.line for each in amplifiers.values()}) == 1
-        group = Group(amplifiers)
+        group = Group(amplifiers, watchdog=2.0)
         await group.open()
-        await group.arm(2.0)
+        await group.arm()
         layers = [Layer(0, (Tone(0, 100.0, 0.5),), 0.0)]
         await group.apply(dict.fromkeys(amplifiers, layers))
         levels = [far.level(number) for number in far.amplifiers]

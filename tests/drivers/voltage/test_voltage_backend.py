@@ -17,6 +17,7 @@ from drivers.operation.checked_amplifier import CheckedAmplifier
 from drivers.protocol.messages import AmplifierState, ChannelLimits
 from paper_table import smooth_rig
 from registry.voltage import Law, VoltageDrive
+from sim.amplifier.sensor_messages import SensedAmplifier
 from sim.bench.bench import Bench
 from sim.waveform import ShapedTone
 from virtual_loop import in_virtual_time
@@ -28,7 +29,7 @@ TONES = (DriveCommand(0, 120.0, 0.5, 30.0), DriveCommand(2, 120.0, 0.25, -110.0)
 @asynccontextmanager
 async def opened(law: str) -> AsyncIterator[tuple[Bench, Amplifier, Guard]]:
     """A bench, its amplifier armed, and a guard."""
-    bench = Bench(voltage_rig(smooth_rig(), law), now=1000.0)
+    bench = Bench(voltage_rig(smooth_rig(), law), now=1000.0, make_amplifier=SensedAmplifier)
     amplifier = voltage_amplifier(bench)
     await amplifier.open()
     await amplifier.arm()
@@ -174,12 +175,12 @@ async def test_envelope_is_converted_at_the_frequency_of_its_set(law: str) -> No
 async def test_amplifier_and_rig_must_agree_on_what_levels_are() -> None:
     """Motion with a voltage section, and voltage without one, are refused."""
     rig = voltage_rig(smooth_rig(), "linear")
-    of_motion = Bench(replace(rig, voltage={}), now=1000.0)
+    of_motion = Bench(replace(rig, voltage={}), now=1000.0, make_amplifier=SensedAmplifier)
     amplifier = voltage_amplifier(of_motion)
     amplifier._link.backend._drives = rig.voltage_of("main")  # type: ignore[attr-defined]
     with pytest.raises(CommandError, match="voltage"):
         await amplifier.open()
-    bare = voltage_amplifier(Bench(rig, now=1000.0))
+    bare = voltage_amplifier(Bench(rig, now=1000.0, make_amplifier=SensedAmplifier))
     bare = Amplifier(bare._link.backend._backend)  # type: ignore[attr-defined]
     await bare.open()
     with pytest.raises(CommandError, match="voltage"):
@@ -207,12 +208,13 @@ async def test_voltage_limits_hold_after_the_conversion() -> None:
 @in_virtual_time
 async def test_level_beyond_the_voltage_is_refused_by_the_guard() -> None:
     """The highest level is what the voltage reaches at every frequency of the rig."""
-    bench = Bench(voltage_rig(smooth_rig(), "quadratic"), now=1000.0)
+    rig = voltage_rig(smooth_rig(), "quadratic")
+    bench = Bench(rig, now=1000.0, make_amplifier=SensedAmplifier)
     weak = {
         name: VoltageDrive(((50.0, 1.0, 0.0), (300.0, 1.0, 0.0)), law=Law.QUADRATIC)
         for name in bench.rig.voltage
     }
-    bench = Bench(replace(bench.rig, voltage=weak), now=1000.0)
+    bench = Bench(replace(bench.rig, voltage=weak), now=1000.0, make_amplifier=SensedAmplifier)
     amplifier = voltage_amplifier(bench)
     await amplifier.open()
     guard = Guard(bench.rig.limits, amplifier.capabilities)

@@ -15,7 +15,6 @@ from model.fem.assembly import assemble
 from model.fem.harmonic import direct_acceleration
 from model.rig.rig import Rig
 from plate_in_time import apart
-from sim.amplifier.contract import Amplifier
 from sim.bench.bench import Bench
 from sim.bench.sensing import PlateSensor
 from virtual_loop import in_virtual_time
@@ -27,7 +26,7 @@ SESSION = 9
 
 def bench_of(rig: Rig) -> Bench:
     """A bench whose amplifiers are armed at 5 s, for 2 s at a time."""
-    bench = Bench(rig, now=5.0, make_amplifier=Amplifier)
+    bench = Bench(rig, now=5.0)
     for name in bench.amplifiers:
         bench.exchange(name, "Arm", {"session": SESSION, "watchdog": 2000}, now=5.0)
     return bench

@@ -14,10 +14,10 @@ from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Actuator, Truth, draw_truth
 from desk_card import DeskCard
-from drivers.blocking import BlockingAmplifier
-from drivers.command import DriveCommand
+from drivers.by_hand.blocking import BlockingAmplifier
+from drivers.contents import Tone
 from drivers.errors import CommandRefused, LinkError
-from drivers.protocol.messages import Achieved
+from drivers.host.dialogue import Staged
 from model.arrays import Float32Array, FloatArray
 from model.cli import app
 from model.errors import InputError
@@ -293,22 +293,20 @@ def test_amplifier_is_disarmed_as_soon_as_the_card_ends(
         """Notes how what it plays ends."""
 
         def apply(
-            self, commands: Sequence[DriveCommand], *, ramp: float = 0.02, valid_for: float = 0.0
-        ) -> Achieved:
-            achieved = super().apply(commands, ramp=ramp, valid_for=valid_for)
+            self, tones: Sequence[Tone], *, ramp: float = 0.02, valid_for: float = 0.0
+        ) -> Staged:
+            staged = super().apply(tones, ramp=ramp, valid_for=valid_for)
             playing.set()
-            return achieved
+            return staged
 
-        def play(
-            self, commands: Sequence[DriveCommand], *, duration: float, ramp: float = 0.02
-        ) -> Achieved:
+        def play(self, tones: Sequence[Tone], *, duration: float, ramp: float = 0.02) -> Staged:
             try:
-                achieved = super().play(commands, duration=duration, ramp=ramp)
+                staged = super().play(tones, duration=duration, ramp=ramp)
             except CommandRefused:
                 ended.append("disarmed")
                 raise
             ended.append("played to its end")
-            return achieved
+            return staged
 
     class EndingCard(SoundCard):
         """Ends while the amplifier plays."""

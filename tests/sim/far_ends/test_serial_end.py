@@ -29,6 +29,7 @@ from drivers.protocol.messages import (
     Stop,
 )
 from model.rig.rig import Rig
+from sim.amplifier.sensor_messages import SensedAmplifier
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.serial_end import SerialEnd
@@ -71,7 +72,13 @@ class Host:
 @pytest.fixture
 async def end(coarse_rig: Rig) -> AsyncIterator[SerialEnd]:
     """An amplifier on a line."""
-    end = SerialEnd([SimulatedDevice(Bench(coarse_rig, now=time.monotonic()), "main")])
+    end = SerialEnd(
+        [
+            SimulatedDevice(
+                Bench(coarse_rig, now=time.monotonic(), make_amplifier=SensedAmplifier), "main"
+            )
+        ]
+    )
     end.start()
     yield end
     end.close()

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.command import DriveCommand
+from drivers.contents import Tone
 from far_end_process import far_end_process
-from playing import playing
+from playing import SESSION, playing
 from rig_files import write_rig
 from sim.sensors.recording_file import read_recording
 
@@ -30,7 +30,7 @@ async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path)
         noisy = {"at_m": [0.2, 0.1], "noise_m_s2_rthz": 0.01, "resolution_m_s2": 0.5}
         assert (await far_end.ask("sensors", sensors={"P1": noisy}))["ok"]
         assert (await far_end.ask("record", file=str(file)))["ok"]
-        tone = DriveCommand(0, 110.0, 0.5)
+        tone = Tone(0, 110.0, 0.5)
         async with playing(far_end.urls["main"], tone, watchdog=0.5) as amplifier:
             assert await far_end.ask("step", seconds=0.4) == {"ok": True, "time_s": 0.4}
             assert (await far_end.ask("state"))["amplifiers"]["main"]["levels"][0] == 0.5
@@ -51,8 +51,9 @@ async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path)
             assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "NONE"
             await far_end.ask("step", seconds=0.51)
             assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "WATCHDOG"
+            await amplifier.read_status()
             await amplifier.clear()
-            await amplifier.arm(0.5)
+            await amplifier.arm(SESSION + 1, 0.5)
             assert (await far_end.ask("inject_fault", fault="arc", amplifier="main"))["ok"]
             assert (await far_end.ask("state"))["amplifiers"]["main"]["fault"] == "ARC"
             begin = (await far_end.ask("state"))["time_s"]
@@ -81,7 +82,7 @@ async def test_simulation_applies_a_fault_within_a_step_at_its_time(tmp_path: Pa
         far_end_process(
             write_rig(tmp_path / "rig.yaml"), "--serial", "--virtual-time", "--sensor", "P1=0.0,0.0"
         ) as far_end,
-        playing(far_end.urls["main"], DriveCommand(0, 110.0, 0.5), watchdog=2.0),
+        playing(far_end.urls["main"], Tone(0, 110.0, 0.5), watchdog=2.0),
     ):
         await far_end.ask("inject_fault", fault="over_temperature", lasts=1.0)
         await far_end.ask("step", seconds=0.8)

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from controller.cli.main import run
-from drivers.command import DriveCommand
-from drivers.protocol.messages import AmplifierState
+from drivers.contents import Tone
+from drivers.protocol.table import QUANTITIES, STATES
 from model.rig.file import example_rig_path
 from playing import playing
 
@@ -50,11 +50,11 @@ async def test_sim_serves_until_interrupted_or_eof(is_interrupted: bool) -> None
             assert line == f"main: serial://{link}?baud=921600\n"
             assert link.readlink().is_char_device()
             assert control.is_socket()
-            tone = DriveCommand(2, 110.0, 0.25)
+            tone = Tone(2, 110.0, 0.25)
             async with playing(line.split()[1], tone, watchdog=2.0) as amplifier:
-                status = await amplifier.status()
-            assert (status.state, status.token) == (AmplifierState.OPERATION_ENABLED, 1)
-            assert status.levels == (0, 0, 0.25, 0)
+                status = await amplifier.read_status()
+            assert (status["state"], status["token"]) == (STATES["OPERATION_ENABLED"], 1)
+            assert status["levels"] == [0, 0, QUANTITIES["level"].to_wire(0.25), 0]
         finally:
             if is_interrupted:
                 process.send_signal(signal.SIGINT)

@@ -11,15 +11,14 @@ import numpy as np
 import pytest
 
 from benchmarks.desk.capture import Capture
-from drivers.amplifier import Amplifier
 from drivers.errors import LinkError
-from drivers.protocol.messages import AmplifierState, Fault, Feature
-from drivers.registry import open_backend
+from drivers.opening import Lines
+from drivers.protocol.table import FAULTS, STATES
 from model.errors import InputError
-from patient_daemon import WATCHDOG
 from sim.soft_amp.output import open_output
 from sim.soft_amp.settings import Protocol, Settings
-from sound_card import BLOCK, RATE, SoftAmp, capture_on, conformance, host, jack_server, until
+from sound_card import BLOCK, RATE, SoftAmp, capture_on, host, jack_server, until
+from steady_host import WATCHDOG, linear_amplifier
 
 pytestmark = [
     pytest.mark.real_time,
@@ -58,7 +57,6 @@ def amp(
 def test_samples_are_those_of_the_page(sound: tuple[Capture, dict[str, str]], amp: SoftAmp) -> None:
     """Level x sin(2 pi f t + phase) within 0.1 dB, and within 0.1 degrees between channels."""
     capture, _ = sound
-    assert conformance(amp.url)["failed"] == 0
     with host(amp.url, CHANNELS) as playing:
         until(capture.is_sounding)
         _wait_for_samples(capture, 0.3)  # 0.2 s of soft start and ramp
@@ -88,13 +86,13 @@ async def test_killed_or_stopped_player_is_silent_and_then_in_fault(
         until(lambda: amp.log.count("open again") > reopened)
         assert capture.end_of_sound() - done < RATE * SILENCE
         assert amp.player != player
-    amplifier = Amplifier(open_backend(amp.url), reply_timeout=2.0)
+    lines = Lines()
+    amplifier = await linear_amplifier(lines, amp.url)
     await amplifier.open()
-    status = await amplifier.status()
-    assert (status.state, status.fault) == (AmplifierState.FAULT, Fault.INTERNAL)
-    assert Feature.VOLTAGE in amplifier.capabilities.features
-    assert (await amplifier.clear()).state is AmplifierState.SWITCH_ON_DISABLED
-    await amplifier.close()
+    status = await amplifier.read_status()
+    assert (status["state"], status["fault"]) == (STATES["FAULT"], FAULTS["INTERNAL"])
+    assert (await amplifier.clear())["state"] == STATES["SWITCH_ON_DISABLED"]
+    await lines.close()
 
 
 def test_refused_device_is_one_message(
@@ -138,10 +136,13 @@ def test_busy_device_is_refused(
         open_output(SETTINGS)
 
 
-def test_all_of_it_killed_is_silent(sound: tuple[Capture, dict[str, str]], tmp_path: Path) -> None:
+@pytest.mark.parametrize("line", ["--tcp", "--modbus-tcp"])
+def test_all_of_it_killed_is_silent(
+    sound: tuple[Capture, dict[str, str]], tmp_path: Path, line: str
+) -> None:
     """The process that plays dies with the one that watches it; here through PortAudio."""
     capture = capture_on(sound[1]["JACK_DEFAULT_SERVER"], "other", 2)
-    options = ("--device", "other", "--channels", "2", "--tcp", "0", "--law", "square")
+    options = ("--device", "other", "--channels", "2", line, "0", "--law", "square")
     # PortAudio leaves samples out where the machine stalls.
     soft_amp = SoftAmp(*options, "--max-gaps", "63", environment=sound[1], log=tmp_path / "log")
     with host(soft_amp.url, 2):

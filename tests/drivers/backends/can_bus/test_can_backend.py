@@ -28,6 +28,7 @@ from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout
 from drivers.guard import Guard, GuardLimits
 from drivers.protocol.messages import AmplifierEvent, AmplifierState, Apply, Arm, Fault, Hello, Ping
 from model.rig.rig import Rig
+from sim.amplifier.sensor_messages import SensedAmplifier
 from sim.bench.bench import Bench
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus import sdo
@@ -103,7 +104,7 @@ class Virtual:
 @asynccontextmanager
 async def virtual_side(rig: Rig) -> AsyncIterator[Virtual]:
     """The amplifiers of a rig on a virtual bus."""
-    bench = Bench(rig, now=time.monotonic())
+    bench = Bench(rig, now=time.monotonic(), make_amplifier=SensedAmplifier)
     devices = {name: SimulatedDevice(bench, name) for name in bench.amplifiers}
     bus = CanBus()
     async with nodes_on(bus, list(devices.values())):

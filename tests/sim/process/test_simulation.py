@@ -1,4 +1,4 @@
-"""A whole simulation whose amplifiers speak protocol 3: wires, control, faults, recording, view."""
+"""A whole simulation in this process: wires, control, faults, recording, view."""
 
 import asyncio
 import io
@@ -26,7 +26,7 @@ from sim.sensors.recording_file import read_recording
 from words_bench import LIMITS, layer
 
 
-async def test_simulation_serves_amplifiers_of_protocol_3(tmp_path: Path) -> None:
+async def test_simulation_serves_amplifiers_on_two_wires(tmp_path: Path) -> None:
     """One on a pseudo-terminal, one on TCP: both play on one plate, a fault stops them."""
     rig = load_rig(write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS))
     simulation = Simulation(
@@ -36,7 +36,6 @@ async def test_simulation_serves_amplifiers_of_protocol_3(tmp_path: Path) -> Non
         sensors=[Accelerometer("P1", 0.1, 0.1)],
         control=tmp_path / "control",
         record=tmp_path / "run.csv",
-        protocol=3,
     )
     ready: asyncio.Future[Mapping[str, str]] = asyncio.get_running_loop().create_future()
     contexts: list[SimulationContext] = []
@@ -44,9 +43,10 @@ async def test_simulation_serves_amplifiers_of_protocol_3(tmp_path: Path) -> Non
         run_simulation(simulation, ready=ready.set_result, view=contexts.append)
     )
     urls, lines = await ready, Lines()
-    group = Group({name: await lines.amplifier(urls[name], LIMITS, name=name) for name in urls})
+    amplifiers = {name: await lines.amplifier(urls[name], LIMITS, name=name) for name in urls}
+    group = Group(amplifiers, watchdog=2.0)
     await group.open()
-    await group.arm(watchdog=2.0)
+    await group.arm()
     await group.apply({name: [layer((1, 150.0, 0.5), ramp=0.0)] for name in urls})
     await asyncio.sleep(0.3)
     reader, writer = await asyncio.open_unix_connection(tmp_path / "control")

@@ -1,1 +1,0 @@
-"""The amplifiers of a rig as one: armed, played, stopped and closed together."""

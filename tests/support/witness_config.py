@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
-from sim.amplifier.amplifier import SimulatedAmplifier
-from sim.waveform import level_of
+from sim.amplifier.contract import Amplifier
+from sim.listening.witness import Witness
 from sim.witness.endpoint import parse_endpoint
-from sim.witness.witness import Witness
+from sim.witness.witness import Witness as OldWitness
 
 
 def witness_config(
@@ -29,10 +29,10 @@ def witness_config(
     }
 
 
-def witness_of_one(kind: str = "serial") -> Witness:
+def witness_of_one(kind: str = "serial") -> OldWitness:
     """A witness of the amplifier m on the wire a, whose host sends no heartbeats."""
     limits = {n: {"frequency_hz": [0, 4000], "level": 1.0} for n in range(4)}
-    return Witness(
+    return OldWitness(
         {
             "wires": {"a": kind},
             "amplifiers": {"m": {"wire": "a", "channels": limits}},
@@ -41,9 +41,10 @@ def witness_of_one(kind: str = "serial") -> Witness:
     )
 
 
-def sense(witness: Witness, now: float, name: str, amplifier: SimulatedAmplifier) -> None:
+def sense(witness: Witness, now: float, name: str, amplifier: Amplifier) -> None:
     """Show the levels and frequencies of an amplifier's channels at a time [s]."""
-    levels = [min(level_of(output, now), 1.0) for output in amplifier.outputs]
+    channels = range(amplifier.playback.channels)
+    levels = [min(amplifier.playback.level(channel, now), 1.0) for channel in channels]
     frequencies = {
         channel: tone.frequency
         for channel, output in enumerate(amplifier.outputs)

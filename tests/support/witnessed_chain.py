@@ -18,9 +18,8 @@ import numpy as np
 from controller.loop.loop import Controller
 from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
-from drivers.amplifier import Amplifier
-from drivers.protocol.messages import Fault
-from drivers.registry import open_backend
+from drivers.host.amplifier import Amplifier
+from drivers.opening import Lines
 from memory_machine import MemoryMachine, live_in_memory
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
@@ -32,12 +31,12 @@ from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
 from registry.limits import GuardLimits
-from sim.amplifier.sensor_messages import SensedAmplifier
+from sim.amplifier.contract import Amplifier as SimulatedAmplifier
+from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
-from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wire
+from sim.listening.witness import OperatorCommand, Witness
 from sim.witness.violation import Violation
-from sim.witness.witness import OperatorCommand, Witness
 from virtual_loop import VirtualLoop, run_virtual
 from witness_config import sense, witness_config
 
@@ -112,7 +111,6 @@ class Chain:
     witness: Witness
     table: OneTable
     controller: Controller
-    amplifiers: Mapping[str, Amplifier]
     links: Mapping[str, str]
     errors: list[BaseException] = field(default_factory=list)
     running: "asyncio.Task[None] | None" = None
@@ -122,7 +120,7 @@ class Chain:
     @property
     def amplifier(self) -> Amplifier:
         """The first amplifier."""
-        return next(iter(self.amplifiers.values()))
+        return next(iter(self.controller.amplifiers.values()))
 
     @property
     def link(self) -> str:
@@ -174,7 +172,7 @@ class Chain:
         """Expected patterns on the wire, by hand: metres over 100 um, radians in degrees."""
         alone = {0: (110.0, 0.2, 90.0)}, {1: (150.0, 0.4, 180.0)}
         parts = alone if len(self.fingers) < 2 else ({0: (90.0, 0.3, 0.0)}, {})
-        names = tuple(self.amplifiers)
+        names = tuple(self.bench.amplifiers)
         if len(names) == 1:
             return {names[0]: {**parts[0], **parts[1]}}
         return {names[0]: parts[0], names[1]: parts[1]}
@@ -195,7 +193,7 @@ class Chain:
         """Trip the first amplifier by an arc."""
         amplifier = next(iter(self.bench.amplifiers.values()))
         self.bench.advance(self.loop.time())
-        amplifier.trip(Fault.ARC, self.loop.time())
+        amplifier.trip("ARC", self.loop.time())
 
     async def fall_silent(self) -> None:
         """Stop the source with fingers down: after its lease of 150 ms they count as lifted."""
@@ -288,9 +286,9 @@ async def _play(
     machine = live_in_memory()
     between = Between(machine)
     rig = make_rig(names, limits)
-    bench = Bench(rig, now=loop.time(), make_amplifier=SensedAmplifier)
+    bench = Bench(rig, now=loop.time(), make_amplifier=SimulatedAmplifier)
     devices = [
-        SimulatedDevice(bench, name, address=number)
+        AmplifierDevice(bench, name, address=number)
         for number, name in enumerate(bench.amplifiers, 1)
     ]
     async with open_wire(Wire(wire), devices) as urls:
@@ -300,10 +298,9 @@ async def _play(
         for link in {*links.values()}:
             witness.opened(link, loop.time())
         witness.contacts(loop.time(), ())
-        backends = {name: Amplifier(open_backend(url)) for name, url in urls.items()}
         table = OneTable(rig.plate)
-        controller = Controller(rig, table, amplifiers=backends)
-        chain = Chain(loop, machine, between, bench, witness, table, controller, backends, links)
+        controller = Controller(rig, table, lines=Lines, urls=urls)
+        chain = Chain(loop, machine, between, bench, witness, table, controller, links)
         async with _sensed(chain):
             await chain._try(controller.open())
             if not chain.errors:

@@ -88,10 +88,10 @@ kill-test: .venv/installed-test
 fault-test: .venv/installed-test
 	$(BIN)/pytest -q -s tests/integration/test_daemon_faults_*.py
 
-# Ten thousand stops while frames are lost, late and doubled, and two thousand with an exception
-# on their way; `make test` takes some hundreds. Others: make stop-test STOPS='--stops 100000'
+# Ten thousand stops while frames are lost, late and doubled, two thousand with an exception on
+# their way, and two thousand by command after a killed host; `make test` takes some hundreds. Others: make stop-test STOPS='--stops 100000'
 stop-test: .venv/installed-test
-	$(BIN)/python tests/support/stops.py $(STOPS)
+	$(BIN)/python tests/support/group_stops.py $(STOPS)
 
 # A plate without hardware, measured, calibrated, played and verified by real processes through
 # JACK (jackd2): three minutes. Others: make desk-test DESK='--plates 10 --promises 20'

@@ -58,7 +58,7 @@ SLOWEST = (
     "test_daemon_faults_killed.py",
     "test_soft_amp_sound.py",
     "test_nothing_is_lost.py",
-    "test_stops.py",
+    "test_group_stops.py",
     "test_convergence.py",
     "test_table_commands.py",
     "test_quick_faults.py",

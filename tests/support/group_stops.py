@@ -1,11 +1,12 @@
 """Stops of groups by the thousand: is an amplifier silent whenever a stop says so?
 
-    python tests/support/group_stops.py [--stops N] [--exceptions N] [--first SEED]
+    python tests/support/group_stops.py [--stops N] [--exceptions N] [--killed N] [--first SEED]
 
 Over every wire of protocol 3, in virtual time. First frames are lost, late and doubled at random
 while all is stopped, at any moment of what a host does. Then one exception is raised on the way of
-each stop, at a line of the drivers that is drawn at random. Whatever happens, a stop ends in time,
-and what it reports of each amplifier agrees with what its channels play.
+each stop, at a line of the drivers that is drawn at random. Last the host is killed, and one of its
+amplifiers stopped by `era amp stop`. Whatever happens, a stop ends in time, and what it reports of
+each amplifier agrees with what its channels play.
 """
 
 import argparse
@@ -15,17 +16,22 @@ import random
 import sys
 import types
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 import drivers
 import sim
+from drivers.by_hand import actions
 from drivers.contents import Layer, Shape, Tone
 from drivers.errors import DriverError
-from drivers.host.amplifier import Stopped
+from drivers.host.amplifier import WATCHDOG, Stopped
+from drivers.host.amplifier import Amplifier as Host
+from drivers.host.feeding import SILENCING
 from drivers.host.group import Group
 from drivers.protocol.records import Values
 from virtual_loop import Stuck, run_virtual
@@ -172,8 +178,6 @@ class Chain:
 
     async def judge(self, outcomes: Mapping[str, Stopped], scene: str) -> None:
         """Compare the outcomes of a stop with the amplifiers, now and until all is silent."""
-        if outcomes.keys() != self.group.amplifiers.keys():
-            self.found.append(f"{scene}: outcomes of {sorted(outcomes)} only")
         certain = [name for name, outcome in outcomes.items() if outcome.is_confirmed]
         self._check(certain, f"{scene}: confirmed silent, but")
         self._granted.clear()
@@ -280,6 +284,8 @@ async def _stop(chain: Chain, wire: str, scene: str, tally: Tally) -> None:
         tally.counts[wire, "raised"] += 1
     else:
         outcomes = stopping.result()
+        if outcomes.keys() != chain.group.amplifiers.keys():
+            chain.found.append(f"{scene}: outcomes of {sorted(outcomes)} only")
         for outcome in outcomes.values():
             tally.counts[wire, "confirmed" if outcome.is_confirmed else "may play"] += 1
         await chain.judge(outcomes, scene)
@@ -317,6 +323,39 @@ async def _stop_with_exception(wire: str, rng: random.Random, tally: Tally, at: 
         await _stop(chain, wire, f"{scene}, exception at line {at} {planted}", tally)
     chain.close()
     return [f"{one} {planted}" for one in chain.found]
+
+
+async def _stop_by_command(wire: str, rng: random.Random, tally: Tally) -> list[str]:
+    """Stop one amplifier of a killed host by `era amp stop`."""
+    chain = Chain(wire, rng)
+    await chain.group.open()
+    scene = rng.choice(tuple(SCENES))
+    await SCENES[scene](chain)
+    if is_early := rng.random() < 0.5:
+        chain.disturb()
+    await asyncio.sleep(rng.uniform(0.0, 0.02))
+    chain.close()
+    for end in chain.ends:
+        end.kill_host()
+    silent_from = asyncio.get_running_loop().time() + WATCHDOG + SILENCING
+    if not is_early:
+        chain.disturb()
+    end = rng.choice(chain.ends)
+    name = rng.choice(tuple(end.hosts))
+
+    @asynccontextmanager
+    async def reached(url: str) -> AsyncIterator[Host]:
+        yield end.hosts[url]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(actions, "reached", reached)
+        async with asyncio.timeout(LONGEST):
+            rows = await actions.stop(name)
+    is_confirmed = rows["silence"] == "confirmed_silent"
+    tally.counts[wire, "stops"] += 1
+    tally.counts[wire, "confirmed" if is_confirmed else "may play"] += 1
+    await chain.judge({name: Stopped(is_confirmed, silent_from)}, f"{scene}, killed")
+    return chain.found
 
 
 @contextmanager
@@ -368,6 +407,11 @@ def stop_with_exception(seed: int, tally: Tally) -> None:
     _run(lambda *given: _stop_with_exception(*given, at), seed, tally)
 
 
+def stop_of_killed_host(seed: int, tally: Tally) -> None:
+    """Stop one amplifier of a killed host by command."""
+    _run(_stop_by_command, seed, tally)
+
+
 def _run(
     main: Callable[[str, random.Random, Tally], Awaitable[list[str]]], seed: int, tally: Tally
 ) -> None:
@@ -384,6 +428,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--stops", type=int, default=10_000, help="with faults of frames")
     parser.add_argument("--exceptions", type=int, default=2_000, help="with an exception each")
+    parser.add_argument("--killed", type=int, default=2_000, help="by command, of a killed host")
     parser.add_argument("--first", type=int, default=0, help="the first seed of each")
     options = parser.parse_args()
     logging.disable(logging.CRITICAL)
@@ -391,6 +436,7 @@ def main() -> int:
     for name, play, limit in (
         ("frames lost, late and doubled", disturbed_stops, options.stops),
         ("one exception each", stop_with_exception, options.exceptions),
+        ("by era amp stop, of a killed host", stop_of_killed_host, options.killed),
     ):
         tally = Tally()
         seed = options.first

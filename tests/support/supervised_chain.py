@@ -22,11 +22,20 @@ from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
-from sim.far_ends.wires import open_wires
-from stop_chain import WIRES
+from sim.far_ends.wires import Wire, open_wires
 from straight_shapes import Shapes
 from witnessed_chain import STROKE, OneTable, make_rig
 from word_lies import Lie
+
+WIRES = {
+    "serial": Wire("serial", speed=921_600),
+    "serial, shared": Wire("serial", speed=115_200, shared=True),
+    "modbus-rtu": Wire("modbus-rtu", speed=115_200),
+    "modbus-tcp": Wire("modbus-tcp"),
+    "socketcand": Wire("socketcand", speed=500_000),
+    "slcan": Wire("slcan", speed=500_000),
+}
+"""Every kind of wire; of two amplifiers one line or bus each kind but serial is shared."""
 
 ENABLED = DaemonState.OPERATION_ENABLED
 LEVELS = {"SW": 0.2, "NE": 0.4}

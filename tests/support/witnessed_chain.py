@@ -31,7 +31,6 @@ from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
 from registry.limits import GuardLimits
-from sim.amplifier.contract import Amplifier as SimulatedAmplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.wires import Wire, open_wire
@@ -286,7 +285,7 @@ async def _play(
     machine = live_in_memory()
     between = Between(machine)
     rig = make_rig(names, limits)
-    bench = Bench(rig, now=loop.time(), make_amplifier=SimulatedAmplifier)
+    bench = Bench(rig, now=loop.time())
     devices = [
         AmplifierDevice(bench, name, address=number)
         for number, name in enumerate(bench.amplifiers, 1)

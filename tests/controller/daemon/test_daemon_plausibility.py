@@ -8,8 +8,7 @@ import pytest
 from controller.daemon.states import DaemonState
 from drivers.host.timing import HEARTBEAT
 from long_form import in_turn, shortly
-from stop_chain import WIRES
-from supervised_chain import ENABLED, supervised_chain
+from supervised_chain import ENABLED, WIRES, supervised_chain
 from virtual_loop import run_virtual
 from word_lies import Lie, achieved, status
 

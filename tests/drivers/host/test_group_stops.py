@@ -5,7 +5,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from group_stops import LINES, Tally, disturbed_stops, stop_with_exception
+from group_stops import (
+    LINES,
+    Tally,
+    disturbed_stops,
+    stop_of_killed_host,
+    stop_with_exception,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -38,3 +44,12 @@ def test_stop_is_true_with_an_exception_on_its_way() -> None:
         stop_with_exception(seed, tally)
     assert tally.found == []
     assert tally.total("confirmed") > tally.total("stops") / 4
+
+
+def test_amp_stop_is_true_after_a_killed_host() -> None:
+    """`era amp stop` with a faulty wire, for an amplifier that a killed host has left playing."""
+    tally = Tally()
+    for seed in range(6 * len(LINES)):
+        stop_of_killed_host(seed, tally)
+    assert tally.found == []
+    assert tally.total("confirmed") > tally.total("stops") / 3

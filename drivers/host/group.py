@@ -223,7 +223,8 @@ class Group:
             ),
             return_exceptions=True,
         )
-        if any(isinstance(each, BaseException) for each in disarmed):
+        failures = [each for each in disarmed if isinstance(each, BaseException)]
+        if not all(isinstance(each, LinkError) for each in failures):  # a mute one stops none
             await self.stop()
 
     def _check_not_silenced(self, before: int) -> None:

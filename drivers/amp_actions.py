@@ -11,7 +11,6 @@ from typing import Any
 
 from drivers import clock
 from drivers.amplifier import WATCHDOG, Amplifier
-from drivers.backends.urls.address import with_address
 from drivers.command import CommandSet, DriveCommand
 from drivers.conformance import LEVEL, Check, CheckResult, raw_line
 from drivers.conformance.report import ConformanceReport
@@ -27,6 +26,7 @@ from drivers.protocol.classes import amplifier_class
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import AmplifierState, Feature, SensorUnit, Status
 from drivers.registry import open_backend
+from drivers.urls.address import with_address
 
 _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
 _STOP_TIMEOUT = 2.0  # s; for boards that restart when their port is opened

@@ -4,8 +4,8 @@ import asyncio
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from drivers.backends.hardware import Port
 from drivers.errors import LinkError
+from drivers.hardware import Port
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.wires.address import WireAddress

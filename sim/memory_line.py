@@ -8,8 +8,8 @@ import contextlib
 from collections.abc import Callable, Sequence
 
 from drivers import clock
-from drivers.backends.hardware import number_below
 from drivers.errors import LinkError
+from drivers.hardware import number_below
 from drivers.host.serial_wire import SerialWire
 from drivers.wires.address import WireAddress
 from sim.amplifier.contract import Amplifier

@@ -23,7 +23,7 @@ import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 import preloaded  # noqa: E402
-from drivers.operation import garbage_collection  # noqa: E402
+from drivers import garbage_collection  # noqa: E402
 from model.config import document  # noqa: E402
 from model.reduction import finite_element_modes  # noqa: E402
 from model.reduction.class_modes import finite_element_classes  # noqa: E402

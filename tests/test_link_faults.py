@@ -19,9 +19,9 @@ from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.command import CommandSet, DriveCommand
 from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkError
+from drivers.garbage_collection import no_long_collections
 from drivers.guard import Guard, GuardLimits, SafeCommandSet
 from drivers.link.link import REPLY_TIMEOUT as USUAL_TIMEOUT
-from drivers.operation.garbage_collection import no_long_collections
 from drivers.operation.watchdog import HEARTBEAT, MIN_HEARTBEATS_PER_WATCHDOG, loss_detection_time
 from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault, Feature
 from drivers.registry import open_backend

@@ -21,10 +21,10 @@ import serial
 from pythonosc.osc_packet import OscPacket
 
 from benchmarks.wires.bench import SESSION, make_sets
-from drivers.backends.urls.serial_line import SerialUrl
 from drivers.codec.serial_line.exchanges import encode_request
 from drivers.codec.serial_line.frame import encode_frame
 from drivers.protocol.messages import Apply, Arm
+from drivers.urls.serial_line import SerialUrl
 from sim.amplifier.amplifier import capabilities
 
 SETS = 100

@@ -12,13 +12,13 @@ import serial
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 
 from benchmarks.wires.bench import SESSION
-from drivers.backends.urls.modbus import ModbusUrl
-from drivers.backends.urls.serial_line import SerialUrl
 from drivers.codec.modbus import exchanges
 from drivers.codec.serial_line.exchanges import encode_request
 from drivers.codec.serial_line.frame import encode_frame
 from drivers.guard import SafeCommandSet
 from drivers.protocol.messages import Apply, Arm, Request
+from drivers.urls.modbus import ModbusUrl
+from drivers.urls.serial_line import SerialUrl
 
 
 def bare_serial(url: str, sets: Sequence[SafeCommandSet]) -> list[float]:

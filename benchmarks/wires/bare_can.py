@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import can
 
-from drivers.backends.urls.can_bus import CanUrl
 from drivers.codec.can_bus.frame import CanFrame, cob_id
 from drivers.codec.can_bus.requests import encode_request
 from drivers.guard import SafeCommandSet
 from drivers.protocol.messages import Apply, Arm
+from drivers.urls.can_bus import CanUrl
 from sim.far_ends.can_bus.set_buffer import Action, RequestFrame, SetBuffer
 
 CALM = 2.0  # s; the longest watchdog

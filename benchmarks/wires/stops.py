@@ -15,9 +15,7 @@ from benchmarks.wires.bench import CALM, make_sets
 from drivers import clock
 from drivers.amplifier import Amplifier
 from drivers.backend import Backend
-from drivers.backends.urls.modbus import ModbusUrl
-from drivers.backends.urls.serial_line import SerialUrl
-from drivers.codec.can_bus.frame import BLOCK
+from drivers.codec.can_bus.canopen import BLOCK
 from drivers.codec.can_bus.timing import CanTimes
 from drivers.codec.modbus import exchanges
 from drivers.codec.modbus.adu import build_adu
@@ -27,6 +25,8 @@ from drivers.codec.serial_line.frame import encode_frame
 from drivers.errors import CommandRefused
 from drivers.protocol.messages import Reply, Request, Stop
 from drivers.registry import open_backend
+from drivers.urls.modbus import ModbusUrl
+from drivers.urls.serial_line import SerialUrl
 
 STOPS = 200
 WIRES: Mapping[str, Sequence[str]] = {

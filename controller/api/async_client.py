@@ -47,7 +47,7 @@ from controller.api.methods import (
 )
 from controller.api.schema import Empty, Message, Topic
 from controller.api.socket_path import find_socket
-from drivers.operation.pauses import pauses
+from drivers.pauses import pauses
 
 MAX_QUEUED_EVENTS = 1000  # not yet taken; the oldest is dropped
 _MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.05, 0.5  # s

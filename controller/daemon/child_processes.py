@@ -11,7 +11,7 @@ import os
 import sys
 
 from drivers import clock
-from drivers.operation.pauses import Backoff
+from drivers.pauses import Backoff
 
 _MAX_PAUSE = 30.0  # s
 _TERMINATE_TIMEOUT = 0.3  # s

@@ -14,7 +14,7 @@ from controller.sources.calibration import CalibratedSource, TouchCalibration, f
 from controller.sources.registry import open_source
 from controller.sources.touch import TouchSource
 from drivers.errors import CommandError
-from drivers.operation.garbage_collection import without_collections
+from drivers.garbage_collection import without_collections
 from drivers.wires.known import address_of
 from model.config.document import ConfigError, Document, read_document
 from model.config.sections import Validation

@@ -32,10 +32,10 @@ from controller.loop.loop import Controller
 from controller.sources.touch import TouchFrame
 from drivers import clock
 from drivers.errors import DriverError
+from drivers.garbage_collection import no_long_collections, without_collections
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.group import GroupState
 from drivers.opening import Lines
-from drivers.operation.garbage_collection import no_long_collections, without_collections
 from drivers.threads import in_thread
 from model.errors import InputError
 from model.table.table import LocalizationTable

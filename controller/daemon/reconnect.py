@@ -7,7 +7,7 @@ from typing import Any, Literal
 from controller.loop.loop import Controller
 from drivers import clock
 from drivers.errors import DriverError
-from drivers.operation.pauses import pauses
+from drivers.pauses import pauses
 from model.errors import InputError
 
 ALIVE_INTERVAL = 0.05  # s; between calls of `alive` while waiting

@@ -11,7 +11,7 @@ from controller.api.waiting_touches import add_frame
 from controller.daemon.config import API_SOURCES, TouchInput
 from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
-from drivers.operation.pauses import Backoff
+from drivers.pauses import Backoff
 from drivers.threads import in_thread
 from model.errors import InputError
 from model.structure.plate import Plate

@@ -15,8 +15,8 @@ from controller.loop.observer import Observer
 from controller.sources.capture import RecordedDatagram, replay_capture
 from controller.sources.tuio import TuioSource
 from drivers.errors import CommandRefused
+from drivers.garbage_collection import no_long_collections
 from drivers.opening import Lines
-from drivers.operation.garbage_collection import no_long_collections
 from model.figures import save_figure
 from model.rig.file import load_rig
 from model.table.table import LocalizationTable

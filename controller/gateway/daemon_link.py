@@ -15,7 +15,7 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import SubscribeParams
 from controller.api.schema import Message
 from controller.api.topics import TOPICS
-from drivers.operation.pauses import pauses
+from drivers.pauses import pauses
 
 _MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.1, 2.0  # s
 _RATE = 10.0  # Hz; of amplifiers and latency

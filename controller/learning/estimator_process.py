@@ -25,7 +25,7 @@ from controller.learning.messages import (
     unpacked,
 )
 from drivers import clock
-from drivers.operation.pauses import Backoff
+from drivers.pauses import Backoff
 from model.identification.settled import SettledPattern
 from registry.plugins import failure_text
 

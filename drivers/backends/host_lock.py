@@ -8,8 +8,8 @@ import contextlib
 import socket
 import sys
 
-from drivers.backends.hardware import HARDWARE_PROVIDER
 from drivers.errors import LinkError
+from drivers.hardware import HARDWARE_PROVIDER
 
 
 class HostLock:

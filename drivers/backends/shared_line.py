@@ -6,8 +6,8 @@ from collections.abc import Callable, Hashable
 from typing import Any, ClassVar, Generic, TypeVar
 from weakref import WeakKeyDictionary
 
-from drivers.backends.hardware import Adapter, Port
 from drivers.errors import LinkError
+from drivers.hardware import Adapter, Port
 
 _OpenT = TypeVar("_OpenT", bound=Port | Adapter)
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import final
 
 from drivers import trace
-from drivers.backends.hardware import Port
 from drivers.errors import LinkError
+from drivers.hardware import Port
 from drivers.trace import Direction
 
 MAX_LINE = 65_536
@@ -34,7 +34,7 @@ class TextLine:
     async def open(self) -> None:
         """Open the port; raises LinkError."""
         # Here, since plug-ins import the names of this module without pyserial.
-        from drivers.backends.ports.opening import open_port
+        from drivers.ports.opening import open_port
 
         if self._port is None:
             self._rest, self._loss = b"", None

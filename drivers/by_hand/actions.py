@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from drivers import clock
-from drivers.backends.urls.address import with_address
 from drivers.by_hand.reaching import (
     identified,
     random_session,
@@ -25,6 +24,7 @@ from drivers.host.jobs import Priority
 from drivers.host.sensors import check_tones, measure_tones, read_sensors
 from drivers.host.timing import check_watchdog
 from drivers.protocol.table import FAULTS, FEATURES, QUANTITIES, STATES
+from drivers.urls.address import with_address
 
 _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
 _STOP_TIMEOUT = 2.0  # s; for boards that restart when their port is opened

@@ -6,13 +6,13 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from drivers.amplifier import Amplifier
-from drivers.backends.urls.address import with_address
 from drivers.conformance.bench import Bench
 from drivers.conformance.check import driving
 from drivers.conformance.findings import ContractViolation, NotApplicable, expect
 from drivers.errors import CommandRefused, DriverError, FrameError
 from drivers.protocol.messages import Feature, SetAddress
 from drivers.registry import open_backend
+from drivers.urls.address import with_address
 
 _FREE = (63, 62)  # addresses that every wire has, and lines of few amplifiers do not use
 _TAKING = 0.1  # s; until an amplifier has taken an address, on any wire

@@ -10,14 +10,14 @@ from pathlib import Path
 
 from serial.tools.list_ports import comports
 
+from drivers.codec.can_bus.canopen import BITRATE
 from drivers.discovery.slcan import detect_slcan
-from drivers.protocol.definition import PROTOCOL
+from drivers.urls import can_bus, modbus, serial_line
 
 _NETWORK = Path("/sys/class/net")
 _CAN_TYPE = "280"  # ARPHRD_CAN of Linux
 _UNDESCRIBED = "n/a"  # by pyserial
-_SPEEDS = (PROTOCOL.serial.baud, 115_200)
-_MODBUS = PROTOCOL.modbus
+_SPEEDS = (serial_line.BAUD, 115_200)
 _GROUP_MAY = 0o060  # read and write
 
 
@@ -53,9 +53,8 @@ def with_slcan(candidate: Candidate) -> Candidate:
         return candidate
     heard = adapter.nodes or ("none",)
     what = adapter.problem or f"heartbeats of nodes: {', '.join(map(str, heard))}"
-    bitrate = PROTOCOL.canopen["bitrate"]
     urls = tuple(
-        f"can+slcan://{_absolute(candidate.name)}?bitrate={bitrate}#{node}"
+        f"can+slcan://{_absolute(candidate.name)}?bitrate={BITRATE}#{node}"
         for node in adapter.nodes
     )
     description = f"{candidate.description}: slcan adapter {adapter.version}, {what}"
@@ -66,7 +65,7 @@ def _serial_ports() -> Iterator[Candidate]:
     for port in sorted(comports()):
         path = port.device
         urls = tuple(f"serial://{_absolute(path)}?baud={speed}" for speed in _SPEEDS)
-        urls += (f"modbus+rtu://{_absolute(path)}?baud={_MODBUS['baud']}#{_MODBUS['unit']}",)
+        urls += (f"modbus+rtu://{_absolute(path)}?baud={modbus.RTU_BAUD}#{modbus.UNIT}",)
         description = "serial port" if port.description == _UNDESCRIBED else port.description
         yield Candidate(path, description, urls, _permission_remedy(path), is_serial=True)
 
@@ -101,8 +100,6 @@ def _can_interfaces() -> Iterator[Candidate]:
             continue
         name = interface.name
         is_up = (interface / "operstate").read_text(encoding="ascii").strip() != "down"
-        node = PROTOCOL.canopen["node"]
-        urls = (f"can+socketcan://{name}#{node}",)
-        bitrate = PROTOCOL.canopen["bitrate"]
-        remedy = f"interface is down: sudo ip link set {name} up type can bitrate {bitrate}"
+        urls = (f"can+socketcan://{name}#{can_bus.NODE}",)
+        remedy = f"interface is down: sudo ip link set {name} up type can bitrate {BITRATE}"
         yield Candidate(name, "CAN interface", urls, remedy=None if is_up else remedy)

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import serial
 
 from drivers.codec.can_bus.adapter_text import SlcanReader
-from drivers.codec.can_bus.frame import CANOPEN, cob_id
+from drivers.codec.can_bus.canopen import BITRATE, cob_id
+from drivers.codec.can_bus.segments import NODE_MAX
 
 _BAUD = 115_200  # ignored by USB devices, which most adapters are
 _REPLY_TIMEOUT = 0.1  # s; USB adapters and their drivers delay bytes by 16 ms at most
@@ -63,9 +64,7 @@ def _listening(line: serial.Serial) -> Iterator[bool]:
     line.write(b"C\r")  # in case it was left open
     _text_until(line, _END)
     try:
-        yield _is_done(line, b"S%d\r" % _SPEEDS.index(CANOPEN["bitrate"])) and _is_done(
-            line, b"L\r"
-        )
+        yield _is_done(line, b"S%d\r" % _SPEEDS.index(BITRATE)) and _is_done(line, b"L\r")
     finally:
         with suppress(serial.SerialException):
             line.write(b"C\r")
@@ -88,7 +87,7 @@ def _text_until(line: serial.Serial, end: re.Pattern[bytes]) -> bytes:
 def _heard(line: serial.Serial) -> Iterator[int]:
     """Yield the nodes whose heartbeats are received."""
     reader, deadline = SlcanReader(), time.monotonic() + _LISTENING_TIME
-    nodes = {cob_id("heartbeat", node): node for node in range(1, int(CANOPEN["node_max"]) + 1)}
+    nodes = {cob_id("heartbeat", node): node for node in range(1, NODE_MAX + 1)}
     while time.monotonic() < deadline:
         for frame in reader.feed(line.read(max(1, line.in_waiting))):
             if frame.id in nodes:

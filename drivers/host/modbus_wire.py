@@ -9,8 +9,14 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from drivers.codec.modbus.adu import ModbusResponse, RequestAdu, ResponseReader, build_adu
-from drivers.codec.modbus.exchanges import Read, Write
+from drivers.codec.modbus.adu import (
+    ModbusResponse,
+    Read,
+    RequestAdu,
+    ResponseReader,
+    Write,
+    build_adu,
+)
 from drivers.host.wire import Arrival, Broken, More, Nak, Reply, Several, read_nak
 from drivers.protocol.quantity import WireQuantity
 from drivers.protocol.records import Number, Numbers, Real, Record, Refusal, Rest, Rows, Values

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Iterator, Mapping, Sequence
 
 from drivers import clock
-from drivers.codec.can_bus.frame import CANOPEN, CanFrame, cob_id
+from drivers.codec.can_bus.canopen import CANOPEN, CanFrame, cob_id
 from drivers.codec.can_bus.segments import (
     NODE_MAX,
     NUMBER_MAX,

@@ -5,7 +5,7 @@ import struct
 from typing import cast
 
 from drivers import clock
-from drivers.codec.can_bus.frame import CANOPEN, cob_id
+from drivers.codec.can_bus.canopen import CANOPEN, cob_id
 from drivers.codec.can_bus.segments import segments
 from drivers.protocol.sets import pack_layers
 from drivers.protocol.table import MESSAGES

@@ -4,8 +4,8 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 
-from drivers.backends.hardware import number_below
 from drivers.errors import LinkError
+from drivers.hardware import number_below
 from drivers.protocol.table import MESSAGES
 from drivers.verdict.can_client import CanClient
 from drivers.verdict.client import Client, Port

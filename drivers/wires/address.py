@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 
-from drivers.backends.hardware import Port
+from drivers.hardware import Port
 from drivers.host.wire import Wire
 
 

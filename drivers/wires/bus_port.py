@@ -11,11 +11,11 @@ from typing import Any, final
 
 import can
 
-from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import REQUEST, pack_frames, unpack_frames
 from drivers.errors import LinkError, system_message
 from drivers.threads import close_in_thread, in_thread
+from drivers.urls.can_bus import CanBusUrl
 
 _WATCHED = ("socketcan", "udp_multicast")
 """Interfaces whose file descriptor the event loop watches: `recv` of the others may block."""

@@ -3,13 +3,13 @@
 How they are packed: `drivers.codec.can_bus.segments`.
 """
 
-from drivers.backends.hardware import number_below
-from drivers.backends.urls.can_bus import CanBusUrl, CanUrl
 from drivers.codec.can_bus.canopen import frame_time
 from drivers.codec.can_bus.segments import NUMBER_MAX, frames_of
 from drivers.errors import CommandError
+from drivers.hardware import number_below
 from drivers.host.can_wire import CanWire
 from drivers.host.wire import NETWORK_DELAY
+from drivers.urls.can_bus import CanBusUrl, CanUrl
 from drivers.wires.address import WireAddress
 
 

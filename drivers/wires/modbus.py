@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
-from drivers.backends.hardware import Port, number_below
-from drivers.backends.ports.opening import open_port
-from drivers.backends.ports.tcp import open_connection
-from drivers.backends.urls.modbus import ModbusUrl
+from drivers.hardware import Port, number_below
 from drivers.host.modbus_wire import ModbusWire
 from drivers.host.wire import NETWORK_DELAY
+from drivers.ports.opening import open_port
+from drivers.ports.tcp import open_connection
+from drivers.urls.modbus import ModbusUrl
 from drivers.wires.address import WireAddress
 from drivers.wires.silent_port import SilentPort
 

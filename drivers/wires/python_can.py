@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from drivers.backends.hardware import Port
+from drivers.hardware import Port
 from drivers.wires.can_address import CanAddress
 
 

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
-from drivers.backends.hardware import Port, number_below
-from drivers.backends.ports.opening import open_port
-from drivers.backends.urls.serial_line import SerialUrl
 from drivers.codec.serial_line.frame import frame_length
+from drivers.hardware import Port, number_below
 from drivers.host.serial_wire import SerialWire
+from drivers.ports.opening import open_port
+from drivers.urls.serial_line import SerialUrl
 from drivers.wires.address import WireAddress
 
 _BITS = 10  # of a byte, with start and stop

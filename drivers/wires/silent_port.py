@@ -5,8 +5,8 @@ import contextlib
 from collections.abc import Awaitable, Callable
 from typing import final
 
-from drivers.backends.hardware import Port
 from drivers.errors import LinkError
+from drivers.hardware import Port
 
 _FRAME_MAX = 256  # bytes
 _BROADCAST = b"\0"

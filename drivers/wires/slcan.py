@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
-from drivers.backends.hardware import Port
-from drivers.backends.ports.opening import open_port
-from drivers.backends.ports.tcp import open_connection
 from drivers.codec.can_bus.adapter_text import SlcanReader, slcan_line
 from drivers.errors import CommandError
+from drivers.hardware import Port
+from drivers.ports.opening import open_port
+from drivers.ports.tcp import open_connection
 from drivers.wires.can_address import CanAddress
 from drivers.wires.text_port import TextPort
 

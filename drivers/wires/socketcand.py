@@ -4,10 +4,10 @@ import asyncio
 import re
 from collections.abc import Callable
 
-from drivers.backends.hardware import Port
-from drivers.backends.ports.tcp import open_connection
 from drivers.codec.can_bus.adapter_text import SocketcandReader, socketcand_element
 from drivers.errors import LinkError
+from drivers.hardware import Port
+from drivers.ports.tcp import open_connection
 from drivers.wires.can_address import CanAddress
 from drivers.wires.text_port import TextPort
 

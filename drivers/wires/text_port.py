@@ -4,10 +4,10 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Protocol, final
 
-from drivers.backends.hardware import Port
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from drivers.errors import LinkError
+from drivers.hardware import Port
 
 
 class _Reader(Protocol):

@@ -4,10 +4,10 @@ A wire has an address made of a URL, a port of bytes, and one of the three proto
 `CanWire` takes and gives frames as `pack_frames` and `unpack_frames` have them.
 """
 
-from drivers.backends.hardware import Port
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from drivers.errors import CommandError, LinkError
+from drivers.hardware import Port
 from drivers.host.can_wire import CanWire
 from drivers.host.modbus_wire import ModbusWire
 from drivers.host.serial_wire import SerialWire

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from drivers import clock
-from drivers.operation.garbage_collection import no_long_collections
+from drivers.garbage_collection import no_long_collections
 from model.rig.rig import Rig
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time

@@ -4,9 +4,9 @@ import pytest
 
 from drivers.amp_actions import identify, set_address
 from drivers.amplifier import Amplifier
-from drivers.backends.urls.address import with_address
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
 from drivers.registry import open_backend
+from drivers.urls.address import with_address
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from virtual_loop import in_virtual_time

@@ -14,7 +14,7 @@ from drivers.codec.can_bus.adapter_text import (
     slcan_line,
     socketcand_element,
 )
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.objects import pack_envelope, unpack_achieved, unpack_faults
 from drivers.codec.can_bus.replies import CanReplyReader, decode_emergency
 from drivers.codec.can_bus.requests import encode_request

@@ -8,7 +8,7 @@ import asyncio
 import heapq
 import itertools
 
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from sim.far_ends.can_bus.bus import CanBus, Listener, Stub
 
 SYNC, PERIOD = CanFrame(0x080, b""), 0.01  # s

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.objects import pack_envelope
 from drivers.codec.can_bus.requests import PdoRequest, encode_broadcast, encode_request
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot

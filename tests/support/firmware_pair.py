@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from drivers.codec.can_bus.adapter_text import SlcanReader, slcan_line
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import REPLY, REQUEST, pack_frames, segments, unpack_frames
 from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.protocol.records import Record, Values

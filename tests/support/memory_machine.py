@@ -15,16 +15,16 @@ from typing import Any, TypeVar, cast
 
 from greenlet import getcurrent, greenlet
 
-from drivers.backends.hardware import HARDWARE_PROVIDER, Adapter, HardwareProvider, Worker
-from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.adapter_text import (
     SlcanReader,
     SocketcandReader,
     slcan_line,
     socketcand_element,
 )
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.errors import LinkError
+from drivers.hardware import HARDWARE_PROVIDER, Adapter, HardwareProvider, Worker
+from drivers.urls.can_bus import CanBusUrl
 from sim.transport.pseudo_terminal import TERMINAL_MAKER, Terminal
 from virtual_loop import VirtualLoop
 

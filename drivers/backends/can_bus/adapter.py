@@ -10,12 +10,12 @@ from typing import final
 import can
 
 from drivers.backends.can_bus.interfaces import flush, open_bus, send_some, wake
-from drivers.backends.hardware import HARDWARE_PROVIDER, Adapter
-from drivers.backends.ports.watched import remedy_of
-from drivers.backends.urls.can_bus import CanBusUrl
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.errors import LinkError, system_message
+from drivers.hardware import HARDWARE_PROVIDER, Adapter
+from drivers.ports.watched import remedy_of
 from drivers.threads import close_in_thread, in_thread
+from drivers.urls.can_bus import CanBusUrl
 
 _READ_TIMEOUT = 0.05  # s; interval in which the reader notices its end
 _BUS_OFF = 0x40  # error class of SocketCAN

@@ -16,8 +16,6 @@ from drivers.backends.can_bus.bus import CanBus, can_bus
 from drivers.backends.can_bus.node import NodeWatch
 from drivers.backends.can_bus.objects import ObjectClient
 from drivers.backends.can_bus.pending import PendingRequests
-from drivers.backends.hardware import Worker, make_worker
-from drivers.backends.urls.can_bus import CanUrl
 from drivers.backends.wire_backend import WireBackend
 from drivers.codec.can_bus.frame import CANOPEN, CanFrame, cob_id
 from drivers.codec.can_bus.replies import UNSOLICITED, CanReply, plain_reply
@@ -29,6 +27,7 @@ from drivers.codec.can_bus.requests import (
 )
 from drivers.codec.can_bus.timing import CanTimes
 from drivers.errors import CommandError, LinkError, LinkTimeout
+from drivers.hardware import Worker, make_worker
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,
@@ -56,6 +55,7 @@ from drivers.protocol.messages import (
     Stop,
 )
 from drivers.statistics import WireCounters
+from drivers.urls.can_bus import CanUrl
 
 _BROADCAST_TIMEOUT = 0.03  # s; for room in the transmit queue
 _ADDRESS_TIMEOUT = 0.5  # s; for an SDO reply to a new address, while nothing plays

@@ -13,12 +13,12 @@ import canopen
 
 from drivers import clock, trace
 from drivers.backends.can_bus.adapter import FULL_PAUSE, open_adapter
-from drivers.backends.hardware import Adapter
 from drivers.backends.shared_line import SharedLine, shared_line
-from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.frame import CanFrame, meaning
 from drivers.errors import LinkTimeout
+from drivers.hardware import Adapter
 from drivers.trace import Direction
+from drivers.urls.can_bus import CanBusUrl
 
 # Its messages become LinkErrors.
 logging.getLogger("canopen").addHandler(logging.NullHandler())

@@ -21,15 +21,15 @@ import can
 from can.interfaces.slcan import slcanBus
 from can.interfaces.virtual import VirtualBus
 
-from drivers.backends.ports.writing import descriptor, write_some
-from drivers.backends.urls.can_bus import CanBusUrl
 from drivers.codec.can_bus.adapter_text import (
     SlcanReader,
     SocketcandReader,
     slcan_line,
     socketcand_element,
 )
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
+from drivers.ports.writing import descriptor, write_some
+from drivers.urls.can_bus import CanBusUrl
 
 _PCAN_CLOCK = 80_000_000  # Hz
 _SAMPLE_POINT = 80.0  # % of a bit

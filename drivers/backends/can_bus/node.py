@@ -12,13 +12,13 @@ from canopen.nmt import NmtMaster
 from drivers import clock
 from drivers.backends.can_bus.bus import CanBus
 from drivers.backends.can_bus.objects import ObjectClient
-from drivers.backends.urls.can_bus import CanUrl
 from drivers.codec.can_bus.frame import CANOPEN, CanFrame, cob_id
 from drivers.codec.can_bus.replies import CanReply, CanReplyReader, decode_emergency
 from drivers.codec.can_bus.requests import host_number
 from drivers.errors import FrameError, LinkError
 from drivers.protocol.messages import AmplifierEvent
 from drivers.statistics import WireCounters
+from drivers.urls.can_bus import CanUrl
 
 MAX_MISSED_NODE_HEARTBEATS = 3  # of the amplifier, until it is lost
 _LATE = 0.005  # s; delay of timers, so that a loss is detected by the third heartbeat

@@ -15,7 +15,6 @@ from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from drivers.backends.hardware import Worker
 from drivers.backends.waiting import DUPLICATE_WAIT
 from drivers.codec.can_bus.frame import cob_id
 from drivers.codec.can_bus.objects import (
@@ -44,6 +43,7 @@ from drivers.codec.sensors import (
     unpack_sensor_reading,
 )
 from drivers.errors import FrameError, LinkError, LinkTimeout
+from drivers.hardware import Worker
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,

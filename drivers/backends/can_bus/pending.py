@@ -3,11 +3,11 @@
 import asyncio
 from dataclasses import dataclass
 
-from drivers.backends.hardware import number_below
 from drivers.backends.waiting import ReplyTimer
 from drivers.codec.can_bus.replies import CanReply
 from drivers.codec.can_bus.requests import SEQUENCE_MAX, PdoRequest, action_of
 from drivers.errors import LinkError
+from drivers.hardware import number_below
 from drivers.protocol.messages import Apply, Commit
 
 

@@ -11,9 +11,7 @@ Modbus has no unsolicited messages: events are changes of state or fault between
 import asyncio
 from collections.abc import Awaitable, Callable
 
-from drivers.backends.hardware import number_below
 from drivers.backends.modbus.line import ModbusLine, modbus_line
-from drivers.backends.urls.modbus import ModbusUrl
 from drivers.backends.waiting import DUPLICATE_WAIT
 from drivers.backends.wire_backend import WireBackend
 from drivers.codec.modbus import exchanges
@@ -22,6 +20,7 @@ from drivers.codec.modbus.blocks import unpack_fault_count
 from drivers.codec.modbus.exchanges import Exchange, Read, Write
 from drivers.codec.modbus.timing import ModbusTimes
 from drivers.errors import LinkError, LinkTimeout
+from drivers.hardware import number_below
 from drivers.protocol.messages import (
     AmplifierEvent,
     AmplifierState,
@@ -37,6 +36,7 @@ from drivers.protocol.messages import (
     Stop,
 )
 from drivers.protocol.wire_times import WireTimes
+from drivers.urls.modbus import ModbusUrl
 
 _ILLEGAL_FUNCTION = 1
 _GATEWAY = (10, 11)  # gateway: no path to the amplifier, or no response from it

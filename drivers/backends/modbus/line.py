@@ -9,18 +9,24 @@ import contextlib
 from collections.abc import Callable
 
 from drivers import clock, trace
-from drivers.backends.hardware import Port
 from drivers.backends.modbus.stream import open_stream
 from drivers.backends.shared_line import SharedLine, shared_line
-from drivers.backends.urls.modbus import ModbusUrl
 from drivers.backends.waiting import ReplyTimer
-from drivers.codec.modbus.adu import ModbusResponse, RequestAdu, ResponseReader, build_adu
-from drivers.codec.modbus.exchanges import Read, Write
+from drivers.codec.modbus.adu import (
+    ModbusResponse,
+    Read,
+    RequestAdu,
+    ResponseReader,
+    Write,
+    build_adu,
+)
 from drivers.codec.modbus.timing import ModbusTimes
 from drivers.errors import LinkError, LinkTimeout
+from drivers.hardware import Port
 from drivers.protocol.definition import PROTOCOL
 from drivers.statistics import WireCounters
 from drivers.trace import Direction
+from drivers.urls.modbus import ModbusUrl
 
 _REACTION = PROTOCOL.reaction
 _BROADCAST: int = PROTOCOL.modbus["broadcast"]

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
-from drivers.backends.hardware import Port
-from drivers.backends.ports.opening import open_port
-from drivers.backends.ports.tcp import open_connection
-from drivers.backends.urls.modbus import ModbusUrl
+from drivers.hardware import Port
+from drivers.ports.opening import open_port
+from drivers.ports.tcp import open_connection
+from drivers.urls.modbus import ModbusUrl
 
 
 async def open_stream(

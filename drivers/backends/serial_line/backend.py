@@ -8,20 +8,20 @@ import asyncio
 from dataclasses import dataclass, replace
 
 from drivers import clock, trace
-from drivers.backends.hardware import number_below
 from drivers.backends.serial_line.line import SerialLine, serial_line
-from drivers.backends.urls.serial_line import SerialUrl
 from drivers.backends.waiting import DUPLICATE_WAIT, ReplyTimer
 from drivers.backends.wire_backend import WireBackend
 from drivers.codec.serial_line.exchanges import decode_event, decode_reply, encode_request, is_event
 from drivers.codec.serial_line.frame import Frame, encode_frame
 from drivers.codec.serial_line.timing import SerialTimes
 from drivers.errors import DriverError, LinkError, LinkTimeout
+from drivers.hardware import number_below
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Broadcast, Hello, Reply, Request, Stop
 from drivers.protocol.wire_times import WireTimes
 from drivers.statistics import WireCounters
 from drivers.trace import Direction
+from drivers.urls.serial_line import SerialUrl
 
 
 @dataclass

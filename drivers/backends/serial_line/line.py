@@ -3,11 +3,11 @@
 from collections.abc import Callable
 
 from drivers import trace
-from drivers.backends.hardware import Port
-from drivers.backends.ports.opening import open_port
 from drivers.backends.shared_line import SharedLine, shared_line
 from drivers.codec.serial_line.frame import Frame, FrameReader
 from drivers.errors import LinkError
+from drivers.hardware import Port
+from drivers.ports.opening import open_port
 from drivers.trace import Direction
 
 

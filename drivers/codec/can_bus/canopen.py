@@ -9,6 +9,9 @@ BLOCK: Final = 8
 _FRAME_BITS = 47 + 8 * BLOCK
 _STUFFED_MAX = (33 + 8 * BLOCK) // 4  # one stuff bit per four at worst
 
+BITRATE: Final = 500_000
+"""Of a bus whose URL names none [bit/s]."""
+
 CANOPEN: Mapping[str, Any] = {
     "heartbeat_ms": 50,  # of the amplifier
     "device_type": 0,  # no device profile

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar, final
 
-from drivers.codec.can_bus.frame import BLOCK, CanFrame
+from drivers.codec.can_bus.canopen import BLOCK, CanFrame
 from drivers.protocol.wire_times import WireTimes
 
 _FRAME_BITS = 47  # besides the data, with the interframe space

@@ -16,7 +16,6 @@ from pymodbus.pdu.register_message import (
     WriteMultipleRegistersRequest,
 )
 
-from drivers.codec.modbus.exchanges import Read, Write
 from drivers.statistics import WireCounters
 
 _DECODER = DecodePDU(False)
@@ -28,6 +27,22 @@ _RTU_MAX = 256
 _EXCEPTION = 0x80
 _READS = (3, 4, 23)
 _WRITES = (5, 6, 15, 16)
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """Registers to write at consecutive addresses."""
+
+    address: int
+    registers: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """A number of registers to read from an address on."""
+
+    address: int
+    count: int
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from drivers.codec.modbus import blocks, sensor_blocks
+from drivers.codec.modbus.adu import Read as Read
+from drivers.codec.modbus.adu import Write as Write
 from drivers.codec.modbus.blocks import (
     CHANNEL_SIZE,
     FAULT_SIZE,
@@ -64,22 +66,6 @@ _WITHOUT_STATE = (
     *(Hello, GetCaps, GetFaults, GetMeasured, LoadEnvelope),
     *(GetSensors, Measure, GetReading, GetBlock),
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Write:
-    """Registers to write at consecutive addresses."""
-
-    address: int
-    registers: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Read:
-    """A number of registers to read from an address on."""
-
-    address: int
-    count: int
 
 
 @dataclass(frozen=True, slots=True)

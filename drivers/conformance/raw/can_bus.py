@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from drivers.backends.can_bus.bus import CanBus, can_bus
-from drivers.backends.urls.can_bus import CanUrl
 from drivers.codec.can_bus.frame import CANOPEN, LAYOUTS, CanFrame, cob_id
 from drivers.codec.can_bus.requests import encode_broadcast, encode_request
 from drivers.codec.can_bus.timing import CanTimes
 from drivers.conformance.raw.line import NO_REPLY, REPLY, RawLine, RawRequest
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Apply, Broadcast, GetStatus, NakCode, Ping, Stage, Stop
+from drivers.urls.can_bus import CanUrl
 
 _TIMEOUT = 0.03  # s, beyond the time on the bus; three times the longest reaction
 _SEND_TIMEOUT = 0.03  # s; for room in the transmit queue

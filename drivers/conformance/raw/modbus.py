@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pymodbus.framer import FramerRTU
 
 from drivers.backends.modbus.line import ModbusLine, modbus_line
-from drivers.backends.urls.modbus import ModbusUrl
 from drivers.codec.modbus import exchanges
 from drivers.codec.modbus.exchanges import Write
 from drivers.codec.modbus.timing import ModbusTimes
 from drivers.conformance.raw.line import NO_REPLY, REPLY, RawLine, RawRequest
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import Apply, Broadcast, Ping, Request, Stop
+from drivers.urls.modbus import ModbusUrl
 
 _MAP = PROTOCOL.modbus
 _Q = PROTOCOL.quantities

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 from drivers.amplifier import WATCHDOG
 from drivers.backends.serial_line.line import SerialLine, serial_line
-from drivers.backends.urls.serial_line import SerialUrl
 from drivers.codec.serial_line.exchanges import encode_request, is_event
 from drivers.codec.serial_line.frame import NEUTRAL, Frame, FrameReader, encode_frame
 from drivers.codec.serial_line.frame import REPLY as REPLY_BIT
@@ -25,6 +24,7 @@ from drivers.protocol.messages import (
     SetAddress,
     Stop,
 )
+from drivers.urls.serial_line import SerialUrl
 
 _NAK = REPLY_BIT | PROTOCOL.types["nak"]
 _OTHER_ADDRESS = PROTOCOL.serial.address_max - 1

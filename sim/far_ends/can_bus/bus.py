@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Callable
 
 from drivers import clock
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from sim.faults.fault_window import Faults
 from sim.transport.frame_time import FrameTime
 from sim.transport.line import TwoWayLine

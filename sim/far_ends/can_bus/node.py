@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable
 
 from drivers import clock
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.protocol.messages import AmplifierEvent, AmplifierState, Fault, Ping, Stop
 from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.objects import CANOPEN, IDS, ObjectDictionary

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.protocol.definition import PROTOCOL
 from drivers.protocol.messages import (
     Achieved,

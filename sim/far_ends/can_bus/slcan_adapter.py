@@ -7,7 +7,7 @@ modelled: acceptance masks, time stamps and polling, which are accepted without 
 import re
 from collections.abc import Callable
 
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from sim.far_ends.can_bus.bus import LENGTHS, CanBus
 from sim.transport.pseudo_terminal import make_terminal
 

@@ -8,7 +8,7 @@ import re
 from dataclasses import dataclass
 
 from drivers import clock
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from sim.far_ends.can_bus.bus import LENGTHS, CanBus
 from sim.transport.loopback import listen, port_of
 

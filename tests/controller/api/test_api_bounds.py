@@ -21,7 +21,7 @@ from controller.api.methods import METHODS
 from controller.api.schema import MAX_RATE, Message
 from controller.api.server import ApiServer
 from controller.api.topics import ContactsEvent
-from drivers.operation.garbage_collection import no_long_collections
+from drivers.garbage_collection import no_long_collections
 from wire_of_memory import Wire
 
 

@@ -13,10 +13,10 @@ import pytest
 
 from drivers import threads
 from drivers.backends.can_bus import adapter
-from drivers.backends.hardware import Adapter, Port
-from drivers.backends.ports import opening
-from drivers.backends.urls.can_bus import CanUrl
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
+from drivers.hardware import Adapter, Port
+from drivers.ports import opening
+from drivers.urls.can_bus import CanUrl
 
 
 class _Hanging:

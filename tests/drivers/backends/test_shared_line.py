@@ -8,19 +8,19 @@ from functools import partial
 import pytest
 
 from drivers.backends.can_bus.backend import CanBackend
-from drivers.backends.hardware import (
+from drivers.backends.modbus.backend import ModbusBackend
+from drivers.backends.serial_line.backend import SerialBackend
+from drivers.backends.shared_line import SharedLine, shared_line
+from drivers.backends.wire_backend import WireBackend
+from drivers.codec.can_bus.canopen import CanFrame
+from drivers.errors import LinkError
+from drivers.hardware import (
     HARDWARE_PROVIDER,
     Adapter,
     HardwareProvider,
     Port,
     Worker,
 )
-from drivers.backends.modbus.backend import ModbusBackend
-from drivers.backends.serial_line.backend import SerialBackend
-from drivers.backends.shared_line import SharedLine, shared_line
-from drivers.backends.wire_backend import WireBackend
-from drivers.codec.can_bus.frame import CanFrame
-from drivers.errors import LinkError
 from drivers.line.priority import priority_of
 from drivers.line.sender import sender_of
 from drivers.protocol.messages import Arm, Ping, Stop

@@ -8,7 +8,6 @@ from pathlib import Path
 import minimalmodbus
 import pytest
 
-from drivers.backends.urls.address import with_address
 from drivers.by_hand import actions
 from drivers.by_hand.discovery import identify_all
 from drivers.contents import Layer, Tone
@@ -17,6 +16,7 @@ from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.table import FEATURES, STATES
 from drivers.trace import tracing
+from drivers.urls.address import with_address
 from registry.limits import GuardLimits
 from word_wires import WORD_WIRES, FarSide
 

@@ -14,7 +14,7 @@ from serial.tools.list_ports_common import ListPortInfo
 from typer.testing import CliRunner
 
 from drivers.cli import app
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.discovery import slcan
 from drivers.discovery.slcan import SlcanAdapter, detect_slcan
 from sim.far_ends.can_bus.bus import CanBus
@@ -22,7 +22,7 @@ from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter as FarAdapter
 
 
 class Adapter:
-    """A serial port with a far end's adapter, in a thread; nodes 1 and 5 send heartbeats."""
+    """A serial port with a far end's adapter, in a thread; nodes 1 and 127 send heartbeats."""
 
     def __init__(self) -> None:
         self.said = b""
@@ -46,7 +46,7 @@ class Adapter:
         self._loop.run_forever()
 
     def _beat(self) -> None:
-        for can_id, data in ((0x701, b"\x05"), (0x705, b"\x7f"), (0x77F, b"\x05"), (0x181, b"\0")):
+        for can_id, data in ((0x701, b"\x05"), (0x77F, b"\x7f"), (0x700, b"\x05"), (0x181, b"\0")):
             self._bus.send(CanFrame(can_id, data), sender=self.on_bus.append)
         self._loop.call_later(0.05, self._beat)
 
@@ -95,11 +95,11 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("patient")
 def test_adapter_listens_and_is_closed(adapter: Adapter) -> None:
-    """Its version, and the amplifiers' nodes that beat there, not the host's; L and no other
+    """Its version, and the amplifiers' nodes that beat there, and no node 0; L and no other
     opening, closed at the end, and not a frame of ours on the bus."""
-    assert detect_slcan(adapter.port) == SlcanAdapter("1013", nodes=(1, 5))
+    assert detect_slcan(adapter.port) == SlcanAdapter("1013", nodes=(1, 127))
     assert adapter.has_got(b"V\rC\rS6\rL\rC\r")
-    assert {frame.id for frame in adapter.on_bus} == {0x701, 0x705, 0x77F, 0x181}
+    assert {frame.id for frame in adapter.on_bus} == {0x701, 0x77F, 0x700, 0x181}
 
 
 def test_other_device_receives_two_characters(adapter: Adapter) -> None:
@@ -135,6 +135,6 @@ def test_discover_probes_adapters_on_request_only(
     assert result.exit_code == 0, result.output
     (place,) = [one for one in json.loads(result.stdout)["places"] if one["place"] == adapter.port]
     url = f"can+slcan://{adapter.port}?bitrate=500000#"
-    assert place["heard"] == ([f"{url}1", f"{url}5"] if is_wanted else [])
-    assert ("slcan adapter 1013, heartbeats of nodes: 1, 5" in place["description"]) == is_wanted
+    assert place["heard"] == ([f"{url}1", f"{url}127"] if is_wanted else [])
+    assert ("slcan adapter 1013, heartbeats of nodes: 1, 127" in place["description"]) == is_wanted
     assert adapter.has_got(b"V\rC\rS6\rL\rC\r" if is_wanted else b"")

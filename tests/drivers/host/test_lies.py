@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import PACKED, pack_frames
 from drivers.contents import Layer, Tone
 from drivers.errors import DriverError, LinkDegraded

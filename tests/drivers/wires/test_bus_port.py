@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager
 import can
 import pytest
 
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames
 from drivers.errors import LinkError
 from drivers.wires.bus_port import BusPort

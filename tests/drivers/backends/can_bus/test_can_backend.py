@@ -20,13 +20,13 @@ from drivers.backends.can_bus import interfaces
 from drivers.backends.can_bus.backend import CanBackend
 from drivers.backends.can_bus.bus import can_bus
 from drivers.backends.can_bus.pending import PendingRequests
-from drivers.backends.urls.can_bus import CanUrl
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.objects import index_of
 from drivers.command import CommandSet, DriveCommand, Envelope, Knot
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout
 from drivers.guard import Guard, GuardLimits
 from drivers.protocol.messages import AmplifierEvent, AmplifierState, Apply, Arm, Fault, Hello, Ping
+from drivers.urls.can_bus import CanUrl
 from model.rig.rig import Rig
 from sim.amplifier.sensor_messages import SensedAmplifier
 from sim.bench.bench import Bench

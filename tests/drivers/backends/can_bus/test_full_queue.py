@@ -13,10 +13,10 @@ import pytest
 from drivers import clock
 from drivers.backends.can_bus.bus import CanBus
 from drivers.backends.can_bus.interfaces import send_some
-from drivers.backends.hardware import HARDWARE_PROVIDER, Adapter, HardwareProvider, Port, Worker
-from drivers.backends.urls.can_bus import CanUrl
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.errors import LinkTimeout
+from drivers.hardware import HARDWARE_PROVIDER, Adapter, HardwareProvider, Port, Worker
+from drivers.urls.can_bus import CanUrl
 from virtual_loop import in_virtual_time
 
 ROOM = 10

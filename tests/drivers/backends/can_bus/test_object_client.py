@@ -6,8 +6,8 @@ import canopen
 import pytest
 
 from drivers.backends.can_bus.objects import ObjectClient
-from drivers.backends.hardware import Worker
 from drivers.errors import LinkTimeout
+from drivers.hardware import Worker
 from drivers.statistics import WireCounters
 
 TIMEOUT = 0.01  # s; of a node that never answers

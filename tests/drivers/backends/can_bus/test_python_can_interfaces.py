@@ -11,8 +11,8 @@ from can.interfaces import BACKENDS
 
 from drivers.backends.can_bus.adapter import open_adapter
 from drivers.backends.can_bus.interfaces import open_bus
-from drivers.backends.urls.can_bus import CanUrl
 from drivers.errors import LinkError
+from drivers.urls.can_bus import CanUrl
 
 OWN = ("slcan", "socketcan", "socketcand")
 CHANNELS = {

@@ -13,8 +13,7 @@ from drivers.amplifier import Amplifier
 from drivers.backends.modbus import line as line_of_modbus
 from drivers.backends.modbus.backend import ModbusBackend
 from drivers.backends.modbus.line import modbus_line
-from drivers.backends.urls.modbus import ModbusUrl
-from drivers.codec.modbus.exchanges import Read, Write
+from drivers.codec.modbus.adu import Read, Write
 from drivers.errors import FrameError, LinkError, LinkTimeout
 from drivers.protocol.messages import (
     Achieved,
@@ -39,6 +38,7 @@ from drivers.protocol.messages import (
     Stage,
     Stop,
 )
+from drivers.urls.modbus import ModbusUrl
 from modbus_peer import Peer, peer
 from sim.far_ends.modbus.frames import RequestAdu as Telegram
 from sim.far_ends.modbus.unit import ModbusUnit

@@ -13,11 +13,11 @@ import pytest
 import serial
 
 from drivers.amplifier import Amplifier
-from drivers.backends.ports import opening
 from drivers.backends.serial_line.backend import SerialBackend
 from drivers.codec.serial_line.exchanges import decode_request, encode_reply
 from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.errors import FrameError, LinkError, LinkTimeout
+from drivers.ports import opening
 from drivers.protocol.messages import GetStatus, Hello, Nak, NakCode, Ping, Request
 from scripted_amplifier import FarEnd
 from vendor_pages import ARMED, IDENTITY, usual_reply

@@ -13,7 +13,7 @@ from drivers.codec.can_bus.adapter_text import (
     slcan_line,
     socketcand_element,
 )
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 
 Reader = SlcanReader | SocketcandReader
 FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))

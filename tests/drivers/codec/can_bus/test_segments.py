@@ -5,7 +5,7 @@ import random
 
 import pytest
 
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import (
     Assembler,
     Message,

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 import can
 import pytest
 
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.errors import LinkError
 from sim.far_ends.can_bus.bus import CanBus
 from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter, SlcanEnd

@@ -12,7 +12,7 @@ import pytest
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError
 
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus import sdo

@@ -6,7 +6,7 @@ import struct
 import pytest
 
 from can_session import INCOMPLETE_LIFE, Timers
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.protocol.messages import AmplifierState, Fault, Ping
 from fake_device import FakeDevice
 from sim.far_ends.can_bus.node import CanNode

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import drivers
 from can_eds import eds_text
 from can_session import Timers
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
 from drivers.protocol.messages import Fault
 from fake_device import FakeDevice
 from sim.far_ends.can_bus import sdo

@@ -4,7 +4,7 @@ from itertools import islice
 
 import pytest
 
-from drivers.operation.pauses import Backoff, pauses
+from drivers.pauses import Backoff, pauses
 
 
 def test_pauses_grow_up_to_a_limit() -> None:

@@ -6,16 +6,16 @@ from collections.abc import Callable
 
 import serial
 
-from drivers.backends.hardware import HARDWARE_PROVIDER, Port
-from drivers.backends.ports.tcp import bound_delay
-from drivers.backends.ports.watched import (
+from drivers.errors import LinkError, system_message
+from drivers.hardware import HARDWARE_PROVIDER, Port
+from drivers.ports.tcp import bound_delay
+from drivers.ports.watched import (
     READ_TIMEOUT,
     WatchedPort,
     close_port,
     connection_of,
     remedy_of,
 )
-from drivers.errors import LinkError, system_message
 from drivers.threads import in_thread
 
 _FAILURES: tuple[type[Exception], ...] = (OSError, ValueError)  # of pyserial, at opening

@@ -7,8 +7,8 @@ import socket
 from collections.abc import Callable
 from typing import cast
 
-from drivers.backends.hardware import Port
 from drivers.errors import LinkError, LinkTimeout, system_message
+from drivers.hardware import Port
 from drivers.host.wire import NETWORK_DELAY
 from drivers.threads import in_thread
 

@@ -1,13 +1,19 @@
 """Modbus amplifier URLs: modbus+tcp://HOST:PORT/UNIT and modbus+rtu:///dev/ttyS1?baud=115200#UNIT."""
 
 from dataclasses import dataclass, replace
+from typing import Final
 from urllib.parse import SplitResult, unquote
 
-from drivers.backends.urls.options import device_of, options_of, split_url, whole_number
 from drivers.errors import CommandError
-from drivers.protocol.definition import PROTOCOL
+from drivers.urls.options import device_of, options_of, split_url, whole_number
 
-_MAP = PROTOCOL.modbus
+UNIT: Final = 1
+"""Of an amplifier as it is made."""
+RTU_BAUD: Final = 115_200
+"""Of a line whose URL names none [baud]; 8 data bits, even parity, 1 stop bit."""
+
+_UNIT_MAX = 247
+_TCP_PORT = 502
 _TCP_FORM = "modbus+tcp://HOST:PORT/UNIT (behind a gateway: ?baud=19200, that of its line)"
 _RTU_FORM = "modbus+rtu:///dev/ttyS1?baud=115200#UNIT"
 _BAUD_MAX = 12_000_000  # the fastest USB adapters
@@ -65,7 +71,7 @@ def _tcp(parts: SplitResult, url: str) -> ModbusUrl:
     return ModbusUrl(
         False,
         host=parts.hostname,
-        port=parts.port or _MAP["tcp_port"],
+        port=parts.port or _TCP_PORT,
         baud=_baud(options, 0, url),
         unit=_unit(unquote(parts.path).strip("/"), url),
     )
@@ -91,7 +97,7 @@ def _rtu(parts: SplitResult, url: str) -> ModbusUrl:
         host=parts.hostname or "",
         port=parts.port or 0,
         device=device,
-        baud=_baud(options, _MAP["baud"] if device else 0, url),
+        baud=_baud(options, RTU_BAUD if device else 0, url),
         parity=_PARITIES[parity],
         stop=whole_number(options.get("stop", "1"), "stop", high=2, url=url),
         unit=_unit(parts.fragment, url),
@@ -104,5 +110,4 @@ def _baud(options: dict[str, str], default: int, url: str) -> int:
 
 
 def _unit(text: str, url: str) -> int:
-    unit: int = _MAP["unit"]
-    return whole_number(text, "unit", high=_MAP["unit_max"], url=url) if text else unit
+    return whole_number(text, "unit", high=_UNIT_MAX, url=url) if text else UNIT

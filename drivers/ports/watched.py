@@ -16,8 +16,8 @@ from typing import final
 
 import serial
 
-from drivers.backends.ports.writing import descriptor, make_writer
 from drivers.errors import LinkError
+from drivers.ports.writing import descriptor, make_writer
 from drivers.threads import close_in_thread
 
 READ_TIMEOUT = 0.1  # s; interval in which a reader thread notices its end

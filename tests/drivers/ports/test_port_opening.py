@@ -6,8 +6,8 @@ import pytest
 import serial
 
 from drivers.backends.modbus.stream import open_stream
-from drivers.backends.ports import opening
-from drivers.backends.urls.modbus import ModbusUrl
+from drivers.ports import opening
+from drivers.urls.modbus import ModbusUrl
 
 
 class _Port:

@@ -2,11 +2,11 @@
 
 import pytest
 
-from drivers.backends.urls.can_bus import CanBusUrl, CanUrl
-from drivers.backends.urls.modbus import ModbusUrl
-from drivers.backends.urls.serial_line import SerialUrl
 from drivers.errors import CommandError
 from drivers.registry import open_backend
+from drivers.urls.can_bus import CanBusUrl, CanUrl
+from drivers.urls.modbus import ModbusUrl
+from drivers.urls.serial_line import SerialUrl
 
 TCP, RTU = "modbus+tcp", "modbus+rtu"
 
@@ -40,7 +40,7 @@ def bus(interface: str, channel: str, *, server: tuple[str, int] = ("", 0)) -> C
             "can+slcan://10.0.0.7:4001#9",
             CanUrl(bus("slcan", "", server=("10.0.0.7", 4001)), 9, 0.05),
         ),
-        ("can+socketcan://can0#63", CanUrl(bus("socketcan", "can0"), 63, 0.05)),
+        ("can+socketcan://can0#127", CanUrl(bus("socketcan", "can0"), 127, 0.05)),
         (
             "can+socketcand://10.0.0.7:29536/can1?heartbeat=20#9",
             CanUrl(bus("socketcand", "can1", server=("10.0.0.7", 29536)), 9, 0.02),
@@ -95,7 +95,7 @@ def test_url_is_parsed(url: str, expected: SerialUrl | ModbusUrl | CanUrl) -> No
                 *("nothing://can0#1", "socketcan://#1", "socketcan://can0/x#1", "slcan://#1"),
                 *("slcan://host/dev/ttyACM0#1", "socketcand://host/can0#1"),
                 *("socketcand://:29536/can0#1", "socketcand://host:29536#1"),
-                *("socketcan://can0#0", "socketcan://can0#64", "socketcan://can0#one"),
+                *("socketcan://can0#0", "socketcan://can0#128", "socketcan://can0#one"),
                 *("socketcan://can0?bitrate=5#1", "socketcan://can0?node=1#1"),
                 *("socketcan://can0?fd=x#1", "socketcand://host:99999/can0#1"),
             )

@@ -7,9 +7,9 @@ import sys
 
 import pytest
 
-from drivers.backends.ports import tcp
-from drivers.backends.ports.tcp import open_connection
 from drivers.errors import LinkError, LinkTimeout
+from drivers.ports import tcp
+from drivers.ports.tcp import open_connection
 
 MEGABYTE = 1 << 20
 
@@ -69,7 +69,7 @@ def test_unresolved_name_does_not_delay_the_end_of_the_program() -> None:
     """Even if the name server does not reply."""
     program = """
 import asyncio, socket, threading
-from drivers.backends.ports import tcp
+from drivers.ports import tcp
 from drivers.errors import LinkError
 
 socket.getaddrinfo = lambda *args, **kwargs: threading.Event().wait()

@@ -5,13 +5,18 @@ serial+tcp://HOST:PORT                          a serial server with raw TCP
 """
 
 from dataclasses import dataclass
+from typing import Final
 from urllib.parse import unquote
 
-from drivers.backends.urls.options import device_of, options_of, split_url, whole_number
 from drivers.errors import CommandError
-from drivers.protocol.definition import PROTOCOL
+from drivers.urls.options import device_of, options_of, split_url, whole_number
+
+BAUD: Final = 921_600
+"""Of a line whose URL names none [baud]; 8 data bits, no parity, 1 stop bit."""
 
 _FORM = "serial:///dev/ttyUSB0?baud=921600 (or serial+tcp://HOST:PORT for a serial server)"
+_ADDRESS = 1  # of an amplifier as it is made
+_ADDRESS_MAX = 247  # as of Modbus, so that one label serves both
 _BAUD_MAX = 12_000_000  # the fastest USB adapters
 
 
@@ -47,11 +52,10 @@ class SerialUrl:
             port = device_of(path)
         else:
             raise CommandError(f"{url!r} must name a port; use {_FORM}")
-        line = PROTOCOL.serial
         return cls(
             port=port,
-            baud=whole_number(options.get("baud", str(line.baud)), "baud", high=_BAUD_MAX, url=url),
+            baud=whole_number(options.get("baud", str(BAUD)), "baud", high=_BAUD_MAX, url=url),
             address=whole_number(
-                options.get("address", str(line.address)), "address", high=line.address_max, url=url
+                options.get("address", str(_ADDRESS)), "address", high=_ADDRESS_MAX, url=url
             ),
         )

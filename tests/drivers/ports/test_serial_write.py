@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import pytest
 import serial
 
-from drivers.backends.ports.watched import WatchedPort
-from drivers.backends.ports.writing import make_writer
 from drivers.errors import LinkError
+from drivers.ports.watched import WatchedPort
+from drivers.ports.writing import make_writer
 
 TIMEOUT = 5.0  # s; for what is expected
 

@@ -2,7 +2,7 @@
 
 import gc
 
-from drivers.operation.garbage_collection import no_long_collections, without_collections
+from drivers.garbage_collection import no_long_collections, without_collections
 
 
 def test_present_objects_are_frozen_during_the_context() -> None:

@@ -5,11 +5,16 @@ also `drivers.backends.can_bus.interfaces`.
 """
 
 from dataclasses import dataclass
+from typing import Final
 from urllib.parse import unquote
 
-from drivers.backends.urls.options import device_of, options_of, split_url, whole_number
-from drivers.codec.can_bus.frame import CANOPEN
+from drivers.codec.can_bus.canopen import BITRATE, CANOPEN
+from drivers.codec.can_bus.segments import NODE_MAX
 from drivers.errors import CommandError
+from drivers.urls.options import device_of, options_of, split_url, whole_number
+
+NODE: Final = 1
+"""Of an amplifier as it is made."""
 
 _FORMS = (
     "can+socketcan://can0#1, can+slcan:///dev/ttyACM0?bitrate=500000#1, "
@@ -107,7 +112,7 @@ class CanUrl:
             channel=channel,
             host=host,
             port=port or 0,
-            bitrate=_whole(options, "bitrate", default=CANOPEN["bitrate"], url=url),
+            bitrate=_whole(options, "bitrate", default=BITRATE, url=url),
             fd=_whole(options, "fd", default=0, url=url),
             baud=_whole(options, "baud", default=115_200, url=url),
             options=tuple((name, options[name]) for name in adapter_options if name in options),
@@ -117,10 +122,9 @@ class CanUrl:
 
 
 def _node(text: str, url: str) -> int:
-    highest = int(CANOPEN["node_max"])
     if not text:
-        return int(CANOPEN["node"])
-    return whole_number(text, "the node after #", high=highest, url=url)
+        return NODE
+    return whole_number(text, "the node after #", high=NODE_MAX, url=url)
 
 
 def _whole(options: dict[str, str], name: str, *, default: int, url: str) -> int:

@@ -14,8 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from typing import Protocol, TypeVar
 
-from drivers.backends.urls.can_bus import CanBusUrl
-from drivers.codec.can_bus.frame import CanFrame
+from drivers.codec.can_bus.canopen import CanFrame
+from drivers.urls.can_bus import CanBusUrl
 
 _T = TypeVar("_T")
 

@@ -15,7 +15,7 @@ from controller.loop.envelopes import RAMPS_ONLY
 def run_daemon() -> int:
     """Run it with the arguments of this process; return the exit status."""
     if float(sys.argv[1]) <= 0:
-        capabilities.envelope_support = lambda rig, amplifiers: RAMPS_ONLY
+        vars(capabilities)["envelope_support"] = lambda rig, amplifiers: RAMPS_ONLY
     sys.argv[1:2] = ["daemon"]
     return main()
 

@@ -19,9 +19,7 @@ from controller.effects.registry import effect_kind, effect_kinds
 from controller.sources.contacts import Contact, ContactKey
 from controller.sources.registry import open_source
 from controller.sources.tuio import TuioSource
-from drivers.backends.serial_line.backend import SerialBackend
 from drivers.errors import CommandError
-from drivers.registry import known_schemes, open_backend
 from drivers.wires.known import address_of
 from drivers.wires.known import known_schemes as known_wires
 from drivers.wires.serial_line import SerialAddress
@@ -104,30 +102,6 @@ KINDS = [
         "    def start(self, contact, now, *, level_db_sl):\n"
         "        return 7\n",
         use=play_effect,
-    ),
-    Kind(
-        "backends",
-        "backend",
-        "from era_haptics.plugins.backends import CommandError as Refused, WireBackend\n"
-        "class THING(WireBackend):\n"
-        f"{URL_CLASS}"
-        "    async def open(self): pass\n"
-        "    async def close(self): pass\n"
-        "    async def exchange(self, request, *, timeout): pass\n",
-        "a class derived from Backend",
-        open_backend,
-        ("serial+tcp", SerialBackend),
-        known_schemes,
-        fails="from era_haptics.plugins.backends import WireBackend\n"
-        "class THING(WireBackend):\n"
-        "    def __init__(self, url): pass\n"
-        "    async def open(self): raise KeyError('open')\n"
-        "    async def close(self): pass\n"
-        "    async def exchange(self, request, *, timeout): pass\n",
-        use=lambda found: asyncio.run(found.open()),
-        ending="://",
-        rest="a:1",
-        error=CommandError,
     ),
     Kind(
         "wires",
@@ -290,7 +264,7 @@ def test_command_attributes_the_failure_of_a_plugin(
     install: Install, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Bad input (2), not a bug of this project (70)."""
-    kind = next(kind for kind in KINDS if kind.group == "backends")
+    kind = next(kind for kind in KINDS if kind.group == "wires")
     module = install("bad", kind, "fine", kind.fails)
     assert run(["amp", "stop", "fine://a:1"]) == 2
     error = capsys.readouterr().err

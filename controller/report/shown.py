@@ -12,10 +12,11 @@ from typing import Any, get_args
 
 from pydantic import BaseModel
 
-import drivers.protocol.messages
 from controller.api.methods import StatusResult
 from controller.daemon.config_sections import DaemonSection
 from controller.effects.layout_file import LayoutSection
+from drivers.protocol.records import Record, Rows
+from drivers.protocol.table import EVENT_RECORD, IDENTITY, MESSAGES, NAK_RECORD
 from model.rig.sections import RigSection
 
 _COMMENT = re.compile(r"(?m)(?:^|(?<=\s))#.*$")
@@ -34,7 +35,7 @@ def shown(text: str, *, home: Path, is_dump: bool = False) -> str:
 
     home: the folder that is replaced by ~; is_dump: of messages on a link.
     """
-    keys = _keys(*(_OF_DUMPS if is_dump else _OF_FILES)) - _PRIVATE
+    keys = (_keys_of_dumps() if is_dump else _keys(*_OF_FILES)) - _PRIVATE
 
     def entry(found: re.Match[str]) -> str:
         key, separator, value = found.groups()
@@ -47,14 +48,31 @@ def shown(text: str, *, home: Path, is_dump: bool = False) -> str:
 
 
 _OF_FILES = (RigSection, DaemonSection, LayoutSection, StatusResult)
-_OF_DUMPS = tuple(each for each in vars(drivers.protocol.messages).values() if is_dataclass(each))
 _PRIVATE = frozenset({"serial_number"})
 _OTHERS = ("baud", "bitrate", "timeout", "cause", "unix_time_s", "link", "way", "message")
 
 
 @cache
+def _keys_of_dumps() -> frozenset[str]:
+    """Every field of the messages of amplifiers, and the keys of a line."""
+    records = [EVENT_RECORD, IDENTITY, NAK_RECORD]
+    for message in MESSAGES.values():
+        records += (message.request, message.reply)
+    return frozenset({*_OTHERS, "time_s"}.union(*map(_fields_of, records)))
+
+
+def _fields_of(record: Record) -> set[str]:
+    names: set[str] = set()
+    for field in record.fields:
+        names.update(field.names)
+        if isinstance(field, Rows):
+            names |= _fields_of(field.record)
+    return names
+
+
+@cache
 def _keys(*models: Any) -> frozenset[str]:
-    """Every key of these models at any depth, and of URLs and dumps."""
+    """Every key of these models at any depth, and of URLs."""
     found, pending, seen = {*_OTHERS}, [*models], set[int]()
     while pending:
         each = pending.pop()

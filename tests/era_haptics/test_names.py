@@ -53,7 +53,7 @@ def test_unknown_name_lists_the_known_ones() -> None:
     [
         ("Client", "scipy matplotlib sim pymodbus"),
         ("load_rig", "matplotlib sim controller"),
-        ("plugins.backends", "model controller sim numpy scipy pymodbus can serial"),
+        ("plugins.wires", "model controller sim numpy scipy"),
         *(
             pytest.param(*row, marks=pytest.mark.long)
             for row in (

@@ -38,6 +38,15 @@ def test_report_hides_values_of_unknown_keys(text: str, expected: str) -> None:
     assert shown(text, home=HOME).rstrip() == expected
 
 
+def test_dump_shows_fields_of_messages() -> None:
+    """State and fault of a status, not the serial number of an identity or an unknown key."""
+    line = (
+        '{"link": "main", "content": {"state": 7, "fault": 1, "serial_number": "A-17", "pin": 4}}'
+    )
+    kept = shown(line, home=HOME, is_dump=True)
+    assert kept == line.replace('"A-17"', "hidden").replace('"pin": 4', '"pin": hidden')
+
+
 def test_example_rig_is_shown_without_its_comments() -> None:
     """All values of plate, ERAs, amplifier and limits."""
     text = example_rig_path().read_text("utf-8")

@@ -290,7 +290,7 @@ class ExpectedAmplifier(ExpectedState):
         if self._unanswered:
             return
         may_be_off = self.state == ENABLED and self.watchdog.may_have_expired(time)
-        of_sensor = self.is_enabled
+        of_sensor = self.is_enabled or not self._is_reported  # a fault may have come before
         self.outputs.check_levels(levels, time, time, may_be_off=may_be_off, of_sensor=of_sensor)
         self.outputs.check_frequencies(frequencies, time)
 

@@ -41,7 +41,9 @@ class TonePlayer:
     async def open(self) -> PlaybackCapabilities:
         """Open all amplifiers, disarmed; what they can play. Raises DriverError, InputError."""
         self.amplifiers = {
-            name: await self._lines.amplifier(url, self._rig.limits, name=name)
+            name: await self._lines.amplifier(
+                url, self._rig.limits, name=name, is_output=bool(self._rig.voltage_of(name))
+            )
             for name, url in self._urls.items()
         }
         self._group = Group(self.amplifiers)

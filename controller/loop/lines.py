@@ -10,7 +10,13 @@ class Lines(Protocol):
     """The open lines of a host, as `drivers.opening.Lines`."""
 
     async def amplifier(
-        self, url: str, limits: GuardLimits, *, name: str, serial_number: str | None = None
+        self,
+        url: str,
+        limits: GuardLimits,
+        *,
+        name: str,
+        serial_number: str | None = None,
+        is_output: bool | None = False,
     ) -> Amplifier:
         """Return the amplifier of a URL, its line open, nothing sent."""
 

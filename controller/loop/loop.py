@@ -193,10 +193,13 @@ class Controller:
 
     async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
         """Open the line of an amplifier; raises LinkError, CommandError."""
-        serial_number = self._serial_numbers.get(name)
         try:
             return await lines.amplifier(
-                self._urls[name], self._rig.limits, name=name, serial_number=serial_number
+                self._urls[name],
+                self._rig.limits,
+                name=name,
+                serial_number=self._serial_numbers.get(name),
+                is_output=bool(self._rig.voltage_of(name)),
             )
         except LinkError:
             self._missing = frozenset({name})

@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.amplifier import Amplifier
-from drivers.command import CommandSet, DriveCommand
-from drivers.guard import Guard, GuardLimits
-from drivers.registry import open_backend
+from drivers.host.group import Group
+from drivers.opening import Lines
 from far_end_process import FarEndProcess, far_end_process
 from model.rig.file import load_rig
 from model.vibration.parametric_plate import parametric_plate
+from patient_daemon import wait_long
+from registry.limits import GuardLimits
 from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.plant.imperfections import draw_imperfections
-from wires import patient
+from words_bench import layer
 
 FREQUENCY = 170.0
 # What no quantisation step divides, so that rounding shows.
@@ -27,32 +27,36 @@ async def steady(far_end: FarEndProcess, wiring: Mapping[str, tuple[str, int]]) 
     """Complex amplitudes at the sensors once all ERAs have played for two seconds."""
     sensors = {name: {"at_m": at} for name, at in SENSORS.items()}
     assert "error" not in await far_end.ask("sensors", sensors=sensors)
-    amplifiers = {}
+    lines, limits = Lines(), GuardLimits(40, 500, 1)
     try:
-        for name, url in far_end.urls.items():
-            amplifiers[name] = amplifier = Amplifier(open_backend(patient(url)), reply_timeout=5.0)
-            await amplifier.open()
-            await amplifier.arm(2.0)
-            commands = tuple(
-                DriveCommand(number, FREQUENCY, *DRIVE[era])
+        group = Group(
+            {
+                name: await lines.amplifier(url, limits, name=name)
+                for name, url in far_end.urls.items()
+            },
+            watchdog=2.0,
+        )
+        await group.open()
+        await group.arm()
+        tones = {
+            name: [
+                (number, FREQUENCY, *DRIVE[era])
                 for era, (at, number) in wiring.items()
                 if at == name
-            )
-            guard = Guard(GuardLimits(40, 500, 1), amplifier.capabilities)
-            await amplifier.stage(guard.check(CommandSet(1, commands, ramp=0.0, valid_for=0.0)))
-        for amplifier in amplifiers.values():
-            await amplifier.commit(1)
+            ]
+            for name in group.amplifiers
+        }
+        await group.apply({name: [layer(*each, ramp=0.0)] for name, each in tones.items()})
         begin = (await far_end.ask("state"))["time_s"]
         for _ in range(2):
             await far_end.ask("step", seconds=1.25)
-            for amplifier in amplifiers.values():
-                await amplifier.heartbeat()
+            for amplifier in group.amplifiers.values():
+                await amplifier.ping()  # of a watchdog in virtual time
         heard = await far_end.ask(
             "tones", since_s=begin + 2, until_s=begin + 2.5, frequencies_hz=[FREQUENCY]
         )
     finally:
-        for amplifier in amplifiers.values():
-            await amplifier.close()
+        await lines.close()
     turn = np.exp(2j * np.pi * FREQUENCY * begin)
     return np.array(
         [
@@ -81,12 +85,15 @@ def predicted(file: Path) -> np.ndarray:
 @pytest.mark.parametrize(
     ("main", "side"), [("serial", "modbus-tcp"), ("slcan", "modbus-rtu"), ("socketcand", "serial")]
 )
-async def test_two_wires_move_the_plate_as_one_does(tmp_path: Path, main: str, side: str) -> None:
+async def test_two_wires_move_the_plate_as_one_does(
+    tmp_path: Path, main: str, side: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Same ERAs, same drive: whichever wires carry it, the plate answers the same.
 
     Time is virtual, so that all commits are at one moment; what is left is what the wires round:
     levels to 0.01 %, phases to 0.01 degrees, together 3e-4 of what four ERAs can add up to.
     """
+    wait_long(monkeypatch)
     one = write_rig(tmp_path / "one.yaml")
     two = write_rig(tmp_path / "two.yaml", *TWO_AMPLIFIERS)
     options = ("--virtual-time", "--wire", f"main={main}")

@@ -227,11 +227,17 @@ class BenchLines:
         self._far_ends = far_ends
 
     async def amplifier(
-        self, url: str, limits: GuardLimits, *, name: str, serial_number: str | None = None
+        self,
+        url: str,
+        limits: GuardLimits,
+        *,
+        name: str,
+        serial_number: str | None = None,
+        is_output: bool | None = False,
     ) -> Host:
         """Return the amplifier of this name, on a new line."""
         line = self._far_ends[name].connect()
-        return Host(line, 1, limits, name=name, serial_number=serial_number)
+        return Host(line, 1, limits, name=name, serial_number=serial_number, is_output=is_output)
 
     async def close(self) -> None:
         """Close all lines."""

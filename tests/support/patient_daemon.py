@@ -14,9 +14,9 @@ from benchmarks.latency.daemon import run_daemon
 from controller.cli.main import main
 from controller.loop.loop import Controller
 from controller.sources import contacts
-from drivers.amp_actions import _opened
-from drivers.amplifier import Amplifier
-from drivers.operation.checked_amplifier import CheckedAmplifier
+from drivers.host.amplifier import Amplifier
+from drivers.host.group import Group
+from drivers.host.line import Line
 
 PROGRAM = (sys.executable, __file__)
 RESTING = (*PROGRAM, "--resting")
@@ -28,10 +28,11 @@ CONTACT_TIMEOUT = 5.0  # s; in place of 0.15 s
 
 def wait_long(patch: pytest.MonkeyPatch) -> None:
     """Let amplifiers be waited for, and wait, that long in this process."""
-    patch.setitem(Amplifier.__init__.__kwdefaults__, "reply_timeout", REPLY_TIMEOUT)  # type: ignore[arg-type]
-    patch.setitem(_opened.__wrapped__.__kwdefaults__, "reply_timeout", REPLY_TIMEOUT)  # type: ignore[attr-defined]
-    patch.setattr(CheckedAmplifier.arm, "__defaults__", (WATCHDOG,))
-    patch.setitem(Controller.__init__.__kwdefaults__, "watchdog", WATCHDOG)  # type: ignore[arg-type]
+    for method in (Line.submit, Amplifier._request):
+        patch.setitem(method.__kwdefaults__, "timeout", REPLY_TIMEOUT)  # type: ignore[arg-type]
+    patch.setattr("drivers.host.amplifier.COMMIT_DELAY", REPLY_TIMEOUT)
+    for made in (Controller, Group):
+        patch.setitem(made.__init__.__kwdefaults__, "watchdog", WATCHDOG)  # type: ignore[arg-type]
 
 
 if __name__ == "__main__":

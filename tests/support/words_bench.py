@@ -124,6 +124,10 @@ async def _opened_group(lines: Lines, urls: Mapping[str, str]) -> Group:
     return group
 
 
-def layer(*tones: tuple[int, float, float], number: int = 0, ramp: float = 0.02) -> Layer:
-    """A layer that plays tones of channel, frequency [Hz] and level."""
+def layer(
+    *tones: tuple[int, float, float] | tuple[int, float, float, float],
+    number: int = 0,
+    ramp: float = 0.02,
+) -> Layer:
+    """A layer that plays tones of channel, frequency [Hz], level and perhaps phase [degrees]."""
     return Layer(number, tuple(Tone(*tone) for tone in tones), ramp)

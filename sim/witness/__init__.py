@@ -1,5 +1,5 @@
-"""An independent witness of the wires: it decodes every frame and reports broken rules.
+"""The witness: it decodes every frame on the wires and reports broken rules.
 
-It shares no code with `drivers` and the far ends: its decoders are written from
-docs/reference/wire-protocol.md, docs/reference/wire-modbus.md and docs/reference/wire-can.md alone.
+Messages are read by the one table and codec (`drivers.protocol`, `drivers.codec`), what plays comes
+from `drivers.playback`; the rules are its own, and nothing of the host or of the far ends is here.
 """

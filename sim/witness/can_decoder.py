@@ -1,40 +1,47 @@
-"""Decoder for CAN, from docs/reference/wire-can.md: requests, replies, sets, heartbeats, EMCY.
+"""Messages on a CAN bus, in the text of an adapter.
 
-Of NMT only boot-up is decoded, of SDO what `can_transfers` lists.
+Of NMT, boot-up and what resets a node are decoded; heartbeats, emergencies and SDO, which other
+masters read, concern no rule.
 """
 
-import struct
-from collections.abc import Mapping
+from collections import deque
 
-from sim.witness import quantities as q
-from sim.witness.can_requests import ACTIONS, FILLING, PER_NODE, WITH_COMMANDS, CanRequests
+from drivers.codec.can_bus.canopen import CANOPEN, cob_id
+from drivers.codec.can_bus.segments import NODE_MAX, REPLY, REQUEST, Assembler, frames_of
+from drivers.codec.can_bus.segments import Message as Words
+from drivers.protocol.serial_payload import HELLO as HELLO_NUMBER
+from drivers.protocol.table import BY_NUMBER, EVENT, MAX_WORDS, NAK
+from drivers.statistics import WireCounters
 from sim.witness.can_text import CanFrame, SlcanText, SocketcandText
-from sim.witness.can_transfers import CanTransfers
 from sim.witness.capture import Direction
 from sim.witness.decoded import (
-    SETS,
+    HELLO,
     BootUp,
     Damaged,
     DecodedFrame,
     Message,
-    Reply,
+    OtherHost,
     Request,
-    RequestKind,
-    StateEvent,
+    event_of,
+    nak_of,
+    reply_of,
+    request_of,
 )
-from sim.witness.quantities import INVALID, OutOfRange
+
+_BLOCK = 8  # bytes of every frame of a message
+_KEPT = 3 * frames_of(MAX_WORDS)  # frames of the host, which an adapter may echo
+_NMT_START: int = CANOPEN["nmt"]["start"]
 
 
 class CanDecoder:
-    """Decodes the text of an adapter; nodes: number of channels by node."""
+    """Decodes the text of an adapter of this kind."""
 
-    def __init__(self, kind: str, nodes: Mapping[int, int]) -> None:
+    def __init__(self, kind: str) -> None:
         reader = SlcanText if kind == "slcan" else SocketcandText
-        self._text = {
-            "amplifier": reader("amplifier"),
-            "host": reader("host"),
-        }
-        self._nodes = {node: _Node(node, channels) for node, channels in nodes.items()}
+        self._text = {"amplifier": reader("amplifier"), "host": reader("host")}
+        self._sent: deque[tuple[int, bytes]] = deque(maxlen=_KEPT)
+        self._senders: dict[tuple[int, bool], _Sender] = {}  # by identifier, and whether numbered
+        self._incomplete: int | None = None  # number of a message that another one has ended
 
     def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
         """Decode bytes; returns the complete frames."""
@@ -43,137 +50,98 @@ class CanDecoder:
             if text.is_damaged:
                 seen.append((text.raw, Damaged("a malformed frame line")))
             elif text.frame is not None:
-                seen += [(text.raw, message) for message in self.take(direction, time, text.frame)]
+                take = self._from_host if direction == "amplifier" else self._from_bus
+                message = take(time, text.frame)
+                if self._incomplete is not None:
+                    seen.append((b"", Damaged(f"message {self._incomplete} without all frames")))
+                    self._incomplete = None
+                seen.append((text.raw, message))
         return seen
 
     def has_partial_frame(self, direction: Direction) -> bool:
         """Whether the last bytes in this direction begin a frame."""
         return self._text[direction].has_partial_frame
 
-    def take(self, direction: Direction, time: float, frame: CanFrame) -> list[Message | None]:
-        """Decode one frame at a time [s]; a message for each amplifier and set that it concerns."""
-        try:
-            if direction == "amplifier":
-                return self._decode_request(time, frame)
-            return self._decode_reply(frame)
-        except INVALID as problem:
-            node = frame.identifier & 0x7F
-            if direction == "amplifier":
-                return [Request(RequestKind.READ, node, problem=str(problem))]
-            return [Damaged(f"an invalid frame: {problem}")]
-
-    def _decode_request(self, time: float, frame: CanFrame) -> list[Message | None]:
-        function, number = frame.identifier & 0x780, frame.identifier & 0x7F
-        if frame.identifier == 0:
-            return [None]
-        if function == 0x700:
-            return [Request(RequestKind.PING, 128 - number)]
-        if frame.identifier == 0x480:
-            return [_broadcast(frame)]
-        for node in self._nodes.values():
-            if node.requests.owns(frame):
-                return node.requests.take(time, frame) or [None]
-        if function == 0x600 and number in self._nodes:
-            self._nodes[number].transfers.requested(time, frame)
-            index = int.from_bytes(frame.data[1:3], "little")
-            identifies = frame.data[0] == 0x40 and index in (0x1018, 0x2000)
-            if frame.data[0] & 0xE3 == 0xC1:  # the end of a block: only envelopes are written so
-                return [Request(RequestKind.ENVELOPE, number)]
-            return [Request(RequestKind.HELLO if identifies else RequestKind.READ, number)]
-        return [None]
-
-    def _decode_reply(self, frame: CanFrame) -> list[Message | None]:
-        function, number = frame.identifier & 0x780, frame.identifier & 0x7F
-        if function == 0x700 and frame.data == b"\0" and number in self._nodes:
-            return [BootUp(number)]
-        if function == 0x080 and number in self._nodes:
-            state = frame.data[3] & 0xF
-            return [StateEvent(number, state, frame.data[3] >> 4)]
-        if function == 0x580 and number in self._nodes:
-            return [self._nodes[number].transfers.answered(frame)]
-        for node in self._nodes.values():
-            if frame.identifier == 0x180 + node.number:
-                return [*node.requests.end_set(frame.data[0]), node.reply(frame)]
-            if frame.identifier == 0x280 + node.number:
-                node.status = frame.data
-                return [None]
-            if function == 0x380 and number in node.numbers:
-                node.levels[number - node.number] = frame.data
-                return [None]
-        return [None]
-
-
-class _Node:
-    """Requests to one amplifier, and frames from it whose message is incomplete."""
-
-    def __init__(self, number: int, channels: int) -> None:
-        self.number = number
-        self.numbers = range(number, number + max(1, -(-channels // PER_NODE)))
-        self.requests = CanRequests(number, self.numbers)
-        self.transfers = CanTransfers(number)
-        self.status: bytes | None = None
-        self.levels: dict[int, bytes] = {}
-
-    def reply(self, frame: CanFrame) -> Message:
-        """Decode a reply with the status and levels sent before it, or an event."""
-        sequence, what, both, _, token, left = struct.unpack_from("<BBBBHH", frame.data)
-        state, fault = q.STATE.whole(both & 0xF), q.FAULT.whole(both >> 4)
-        if sequence == 0:
-            return StateEvent(self.number, state, fault)
-        if frame.is_fd:
-            self._take_reply(frame.data[8:])
-        status, levels = self.status, self.levels
-        self.status, self.levels = None, {}
-        result = what >> 4
-        high_voltage = temperature = reported = None
-        if status is not None and status[0] == sequence:
-            _, flag, temperature, _, count = struct.unpack_from("<BBhHB", status)
-            high_voltage = bool(flag & 1)
-            reported = _levels(levels, count & 0x1F, sequence)
-        kind = ACTIONS[what & 7]
-        is_whole = reported is not None or result or kind in SETS
-        return Reply(
-            self.number,
-            (self.number, sequence, kind),
-            refusal=result,
-            problem="" if is_whole else "status or levels are missing",
-            is_exact=bool(what & 8) if kind in WITH_COMMANDS else None,
-            status=q.status_of(
-                state,
-                fault,
-                token,
-                left=left,
-                high_voltage=high_voltage,
-                temperature=temperature,
-                levels=reported,
-            ),
-        )
-
-    def _take_reply(self, data: bytes) -> None:
-        blocks = [data[at : at + 8] for at in range(0, len(data) - 7, 8)]
-        blocks = [block for block in blocks if block != FILLING]
-        if blocks:
-            self.status = blocks[0]
-            self.levels = dict(enumerate(blocks[1:]))
-
-
-def _broadcast(frame: CanFrame) -> Request:
-    token, ramp, _, what, _ = struct.unpack_from("<HHHBB", frame.data)
-    kind = ACTIONS[what & 7]
-    if kind is RequestKind.COMMIT:
-        return q.request_of(kind, 0, None, token=token)
-    if kind is RequestKind.STOP:
-        return q.request_of(kind, 0, None, ramp=ramp)
-    raise OutOfRange(f"{kind.value} as a broadcast")
-
-
-def _levels(blocks: dict[int, bytes], count: int, sequence: int) -> list[int] | None:
-    """Levels of `count` channels; None where a block is missing."""
-    levels: list[int] = []
-    for group in range(-(-count // PER_NODE)):
-        block = blocks.get(group)
-        if block is None or block[7] != sequence:
+    def _from_host(self, time: float, frame: CanFrame) -> Message | None:
+        node, kind = frame.identifier & NODE_MAX, frame.identifier & ~NODE_MAX
+        self._sent.append((frame.identifier, frame.data))
+        if frame.identifier == cob_id("nmt") and len(frame.data) == 2:
+            return None if frame.data[0] == _NMT_START else BootUp(frame.data[1])
+        if kind != REQUEST:
             return None
-        word = int.from_bytes(block[:7], "little")
-        levels += [word >> 14 * place & 0x3FFF for place in range(PER_NODE)]
-    return levels[:count]
+        sender = self._sender(frame.identifier, frame.data)
+        words = self._add(sender, time, frame.data)
+        if not isinstance(words, Words):
+            return words
+        key = (node, words.number, words.type) if node else None
+        if words.type == HELLO_NUMBER and node:
+            return Request(HELLO, node, key, begun=sender.begun)
+        found = request_of(words.type, words.words, node, key)
+        return Request(found.name, node, key, found.values, found.problem, sender.begun)
+
+    def _from_bus(self, time: float, frame: CanFrame) -> Message | None:
+        node, kind = frame.identifier & NODE_MAX, frame.identifier & ~NODE_MAX
+        if frame.identifier == cob_id("heartbeat", node) and frame.data == b"\0":
+            return BootUp(node)
+        if kind == REQUEST and node and (frame.identifier, frame.data) not in self._sent:
+            is_first = len(frame.data) == _BLOCK and frame.data[1] == 0
+            known = BY_NUMBER.get(frame.data[2]) if is_first else None
+            return None if known is None else OtherHost(node, known.name)
+        if kind != REPLY or not node:
+            return None
+        words = self._add(self._sender(frame.identifier, frame.data), time, frame.data)
+        if not isinstance(words, Words):
+            return words
+        if words.number == 0:
+            if words.type == EVENT:
+                return event_of(words.words, node)
+            return Damaged(f"a message of type {words.type} without a number")
+        if words.type == NAK:
+            return nak_of(words.words, node, (node, words.number, *words.words[:1]))
+        if words.type not in BY_NUMBER and words.type != HELLO_NUMBER:
+            return Damaged(f"a reply of unknown type {words.type}")
+        name = HELLO if words.type == HELLO_NUMBER else BY_NUMBER[words.type].name
+        return reply_of(name, words.words, node, (node, words.number, words.type))
+
+    def _add(self, sender: "_Sender", time: float, data: bytes) -> Words | Damaged | None:
+        self._incomplete = sender.ended_by(data)
+        return sender.add(time, data)
+
+    def _sender(self, identifier: int, data: bytes) -> "_Sender":
+        is_numbered = data[:1] != b"\0"
+        known = self._senders.get((identifier, is_numbered))
+        if known is None:
+            known = self._senders[identifier, is_numbered] = _Sender(is_numbered=is_numbered)
+        return known
+
+
+class _Sender:
+    """Messages of one identifier; begun: time of the first frame of the last one [s]."""
+
+    def __init__(self, *, is_numbered: bool) -> None:
+        self.begun = 0.0
+        self._counters = WireCounters()
+        self._assembler = Assembler(self._counters, is_numbered=is_numbered)
+        self._number: int | None = None  # of the last frame
+        self._is_whole = True
+
+    def ended_by(self, data: bytes) -> int | None:
+        """Return the number of a message that is not whole and that a frame ends; None for none."""
+        is_other = data[:1] != bytes([self._number or 0])
+        return self._number if is_other and not self._is_whole else None
+
+    def add(self, time: float, data: bytes) -> Words | Damaged | None:
+        """Take the data of a frame; returns the message that it completes."""
+        if len(data) != _BLOCK:
+            return Damaged(f"a frame of {len(data)} bytes, must be {_BLOCK}")
+        if data[0] != self._number or (self._is_whole and data[1] == 0):
+            self._number, self._is_whole, self.begun = data[0], False, time
+        before = self._counters.invalid_frames, self._counters.unexpected_frames
+        words = self._assembler.add(data, time)
+        if words is not None:
+            self._is_whole = True
+        elif self._counters.invalid_frames > before[0]:
+            return Damaged("a frame that fits no message")
+        elif self._counters.unexpected_frames > before[1]:
+            self._is_whole = True  # an older one, or a copy
+        return words

@@ -9,6 +9,9 @@ from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.config import TimeLimits
 from sim.witness.delays import Delays
 
+_REPEATED = 0.1  # s; within which a stop that is not confirmed goes on, for each amplifier
+_CONFIRMED = 0.3  # s; then the host says that it is not
+
 
 @dataclass
 class KnownInputs:
@@ -129,11 +132,28 @@ class Deadlines:
             f"stop requested at {time:.4f} s, not sent to {session.name} within {limit * 1e3:g} ms",
         )
 
-    def expect_all_amplifiers(self, first: AmplifierSession, time: float, token: int) -> None:
-        """A set played by one amplifier must be played by all, or silenced."""
+    def expect_confirmation(self, session: AmplifierSession, time: float) -> None:
+        """A stop must be confirmed, or go on: it is repeated, or the status is read."""
+        first = session.first_stop
+        if first is None or time > first + _CONFIRMED - _REPEATED:
+            return
+        wire = [one for one in self._sessions.values() if one.config.wire == session.config.wire]
+        limit = _REPEATED * len(wire)
+        self._expect(
+            time + limit,
+            lambda: session.first_stop != first or session.last_stop > time or not session.is_open,
+            "stop",
+            session,
+            f"stop sent to {session.name} at {time:.4f} s, neither confirmed nor repeated within "
+            f"{limit * 1e3:g} ms",
+        )
+
+    def expect_commits(self, first: AmplifierSession, time: float, token: int) -> None:
+        """A set that one amplifier plays must be played by all that it was sent to, or silenced."""
         limit = self._times.together
         for session in self._sessions.values():
-            if session is not first and session.amplifier.is_enabled:
+            is_part = session.staged is not None and session.staged[0] == token
+            if session is not first and is_part and session.amplifier.is_enabled:
                 self._expect(
                     time + limit,
                     partial(_is_joined, session, first, time, token),
@@ -155,7 +175,8 @@ class Deadlines:
 
     def _is_silenced(self, session: AmplifierSession, last_lift: float) -> bool:
         """Whether it was silenced after a lift, or need not be."""
-        is_silent = not session.vibrates or session.amplifier.is_in_fault or not session.is_open
+        vibrates = session.vibrates(last_lift + self._times.lift)
+        is_silent = not vibrates or session.amplifier.is_in_fault or not session.is_open
         is_touched_again = self._inputs.last_touch >= last_lift
         is_given_up = session.last_feed is None  # since a disturbance
         is_stalled = self._inputs.stalled_since is not None
@@ -183,7 +204,7 @@ def _is_joined(session: AmplifierSession, first: AmplifierSession, time: float, 
     """Whether an amplifier plays the set of the first one too, or the first one is silenced."""
     return (
         token in session.committed_tokens
-        or not first.vibrates
+        or not first.vibrates(time)
         or first.last_silenced >= time  # since then it may play another set
         or not first.is_open  # its watchdog silences it
     )

@@ -1,164 +1,92 @@
-"""Decoded frames, the same for every kind of wire."""
+"""Decoded messages of protocol 3, the same for every kind of wire."""
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import TypeAlias
 
-Data: TypeAlias = bytes
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.table import (
+    BY_NUMBER,
+    EVENT_RECORD,
+    FAULTS,
+    IDENTITY,
+    MESSAGES,
+    NAK_RECORD,
+    STATES,
+    read_request,
+)
 
-
-class RequestKind(Enum):
-    """Kind of a request; READ: any read that does not concern the amplifier's state."""
-
-    HELLO = "Hello"
-    CAPABILITIES = "GetCaps"
-    ARM = "Arm"
-    DISARM = "Disarm"
-    STAGE = "Stage"
-    COMMIT = "Commit"
-    APPLY = "Apply"
-    STOP = "Stop"
-    STATUS = "GetStatus"
-    FAULTS = "GetFaults"
-    CLEAR = "Clear"
-    PING = "Ping"
-    ENVELOPE = "LoadEnvelope"
-    ADDRESS = "SetAddress"
-    READ = "a read"
-
-
-SETS = frozenset({RequestKind.STAGE, RequestKind.COMMIT, RequestKind.APPLY})
-"""Requests that carry a token."""
-
-STATE_CHANGING = SETS | {
-    RequestKind.ARM,
-    RequestKind.DISARM,
-    RequestKind.STOP,
-    RequestKind.CLEAR,
-}
+HELLO = "Hello"
+A_READ = "a read"
+"""Name of a read that is no message, and changes nothing."""
+STATUS_RECORD = MESSAGES["GetStatus"].reply
+CHANGING = frozenset({"Arm", "Disarm", "Set", "Commit", "Silence", "Stop", "Clear"})
 """Requests that change what the amplifier does."""
-
-WATCHDOG_FEEDING = SETS | {RequestKind.ARM, RequestKind.PING}
+BROADCAST = frozenset(name for name, message in MESSAGES.items() if message.is_broadcast)
+"""Requests that may be for all amplifiers of a line."""
+FEEDING = frozenset(name for name, message in MESSAGES.items() if message.feeds)
 """Requests that feed the watchdog unless they are refused."""
-
-INCOMPLETE_SET = "incomplete set"
-"""How the problem of a set with missing frames begins."""
-
-REPLY_TO_DAMAGED_FRAME = "replies to a damaged frame"
-"""The problem of a reply to a request that arrived damaged."""
-
-
-@dataclass(frozen=True, slots=True)
-class ChannelCommand:
-    """One channel of a set: frequency [Hz], level 0..1, phase [deg], flags and envelope slots."""
-
-    frequency: float
-    level: float
-    phase: float
-    keep_phase: bool = False
-    skip_ending: bool = False
-    onset: int = 0
-    ending: int = 0
-
-    @property
-    def vibrates(self) -> bool:
-        """Whether it commands any vibration."""
-        return self.level > 0 or self.onset > 0
-
-
-@dataclass(frozen=True, slots=True)
-class EnvelopeLoad:
-    """An envelope for a slot: step [s] and the level of each knot."""
-
-    slot: int
-    step: float
-    levels: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A request. address: 0 for broadcast; key: matches its reply, None where there is none.
+    """A request. address: 0 for broadcast; key: of its reply, None where there is none.
 
-    ramp, valid_for, watchdog [s]; session: None where the wire carries none; commands by channel;
-    problem: what is wrong with it, or "".
+    values: of its record; problem: what is wrong with it, or ""; begun: when the first of its
+    frames passed, None where it has one [s].
     """
 
-    kind: RequestKind
+    name: str
     address: int
     key: Hashable = None
-    token: int = 0
-    ramp: float = 0.0
-    valid_for: float = 0.0
-    watchdog: float = 0.0
-    session: int | None = None
-    commands: Mapping[int, ChannelCommand] = field(default_factory=dict)
-    envelope: EnvelopeLoad | None = None
+    values: Values = field(default_factory=dict)
     problem: str = ""
-
-    @property
-    def vibrates(self) -> bool:
-        """Whether its own commands ask for any vibration."""
-        return any(command.vibrates for command in self.commands.values())
-
-    @property
-    def is_incomplete_set(self) -> bool:
-        """Whether frames of the set are missing."""
-        return self.problem.startswith(INCOMPLETE_SET)
+    begun: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
-    """Reported status; None where the frame does not carry it. Times [s], temperature [°C]."""
+class Progress:
+    """Part of an exchange: the amplifier has carried the request out, or the host goes on."""
 
-    state: int
-    fault: int
-    token: int | None = None
-    watchdog_left: float | None = None
-    high_voltage: bool | None = None
-    temperature: float | None = None
-    levels: tuple[float, ...] | None = None
+    key: Hashable
+    is_from_host: bool
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """A reply. key: of its request, None where it matches none; refusal: 0 if granted.
+    """A reply. key: of its request, None where it matches none; values: None where it has none.
 
-    achieved: the set as played, by channel, and its token; is_exact: whether it plays as commanded;
-    constant: what must be the same in every reply to such a request; voices: of a channel, as it
-    states, or 0; faults: newest first, each with its age [s]; item: index and subindex of an object
-    that was read, since the time begun [s].
+    refusal: code, 0 if granted; problem: what is wrong with it, or "".
     """
 
     address: int
     key: Hashable = None
+    values: Values | None = None
     refusal: int = 0
-    status: Status | None = None
-    token: int = 0
-    achieved: Mapping[int, ChannelCommand] | None = None
-    is_exact: bool | None = None
-    constant: bytes | None = None
-    voices: int = 0
-    faults: tuple[tuple[int, float], ...] | None = None
-    item: tuple[int, int] | None = None
-    begun: float = 0.0
     problem: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class StateEvent:
-    """An unsolicited change of state."""
+class Event:
+    """An unsolicited change of state: values of its record."""
 
     address: int
-    state: int
-    fault: int
+    values: Values
 
 
 @dataclass(frozen=True, slots=True)
 class BootUp:
-    """An amplifier, or another device with its address, has started."""
+    """An amplifier has started, or a master has reset it."""
 
     address: int
+
+
+@dataclass(frozen=True, slots=True)
+class OtherHost:
+    """A request of another host to an amplifier, by its name."""
+
+    address: int
+    name: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,6 +96,55 @@ class Damaged:
     reason: str
 
 
-Message: TypeAlias = Request | Reply | StateEvent | BootUp | Damaged
+Message: TypeAlias = Request | Progress | Reply | Event | BootUp | OtherHost | Damaged
 DecodedFrame: TypeAlias = tuple[bytes, Message | None]
 """A frame and its message; None for part of a message, or none that concerns the rules."""
+
+
+def request_of(number: int, words: Sequence[int], address: int, key: Hashable) -> Request:
+    """Read a request by the number of its message."""
+    name = BY_NUMBER[number].name if number in BY_NUMBER else f"type {number}"
+    try:
+        _, values = read_request(number, words)
+    except Refusal as refusal:
+        return Request(name, address, key, problem=str(refusal))
+    problem = "" if address or name in BROADCAST else "must not be a broadcast"
+    return Request(name, address, key, values, problem)
+
+
+def reply_of(name: str, words: Sequence[int], address: int, key: Hashable) -> Reply:
+    """Read the reply to a request of this name."""
+    record = IDENTITY if name == HELLO else MESSAGES[name].reply
+    try:
+        values = record.unpack(words, is_strict=False)
+    except Refusal as refusal:
+        return Reply(address, key, problem=str(refusal))
+    problem = state_problem(values) if record is STATUS_RECORD else ""
+    return Reply(address, key, values, problem=problem)
+
+
+def nak_of(words: Sequence[int], address: int, key: Hashable) -> Reply:
+    """Read a refusal."""
+    try:
+        values = NAK_RECORD.unpack(words, is_strict=False)
+    except Refusal as refusal:
+        return Reply(address, key, problem=str(refusal))
+    return Reply(address, key, refusal=values["code"])
+
+
+def event_of(words: Sequence[int], address: int) -> Event | Damaged:
+    """Read an Event."""
+    try:
+        values = EVENT_RECORD.unpack(words, is_strict=False)
+    except Refusal as refusal:
+        return Damaged(f"an invalid Event: {refusal}")
+    problem = state_problem(values)
+    return Damaged(f"an invalid Event: {problem}") if problem else Event(address, values)
+
+
+def state_problem(values: Values) -> str:
+    """Describe a state or fault that is none; "" if both are known."""
+    for name, known in (("state", STATES), ("fault", FAULTS)):
+        if values[name] not in known.values():
+            return f"{name} must be 0 to {max(known.values())}, got {values[name]}"
+    return ""

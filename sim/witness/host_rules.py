@@ -3,19 +3,28 @@
 Checked as each frame passes; time limits are in `deadlines`.
 """
 
-from collections.abc import Collection, Hashable, Mapping
+from collections.abc import Collection, Hashable, Mapping, Sequence
 
-from sim.witness.amplifier_session import AmplifierSession
+from drivers.protocol.records import Values
+from drivers.protocol.sets import LayerSet
+from drivers.protocol.table import QUANTITIES
+from sim.witness.amplifier_session import AmplifierSession, is_vibrating
 from sim.witness.config import TimeLimits
 from sim.witness.deadlines import Deadlines, KnownInputs
-from sim.witness.decoded import WATCHDOG_FEEDING, ChannelCommand, Request, RequestKind
+from sim.witness.decoded import A_READ, BROADCAST, FEEDING, HELLO, Request
 from sim.witness.delays import Delays
-from sim.witness.set_rules import ExpectedSets, check_envelope, check_set
+from sim.witness.set_rules import ExpectedSets, check_expected, check_set
+from sim.witness.unanswered import LATCHED, Sent
+from sim.witness.watched_wire import WatchedWire
 
 _IN_FLIGHT = 0.001  # s; from the host's write until a frame is seen
+_IN_TRANSPORT = 0.010  # s; bytes may wait before they pass, while their host counts from its write
 _REORDER_WINDOW = 0.020  # s; of two commands given within it the earlier may still be sent first
-_HEARTBEAT_STATUS = 0.002  # s; over CAN a heartbeat is followed by the order of its status
-_UNORDERED = (RequestKind.READ, RequestKind.HELLO, RequestKind.CAPABILITIES)
+_OTHER_HOST = 2.0  # s; for which a host that hears another one sends nothing that plays or feeds
+_UNORDERED = (A_READ, HELLO, "GetCaps")
+_READINGS = ("GetSensors", "Measure", "GetReading", "GetMeasured")
+_SILENCING = ("Stop", "Disarm", "Silence")
+_RAMP = QUANTITIES["ramp"]
 
 
 class HostRules:
@@ -62,50 +71,6 @@ class HostRules:
             for session in self._sessions.values():
                 session.last_feed = None  # the next heartbeat is due after the loop has run
 
-    # frames
-
-    def check_request(self, session: AmplifierSession, time: float, request: Request) -> None:
-        """Check a request to one amplifier; a broadcast is checked for each."""
-        if request.problem:
-            session.report(
-                "commit" if request.is_incomplete_set else "garbage",
-                time,
-                f"host sent {request.kind.value}: {request.problem}",
-            )
-        if request.key is not None:
-            self._check_credit(session, time, request)
-        self._check_stop(session, time, request)
-        if request.kind in WATCHDOG_FEEDING:
-            self._check_stall(session, time, request)
-        if request.kind is RequestKind.ARM:
-            self._check_arm(session, time)
-        if request.kind in (RequestKind.APPLY, RequestKind.STAGE):
-            check_set(session, time, request, self._expected)
-            if request.vibrates:
-                self._check_justified(session, time)
-        if request.kind is RequestKind.ENVELOPE and request.envelope is not None:
-            check_envelope(session, time, max(request.envelope.levels, default=0.0))
-        self._remember(session, time, request)
-
-    def request_granted(self, session: AmplifierSession, time: float, request: Request) -> None:
-        """Note that a request was not refused."""
-        match request.kind:
-            case RequestKind.HELLO:
-                session.is_identified = True
-            case RequestKind.ARM:
-                if session.is_stopped:
-                    session.report(
-                        "stop", time, f"{session.name} armed before its stop was cleared"
-                    )
-                session.last_set = session.active_set = None
-                session.armed_at = time
-                session.last_feed = time
-            case RequestKind.CLEAR:
-                session.is_stopped = False
-            case RequestKind.APPLY | RequestKind.COMMIT:
-                if self._vibrates(session, request):
-                    session.last_vibration = time
-
     def advance(self, time: float) -> None:
         """Check the deadlines and heartbeats that are due by now."""
         self._deadlines.advance(time)
@@ -115,70 +80,115 @@ class HostRules:
             if session.amplifier.last_fault > inputs.last_command and inputs.is_arm_requested:
                 inputs.is_arm_requested = False  # a fault cancels earlier commands
 
+    # frames
+
+    def check_request(
+        self, wire: WatchedWire, session: AmplifierSession, time: float, sent: Sent
+    ) -> None:
+        """Check a request to one amplifier; a broadcast is checked for each."""
+        request = sent.request
+        if request.problem:
+            what = f"host sent {request.name}: {request.problem}"
+            session.report("garbage", time, what)
+            return
+        layers: Sequence[LayerSet] | None = None
+        if request.name == "Set":
+            layers, problem = session.amplifier.sets.sent(request.values, time)
+            if problem:
+                session.report("garbage", time, f"host sent a set: {problem}")
+        elif request.name == "Commit" and session.staged is not None:
+            token, staged = session.staged
+            layers = staged if token == request.values["token"] else None
+        is_silent = request.name == "Set" and layers is not None and not is_vibrating(layers)
+        self._check_credit(wire, session, sent, is_silent=is_silent)
+        self._check_stop(session, time, request)
+        if request.name in FEEDING:
+            self._check_feeding(session, time, request)
+        if request.name == "Arm":
+            self._check_arm(session, time)
+        if request.name == "Set" and layers is not None:
+            check_set(session, time, request.values["token"], layers)
+            if is_vibrating(layers):
+                self._check_justified(session, time)
+                if self._expected is not None:
+                    check_expected(session, time, layers, self._expected)
+        self._remember(session, time, request, layers)
+
+    def request_granted(self, session: AmplifierSession, time: float, request: Request) -> None:
+        """Note that a request was not refused."""
+        if request.name == HELLO:
+            session.is_identified = True
+        elif request.name == "Arm":
+            was_stopped, session.is_stopped = session.is_stopped, False
+            if was_stopped and not session.is_disturbed(time):
+                what = f"{session.name} armed before its stop was cleared"
+                session.report("stop", time, what)
+            session.armed_at = session.last_feed = time
+        elif request.name == "Clear":
+            session.is_stopped = False
+
+    def status_heard(self, session: AmplifierSession, time: float, values: Values) -> None:
+        """Note a status: whether it confirms a stop."""
+        if "levels" in values and values["state"] in LATCHED and not any(values["levels"]):
+            session.first_stop = None
+
     # rules
 
-    def _check_credit(self, session: AmplifierSession, time: float, request: Request) -> None:
-        """Only a silencing request, to any amplifier of a wire, may precede a pending reply."""
-        is_silent_set = request.kind is RequestKind.APPLY and not request.vibrates
-        if is_silent_set or request.kind in (RequestKind.STOP, RequestKind.DISARM):
-            for other in self._sessions.values():
-                if other.config.wire == session.config.wire:
-                    other.preempted_at = time
+    def _check_credit(
+        self, wire: WatchedWire, session: AmplifierSession, sent: Sent, *, is_silent: bool
+    ) -> None:
+        """Only a silencing request may precede a reply that is pending on its wire."""
+        request = sent.request
+        if request.name in _SILENCING or is_silent:
+            wire.preempted_by = sent.number
             return
-        for at, awaited in session.pending.values():
+        if wire.is_disturbed(sent.begun):
+            return
+        is_to_each = wire.kind == "modbus-tcp" and len(wire.sessions) > 1
+        for pending in wire.pending.values():
+            awaited, at = pending.sent.request, pending.sent.begun
+            is_broadcast = is_to_each and awaited.name in BROADCAST
             # A last lift preempts too, even if a finger has come since.
-            preempted = max(session.preempted_at, self._inputs.last_lift)
-            if awaited.kind is RequestKind.STATUS and _is_part_of_heartbeat(
-                session, at, begun_before=preempted
-            ):
-                session.preempted_at = preempted = at
-            is_awaited = at > preempted
-            if is_awaited and time - at < self._times.reply - self._times.slack:
+            is_preempted = pending.sent.number < wire.preempted_by or at <= self._inputs.last_lift
+            if is_preempted or awaited.name in _READINGS or is_broadcast:
+                continue
+            # The host counts from its write: the bytes may have waited in a transport since.
+            if sent.begun - at < self._times.reply - max(self._times.slack, _IN_TRANSPORT):
                 session.report(
                     "credit",
-                    time,
-                    f"host sent {request.kind.value} to {session.name} {(time - at) * 1e3:.1f} ms "
-                    f"after {awaited.kind.value}, whose reply is pending",
+                    sent.begun,
+                    f"host sent {request.name} to {session.name} {(sent.begun - at) * 1e3:.1f} ms "
+                    f"after {awaited.name} to {pending.session.name}, whose reply is pending",
                 )
 
     def _check_stop(self, session: AmplifierSession, time: float, request: Request) -> None:
         requested_at = session.stop_requested_at
-        is_other = request.kind is not RequestKind.STOP and request.kind not in _UNORDERED
+        is_other = request.name != "Stop" and request.name not in _UNORDERED
         # Requests written at the same moment as the stop may precede it.
         if requested_at is None or time <= requested_at + _IN_FLIGHT or not is_other:
             return
-        if (
-            request.kind is RequestKind.DISARM
-            and requested_at < self._inputs.last_disarm + _REORDER_WINDOW
-        ):
+        if request.name == "Disarm" and requested_at < self._inputs.last_disarm + _REORDER_WINDOW:
             return  # silences as well
-        if request.kind is RequestKind.STATUS and _is_part_of_heartbeat(
-            session, time, begun_before=requested_at
-        ):
-            return
-        session.report(
-            "stop",
-            time,
-            f"stop requested at {requested_at:.4f} s, but the next request to {session.name} is "
-            f"{request.kind.value}",
-        )
+        what = f"stop requested at {requested_at:.4f} s, but the next request to {session.name} is "
+        session.report("stop", time, f"{what}{request.name}")
         session.stop_requested_at = None
 
-    def _check_stall(self, session: AmplifierSession, time: float, request: Request) -> None:
-        """A stalled control loop must not feed the watchdog."""
-        since = self._inputs.stalled_since
-        is_by_loop = request.vibrates or request.kind in (
-            RequestKind.PING,
-            RequestKind.COMMIT,
-            RequestKind.STAGE,
-        )
-        if since is not None and time > since + self._times.slack and is_by_loop:
-            session.report(
-                "heartbeat",
-                time,
-                f"control loop stalled since {since:.4f} s, but {request.kind.value} feeds the "
-                f"watchdog of {session.name}",
-            )
+    def _check_feeding(self, session: AmplifierSession, time: float, request: Request) -> None:
+        """Nothing feeds while the loop stalls, after a stop, beside another host's session."""
+        name, since = request.name, self._inputs.stalled_since
+        is_late = since is not None and time > since + self._times.slack
+        if is_late and name != "Silence" and not session.is_disturbed(time):
+            what = f"control loop stalled since {since:.4f} s, but {name} feeds the watchdog of "
+            session.report("heartbeat", time, f"{what}{session.name}")
+        if session.is_stopped and name not in ("Arm", "Silence"):
+            session.report("stop", time, f"{name} sent after a stop: {session.name}")
+        number = request.values["session"]
+        if name in ("Set", "Commit") and session.session not in (None, number):
+            what = f"host sent {name} of session {number} to {session.name}, armed with "
+            session.report("session", time, f"{what}{session.session}")
+        if time < session.heard_other_host + _OTHER_HOST:
+            what = f"host sent {name} to {session.name}, driven by another host at "
+            session.report("session", time, f"{what}{session.heard_other_host:.4f} s")
         session.last_feed = time
 
     def _check_heartbeat(self, session: AmplifierSession, time: float) -> None:
@@ -202,24 +212,23 @@ class HostRules:
             session.report("identified", time, f"{session.name} armed without identification")
 
     def _check_justified(self, session: AmplifierSession, time: float) -> None:
-        """Vibration needs an enabled, unstopped amplifier and a contact."""
-        if session.is_stopped:
-            session.report("stop", time, f"vibration commanded after a stop: {session.name}")
-        elif self._is_known_disabled(session):
+        """Vibration needs an enabled amplifier and a contact."""
+        # A set that waits in a queue may still go out with the reply that says so.
+        is_known = time > session.amplifier.reported_at + _IN_FLIGHT and not session.is_disturbed(
+            time
+        )
+        if is_known and not session.is_stopped and self._is_known_disabled(session):
             session.report("enabled", time, f"vibration commanded while disabled: {session.name}")
         is_touched = self._inputs.contacts is None or self._inputs.contacts
         last_lift = self._inputs.last_lift
         if not is_touched and time > last_lift + self._times.lift + self._times.slack:
-            session.report(
-                "justified",
-                time,
-                f"vibration commanded on {session.name} without a contact since {last_lift:.4f} s",
-            )
+            what = f"vibration commanded on {session.name} without a contact since "
+            session.report("justified", time, f"{what}{last_lift:.4f} s")
 
     def _is_known_disabled(self, session: AmplifierSession) -> bool:
         """Whether it is not enabled and the host can know.
 
-        A fault event may cross a set on the wire, which the amplifier then refuses.
+        An Event of a fault may cross a set on the wire, which the amplifier then refuses.
         """
         amplifier = session.amplifier
         is_enabled = amplifier.state is None or amplifier.is_enabled
@@ -227,71 +236,60 @@ class HostRules:
 
     # state of the session
 
-    def _remember(self, session: AmplifierSession, time: float, request: Request) -> None:
-        match request.kind:
-            case RequestKind.STAGE:
-                session.staged = {request.token: request}
-            case RequestKind.APPLY | RequestKind.COMMIT:
-                is_commit = request.kind is RequestKind.COMMIT
-                staged = session.staged.get(request.token) if is_commit else request
-                session.active_set = staged or session.active_set
-                is_new = request.token != session.last_token
-                session.committed_tokens.append(request.token)
-                commands = self._channel_commands(session, request)
-                session.vibrates = self._vibrates(session, request)
-                session.last_token = request.token
-                session.levels = {
-                    channel: command for channel, command in commands.items() if command.level
-                }
-                if is_new and session.vibrates:
-                    self._deadlines.expect_all_amplifiers(session, time, request.token)
-                if not session.vibrates:
-                    session.last_silenced = time
-                    self._check_release(session, time, request.ramp, commands)
-            case RequestKind.STOP | RequestKind.DISARM | RequestKind.ARM:
-                session.vibrates = False
-                session.last_silenced = time
-                session.levels = {}
-                session.staged = {}
-                if request.kind is RequestKind.STOP:
-                    session.is_stopped, session.stop_requested_at = True, None
-                    if self._inputs.is_arm_requested:
-                        self._inputs.is_arm_requested, self._inputs.last_silencing = False, time
-            case _:
-                pass
-
-    def _check_release(
+    def _remember(
         self,
         session: AmplifierSession,
         time: float,
-        ramp: float,
-        commands: Mapping[int, ChannelCommand],
+        request: Request,
+        layers: Sequence[LayerSet] | None,
     ) -> None:
+        values = request.values
+        if request.name in ("Stop", "GetStatus"):
+            session.last_stop = time
+        if request.name in _SILENCING:
+            if not session.is_stopped:
+                self._check_release(session, time, _RAMP.from_wire(values["ramp"]))
+            session.silence_sent(time)
+        if request.name == "Stop":
+            session.is_stopped, session.stop_requested_at = True, None
+            session.session = None
+            if session.first_stop is None:
+                session.first_stop = time
+            self._deadlines.expect_confirmation(session, time)
+            if self._inputs.is_arm_requested:
+                self._inputs.is_arm_requested, self._inputs.last_silencing = False, time
+        elif request.name == "Arm":
+            session.session = values["session"]
+            session.silence_sent(time)
+            session.last_set = None
+        elif layers is not None and (request.name == "Commit" or values["now"]):
+            self._note_playing(session, time, values["token"], layers)
+
+    def _note_playing(
+        self, session: AmplifierSession, time: float, token: int, layers: Sequence[LayerSet]
+    ) -> None:
+        is_new = token not in session.committed_tokens
+        had_endings = any(
+            command.ending is not None
+            for one, _ in session.layers.values()
+            for command in one.commands
+        )
+        session.set_sent(token, layers, time)
+        if is_vibrating(layers):
+            session.last_vibration = time
+        if is_new:
+            self._deadlines.expect_commits(session, time, token)
+        if not session.vibrates(time):
+            session.last_silenced = time
+            if not had_endings:
+                ramp = max((one.ramp for one in layers), default=0)
+                self._check_release(session, time, _RAMP.from_wire(ramp))
+
+    def _check_release(self, session: AmplifierSession, time: float, ramp: float) -> None:
         """The ramp to zero must end within the release time after the last lift."""
         last_lift = self._inputs.last_lift
         if self._inputs.contacts or not 0 <= time - last_lift <= self._times.lift:
             return
-        has_endings = session.staged and any(not one.skip_ending for one in commands.values())
-        if time + ramp > last_lift + self._times.release + self._times.slack and not has_endings:
-            session.report(
-                "lift",
-                time,
-                f"last finger lifted at {last_lift:.4f} s, {session.name} is silent only after a "
-                f"ramp of {ramp:g} s",
-            )
-
-    def _channel_commands(
-        self, session: AmplifierSession, request: Request
-    ) -> Mapping[int, ChannelCommand]:
-        if request.kind is RequestKind.COMMIT:
-            staged = session.staged.get(request.token)
-            return staged.commands if staged is not None else session.levels
-        return request.commands
-
-    def _vibrates(self, session: AmplifierSession, request: Request) -> bool:
-        return any(one.vibrates for one in self._channel_commands(session, request).values())
-
-
-def _is_part_of_heartbeat(session: AmplifierSession, time: float, *, begun_before: float) -> bool:
-    """Whether a request for the status at a time [s] belongs to a heartbeat on the line before."""
-    return session.last_ping <= begun_before and time <= session.last_ping + _HEARTBEAT_STATUS
+        if time + ramp > last_lift + self._times.release + self._times.slack:
+            what = f"last finger lifted at {last_lift:.4f} s, {session.name} is silent only after "
+            session.report("lift", time, f"{what}a ramp of {ramp:g} s")

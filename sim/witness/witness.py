@@ -7,11 +7,11 @@ from typing import Any, Literal
 from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.capture import Direction
 from sim.witness.config import WitnessConfig, parse_config
-from sim.witness.decoded import STATE_CHANGING, Damaged, Data, Request
+from sim.witness.decoded import CHANGING, Damaged
 from sim.witness.delays import Delays
 from sim.witness.exchanges import Exchanges
+from sim.witness.expected_amplifier import ExpectedAmplifier
 from sim.witness.host_rules import HostRules
-from sim.witness.reference_amplifier import ReferenceAmplifier
 from sim.witness.set_rules import ExpectedSets
 from sim.witness.violation import Report, Violation
 from sim.witness.watched_wire import WatchedWire
@@ -65,9 +65,8 @@ class Witness:
             if not is_disturbed(self._now):
                 report(invariant, time, sentence)
 
-        amplifier = ReferenceAmplifier(
+        amplifier = ExpectedAmplifier(
             name,
-            config,
             times=self._config.times_s,
             report=report_unless_disturbed,
             report_always=report,
@@ -79,7 +78,7 @@ class Witness:
         """The names of the wires."""
         return tuple(self._wires)
 
-    def record_bytes(self, link: str, direction: Direction, time: float, data: Data) -> None:
+    def record_bytes(self, link: str, direction: Direction, time: float, data: bytes) -> None:
         """Process bytes on a wire, toward the amplifier or the host."""
         self._advance(time)
         wire = self._wires[link]
@@ -92,9 +91,9 @@ class Witness:
             if message is None:
                 continue
             if isinstance(message, Damaged):
-                self._exchanges.damaged(wire, time, direction, message, begun=begun)
-            if direction == "amplifier" or isinstance(message, Request):
-                self._exchanges.sent(wire, time, raw, message)
+                self._exchanges.damaged(wire, time, direction, message, begun)
+            if direction == "amplifier":
+                self._exchanges.sent(wire, time, raw, message, begun)
             else:
                 self._exchanges.received(wire, time, message)
 
@@ -108,24 +107,28 @@ class Witness:
     def opened(self, link: str, time: float) -> None:
         """Note that a host has opened a wire: its amplifiers are not identified yet."""
         self._advance(time)
-        self._wires[link].reset()
-        for session in self._wires[link].sessions.values():
-            session.is_open, session.is_identified, session.vibrates = True, False, False
-            session.forget_pending()
+        wire = self._wires[link]
+        wire.reset()
+        wire.forget_pending()
+        for session in wire.sessions.values():
+            session.is_open, session.is_identified, session.session = True, False, None
+            session.layers.clear()
             session.constants.clear()  # it may be another one
             session.amplifier.forget_state()
 
     def closed(self, link: str, time: float) -> None:
         """Note that the host has closed or lost a wire."""
         self._advance(time)
-        if any(session.pending for session in self._wires[link].sessions.values()):
-            self._wires[link].disturb(time)  # the next host may receive their replies
-        for session in self._wires[link].sessions.values():
+        wire = self._wires[link]
+        if wire.pending:
+            wire.disturb(time)  # the next host may receive their replies
+        for pending in wire.pending.values():
+            if pending.sent.request.name in CHANGING:
+                pending.session.amplifier.forget_state()  # it may execute a request unheard
+        wire.forget_pending()
+        for session in wire.sessions.values():
             session.is_open = False
-            if any(request.kind in STATE_CHANGING for _, request in session.pending.values()):
-                session.amplifier.forget_state()  # it may execute a request unheard
-            session.forget_pending()
-            session.stop_requested_at = session.last_feed = None
+            session.stop_requested_at = session.last_feed = session.first_stop = None
 
     def contacts(
         self, time: float, contacts: Collection[Hashable], *, is_answerable: bool = True
@@ -176,8 +179,10 @@ class Witness:
                 session.report(
                     "limits", time, f"channel {channel} of {amplifier} has level {level:.4f}"
                 )
-        is_changing = any(request.kind in STATE_CHANGING for _, request in session.pending.values())
-        if not (is_changing or session.is_disturbed(time)):
+        wire = self._wires[session.config.wire]
+        # A reply that is on its way is of an earlier time, which must not be passed before.
+        is_pending = any(pending.session is session for pending in wire.pending.values())
+        if not (is_pending or session.is_disturbed(time)):
             session.amplifier.check_sensors(levels, frequencies or {}, time)
 
     def finish(self, time: float | None = None) -> list[Violation]:
@@ -189,6 +194,7 @@ class Witness:
     def _advance(self, time: float) -> None:
         self._now = max(self._now, time)
         self._host.advance(self._now)
-        for session in self._sessions.values():
-            session.amplifier.advance(self._now)
-            self._exchanges.check_overdue(session, self._now)
+        for wire in self._wires.values():
+            for session in wire.sessions.values():
+                session.amplifier.advance(self._now)
+            self._exchanges.check_overdue(wire, self._now)

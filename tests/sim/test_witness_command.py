@@ -14,26 +14,29 @@ from resource import RLIM_INFINITY, RLIMIT_FSIZE, prlimit
 import pytest
 from typer.testing import CliRunner
 
-from drivers.amplifier import Amplifier
-from drivers.registry import open_backend
+from drivers.opening import Lines
 from model.errors import InputError
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
+from registry.limits import GuardLimits
+from rig_on_wire import far_side
 from sim.cli import app
+from sim.far_ends.wires import Wire
 from sim.witness.capture import read_capture
 from sim.witness.config import parse_config
-from wires import WIRES, far_side
 
 URL = "serial:///dev/ttyUSB0"
-# docs/reference/wire-protocol.md: Hello, Arm and Stop with their answers; then an Apply although
-# stopped.
+# docs/reference/serial.md: Hello and Arm with their replies, and the Event of Arm.
 SESSION = """
-0.000 wire1 > 00 02 01 03 01 07 05 5D 22 C1 B5 00   # Hello
-0.002 wire1 < 0002810301070204180441636D65045175616404412D313703312E326EA37E2400
-0.010 wire1 > 00 05 03 02 01 07 02 FA 02 09 05 90 59 CA 1E 00
-0.012 wire1 < 000583020107020401010301FA02FA030807020401010101010101056DDF034300
+0.000 wire1 > 00 02 01 03 01 06 05 1C 13 DA AC 00   # Hello
+0.002 wire1 < 00028103010602082D0B6572612D6861707469637313
+0.003 wire1 < 73696D756C6174656420616D706C69666965720553494D2D610131D333CD4800
+0.010 wire1 > 00 05 03 03 01 07 04 17 2A FA 05 A3 B1 3E FC 00
+0.011 wire1 < 00051E0301010204010102FF010105ED82084200   # Event
+0.012 wire1 < 000583030107020401010201010102FA02FA0308070103080401010101010101
+0.012 wire1 < 0101010101010101010101010101010105BDAD53A200
 """
-DAMAGED = "0.020 wire1 > 00 05 08 02 01 07 02 05 05 5E D5 8B 3F 00\n"
+DAMAGED = "0.020 wire1 > 00 05 0C 03 01 08 02 07 05 3C 50 CD 6A 00\n"
 TIMEOUT = 30  # s; for a loaded machine, not an expectation
 LIMITS = {0: {"frequency_hz": [40, 500], "level": 1.0}}
 CONFIG = {"wires": {"a": "serial"}, "amplifiers": {"m": {"wire": "a", "channels": LIMITS}}}
@@ -50,14 +53,14 @@ def _replay(tmp_path: Path, text: str, *options: str) -> tuple[int, str]:
 
 
 def test_witness_replay_reports_a_damaged_frame_only(tmp_path: Path) -> None:
-    """Four good frames break no rule; a damaged one is named, with the frames before it."""
+    """Five good frames break no rule; a damaged one is named, with the frames before it."""
     status, out = _replay(tmp_path, SESSION)
-    assert (status, json.loads(out)) == (0, {"frames": 4, "violations": []})
+    assert (status, json.loads(out)) == (0, {"frames": 5, "violations": []})
     status, out = _replay(tmp_path, SESSION + DAMAGED)
     (found,) = json.loads(out)["violations"]
     assert status == 1
     assert (found["invariant"], found["wire"], found["time_s"]) == ("garbage", "wire1", 0.02)
-    assert len(found["frames"]) == 5
+    assert len(found["frames"]) == 6
 
 
 @pytest.mark.parametrize(
@@ -138,7 +141,7 @@ async def test_witness_relays_a_wire_until_interrupted(
 ) -> None:
     """A session through the relay passes; a full disk only makes the capture incomplete."""
     capture = tmp_path / "capture.txt"
-    async with far_side(WIRES["serial"], coarse_rig) as far:
+    async with far_side(Wire("serial"), coarse_rig) as far:
         options = ("--slack", "5000", "--record", str(capture))
         code = "import sys; from controller.cli.main import main; sys.exit(main())"
         process = await asyncio.create_subprocess_exec(
@@ -152,10 +155,11 @@ async def test_witness_relays_a_wire_until_interrupted(
         line = await asyncio.wait_for(process.stdout.readline(), TIMEOUT)
         prlimit(process.pid, RLIMIT_FSIZE, (room, RLIM_INFINITY))
         url = line.decode().split(": ")[1].strip()
-        amplifier = Amplifier(open_backend(url), reply_timeout=2.0)
+        lines = Lines()
+        amplifier = await lines.amplifier(url, GuardLimits(40.0, 500.0, 1.0), name="main")
         await amplifier.open()
-        await amplifier.status()
-        await amplifier.close()
+        await amplifier.read_status()
+        await lines.close()
         process.send_signal(signal.SIGINT)
         out, err = await asyncio.wait_for(process.communicate(), TIMEOUT)
     assert out.decode().split()[0] == "8"

@@ -6,17 +6,18 @@ import socket
 
 import pytest
 
-from drivers.amplifier import Amplifier
-from drivers.command import CommandSet, DriveCommand
-from drivers.guard import Guard, GuardLimits
-from drivers.protocol.messages import AmplifierState
-from drivers.registry import open_backend
+from drivers.by_hand.reaching import random_session
+from drivers.contents import Layer, Tone
+from drivers.opening import Lines
+from drivers.protocol.table import STATES
 from model.errors import InputError
 from model.rig.rig import Rig
+from registry.limits import GuardLimits
+from rig_on_wire import far_side
 from sim.witness.endpoint import parse_endpoint
 from sim.witness.witness import Witness
 from sim.witness_relay import relays
-from wires import WIRES, far_side, patient
+from wires import WIRES
 from witness_config import witness_config
 
 
@@ -26,22 +27,18 @@ def _witness(url: str, *, level: float) -> Witness:
 
 
 async def _drive(url: str) -> None:
-    amplifier = Amplifier(open_backend(patient(url)), reply_timeout=2.0)
-    await amplifier.open()
+    lines = Lines()
     try:
-        guard = Guard(GuardLimits(40.0, 500.0, 1.0), amplifier.capabilities)
-        wanted = CommandSet(1, (DriveCommand(0, 110.0, 0.4, 90.0),), ramp=0.01, valid_for=0.0)
-        assert (await amplifier.arm()).state is AmplifierState.OPERATION_ENABLED
-        assert (await amplifier.apply(guard.check(wanted))).commands[0].level == 0.4
-        await amplifier.heartbeat()
-        assert (await amplifier.stop()).state is AmplifierState.QUICK_STOP_ACTIVE
-        async with asyncio.timeout(60):
-            while True:  # it can be cleared once its ramp is over
-                if (await amplifier.clear()).state is AmplifierState.SWITCH_ON_DISABLED:
-                    break
-                await asyncio.sleep(0.002)
+        amplifier = await lines.amplifier(url, GuardLimits(40.0, 500.0, 1.0), name="main")
+        await amplifier.open()
+        assert (await amplifier.arm(random_session()))["state"] == STATES["OPERATION_ENABLED"]
+        tone = Tone(0, 110.0, 0.4, 90.0)
+        await amplifier.stage(1, [Layer(0, (tone,), ramp=0.01)], now=True)
+        await amplifier.ping()
+        assert (await amplifier.stop()).is_confirmed
+        assert (await amplifier.clear())["state"] == STATES["SWITCH_ON_DISABLED"]
     finally:
-        await amplifier.close()
+        await lines.close()
 
 
 @pytest.mark.parametrize("wire", WIRES)

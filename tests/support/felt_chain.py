@@ -36,9 +36,9 @@ from sim.bench.bench import Bench
 from sim.control.context import SimulationContext
 from sim.control.operations import carry_out
 from sim.far_ends.wires import Wire, open_wires
-from sim.listening.witness import Witness
 from sim.plant.imperfections import draw_imperfections
 from sim.witness.violation import Violation
+from sim.witness.witness import Witness
 from touch_stream import Stream
 from virtual_loop import run_virtual
 from witness_config import witness_config

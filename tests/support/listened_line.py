@@ -6,8 +6,8 @@ from typing import Any
 
 from drivers.codec.can_bus.adapter_text import slcan_line
 from drivers.codec.can_bus.segments import unpack_frames
-from sim.listening.witness import Witness
 from sim.witness.capture import Direction
+from sim.witness.witness import Witness
 from words_line import MemoryLine
 
 WIRES = {"can": "slcan", "serial": "serial", "rtu": "modbus-rtu", "tcp": "modbus-tcp"}

@@ -25,7 +25,7 @@ class RandomGroup:
         self.rng = random.Random(seed)
         self.lines = lines
         hosts = {name: host for line in lines for name, host in line.hosts.items()}
-        self.group = Group(hosts, draw=self.rng.randint)
+        self.group = Group(hosts, watchdog=self.rng.choice((0.25, 0.5)), draw=self.rng.randint)
         self.is_beating = True
 
     def disturb(self, *, is_on: bool) -> None:
@@ -67,7 +67,7 @@ class RandomGroup:
     async def _step(self) -> None:
         if not self.group.is_armed and self.rng.random() < 0.8:
             await self.group.clear()
-            await self.group.arm(self.rng.choice((0.25, 0.5)))
+            await self.group.arm()
             return
         chosen = self.rng.random()
         names = [*self.group.amplifiers]

@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from sim.amplifier.contract import Amplifier
-from sim.listening.witness import Witness
 from sim.witness.endpoint import parse_endpoint
-from sim.witness.witness import Witness as OldWitness
+from sim.witness.witness import Witness
 
 
 def witness_config(
@@ -27,18 +26,6 @@ def witness_config(
         },
         "times_s": times_s,
     }
-
-
-def witness_of_one(kind: str = "serial") -> OldWitness:
-    """A witness of the amplifier m on the wire a, whose host sends no heartbeats."""
-    limits = {n: {"frequency_hz": [0, 4000], "level": 1.0} for n in range(4)}
-    return OldWitness(
-        {
-            "wires": {"a": kind},
-            "amplifiers": {"m": {"wire": "a", "channels": limits}},
-            "times_s": {"slack": 0.002, "heartbeat": 3.0},
-        }
-    )
 
 
 def sense(witness: Witness, now: float, name: str, amplifier: Amplifier) -> None:

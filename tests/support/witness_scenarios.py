@@ -3,12 +3,13 @@
 import asyncio
 import contextlib
 import random
+import re
 
+import hand_written as hand
+from drivers.by_hand import reaching
 from drivers.errors import CommandRefused
-from drivers.guard import Guard, GuardLimits
+from drivers.protocol.sets import LayerSet, pack_layers, parts
 from witnessed_chain import Chain, with_level
-
-_STOP = bytes.fromhex("0005080201070205055ED58B3F00")  # one bit of its CRC is wrong
 
 
 async def day(chain: Chain) -> None:
@@ -45,11 +46,11 @@ async def hung(chain: Chain) -> None:
     await chain.hang()
     for _ in range(20):
         await chain.rest(0.02)
-        await chain.amplifier.status()
+        await chain.amplifier.read_status()
     await chain.touch()
     await chain.operate("clear", rest=0.05)
-    await chain.operate("arm")
     chain.run()
+    await chain.operate("arm")
     await chain.touch(2, rest=0.06)
     await chain.touch(rest=0.06)
 
@@ -125,7 +126,7 @@ async def arc(chain: Chain) -> None:
     chain.trip()
     for _ in range(10):
         await chain.rest(0.02)
-        await chain.amplifier.status()
+        await chain.amplifier.read_status()
     await chain.touch()
     await chain.operate("clear", rest=0.05)
 
@@ -136,21 +137,21 @@ async def asked(chain: Chain) -> None:
     await chain.touch(1, rest=0.06)
     chain.trip()
     await chain.rest(0.02)
-    await chain.amplifier.status()
-    await chain.amplifier.faults()
-    await chain.touch()
+    await chain.amplifier.read_status()
+    await reaching.request(chain.amplifier, "GetFaults", {})
+    await chain.touch(rest=0.1)
     await chain.operate("clear", rest=0.05)
     await chain.amplifier.identify()
     chain.trip()
-    await chain.amplifier.faults()
+    await reaching.request(chain.amplifier, "GetFaults", {})
 
 
 async def noise(chain: Chain) -> None:
-    """Damaged frames come to the amplifier (a stop and a ping), which must not mind them."""
+    """A damaged stop comes to the amplifier, which must not mind it."""
     await chain.operate("arm")
     await chain.touch(1, rest=0.06)
     chain.disturb()
-    chain.inject("amplifier", _STOP)
+    chain.inject("amplifier", _damaged(hand.frame(hand.STOP, (5,), sequence=999)))
     await chain.rest(0.1)
     chain.disturb(False)
     await chain.touch(rest=0.05)
@@ -184,8 +185,7 @@ async def damaged_answer(chain: Chain) -> None:
     def damage(toward: str, data: bytes) -> bytes:
         if toward == "host" and not damaged.is_set():
             damaged.set()
-            at = len(data) - 4  # in the checksum, and never a zero byte
-            return data[:at] + bytes([data[at] ^ 0x55 or 1]) + data[at + 1 :]
+            return _damaged(data)
         return data
 
     await chain.operate("arm", rest=0.02)
@@ -195,6 +195,12 @@ async def damaged_answer(chain: Chain) -> None:
     await chain.rest(0.005)
     await chain.touch(1, rest=0.15)
     await chain.touch(rest=0.05)
+
+
+def _damaged(data: bytes) -> bytes:
+    """A frame with another checksum, and without a zero byte in it."""
+    at = len(data) - 4
+    return data[:at] + bytes([data[at] ^ 0x55 or 1]) + data[at + 1 :]
 
 
 async def foreign_answer(chain: Chain) -> None:
@@ -221,14 +227,14 @@ async def foreign_answer(chain: Chain) -> None:
 
 
 async def incomplete_set(chain: Chain) -> None:
-    """On CAN the frame of one channel is lost."""
+    """On CAN the second frame of a set is lost."""
     lost = asyncio.Event()
 
     def lose(toward: str, data: bytes) -> bytes:
-        at = data.find(b"t301")
-        if toward == "amplifier" and at >= 0 and not lost.is_set():
+        second = re.search(rb"t2018..01[^\r]*\r", data)
+        if toward == "amplifier" and second is not None and not lost.is_set():
             lost.set()
-            return data[:at] + data[data.index(b"\r", at) + 1 :]
+            return data.replace(second[0], b"", 1)
         return data
 
     await chain.operate("arm", rest=0.02)
@@ -253,7 +259,7 @@ async def slow_touch(chain: Chain) -> None:
     await asked.wait()
     await chain.rest(0.005)
     await chain.touch(1)
-    await chain.amplifier.status()
+    await chain.amplifier.read_status()
     await chain.rest(0.1)
     chain.between.delay = 0.0
     await chain.touch(rest=0.05)
@@ -264,17 +270,18 @@ async def disarmed_amid(chain: Chain) -> None:
     await chain.operate("arm")
     await chain.touch(1, rest=0.06)
     await chain.operate("disarm", rest=0.1)
-    await chain.amplifier.status()
+    await chain.amplifier.read_status()
     await chain.touch()
 
 
 async def strangers_set(chain: Chain) -> None:
     """A program that goes round the controller sends a silent set to a disarmed amplifier."""
-    guard = Guard(GuardLimits(40.0, 500.0, 0.5), chain.amplifier.capabilities)
     await chain.rest(0.02)
-    await chain.amplifier.status()
+    await chain.amplifier.read_status()
+    stream = pack_layers([LayerSet(0, 0, 0)])
+    (silent,) = parts(stream, session=9, token=7, now=True)
     with contextlib.suppress(CommandRefused):
-        await chain.amplifier.apply(guard.silence(7, (0, 1), ramp=0.0))
+        await reaching.request(chain.amplifier, "Set", silent)
     await chain.rest(0.02)
 
 
@@ -282,13 +289,9 @@ async def strangers_heartbeat(chain: Chain) -> None:
     """Another program feeds the watchdog while a finger is felt; on CAN it is the same host."""
     await chain.operate("arm")
     await chain.touch(1, rest=0.06)
-    amplifier, own = chain.amplifier, chain.amplifier.session
-    amplifier.session = own % 65535 + 1
-    beating = asyncio.ensure_future(amplifier.heartbeat())
-    await asyncio.sleep(0)
-    amplifier.session = own
+    own = chain.amplifier.session
     with contextlib.suppress(CommandRefused):
-        await beating
+        await reaching.request(chain.amplifier, "Ping", {"session": own % 65535 + 1})
     await chain.touch(rest=0.05)
 
 

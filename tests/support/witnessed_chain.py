@@ -34,8 +34,8 @@ from registry.limits import GuardLimits
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.wires import Wire, open_wire
-from sim.listening.witness import OperatorCommand, Witness
 from sim.witness.violation import Violation
+from sim.witness.witness import OperatorCommand, Witness
 from virtual_loop import VirtualLoop, run_virtual
 from witness_config import sense, witness_config
 
@@ -167,10 +167,10 @@ class Chain:
         """Notify the witness that faults of the first wire begin or end."""
         self.witness.faults(self.loop.time(), self.link, are_on=are_on)
 
-    def expected(self) -> dict[str, dict[int, tuple[float, float, float]]]:
+    def expected(self) -> dict[str, dict[int, list[tuple[float, float, float]]]]:
         """Expected patterns on the wire, by hand: metres over 100 um, radians in degrees."""
-        alone = {0: (110.0, 0.2, 90.0)}, {1: (150.0, 0.4, 180.0)}
-        parts = alone if len(self.fingers) < 2 else ({0: (90.0, 0.3, 0.0)}, {})
+        alone = {0: [(110.0, 0.2, 90.0)]}, {1: [(150.0, 0.4, 180.0)]}
+        parts = alone if len(self.fingers) < 2 else ({0: [(90.0, 0.3, 0.0)]}, {})
         names = tuple(self.bench.amplifiers)
         if len(names) == 1:
             return {names[0]: {**parts[0], **parts[1]}}

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from drivers.protocol.records import Values
 from drivers.protocol.table import STATES
-from sim.listening.decoded import Request
+from sim.witness.decoded import Request
 
 ENABLED = STATES["OPERATION_ENABLED"]
 LATCHED = tuple(STATES[name] for name in ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT"))

@@ -7,8 +7,8 @@ import pytest
 
 import hand_written as hand
 from hand_written_talk import Talk
-from sim.listening.witness import Witness
 from sim.witness.capture import read_capture
+from sim.witness.witness import Witness
 
 
 @pytest.mark.parametrize(("after", "broken"), [(0.028, []), (0.018, ["credit"])])

@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from sim.listening.can_decoder import CanDecoder
-from sim.listening.decoded import (
+from sim.witness.can_decoder import CanDecoder
+from sim.witness.capture import Direction
+from sim.witness.decoded import (
     BootUp,
     Damaged,
     Event,
@@ -19,11 +20,10 @@ from sim.listening.decoded import (
     Reply,
     Request,
 )
-from sim.listening.modbus_decoder import ModbusDecoder
-from sim.listening.serial_decoder import SerialDecoder
-from sim.listening.watched_wire import Decoder
-from sim.witness.capture import Direction
+from sim.witness.modbus_decoder import ModbusDecoder
 from sim.witness.modbus_frames import crc16
+from sim.witness.serial_decoder import SerialDecoder
+from sim.witness.watched_wire import Decoder
 
 DOCS = Path(__file__).parents[3] / "docs" / "reference"
 STATUS = {"state": 4, "fault": 0, "flags": 1, "watchdog_left": 250, "temperature": 250}

@@ -18,9 +18,10 @@ from drivers.protocol.table import (
     STATUS_FLAGS,
 )
 from drivers.protocol.tokens import is_newer_token
-from sim.listening.decoded import CHANGING, FEEDING, STATUS_RECORD, Request
-from sim.listening.expected_outputs import Interval
-from sim.listening.expected_state import (
+from sim.witness.config import TimeLimits
+from sim.witness.decoded import CHANGING, FEEDING, STATUS_RECORD, Request
+from sim.witness.expected_outputs import Interval
+from sim.witness.expected_state import (
     DISABLED,
     FAULT,
     NAMES,
@@ -31,9 +32,8 @@ from sim.listening.expected_state import (
     SWITCHED_ON,
     ExpectedState,
 )
-from sim.listening.set_replies import achieved_problem
-from sim.listening.unanswered import ENABLED, LATCHED, Sent, is_carried_out
-from sim.witness.config import TimeLimits
+from sim.witness.set_replies import achieved_problem
+from sim.witness.unanswered import ENABLED, LATCHED, Sent, is_carried_out
 from sim.witness.violation import ReportViolation
 
 _WARM = QUANTITIES["temperature"].to_wire(60.0)  # from here on an amplifier may derate

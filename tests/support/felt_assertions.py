@@ -26,7 +26,7 @@ from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
-from model.transients.envelope import ramped_onset, shaped
+from model.transients.envelope import BaseEnvelope, shaped
 from model.vibration.direct import direct_responder
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
@@ -41,13 +41,13 @@ COMMANDED, RELEASE = 0.020, 0.010  # s; from the last finger's lift to a command
 
 @dataclass(frozen=True)
 class Truth:
-    """The true rig, its table and the stream, and whether onsets are shaped on this wire."""
+    """The true rig, its table and the stream; onset_knots: that the wire carries, None for all."""
 
     rig: Rig
     table: LocalizationTable
     stream: Stream
     drive_mode: str = "phased"
-    is_shaped: bool = True
+    onset_knots: int | None = None
 
     def asked(self, situation: Situation) -> Question:
         """The query of a situation."""
@@ -57,7 +57,7 @@ class Truth:
             level_db_sl=LEVEL_DB_SL,
             drive_mode=self.drive_mode,
             frequencies=(40.0, 500.0),
-            envelopes=self.is_shaped,
+            envelopes=True,
         )
 
     def fields(self, heard: Heard, points: FloatArray) -> tuple[FloatArray, ComplexArray]:
@@ -166,16 +166,19 @@ def localization_matches_prediction(played: Played, truth: Truth) -> None:
 
 
 def onset_matches_prediction(played: Played, truth: Truth) -> None:
-    """Contrast of the peaks over the first 100 ms from rest within 2 dB, shaped or plain.
+    """Contrast of the peaks over the first 100 ms from rest within 2 dB.
 
-    Of the onset that the table gives, played without wires on the plate that was drawn.
+    Of the onset that the table gives, with as many knots as the wire carries, played without wires
+    on the plate that was drawn.
     """
     timing = Timing(truth.table)
     first, *_ = _touched(played)
     question = truth.asked(first.situation)
-    pattern = truth.table.query(question)
-    if truth.is_shaped:
-        pattern = timing.with_envelopes(question, pattern, ending=False)
+    pattern = timing.with_envelopes(question, truth.table.query(question), ending=False)
+    assert pattern.onset is not None
+    if truth.onset_knots is not None:
+        onset = {name: _sampled(each, truth.onset_knots) for name, each in pattern.onset.items()}
+        pattern = replace(pattern, onset=onset)
     predicted = _onset_contrast(truth, first.situation, pattern)
     measured = _contrast(
         {p: felt.peaks for p, felt in first.onset.items()},
@@ -191,11 +194,8 @@ def _onset_contrast(truth: Truth, situation: Situation, pattern: Pattern) -> flo
     real = truth.drawn.plate.realised(truth.rig)
     plant = Plant(reduce_plate(real.plate, real.mesh, footprints_of(real.eras)), real.eras)
     plant.set_contacts(truth.resting(situation))
-    bases = (
-        shaped(pattern.onset, real.eras)
-        if pattern.onset
-        else ramped_onset(pattern.excitation, real.eras, ramp=pattern.ramp)
-    )
+    assert pattern.onset is not None
+    bases = shaped(pattern.onset, real.eras)
     for number, (era, terms) in enumerate(zip(real.eras, bases, strict=True)):
         plant.set_input(number, realised(terms, truth.drawn.channels[truth.rig.wiring[era.name]]))
     discs = {place: truth.fingertip(place) for place in situation.fingers.values()}
@@ -208,6 +208,12 @@ def _onset_contrast(truth: Truth, situation: Situation, pattern: Pattern) -> flo
     }
     weights = fingertip_weights(*truth.stream.places[situation.felt_at], truth.rig.plate)
     return _contrast(peaks, situation, weights)
+
+
+def _sampled(envelope: BaseEnvelope, knots: int) -> BaseEnvelope:
+    """The values of an envelope at so many moments, equally far apart, and at its end."""
+    times = np.linspace(0, envelope.duration, knots + 2)[1:]
+    return replace(envelope, knots=tuple(envelope.amplitude(times)), step=float(times[0]))
 
 
 def onset_is_on_time(played: Played, truth: Truth) -> None:

@@ -1,7 +1,7 @@
 """A CAN bus as it is at its worst for a host that relies on the order of its frames.
 
-The host's adapter transmits what waits by priority, as controllers with several mailboxes do, and
-another device sends a SYNC every 10 ms.
+The host's adapter transmits what waits by priority and, of one identifier, the newest first, as
+controllers with several mailboxes may. Another device sends a SYNC every 10 ms.
 """
 
 import asyncio
@@ -15,13 +15,13 @@ SYNC, PERIOD = CanFrame(0x080, b""), 0.01  # s
 
 
 class MailboxBus(CanBus):
-    """The bus; transmitted: identifiers of the host's frames in the order in which they were."""
+    """The bus; given, transmitted: the host's frames in the order in which they were."""
 
     def __init__(self, bitrate: int | None = None) -> None:
         assert bitrate is not None, "without transmission time no frame waits"
         super().__init__(bitrate)
-        self.given: list[int] = []
-        self.transmitted: list[int] = []
+        self.given: list[CanFrame] = []
+        self.transmitted: list[CanFrame] = []
         self._waiting: list[tuple[int, int, CanFrame, Listener]] = []
         self._numbers = itertools.count()
         self._next: asyncio.TimerHandle | None = None
@@ -31,8 +31,8 @@ class MailboxBus(CanBus):
         if isinstance(getattr(sender, "__self__", None), Stub) or frame is SYNC:
             super().send(frame, sender=sender)
             return
-        self.given.append(frame.id)
-        heapq.heappush(self._waiting, (frame.id, next(self._numbers), frame, sender))
+        self.given.append(frame)
+        heapq.heappush(self._waiting, (frame.id, -next(self._numbers), frame, sender))
         if self._next is None:
             self._transmit()
 
@@ -46,7 +46,7 @@ class MailboxBus(CanBus):
         self._next = None
         if self._waiting:
             _, _, frame, sender = heapq.heappop(self._waiting)
-            self.transmitted.append(frame.id)
+            self.transmitted.append(frame)
             super().send(frame, sender=sender)
             loop = asyncio.get_running_loop()
             self._next = loop.call_at(self._free_from, self._transmit)

@@ -9,8 +9,8 @@ import pytest_asyncio
 
 import dashboard_pictures
 from chromium import Browser, Page, open_browser
-from controller.api.schema import DaemonStateName, LatencySummary
-from controller.api.topics import LatencyEvent, StateEvent
+from controller.api.schema import DaemonStateName
+from controller.api.topics import StateEvent
 from controller.gateway.app import MAX_SESSIONS
 from daemon_bench import running_daemon, until_state
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard
@@ -57,7 +57,7 @@ async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Pat
             bench.far.device.inject_fault(FaultWindow("hang"))
             await tab.until(f"{STATE} === 'COMM_LOST'")
             assert await tab.evaluate(REASON) == "link-lost"
-            await tab.until(BANNER, lambda text: "0.25\u00a0s" in text)
+            await tab.until(BANNER, lambda text: "after 2\u00a0s" in text)  # of the bench
             await tab.until("document.querySelector('.tile.bad') !== null")
             tile = await tab.evaluate(TILE)
             assert "%" not in tile
@@ -79,13 +79,10 @@ async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Pat
 
 
 async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> None:
-    """In turn: why onsets are plain, while that holds; which amplifiers a stop did not silence.
+    """Which amplifiers a stop did not silence: beside the button and in the list of events.
 
-    That stands beside the button and in the list of events, until a stop is confirmed. The end of
-    the daemon after a loss is an event of its own.
+    Until a stop is confirmed. The end of the daemon after a loss is an event of its own.
     """
-    summary = LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[])
-    plain = "document.querySelector('#plain').innerText"
     problem = "document.querySelector('#problem').innerText"
     states: list[tuple[DaemonStateName, str]] = [
         ("READY_TO_SWITCH_ON", ""),
@@ -94,12 +91,6 @@ async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> No
     ]
     with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
         await open_dashboard(tab, gateway, DESKTOP)
-        for reason in ("loading took 50 ms", None):
-            daemon.publish("latency", LatencyEvent(latency_ms=summary, ramp_only_reason=reason))
-            await tab.until(
-                plain,
-                lambda text, shown=reason or "": text.endswith(shown) and bool(text) == bool(shown),
-            )
         daemon.silence = UNCONFIRMED
         await tab.click("#stop")
         shown = await tab.until(problem, lambda text: "side" in text)

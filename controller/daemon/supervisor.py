@@ -466,7 +466,7 @@ class Supervisor:
             self.post(DaemonEvent(Trigger.LINK_DEGRADED, cause, "check cables and supply"))
             _rate_limited_logger.warning("link: degraded: %s", cause, extra={"topic": "link"})
             self._link_changed("degraded", degraded, cause)
-        else:
+        elif not self._controller.group.lost_by:  # the next heartbeat reports those
             cause = "all amplifiers reply again and play what they should"
             self.post(DaemonEvent(Trigger.LINK_RESTORED, cause, "era disarm, or era stop"))
             _rate_limited_logger.info("link: restored: %s", cause, extra={"topic": "link"})

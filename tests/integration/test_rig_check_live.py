@@ -13,15 +13,14 @@ from typer.testing import CliRunner, Result
 
 from controller.cli.demo import app
 from controller.daemon.socket_lock import SocketLock
-from drivers.amplifier import Amplifier
 from drivers.errors import CommandError, LinkError
-from drivers.protocol.messages import Capabilities, Feature
 from memory_machine import live_in_memory
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from rig_files import write_rig
 from rig_on_wire import far_side
+from sim.amplifier.contract import Amplifier
 from virtual_loop import run_virtual
 from wires import WIRES
 
@@ -156,14 +155,7 @@ def test_amplifier_that_is_not_there_or_has_no_sensors_is_named(
     """By its port or its name, before anything plays."""
     with pytest.raises(LinkError, match="/dev/nowhere"):
         check("--url", "serial:///dev/nowhere?baud=921600", "--yes", on=plate)
-    capabilities = Amplifier.capabilities.fget  # type: ignore[attr-defined]
-
-    def without_sensors(amplifier: Amplifier) -> Capabilities:
-        found = capabilities(amplifier)
-        features = [each for each in found.features if each is not Feature.SENSORS]
-        return replace(found, features=tuple(features))  # type: ignore[no-any-return]
-
-    monkeypatch.setattr(Amplifier, "capabilities", property(without_sensors))
+    monkeypatch.setattr(Amplifier, "attach", lambda amplifier, sensing: None)
     with pytest.raises(CommandError, match=r"main.*sensors"):
         check("--url", PORT, "--yes", on=plate)
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 
 from drivers import clock
 from drivers.contents import Layer, Tone
-from drivers.errors import LinkError
+from drivers.errors import LinkDegraded, LinkError
+from drivers.host.amplifier import WATCHDOG
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from drivers.host.line import Line
@@ -28,13 +29,17 @@ LIMITS = GuardLimits(20.0, 1000.0, 1.0)
 
 @dataclass
 class HostedRig:
-    """The bench, its devices, and the group of their hosts; urls: on real wires, by name."""
+    """The bench, its devices, and the group of their hosts.
+
+    urls: on real wires, by name; watchdog [s]: of the group, also when it is opened again.
+    """
 
     bench: Bench
     devices: Mapping[str, AmplifierDevice]
     group: Group
     urls: Mapping[str, str] = field(default_factory=dict)
     opened: Lines = field(default_factory=Lines)
+    watchdog: float = WATCHDOG
 
     @property
     def lines(self) -> Mapping[str, Line]:
@@ -52,16 +57,17 @@ class HostedRig:
         async with asyncio.timeout(within):
             while True:
                 with contextlib.suppress(LinkError):
-                    self.group = await _opened_group(self.opened, self.urls)
+                    self.group = await _opened_group(self.opened, self.urls, self.watchdog)
                     return
                 await self.opened.close()
                 await asyncio.sleep(0.05)
 
     async def beat_until(self, time: float) -> None:
-        """Feed the watchdogs until a time [s]."""
+        """Feed the watchdogs of those that reply until a time [s]."""
         while (left := time - clock.now()) > 0:
             await asyncio.sleep(min(left, 0.1))
-            await self.group.beat()
+            with contextlib.suppress(LinkDegraded):
+                await self.group.beat()
 
 
 def make_bench(rig: Rig) -> tuple[Bench, dict[str, AmplifierDevice]]:
@@ -101,24 +107,27 @@ async def rig_in_memory(rig: Rig) -> AsyncIterator[HostedRig]:
 
 
 @asynccontextmanager
-async def rig_on_wire(rig: Rig, wire: Wire) -> AsyncIterator[HostedRig]:
-    """The amplifiers of a rig on a wire, identified and disarmed."""
+async def rig_on_wire(
+    rig: Rig, wire: Wire, *, watchdog: float = WATCHDOG
+) -> AsyncIterator[HostedRig]:
+    """The amplifiers of a rig on a wire, identified and disarmed; watchdog [s]."""
     bench, devices = make_bench(rig)
     async with open_wire(wire, list(devices.values())) as urls:
         opened = Lines()
         try:
-            group = await _opened_group(opened, urls)
-            yield HostedRig(bench, devices, group, urls, opened)
+            group = await _opened_group(opened, urls, watchdog)
+            yield HostedRig(bench, devices, group, urls, opened, watchdog)
         finally:
             await opened.close()
             for device in devices.values():
                 device.close()
 
 
-async def _opened_group(lines: Lines, urls: Mapping[str, str]) -> Group:
+async def _opened_group(lines: Lines, urls: Mapping[str, str], watchdog: float) -> Group:
     """A group of the amplifiers at these URLs, identified and disarmed."""
     group = Group(
-        {name: await lines.amplifier(url, LIMITS, name=name) for name, url in urls.items()}
+        {name: await lines.amplifier(url, LIMITS, name=name) for name, url in urls.items()},
+        watchdog=watchdog,
     )
     await group.open()
     return group

@@ -53,7 +53,7 @@ test-long: .venv/installed-test
 
 # A short form of the whole suite on a machine that has no time: what talks to wires, processes and
 # clients, beside six processes that compute without pause.
-BUSY := tests/drivers/backends tests/drivers/conformance/test_vanished_host.py tests/firmware \
+BUSY := tests/drivers/by_hand tests/drivers/host tests/drivers/ports tests/drivers/wires tests/firmware \
 	tests/controller/daemon tests/controller/gateway tests/controller/api tests/integration
 test-busy: .venv/installed-test
 	$(BIN)/python tests/support/busy_machine.py $(BIN)/pytest -m 'not long' --numprocesses 2 \

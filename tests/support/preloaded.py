@@ -47,7 +47,6 @@ _LOADED = (
     "controller.daemon.config_reader",
     "controller.daemon.run",
     "controller.gateway.serving",
-    "drivers.amp_actions",
     "model.commands.progress",
     "model.fem.modal",
     "model.studies.run",

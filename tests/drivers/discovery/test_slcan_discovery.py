@@ -13,7 +13,7 @@ import pytest
 from serial.tools.list_ports_common import ListPortInfo
 from typer.testing import CliRunner
 
-from drivers.cli import app
+from drivers.by_hand.cli import app
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.discovery import slcan
 from drivers.discovery.slcan import SlcanAdapter, detect_slcan

@@ -118,7 +118,7 @@ KINDS = [
         known_wires,
         fails="from era_haptics.plugins.wires import WireAddress\n"
         "class THING(WireAddress):\n"
-        "    def __init__(self, url): pass\n"
+        "    def __init__(self, url): self.line, self.number, self.settings = url, 1, {}\n"
         "    def exchange_time(self, words, reply): return 0.0\n"
         "    def make_wire(self): pass\n"
         "    async def open_port(self, on_data, on_loss): raise KeyError('open')\n",

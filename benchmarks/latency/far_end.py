@@ -3,9 +3,9 @@
     python -m benchmarks.latency.far_end RIG FILE WIRE
 
 WIRE: `pty`, a pseudo-terminal, or `tcp`, as to a serial server. Prints the URLs of the amplifiers
-in the order of the rig. On SIGUSR1 it writes a JSON line for each Apply, Stage and Commit frame,
-with arrival on CLOCK_MONOTONIC, amplifier, type, number and payload, and prints "written". There
-is no plate.
+in the order of the rig. On SIGUSR1 it writes a JSON line for each Set and Commit frame, with
+arrival on CLOCK_MONOTONIC, amplifier, type, number and payload, and prints "written". There is no
+plate.
 """
 
 import asyncio
@@ -18,18 +18,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
-from drivers.codec.serial_line.exchanges import decode_request, encode_reply
-from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
-from drivers.protocol.definition import PROTOCOL
+from drivers.codec.serial_line.frame import Frame, FrameReader
+from drivers.protocol.table import MESSAGES
 from model.rig.file import load_rig
-from sim.amplifier.amplifier import SimulatedAmplifier
+from sim.amplifier.contract import Amplifier
+from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.pseudo_terminal import make_terminal
 
-SETS = tuple(PROTOCOL.types[name] for name in ("apply", "stage", "commit"))
+SETS = tuple(MESSAGES[name].number for name in ("Set", "Commit"))
+BAUD = 921_600
 
 
 class Wire(asyncio.Protocol):
-    """A wire to the daemon; on_data: called with received bytes. `write` sends once it is open."""
+    """A wire to the daemon; on_data: called with received bytes. `send` sends once it is open."""
 
     def __init__(self, on_data: Callable[[bytes], None]) -> None:
         self.write: Callable[[bytes], object] = len  # until it is open
@@ -40,13 +41,17 @@ class Wire(asyncio.Protocol):
         terminal = make_terminal(self._on_data)
         terminal.listen()
         self.write = terminal.write
-        return f"serial://{terminal.port}?baud={PROTOCOL.serial.baud}"
+        return f"serial://{terminal.port}?baud={BAUD}"
 
     async def open_server(self) -> str:
         """Open a TCP port on the loopback for one connection and return its URL."""
         loop = asyncio.get_running_loop()
         self._server = await loop.create_server(lambda: self, "127.0.0.1", 0)
         return f"serial+tcp://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
+
+    def send(self, data: bytes) -> None:
+        """Send bytes to the daemon."""
+        self.write(data)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """The daemon has connected."""
@@ -59,19 +64,15 @@ class Wire(asyncio.Protocol):
 
 async def open_amplifier(name: str, kind: str, seen: list[tuple[int, str, Frame]]) -> str:
     """Serve an amplifier on a wire of a kind, note its sets, and return its URL."""
-    amplifier = SimulatedAmplifier(name, channels=4)
     reader = FrameReader()
 
     def arrived(data: bytes) -> None:
         now = time.monotonic_ns()
-        for frame in reader.feed(data):
-            if frame.kind in SETS:
-                seen.append((now, name, frame))
-            amplifier.tick(now * 1e-9)
-            reply = amplifier.handle(decode_request(frame), now * 1e-9)
-            wire.write(encode_frame(encode_reply(reply, frame)))
+        seen.extend((now, name, frame) for frame in reader.feed(data) if frame.kind in SETS)
+        end.receive(data, now * 1e-9)
 
     wire = Wire(arrived)
+    end = SerialAmplifiers({1: Amplifier(name, channels=4)}, wire.send)
     return await (wire.open_terminal() if kind == "pty" else wire.open_server())
 
 

@@ -15,11 +15,10 @@ from controller.loop.intent import BuzzNewestContact
 from controller.loop.routing import phasor_of, route
 from controller.loop.selection import MOVE_TOLERANCE, Selector
 from controller.sources.contacts import Contact, ContactKey
-from drivers.codec.serial_line.exchanges import decode_request
-from drivers.codec.serial_line.frame import Frame
-from drivers.command import DriveCommand
-from drivers.contents import Layer
-from drivers.protocol.messages import Apply, Commit, Stage
+from drivers.contents import Layer, Tone
+from drivers.protocol.serial_payload import unpack_words
+from drivers.protocol.sets import Assembly, unpack_layers
+from drivers.protocol.table import MAX_WORDS, QUANTITIES, read_request
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 
@@ -30,15 +29,15 @@ _TOLERANCE = (1e-4, 2e-3)  # absolute in full strokes, relative to the level
 
 @dataclass(frozen=True)
 class Command:
-    """A set at the far end: arrival of its last byte [s], number of that frame, token, commands.
+    """A set at the far end: arrival of its last byte [s], number of that frame, token, tones.
 
-    commands: with the amplifier of each.
+    commands: the tones of all layers, with the amplifier of each.
     """
 
     time: float
     sequence: int
     token: int
-    commands: tuple[tuple[str, DriveCommand], ...]
+    commands: tuple[tuple[str, Tone], ...]
 
 
 def read_commands(
@@ -46,29 +45,40 @@ def read_commands(
 ) -> Iterator[Command]:
     """Read the lines of the far end: a set plays once the last amplifier has it, and its commit.
 
-    Stages are of no moment by themselves. A frame that is repeated counts when it first came.
+    Parts that are staged are of no moment by themselves. A frame that is repeated counts when it
+    first came.
     """
-    staged: dict[tuple[str, int], tuple[DriveCommand, ...]] = {}
-    played: dict[int, dict[str, tuple[DriveCommand, ...]]] = {}
+    assemblies = {name: Assembly() for name in amplifiers}
+    staged: dict[tuple[str, int], tuple[Tone, ...]] = {}
+    played: dict[int, dict[str, tuple[Tone, ...]]] = {}
     for when, name, kind, sequence, payload in lines:
-        amplifier, number = str(name), int(sequence)
-        request = decode_request(Frame(int(kind), 1, number, bytes.fromhex(str(payload))))
-        match request:
-            case Stage(command_set=wanted):
-                staged[amplifier, wanted.token] = wanted.commands
+        amplifier, number, time = str(name), int(sequence), int(when) * 1e-9
+        message, values = read_request(int(kind), unpack_words(bytes.fromhex(str(payload))))
+        token = values["token"]
+        if message == "Set":
+            stream = assemblies[amplifier].add(values, time, MAX_WORDS * values["parts"])
+            if stream is None:
                 continue
-            case Commit(token=token):
-                commands = staged[amplifier, token]
-            case Apply(command_set=wanted):
-                token, commands = wanted.token, wanted.commands
-            case _:
-                raise AssertionError(f"{type(request).__name__} is no set")
+            staged[amplifier, token] = _tones(stream)
+            if not values["now"]:
+                continue
         several = played.setdefault(token, {})
-        several.setdefault(amplifier, commands)
+        several.setdefault(amplifier, staged[amplifier, token])
         if several.keys() == set(amplifiers):
             del played[token]
             all_of_them = tuple((name, each) for name in several for each in several[name])
-            yield Command(int(when) * 1e-9, number, token, all_of_them)
+            yield Command(time, number, token, all_of_them)
+
+
+def _tones(stream: Sequence[int]) -> tuple[Tone, ...]:
+    """Return the tones of all layers of a set."""
+    in_units = [QUANTITIES[name].from_wire for name in ("frequency", "level", "phase")]
+    frequency, level, phase = in_units
+    return tuple(
+        Tone(each.channel, frequency(each.frequency), level(each.level), phase(each.phase))
+        for layer in unpack_layers(stream)
+        for each in layer.commands
+    )
 
 
 @dataclass(frozen=True)
@@ -163,7 +173,7 @@ class Expected:
             frequency, amplitude = expected.get((amplifier, played.channel), (played.frequency, 0j))
             if played.level > 0 and abs(played.frequency - frequency) > 0.01:
                 return math.inf
-            difference = abs(played.phasor - amplitude)
+            difference = abs(phasor_of(played) - amplitude)
             most = max(most, difference / (absolute + relative * loudest))
         return most
 

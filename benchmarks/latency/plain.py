@@ -20,12 +20,12 @@ from urllib.parse import urlsplit
 import serial
 from pythonosc.osc_packet import OscPacket
 
-from benchmarks.wires.bench import SESSION, make_sets
-from drivers.codec.serial_line.exchanges import encode_request
-from drivers.codec.serial_line.frame import encode_frame
-from drivers.protocol.messages import Apply, Arm
+from benchmarks.wires.bench import arm_values, make_sets
+from drivers.codec.serial_line.frame import Frame, encode_frame
+from drivers.host.serial_wire import SerialWire
+from drivers.protocol.serial_payload import pack_words
+from drivers.protocol.table import MESSAGES, VERSION
 from drivers.urls.serial_line import SerialUrl
-from sim.amplifier.amplifier import capabilities
 
 SETS = 100
 
@@ -35,9 +35,10 @@ class Panel(asyncio.DatagramProtocol):
 
     def __init__(self, port: int) -> None:
         self._port = port
+        message = MESSAGES["Set"]
         self._sets = [
-            encode_request(Apply(safe, SESSION), address=1, sequence=0)
-            for safe in make_sets(capabilities(4), SETS)
+            Frame(message.number, 1, 0, pack_words(message.request.pack(values)), VERSION)
+            for values in make_sets(SETS)
         ]
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
@@ -49,7 +50,9 @@ class Panel(asyncio.DatagramProtocol):
                     pass
                 case ["fseq", number]:
                     pass
-        chosen = self._sets[int(x * SETS) % SETS]._replace(sequence=number & 0xFFFF)
+        chosen, token = self._sets[int(x * SETS) % SETS], number & 0xFFFF
+        payload = chosen.payload[:2] + token.to_bytes(2, "little") + chosen.payload[4:]
+        chosen = chosen._replace(sequence=token, payload=payload)
         with contextlib.suppress(BlockingIOError):  # no room: the touch is lost
             os.write(self._port, encode_frame(chosen))
 
@@ -81,10 +84,10 @@ def _opened(url: SerialUrl) -> serial.Serial | socket.socket:
 
 async def main() -> None:
     loop = asyncio.get_running_loop()
-    with _opened(SerialUrl.parse(sys.argv[2])) as port:
-        os.write(
-            port.fileno(), encode_frame(encode_request(Arm(2.0, SESSION), address=1, sequence=0))
-        )
+    parsed = SerialUrl.parse(sys.argv[2])
+    with _opened(parsed) as port:
+        arm = SerialWire(parsed.baud, sequence=0).request(1, "Arm", arm_values())
+        os.write(port.fileno(), arm)
         loop.add_reader(port.fileno(), os.read, port.fileno(), 4096)
         transport, _ = await loop.create_datagram_endpoint(
             lambda: Panel(port.fileno()), local_addr=("127.0.0.1", 0)

@@ -9,8 +9,8 @@ import numpy as np
 
 from benchmarks.plant.problem import FINGERS, Case
 from benchmarks.setting import RIG
-from drivers.command import CommandSet, DriveCommand
-from drivers.protocol.messages import Achieved, Apply, Arm
+from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
+from drivers.protocol.table import QUANTITIES
 from model.finger.fingertip import fingertip_points
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.file import load_rig
@@ -23,6 +23,8 @@ from sim.bench.bench import Bench
 from sim.plant.plant import SAMPLE_RATE, Plant
 
 FREQUENCIES = (110.0, 110.0, 250.0, 320.0)
+SESSION, HALF = 1, 5000  # of the wire
+_FREQUENCY = QUANTITIES["frequency"].to_wire
 ONSETS = 0.5  # s between two new tones: a plate that only hums steadily would be no fair case
 
 
@@ -97,7 +99,8 @@ class Rigs:
         bench.place_fingers({str(n): FINGERS[n] for n in range(case.fingers)}, now=0.0)
         token = 0
         for name in bench.amplifiers:
-            bench.exchange(name, Arm(2.0), now=0.0)
+            watchdog = QUANTITIES["watchdog"].to_wire(2.0)
+            bench.exchange(name, "Arm", {"session": SESSION, "watchdog": watchdog}, now=0.0)
 
         def go_on(seconds: float) -> None:
             nonlocal token
@@ -109,12 +112,15 @@ class Rigs:
                     token += 1
                     for name, amplifier in bench.amplifiers.items():
                         commands = tuple(
-                            DriveCommand(channel, FREQUENCIES[(channel + token) % 4], 0.5)
-                            for channel in range(amplifier.capabilities.channels)
+                            Command(
+                                channel, _FREQUENCY(FREQUENCIES[(channel + token) % 4]), HALF, 0
+                            )
+                            for channel in range(amplifier.capabilities["channels"])
                         )
-                        wanted = CommandSet(token, commands, 0.02, 0.0)
-                        reply = bench.exchange(name, Apply(wanted), now=now)
-                        assert isinstance(reply, Achieved)
+                        stream = pack_layers([LayerSet(0, 20, 0, commands)])
+                        (part,) = parts(stream, session=SESSION, token=token, now=True)
+                        taken = bench.exchange(name, "Set", part, now=now)
+                        assert taken["played"]
                 bench.advance(now + case.step)
             bench.fingers.felt(bench.time, bench.time)  # sampled to the last
 

@@ -1,4 +1,4 @@
-"""`make bench-wires`: time of an exchange by the drivers and by the bare library of each wire.
+"""`make bench-wires`: time of an exchange by the host and by the bare library of each wire.
 
 Writes docs/measured/wire-benchmarks.md. A wire is one entry in WIRES.
 """
@@ -7,110 +7,49 @@ import asyncio
 import platform
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.page import write_parts
-from benchmarks.wires.bare import bare_modbus, bare_serial
-from benchmarks.wires.bare_can import bare_can, can_codec
+from benchmarks.wires.bare import bare_can, bare_modbus, bare_serial
 from benchmarks.wires.bench import (
-    CHANNELS,
-    SESSION,
+    REFUSALS,
     Times,
+    after_refusals,
     all_at_once,
     far_end,
     make_sets,
     ours,
-    sent_apart,
 )
+from benchmarks.wires.calls import calls_of_a_set
 from benchmarks.wires.stops import STOPS, stop_latencies
 from benchmarks.wires.stops import WIRES as STOP_WIRES
-from drivers.codec.modbus import exchanges
-from drivers.codec.modbus.adu import build_adu
-from drivers.codec.serial_line.exchanges import decode_request, encode_request
-from drivers.codec.serial_line.frame import FrameReader, encode_frame
-from drivers.guard import SafeCommandSet
-from drivers.protocol.messages import (
-    Achieved,
-    AmplifierState,
-    Apply,
-    Broadcast,
-    Capabilities,
-    Fault,
-    Feature,
-    Reply,
-    Request,
-    Status,
-)
-from sim.far_ends.modbus.unit import ModbusUnit
+from drivers.protocol.records import Values
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "measured" / "wire-benchmarks.md"
 COUNT = 1500
 ROUNDS = 5  # ours and bare take turns, so that both see the same machine
-WIDE = Capabilities(
-    *(16, 20.0, 600.0, 0.01, 1.0, 0.0001, 0.01, 1.0, 0.1, 2.0, 32, 63, 0.001, 0.1),
-    features=Feature.WHOLE,
-)
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A wire: options of `era sim`, and the bare library doing the same exchange.
-
-    codec: encodes and decodes a set once; None where the library does that.
-    """
+    """A wire: options of `era sim`, and the bare library doing the same exchange."""
 
     options: Sequence[str]
-    bare: Callable[[str, Sequence[SafeCommandSet]], list[float]]
+    bare: Callable[[str, Sequence[Values]], list[float]]
     library: str
-    codec: Callable[[SafeCommandSet], None] | None = None
-
-
-_READER = FrameReader()
-
-
-def _serial_codec(safe: SafeCommandSet) -> None:
-    data = encode_frame(encode_request(Apply(safe, SESSION), address=1, sequence=1))
-    decode_request(_READER.feed(data)[0])
-
-
-class _Accepting:
-    """An amplifier that accepts every set."""
-
-    is_answering = True
-
-    def exchange(self, request: Request) -> Reply:
-        if isinstance(request, Apply):
-            return Achieved(request.command_set.token, request.command_set.commands)
-        return Status(
-            AmplifierState.OPERATION_ENABLED, Fault.NONE, 1, True, 25.0, 1.0, (0.0,) * CHANNELS
-        )
-
-    def broadcast(self, request: Broadcast) -> None:
-        pass
-
-
-_UNIT = ModbusUnit(_Accepting())
-
-
-def _modbus_codec(safe: SafeCommandSet) -> None:
-    exchange = exchanges.encode_request(Apply(safe, SESSION), tag=1, channels=CHANNELS)
-    adu = build_adu(exchange.read, exchange.write, unit=1, transaction=1, is_rtu=False)
-    answer = _UNIT.reply(adu.frame[7:])
-    assert answer is not None
 
 
 WIRES: Mapping[str, Measured] = {
-    "serial": Measured(["--serial"], bare_serial, "pyserial", _serial_codec),
+    "serial": Measured(["--serial"], bare_serial, "pyserial"),
     "serial, 921 600 baud": Measured(["--serial", "--speed", "921600"], bare_serial, "pyserial"),
-    "Modbus TCP": Measured(["--modbus-tcp", "0"], bare_modbus, "pymodbus", _modbus_codec),
+    "Modbus TCP": Measured(["--modbus-tcp", "0"], bare_modbus, "pymodbus"),
     "Modbus RTU, 115 200 baud": Measured(
         ["--modbus-rtu", "--speed", "115200"], bare_modbus, "pymodbus"
     ),
-    "CAN, socketcand": Measured(["--socketcand", "0"], bare_can, "python-can", can_codec),
+    "CAN, socketcand": Measured(["--socketcand", "0"], bare_can, "python-can"),
     "CAN, slcan": Measured(["--slcan"], bare_can, "python-can"),
     "CAN, slcan, 500 kbit/s": Measured(["--slcan", "--speed", "500000"], bare_can, "python-can"),
 }
@@ -125,9 +64,8 @@ EIGHT_ROUNDS = 300
 
 
 HEAD = (
-    "| wire | median [ms] | 99th [ms] | applies/s | bare library | median [ms] | 99th [ms] "
-    "| ratio | codec [sets/s, encode and decode] |",
-    "|---|---|---|---|---|---|---|---|---|",
+    "| wire | median [ms] | 99th [ms] | sets/s | bare library | median [ms] | 99th [ms] | ratio |",
+    "|---|---|---|---|---|---|---|---|",
 )
 STOP_HEAD = (
     "| wire | median [ms] | 99th [ms] | maximum [ms] |",
@@ -148,12 +86,15 @@ def main() -> None:
         rows = [_row(name, WIRES[name], rig) for name in names]
         stops = [_stop_row(name, options, rig) for name, options in STOP_WIRES.items()]
         eight = _eight(Path(folder))
+        refused = _refused(rig)
     machine = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
     run = f"{COUNT} exchanges each, in {ROUNDS} alternating rounds ({machine})."
     parts = {
         "wires": "\n".join([run, "", *HEAD, *rows]),
         "stops": "\n".join([f"{STOPS} stops each ({machine}).", "", *STOP_HEAD, *stops]),
         "eight": "\n".join([*EIGHT_HEAD, *eight]),
+        "refusals": refused,
+        "calls": "\n".join(_calls()),
     }
     print("\n\n".join(parts.values()))
     write_parts(PAGE, parts)
@@ -166,12 +107,12 @@ def _row(name: str, wire: Measured, rig: Path) -> str:
         with far_end(rig, wire.options) as (url,):
             our_times += asyncio.run(ours(url, COUNT // ROUNDS))
         with far_end(rig, wire.options) as (url,):
-            bare_times += wire.bare(url, make_sets(WIDE, COUNT // ROUNDS))
+            bare_times += wire.bare(url, make_sets(COUNT // ROUNDS))
     mine, bare = Times.of(our_times), Times.of(bare_times)
     return (
         f"| {name} | {mine.median * 1e3:.2f} | {mine.p99 * 1e3:.2f} | {mine.rate:.0f} | "
         f"{wire.library} | {bare.median * 1e3:.2f} | {bare.p99 * 1e3:.2f} | "
-        f"{mine.median / bare.median:.2f} | {_codec_rate(wire)} |"
+        f"{mine.median / bare.median:.2f} |"
     )
 
 
@@ -183,14 +124,23 @@ def _stop_row(name: str, options: Sequence[str], rig: Path) -> str:
     )
 
 
-def _codec_rate(wire: Measured) -> str:
-    if wire.codec is None:
-        return ""
-    (safe,) = make_sets(WIDE, 1)
-    count, begin = 5000, time.perf_counter()
-    for _ in range(count):
-        wire.codec(safe)
-    return f"{count / (time.perf_counter() - begin):.0f}"
+def _refused(rig: Path) -> str:
+    """A sentence about sets before and after many that the amplifier refuses."""
+    with far_end(rig, ["--serial"]) as (url,):
+        before, after = map(Times.of, asyncio.run(after_refusals(url, COUNT // ROUNDS)))
+    return (
+        f"Serial, medians of {COUNT // ROUNDS} sets: {before.median * 1e3:.2f} ms before "
+        f"{REFUSALS} refusals, {after.median * 1e3:.2f} ms after them."
+    )
+
+
+def _calls() -> list[str]:
+    """How many functions of the host one set enters, and in how many files, a row each."""
+    rows = ["| amplifiers | calls | files |", "|---|---|---|"]
+    for amplifiers in (1, 4):
+        entered = asyncio.run(calls_of_a_set(amplifiers))
+        rows.append(f"| {amplifiers} | {entered.total()} | {len(entered)} |")
+    return rows
 
 
 def _eight(folder: Path) -> list[str]:
@@ -209,14 +159,11 @@ def _eight(folder: Path) -> list[str]:
     rows = []
     for name, options in EIGHT.items():
         with far_end(rig, options, amplifiers=8) as urls:
-            cpu = time.process_time()
-            together = Times.of(asyncio.run(all_at_once(urls, EIGHT_ROUNDS)))
-            cpu = time.process_time() - cpu
-        with far_end(rig, options, amplifiers=8) as urls:
-            apart = Times.of(asyncio.run(sent_apart(urls, EIGHT_ROUNDS)))
+            found = asyncio.run(all_at_once(urls, EIGHT_ROUNDS))
+        together, apart = Times.of(found.times), Times.of(found.skews)
         rows.append(
             f"| {name} | {together.median * 1e3:.2f} | {together.p99 * 1e3:.2f} | "
-            f"{cpu / EIGHT_ROUNDS * 1e3:.2f} | {apart.median * 1e3:.3f} | {apart.p99 * 1e3:.3f} |"
+            f"{found.computed * 1e3:.2f} | {apart.median * 1e3:.3f} | {apart.p99 * 1e3:.3f} |"
         )
     return rows
 

@@ -1,39 +1,42 @@
-"""The bare library of each wire doing the exchange of an apply, nothing around it.
+"""The bare library of each wire doing the exchange of a set, nothing around it.
 
-Each takes the URL of a simulated amplifier that is armed and requests that are encoded already, and
-gives the time of each exchange [s].
+Each takes the URL of a simulated amplifier and the values of Set messages, encodes all of them
+before, arms, and gives the time of each exchange [s].
 """
 
 import asyncio
 import time
 from collections.abc import Sequence
 
+import can
 import serial
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 
-from benchmarks.wires.bench import SESSION
-from drivers.codec.modbus import exchanges
-from drivers.codec.serial_line.exchanges import encode_request
-from drivers.codec.serial_line.frame import encode_frame
-from drivers.guard import SafeCommandSet
-from drivers.protocol.messages import Apply, Arm, Request
+from benchmarks.wires.bench import arm_values
+from drivers.codec.can_bus.segments import REPLY, frames_of, unpack_frames
+from drivers.host.can_wire import CanWire
+from drivers.host.serial_wire import SerialWire
+from drivers.protocol.records import Values
+from drivers.protocol.table import MESSAGES
+from drivers.urls.can_bus import CanUrl
 from drivers.urls.modbus import ModbusUrl
 from drivers.urls.serial_line import SerialUrl
 
+_BOX, _REPLY_AT = 256, 128  # registers of a message, and from there to its reply
+_REPLY_HEAD = 2  # tag, result
 
-def bare_serial(url: str, sets: Sequence[SafeCommandSet]) -> list[float]:
+
+def bare_serial(url: str, sets: Sequence[Values]) -> list[float]:
     """pyserial: write the frame, read until the zero that ends the reply."""
     parsed = SerialUrl.parse(url)
-    requests = [
-        encode_frame(encode_request(Apply(safe, SESSION), address=1, sequence=number & 0xFFFF))
-        for number, safe in enumerate(sets)
-    ]
-    arm = encode_frame(encode_request(Arm(2.0, SESSION), address=1, sequence=0))
+    wire = SerialWire(parsed.baud, sequence=0)
+    arm = wire.request(1, "Arm", arm_values())
+    requests = [wire.request(1, "Set", values) for values in sets]
     times = []
     with serial.Serial(parsed.port, parsed.baud, timeout=1, exclusive=True) as port:
         _exchange(port, arm)
-        while port.in_waiting:  # the event of having been armed
-            port.read(port.in_waiting)
+        time.sleep(0.1)  # until the event of having been armed has come
+        port.reset_input_buffer()
         for request in requests:
             begin = time.perf_counter()
             _exchange(port, request)
@@ -48,36 +51,90 @@ def _exchange(port: serial.Serial, request: bytes) -> None:
         ends += port.read(max(1, port.in_waiting)).count(0)
 
 
-def bare_modbus(url: str, sets: Sequence[SafeCommandSet]) -> list[float]:
-    """pymodbus's own client: write the block and read what was achieved, function 23."""
+def bare_modbus(url: str, sets: Sequence[Values]) -> list[float]:
+    """pymodbus's own client: write the message, then read its reply."""
     return asyncio.run(_with_pymodbus(ModbusUrl.parse(url), sets))
 
 
-async def _with_pymodbus(url: ModbusUrl, sets: Sequence[SafeCommandSet]) -> list[float]:
+async def _with_pymodbus(url: ModbusUrl, sets: Sequence[Values]) -> list[float]:
     client = (
         AsyncModbusSerialClient(url.device, baudrate=url.baud, timeout=1)
         if url.device
         else AsyncModbusTcpClient(url.host, port=url.port, timeout=1)
     )
     await client.connect()
+    times: list[float] = []
 
-    async def ask(request: Request, tag: int) -> None:
-        exchange = exchanges.encode_request(request, tag=tag, channels=4)
-        assert exchange.write is not None
-        words = list(exchange.write.registers)
+    async def ask(name: str, tag: int, values: Values, count: int) -> None:
+        message = MESSAGES[name]
+        words = [tag, *message.request.pack(values)]
         begin = time.perf_counter()
-        await client.readwrite_registers(
-            read_address=exchange.read.address,
-            read_count=exchange.read.count,
-            write_address=exchange.write.address,
-            values=words,
-            device_id=url.unit,
+        await client.write_registers(message.number * _BOX, words, device_id=url.unit)
+        reply = await client.read_holding_registers(
+            message.number * _BOX + _REPLY_AT, count=_REPLY_HEAD + count, device_id=url.unit
         )
         times.append(time.perf_counter() - begin)
+        assert reply.registers[:_REPLY_HEAD] == [tag, 0]
 
-    times: list[float] = []
-    await ask(Arm(2.0, SESSION), 1)
-    for number, safe in enumerate(sets):
-        await ask(Apply(safe, SESSION), number % 65535 + 1)
+    await ask("Arm", 1, arm_values(), 1)
+    for number, values in enumerate(sets):
+        await ask("Set", number % 65534 + 2, values, len(MESSAGES["Set"].reply.fields))
     client.close()
     return times[1:]
+
+
+def bare_can(url: str, sets: Sequence[Values]) -> list[float]:
+    """python-can: send the frames of a set, receive until its reply is whole."""
+    parsed = CanUrl.parse(url)
+    wire = CanWire(parsed.bus.bitrate, sequence=0)
+
+    def made(name: str, values: Values) -> list[can.Message]:
+        frames = unpack_frames(wire.request(parsed.node, name, values))
+        return [
+            can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False)
+            for frame in frames
+        ]
+
+    hello, arm = made("Hello", {}), made("Arm", arm_values())
+    requests = [made("Set", values) for values in sets]
+    times = []
+    with _open(parsed) as bus:
+        for first in (hello, arm):
+            _carry(bus, first, parsed.node)
+        for request in requests:
+            begin = time.perf_counter()
+            _carry(bus, request, parsed.node)
+            times.append(time.perf_counter() - begin)
+    return times
+
+
+def _carry(bus: can.BusABC, request: Sequence[can.Message], node: int) -> None:
+    for message in request:
+        bus.send(message)
+    left: int | None = None
+    while left != 0:
+        received = bus.recv(1.0)
+        assert received is not None
+        data = received.data
+        if received.arbitration_id == REPLY + node and data[0] == request[-1].data[0]:
+            left = frames_of(data[3]) - 1 if data[1] == 0 else (left or 0) - 1
+
+
+def _open(url: CanUrl) -> can.BusABC:
+    bus = url.bus
+    if bus.interface == "slcan":
+        return can.Bus(
+            interface="slcan",
+            channel=bus.channel,
+            bitrate=bus.bitrate,
+            sleep_after_open=0,
+            ignore_config=True,
+        )
+    return can.Bus(
+        interface="socketcand",
+        channel=bus.channel,
+        host=bus.host,
+        port=bus.port,
+        tcp_tune=True,
+        ignore_config=True,
+    )

@@ -1,27 +1,30 @@
 """How long exchanges take on a wire whose far end is a process of its own."""
 
-import asyncio
 import contextlib
-import itertools
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import AsyncIterator, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
-from drivers.amplifier import Amplifier
-from drivers.command import CommandSet, DriveCommand
-from drivers.guard import Guard, GuardLimits, SafeCommandSet
-from drivers.operation.simultaneous import simultaneous_commits
-from drivers.protocol.messages import Capabilities
-from drivers.registry import open_backend
+from drivers.contents import Layer, Tone
+from drivers.errors import CommandRefused
+from drivers.host.amplifier import Amplifier
+from drivers.host.group import Group
+from drivers.opening import Lines
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
+from drivers.protocol.table import QUANTITIES
+from registry.limits import GuardLimits
 
 CHANNELS = 4
 SESSION = 1
 CALM = 2.0  # s; the longest watchdog
+REFUSALS = 1000
+_LIMITS = GuardLimits(20.0, 1000.0, 1.0)
+_LEVEL = 0.2
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Times:
             median=statistics.median(ordered),
             p99=ordered[int(0.99 * len(ordered))],
             maximum=ordered[-1],
-            rate=len(ordered) / sum(ordered),
+            rate=len(ordered) / (sum(ordered) or 1.0),
         )
 
 
@@ -58,74 +61,94 @@ def far_end(rig: Path, options: Sequence[str], *, amplifiers: int = 1) -> Iterat
             process.terminate()
 
 
-def make_sets(
-    capabilities: Capabilities, count: int, *, channels: int = CHANNELS
-) -> list[SafeCommandSet]:
-    """So many sets of four channels, each with a token of its own."""
-    # A guard lets two thousand sets a second through; by this clock they are a second apart.
-    seconds = itertools.count(0.0)
-    guard = Guard(GuardLimits(10.0, 600.0, 1.0), capabilities, clock=lambda: next(seconds))
-    return [
-        guard.check(
-            CommandSet(
-                token=number % 65535 + 1,
-                commands=tuple(
-                    DriveCommand(channel, 110.0 + number % 50, 0.2) for channel in range(channels)
-                ),
-                ramp=0.0,
-                valid_for=0.0,
-            )
+@contextlib.asynccontextmanager
+async def armed(urls: Sequence[str]) -> AsyncIterator[Group]:
+    """A group of the amplifiers at these URLs, armed, as long as the context lasts."""
+    lines = Lines()
+    amplifiers: dict[str, Amplifier] = {}
+    for number, url in enumerate(urls):
+        name = f"amplifier {number}"
+        amplifiers[name] = await lines.amplifier(url, _LIMITS, name=name)
+    group = Group(amplifiers, watchdog=CALM)
+    try:
+        await group.open()
+        await group.arm()
+        yield group
+        await group.stop()
+    finally:
+        await lines.close()
+
+
+def layer(number: int, *, channels: int = CHANNELS) -> Layer:
+    """The layer of the set of a number: every channel, each set with a frequency of its own."""
+    frequency = 110.0 + number % 50
+    return Layer(0, tuple(Tone(each, frequency, _LEVEL) for each in range(channels)), 0.0)
+
+
+def make_sets(count: int) -> list[Values]:
+    """Return the values of so many Set messages of the same layers, played at once."""
+    frequency, level = QUANTITIES["frequency"], QUANTITIES["level"]
+    made = []
+    for number in range(count):
+        commands = tuple(
+            Command(one.channel, frequency.to_wire(one.frequency), level.to_wire(one.level), 0)
+            for one in layer(number).tones
         )
-        for number in range(count)
-    ]
+        stream = pack_layers([LayerSet(0, 0, 0, commands)])
+        made += parts(stream, session=SESSION, token=number % 0xFFFF + 1, now=True)
+    return made
+
+
+def arm_values() -> Values:
+    """The values of the request that arms."""
+    return {"session": SESSION, "watchdog": QUANTITIES["watchdog"].to_wire(CALM)}
 
 
 async def ours(url: str, count: int) -> list[float]:
-    """The time [s] of each of so many applies through `Amplifier`."""
-    amplifier = Amplifier(open_backend(url), reply_timeout=1.0)
-    await amplifier.open()
-    await amplifier.arm(CALM)
-    times = []
-    for safe in make_sets(amplifier.capabilities, count):
-        begin = time.perf_counter()
-        await amplifier.apply(safe)
-        times.append(time.perf_counter() - begin)
-    await amplifier.disarm()
-    await amplifier.close()
-    return times
+    """The time [s] of each of so many sets that the host has an amplifier play at once."""
+    async with armed([url]) as group:
+        (amplifier,) = group.amplifiers.values()
+        return [await _played(amplifier, number) for number in range(count)]
 
 
-async def all_at_once(urls: Sequence[str], count: int) -> list[float]:
-    """The time [s] of each of so many rounds in which every amplifier plays a set."""
-    amplifiers = [Amplifier(open_backend(url), reply_timeout=1.0) for url in urls]
-    for amplifier in amplifiers:
-        await amplifier.open()
-        await amplifier.arm(CALM)
-    times = []
-    for safe in make_sets(amplifiers[0].capabilities, count, channels=1):
-        begin = time.perf_counter()
-        await asyncio.gather(*(amplifier.apply(safe) for amplifier in amplifiers))
-        times.append(time.perf_counter() - begin)
-    for amplifier in amplifiers:
-        await amplifier.disarm()
-        await amplifier.close()
-    return times
+async def after_refusals(url: str, count: int) -> tuple[list[float], list[float]]:
+    """Times [s] of so many sets before and after 1 000 that the amplifier refuses."""
+    async with armed([url]) as group:
+        (amplifier,) = group.amplifiers.values()
+        before = [await _played(amplifier, number) for number in range(count)]
+        for number in range(REFUSALS):
+            with contextlib.suppress(CommandRefused):
+                await _played(amplifier, number % count)  # tokens that are not new
+                raise AssertionError("a set with an old token must be refused")
+        return before, [await _played(amplifier, count + each) for each in range(count)]
 
 
-async def sent_apart(urls: Sequence[str], count: int) -> list[float]:
-    """How far apart [s] the commits of each of so many starts go out, the first to the last."""
-    amplifiers = [Amplifier(open_backend(url), reply_timeout=1.0) for url in urls]
-    for amplifier in amplifiers:
-        await amplifier.open()
-        await amplifier.arm(CALM)
-    apart = []
-    for safe in make_sets(amplifiers[0].capabilities, count, channels=1):
-        await asyncio.gather(*(amplifier.stage(safe) for amplifier in amplifiers))
-        commits = [(one.wire_times.commit(), partial(one.commit, safe.token)) for one in amplifiers]
-        await asyncio.gather(*simultaneous_commits(commits))
-        sent = [amplifier.last_sent_at for amplifier in amplifiers]
-        apart.append(max(sent) - min(sent))
-    for amplifier in amplifiers:
-        await amplifier.disarm()
-        await amplifier.close()
-    return apart
+async def _played(amplifier: Amplifier, number: int) -> float:
+    begin = time.perf_counter()
+    await amplifier.stage(number % 0xFFFF + 1, [layer(number)], now=True)
+    return time.perf_counter() - begin
+
+
+@dataclass(frozen=True)
+class Together:
+    """Of rounds in which all amplifiers play: times [s], processor time [s] of each, skews [s]."""
+
+    times: Sequence[float]
+    computed: float
+    skews: Sequence[float]
+
+
+async def all_at_once(urls: Sequence[str], count: int) -> Together:
+    """Measure so many rounds: staged on all amplifiers, committed at one moment, confirmed."""
+    times, skews = [], []
+    async with armed(urls) as group:
+        computed = time.process_time()
+        for number in range(count):
+            layers = {name: [layer(number, channels=1)] for name in group.amplifiers}
+            begin = time.perf_counter()
+            await group.apply(layers)
+            times.append(time.perf_counter() - begin)
+            sent = [each.played_at for each in group.amplifiers.values()]
+            skews.append(max(sent) - min(sent))
+        computed = time.process_time() - computed
+    return Together(times, computed / count, skews)

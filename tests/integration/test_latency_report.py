@@ -13,11 +13,10 @@ from benchmarks.latency.report import cases, flooded_lines, report
 from benchmarks.latency.run import Case, Disturbed, Failed, Found, attempt
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import LatencySummary
-from drivers.codec.serial_line.exchanges import encode_request
-from drivers.command import CommandSet, DriveCommand
-from drivers.guard import Guard, GuardLimits, SafeCommandSet
-from drivers.protocol.messages import Apply, Commit, Request, Stage
-from sim.amplifier.amplifier import capabilities
+from drivers.protocol.serial_payload import pack_words
+from drivers.protocol.sets import Command as ToneOnWire
+from drivers.protocol.sets import LayerSet, pack_layers, parts
+from drivers.protocol.table import MESSAGES
 
 CASES = cases(0.01, 1)
 
@@ -121,36 +120,49 @@ def test_match_falls_back_to_the_touch_without_the_flood() -> None:
     assert matched.unmatched == 1
 
 
-def safe(token: int, level: float) -> SafeCommandSet:
-    """A set of one channel that a guard has checked."""
-    commands = (DriveCommand(0, 100.0, level),)
-    asked = CommandSet(token, commands, ramp=0.02, valid_for=0.0)
-    return Guard(
-        GuardLimits(frequency_min=40.0, frequency_max=500.0, level=1.0), capabilities(4)
-    ).check(asked)
+def set_values(token: int, level: int, *, now: bool = False) -> dict[str, object]:
+    """A set of one channel, 100 Hz, level in 1/10000, silent where it is 0."""
+    commands = (ToneOnWire(0, 2000, level, 0),)
+    stream = pack_layers([LayerSet(0, 20, 0, commands)])
+    (part,) = parts(stream, session=9, token=token, now=now)
+    return part
 
 
-def line(milliseconds: int, amplifier: str, request: Request) -> tuple[int | str, ...]:
+def line(
+    milliseconds: int, amplifier: str, name: str, values: dict[str, object]
+) -> tuple[int | str, ...]:
     """What the far end writes of a request."""
-    frame = encode_request(request, address=1, sequence=milliseconds)
-    return (milliseconds * 1_000_000, amplifier, frame.kind, frame.sequence, frame.payload.hex())
+    message = MESSAGES[name]
+    payload = pack_words(message.request.pack(values)).hex()
+    return (milliseconds * 1_000_000, amplifier, message.number, milliseconds, payload)
 
 
 def test_set_of_two_amplifiers_plays_at_the_commit_of_the_second() -> None:
-    """Stages have no moment, nor has a repeated commit; silence needs no stage."""
+    """What is staged has no moment, nor has a repeated commit; silence needs no commit."""
+    commit = {"session": 9, "token": 5}
     lines = [
-        line(1, "a", Stage(safe(5, 0.5))),
-        line(2, "b", Stage(safe(5, 0.25))),
-        line(3, "a", Commit(5)),
-        line(4, "a", Commit(5)),
-        line(6, "b", Commit(5)),
-        line(7, "b", Apply(safe(7, 0.0))),
-        line(9, "a", Apply(safe(7, 0.0))),
+        line(1, "a", "Set", set_values(5, 5000)),
+        line(2, "b", "Set", set_values(5, 2500)),
+        line(3, "a", "Commit", commit),
+        line(4, "a", "Commit", commit),
+        line(6, "b", "Commit", commit),
+        line(7, "b", "Set", set_values(7, 0, now=True)),
+        line(9, "a", "Set", set_values(7, 0, now=True)),
     ]
     first, second = read_commands(lines, ("a", "b"))
     assert (first.time, first.token, first.sequence) == (pytest.approx(0.006), 5, 6)
-    assert [(name, each.level) for name, each in first.commands] == [
-        ("a", pytest.approx(0.5, abs=1e-4)),
-        ("b", pytest.approx(0.25, abs=1e-4)),
+    assert [(name, each.frequency, each.level) for name, each in first.commands] == [
+        ("a", pytest.approx(100.0), pytest.approx(0.5)),
+        ("b", pytest.approx(100.0), pytest.approx(0.25)),
     ]
     assert (second.time, second.token) == (pytest.approx(0.009), 7)
+
+
+def test_set_in_parts_plays_once_it_is_whole() -> None:
+    """A set of two parts, the second first; the tones of both layers are read."""
+    commands = tuple(ToneOnWire(channel, 2000, 1000, 0) for channel in range(16))
+    layers = [LayerSet(number, 20, 0, commands) for number in (0, 1)]
+    first, second = parts(pack_layers(layers), session=9, token=3, now=True)
+    lines = [line(1, "a", "Set", second), line(2, "a", "Set", first)]
+    (read,) = read_commands(lines, ("a",))
+    assert (read.time, read.sequence, len(read.commands)) == (pytest.approx(0.002), 2, 32)

@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -92,13 +91,20 @@ class Disturbed(Exception):
     """The machine was too busy to measure."""
 
 
+class _OpenLine:
+    """A serial line as fast as that of the far end."""
+
+    def __init__(self) -> None:
+        self.wire = SerialWire(921_600, sequence=0)
+
+
 class _Open:
     """An amplifier on a line of its own, as far as it decides the pattern."""
 
     def __init__(self, limits: GuardLimits) -> None:
         self.capabilities = capabilities(4)
         self.ledger = Ledger(limits, self.capabilities)
-        self.line = SimpleNamespace(wire=SerialWire(921_600, sequence=0))
+        self.line = _OpenLine()
 
 
 def attempt(

@@ -120,6 +120,7 @@ async def after_refusals(url: str, count: int) -> tuple[list[float], list[float]
             with contextlib.suppress(CommandRefused):
                 await _played(amplifier, number % count)  # tokens that are not new
                 raise AssertionError("a set with an old token must be refused")
+            await amplifier.read_status()  # which says that it does not play
         return before, [await _played(amplifier, count + each) for each in range(count)]
 
 

@@ -42,17 +42,20 @@ async def stop_latencies(url: str, count: int = STOPS) -> list[float]:
             await amplifier.stage(number & 0xFFFF, [layer(number)], now=True)
 
         busy = [asyncio.create_task(_repeat(call)) for call in (play, amplifier.ping)]
-        for session in range(1, count + 1):
-            await amplifier.clear()
-            await amplifier.arm(session, CALM)
-            await asyncio.sleep(pauses.uniform(0.0, 0.05))
-            sent_at.clear()
-            begin = clock.now()
+        try:
             await amplifier.stop()
-            latencies.append(sent_at[0] - begin + transit)
-        for task in busy:
-            task.cancel()
-        await asyncio.gather(*busy, return_exceptions=True)
+            for session in range(1, count + 1):
+                await amplifier.clear()
+                await amplifier.arm(session, CALM)
+                await asyncio.sleep(pauses.uniform(0.0, 0.05))
+                sent_at.clear()
+                begin = clock.now()
+                await amplifier.stop()
+                latencies.append(sent_at[0] - begin + transit)
+        finally:
+            for task in busy:
+                task.cancel()
+            await asyncio.gather(*busy, return_exceptions=True)
     return latencies
 
 

@@ -88,14 +88,14 @@ def memory_line(devices: Sequence[AmplifierDevice], name: str) -> Line:
 
 
 @asynccontextmanager
-async def rig_in_memory(rig: Rig) -> AsyncIterator[HostedRig]:
-    """The amplifiers of a rig, each on a line of its own, identified and disarmed."""
+async def rig_in_memory(rig: Rig, *, watchdog: float = WATCHDOG) -> AsyncIterator[HostedRig]:
+    """The amplifiers of a rig, each on a line of its own, identified and disarmed; watchdog [s]."""
     bench, devices = make_bench(rig)
     hosts = {
         name: Host(memory_line([each], name), each.address, LIMITS, name=name)
         for name, each in devices.items()
     }
-    group = Group(hosts)
+    group = Group(hosts, watchdog=watchdog)
     await group.open()
     try:
         yield HostedRig(bench, devices, group)

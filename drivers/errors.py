@@ -42,8 +42,9 @@ class CommandRefused(DriverError):
     """The guard or the amplifier refused a request; nothing of it was applied.
 
     channel: the one at fault, if any; until: time [s] from which the same request is allowed, if
-    only its time is wrong. may_play: whether a set may have been played all the same, since an
-    earlier attempt had no reply.
+    only its time is wrong. may_play: whether it may have been carried out all the same, since an
+    earlier attempt had no reply. is_disarmed: whether the amplifier is not armed by this host any
+    more.
     """
 
     def __init__(
@@ -53,11 +54,13 @@ class CommandRefused(DriverError):
         channel: int | None = None,
         until: float | None = None,
         may_play: bool = False,
+        is_disarmed: bool = False,
     ) -> None:
         super().__init__(reason)
         self.channel = channel
         self.until = until
         self.may_play = may_play
+        self.is_disarmed = is_disarmed
 
 
 class Preempted(CommandRefused):

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.errors import CommandError, CommandRefused, LinkDegraded, LinkError, Preempted
-from drivers.host.comparison import MAX_CONTRADICTIONS, problem_of
+from drivers.host.comparison import MAX_CONTRADICTIONS, name_of, problem_of
 from drivers.host.feeding import Feeding
 from drivers.host.jobs import RequestCounts
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import MESSAGES, QUANTITIES, STATES
+from drivers.protocol.table import FAULTS, MESSAGES, QUANTITIES, STATES
 from drivers.protocol.tokens import is_newer_token
 from drivers.statistics import LinkStatistics
 
@@ -159,7 +159,11 @@ class Dialogue:
             raise self._driven_by_another()
 
     def check_request(self, name: str) -> None:
-        """Raise LinkError for what plays or feeds, while degraded or beside another host."""
+        """Raise for what plays or feeds, while it must not go out.
+
+        LinkError while degraded or beside another host, CommandRefused once a status has shown that
+        it is not armed any more.
+        """
         if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
             return
         if self._other_host_at > -math.inf:
@@ -168,6 +172,13 @@ class Dialogue:
             raise LinkDegraded(
                 f"{self.silence_cause}. The amplifier may play its last set until its watchdog has "
                 "passed; nothing new is played until it replies"
+            )
+        if name != "Arm" and self.status is not None and self.status["state"] != _ENABLED:
+            fault = name_of(FAULTS, self.status["fault"])
+            raise CommandRefused(
+                f"amplifier {self.name} is no longer armed, fault {fault}; once the cause is gone, "
+                "clear and arm again",
+                is_disarmed=True,
             )
 
     def check_admitted(self, token: int) -> None:

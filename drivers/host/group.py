@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum, auto
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 from drivers import clock
 from drivers.contents import Layer, is_silence
@@ -180,7 +180,7 @@ class Group:
         self._leave_armed()
         before = self._silences
         with self._silences_in_progress():
-            await self._all(each.disarm(STOP_RAMP) for each in self.amplifiers.values())
+            await _to_completion(self._disarm([*self.amplifiers.values()], STOP_RAMP))
         self._check_not_silenced(before)
         return before
 
@@ -219,7 +219,9 @@ class Group:
             *(
                 self._retried(each, partial(each.disarm, STOP_RAMP))
                 for each, result in zip(members, results, strict=True)
-                if not isinstance(result, CommandRefused) or isinstance(result, Preempted)
+                if not isinstance(result, CommandRefused)
+                or isinstance(result, Preempted)
+                or result.may_play
             ),
             return_exceptions=True,
         )
@@ -237,7 +239,8 @@ class Group:
     async def apply(self, layers: Mapping[str, Sequence[Layer]]) -> Played:
         """Play layers on the amplifiers of these names, all from one moment on.
 
-        Refused on one means committed on none, and CommandRefused; silence alone is not staged.
+        Refused on one means committed on none, and CommandRefused; silence alone is not staged. One
+        that is no longer armed does not refuse a set: it stops all.
         Raises Preempted where a stop, disarm or `abort_exchange` came first, and LinkDegraded where
         one does not reply: then it is unknown whether the set plays. What else fails stops all
         amplifiers before it is raised.
@@ -265,9 +268,9 @@ class Group:
         refusals = {
             name: result
             for name, result in zip(layers, results, strict=True)
-            if isinstance(result, CommandRefused) and not isinstance(result, Preempted)
+            if _is_of_set(result) and not isinstance(result, Preempted)
         }
-        others = [result for result in results if not isinstance(result, CommandRefused)]
+        others = [result for result in results if not _is_of_set(result)]
         if is_silent or not refusals or any(isinstance(each, BaseException) for each in others):
             self._raise_worst(results)
         if refusals:
@@ -542,6 +545,11 @@ def is_lost(amplifier: Amplifier) -> bool:
 def round_trip_of(amplifier: Amplifier) -> float:
     """Return how long the longest exchange with an amplifier takes on its wire [s]."""
     return amplifier.line.wire.round_trip("Set", PART_BYTES)
+
+
+def _is_of_set(result: object) -> TypeGuard[CommandRefused]:
+    """Whether a set was refused, by an amplifier that may play another one."""
+    return isinstance(result, CommandRefused) and not result.is_disarmed
 
 
 def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:

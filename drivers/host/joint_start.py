@@ -61,7 +61,7 @@ class JointStart:
             if not each.result.done():
                 each.result.set_exception(Preempted(f"one of several commits failed: {error}"))
                 each.result.exception()  # retrieved, where nobody waits for it
-                each.send()
+            each.send()  # nothing, but its line is held no longer
 
     def _give_up(self) -> None:
         self.fail(CommandRefused("commits must be sent together; one of the lines is too busy"))

@@ -26,6 +26,7 @@ BUSY_PAUSE = 0.005  # s; before a request goes again to a busy amplifier
 _LATE = 0.005  # s; a timer later than this means that this process was delayed
 _LOOKS = 4  # at the port for a reply, where this process was delayed
 _COMMIT_WORDS = 2
+_NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")
 SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
 
 
@@ -138,7 +139,7 @@ class Line:
         if isinstance(arrival, Reply):
             try:
                 member.note_reply(job.name, job.values, arrival.values, job.sent_at)
-            except CommandRefused as error:
+            except Exception as error:  # whatever it is, no caller may wait for ever
                 self._fail(job, error)
                 return
             if not job.result.done():
@@ -236,7 +237,13 @@ class Line:
             return
         channel = "" if nak.channel is None else f", channel {nak.channel}"
         text = f"{self.name}: the amplifier refused the request: {nak.code}{channel}"
-        self._fail(job, CommandRefused(text, channel=nak.channel, may_play=job.had_no_reply))
+        refusal = CommandRefused(
+            text,
+            channel=nak.channel,
+            may_play=job.had_no_reply,
+            is_disarmed=nak.code in _NOT_ARMED,
+        )
+        self._fail(job, refusal)
 
     def _repeat(self, job: Job, *, pause: float = 0.0) -> None:
         """Queue a request again, unless another one of its amplifier comes before it."""

@@ -1,6 +1,7 @@
 """Stops of all amplifiers of a plate, repeated until each is silent or must be."""
 
 import asyncio
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -8,6 +9,8 @@ from drivers.host.amplifier import Amplifier, Stopped
 from drivers.host.jobs import Priority
 from drivers.host.line import Line
 from drivers.protocol.records import Values
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -40,10 +43,13 @@ class Stopping:
 
         Never raises an Exception.
         """
+        tasks = {name: self._stop(name, ramp) for name in self._amplifiers}  # begin a moment later
         for line in {each.line for each in self._amplifiers.values()}:
             if len(line.members) > 1:
-                self._broadcast(line, ramp)
-        tasks = {name: self._stop(name, ramp) for name in self._amplifiers}
+                try:
+                    self._broadcast(line, ramp)
+                except Exception:  # each amplifier is stopped by itself as well
+                    _logger.exception("%s: the broadcast of a stop failed", line.name)
         names = [*tasks] if waits_for is None else [*waits_for]
         results = await asyncio.gather(
             *(asyncio.shield(tasks[name]) for name in names), return_exceptions=True

@@ -1,0 +1,158 @@
+"""What a group does where something fails that should not: nobody feels more than is said."""
+
+import asyncio
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+
+from armed_group import layer, losing, tone, with_group
+from drivers.errors import CommandRefused, DriverError
+from drivers.host.group import Group
+from drivers.host.joint_start import JointStart
+from drivers.protocol.records import Refusal, Values
+from sim.amplifier.contract import Amplifier as FarEnd
+from virtual_loop import in_virtual_time
+from words_line import MemoryLine
+
+
+def altered(
+    far: FarEnd, change: Callable[[str, Values, float, Callable[..., Values]], Values]
+) -> None:
+    """Have a far end reply by a function of the request, its time, and what it does itself."""
+    handle = far.handle
+    far.handle = lambda name, values, now: change(name, values, now, handle)  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("wire", ["serial", "can"])
+def test_set_refused_by_one_that_has_tripped_stops_the_others(wire: str) -> None:
+    """Not only at the next heartbeat: a refusal of the ledger leaves others playing, this not."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.apply({name: [layer(0, tone())] for name in "ab"})
+        ends[1].far["b"].trip("OVER_VOLTAGE", ends[1].loop.time())
+        with pytest.raises(CommandRefused):
+            await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
+        assert not group.is_armed
+        await asyncio.sleep(0.01)
+        assert ends[0].levels("a") == [0.0, 0.0]
+
+    with_group(test, wire, ("a",), ("b",))
+
+
+def test_nothing_is_sent_to_play_behind_a_status_that_shows_a_fault() -> None:
+    """A set that waits behind the reading does not go out, and the others are stopped."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.apply({name: [layer(0, tone())] for name in "ab"})
+        ends[1].far["b"].trip("OVER_VOLTAGE", ends[1].loop.time())
+        reading = asyncio.ensure_future(group.amplifiers["b"].read_status())
+        await asyncio.sleep(0)
+        ends[1].sent.clear()
+        with pytest.raises(CommandRefused, match="OVER_VOLTAGE"):
+            await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
+        await reading
+        assert [each for _, each in ends[1].sent if each in ("1:5", "1:6")] == []
+        assert (ends[0].levels("a"), group.is_armed) == ([0.0, 0.0], False)
+
+    with_group(test, "serial", ("a",), ("b",))
+
+
+def test_reply_that_cannot_be_noted_keeps_nobody_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The exchange fails, all are stopped; a stop whose reply cannot be noted ends in time."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        def fail(*_: object) -> None:
+            raise ZeroDivisionError("planted")
+
+        await group.apply({name: [layer(0, tone())] for name in "ab"})
+        monkeypatch.setattr(group.amplifiers["b"].ledger, "resolve", fail)
+        with pytest.raises(ZeroDivisionError):
+            async with asyncio.timeout(1.0):
+                await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
+        assert not group.is_armed
+        await asyncio.sleep(0.01)
+        assert (ends[0].levels("a"), ends[1].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
+        monkeypatch.setattr(group.amplifiers["b"].ledger, "silenced", fail)
+        async with asyncio.timeout(1.0):
+            await group.stop()
+
+    with_group(test, "serial", ("a",), ("b",))
+
+
+def test_stop_is_sent_to_each_where_the_broadcast_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever fails in the broadcast, which comes first."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.apply({name: [layer(0, tone())] for name in "ab"})
+        submit = ends[0].line.submit
+
+        def fail(member: object, *values: object, **other: object) -> object:
+            if member is None:
+                raise ZeroDivisionError("planted")
+            return submit(member, *values, **other)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(ends[0].line, "submit", fail)
+        stopped = await group.stop()
+        assert all(each.is_confirmed for each in stopped.values())
+        assert (ends[0].levels("a"), ends[0].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
+
+    with_group(test, "serial", ("a", "b"))
+
+
+def test_arm_that_was_busy_after_a_lost_reply_does_not_stay_armed() -> None:
+    """The first attempt has armed it, the repeated ones are refused: it is disarmed."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.disarm()
+        ends[0].far["a"].session = 1  # that of the test never changes, and is not taken twice
+        asked = 0
+
+        def busy(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
+            nonlocal asked
+            if name == "Arm":
+                asked += 1
+                if asked > 1:
+                    raise Refusal("busy", "BUSY")
+            return handle(name, values, now)
+
+        ends[0].outward = losing("Arm", count=2)  # its event, and the reply
+        altered(ends[0].far["a"], busy)
+        with pytest.raises(CommandRefused):
+            await group.arm()
+        assert asked > 1
+        assert ends[0].far["a"].state != "OPERATION_ENABLED"
+
+    with_group(test, "serial", ("a",))
+
+
+def test_arming_anew_stops_what_cannot_be_disarmed() -> None:
+    """One has tripped, so the other is to be disarmed first; it ignores that and is stopped."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.apply({name: [layer(0, tone())] for name in "ab"})
+
+        def ignore(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
+            return handle("GetStatus" if name == "Disarm" else name, values, now)
+
+        altered(ends[0].far["a"], ignore)
+        ends[1].far["b"].trip("OVER_VOLTAGE", ends[1].loop.time())
+        with pytest.raises(DriverError):
+            await group.arm()
+        assert ends[0].levels("a") == [0.0, 0.0]
+
+    with_group(test, "serial", ("a",), ("b",))
+
+
+@in_virtual_time
+async def test_commits_that_fail_together_are_all_let_go() -> None:
+    """Also those that nobody waits for any more: a held line would carry no heartbeat."""
+    loop = asyncio.get_running_loop()
+    start = JointStart(3, loop.time() + 1)
+    let_go: list[int] = []
+    results = [loop.create_future() for _ in range(2)]
+    for number, result in enumerate(results):
+        start.arrive(0.001, result, partial(let_go.append, number))
+    results[0].cancel()
+    start.fail(CommandRefused("one"))
+    assert let_go == [0, 1]

@@ -129,7 +129,7 @@ def _refused(rig: Path) -> str:
     with far_end(rig, ["--serial"]) as (url,):
         before, after = map(Times.of, asyncio.run(after_refusals(url, COUNT // ROUNDS)))
     return (
-        f"Serial, medians of {COUNT // ROUNDS} sets: {before.median * 1e3:.2f} ms before "
+        f"Serial, medians of {COUNT // ROUNDS} sets: {before.median * 1e3:.2f} ms CPU before "
         f"{REFUSALS} refusals, {after.median * 1e3:.2f} ms after them."
     )
 

@@ -5,7 +5,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -112,22 +112,25 @@ async def ours(url: str, count: int) -> list[float]:
 
 
 async def after_refusals(url: str, count: int) -> tuple[list[float], list[float]]:
-    """Times [s] of so many sets before and after 1 000 that the amplifier refuses."""
+    """Processor times [s] of so many sets before and after 1 000 that the amplifier refuses."""
     async with armed([url]) as group:
         (amplifier,) = group.amplifiers.values()
-        before = [await _played(amplifier, number) for number in range(count)]
+        before = [await _played(amplifier, each, time.process_time) for each in range(count)]
         for number in range(REFUSALS):
             with contextlib.suppress(CommandRefused):
-                await _played(amplifier, number % count)  # tokens that are not new
+                await _played(amplifier, number % (count - 1))  # an old token
                 raise AssertionError("a set with an old token must be refused")
-            await amplifier.read_status()  # which says that it does not play
-        return before, [await _played(amplifier, count + each) for each in range(count)]
+            await amplifier.ping()  # says that it does not play, and feeds the watchdog
+        after = range(count, 2 * count)
+        return before, [await _played(amplifier, each, time.process_time) for each in after]
 
 
-async def _played(amplifier: Amplifier, number: int) -> float:
-    begin = time.perf_counter()
+async def _played(
+    amplifier: Amplifier, number: int, clock: Callable[[], float] = time.perf_counter
+) -> float:
+    begin = clock()
     await amplifier.stage(number % 0xFFFF + 1, [layer(number)], now=True)
-    return time.perf_counter() - begin
+    return clock() - begin
 
 
 @dataclass(frozen=True)

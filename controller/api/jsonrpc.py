@@ -50,7 +50,7 @@ ERROR_MEANINGS = {
     ErrorCode.INTERNAL: "a bug in the daemon; its log has the details",
     ErrorCode.WRONG_STATE: "the daemon's state does not allow it, such as not being armed",
     ErrorCode.LEASE: "the lease has expired, or belongs to another client",
-    ErrorCode.REFUSED: "the guard, a limit or an amplifier refused",
+    ErrorCode.REFUSED: "a limit or an amplifier refused",
     ErrorCode.LINK: "the link to an amplifier failed",
     ErrorCode.BUSY: "too many requests or connections at once",
     ErrorCode.NOT_SILENT: "after a stop, an amplifier is not confirmed silent",

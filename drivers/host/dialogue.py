@@ -98,7 +98,10 @@ class Dialogue:
         if name == "Hello":
             return
         if MESSAGES[name].feeds and (name == "Arm" or values["session"] == self.session):
-            self.feeding.may = now
+            if name == "Silence" and self.silence_cause is not None:
+                self.feeding.unheard(_RAMP.from_wire(values["ramp"]), now)
+            else:
+                self.feeding.sent(now)
         admitted = self._admitted
         if name in _SILENCING or name == "Arm":
             self._admitted = None
@@ -123,7 +126,7 @@ class Dialogue:
         if message is None:
             return
         if message.feeds:
-            self.feeding.since, self.feeding.confirmed_at = sent_at, now
+            self.feeding.confirmed(sent_at, now)
         if message.reply is _STATUS:
             self._note_status(name, values, reply, sent_at, now)
         elif name == "Set" and reply["played"]:

@@ -13,30 +13,57 @@ SILENCING = 0.005 + REACTION
 class Feeding:
     """What may have fed and what surely did, and the watchdog [s]; delay [s]: of the line.
 
-    may: when the last request that may have fed went out: how long the amplifier may play follows
-    from it. since, confirmed_at: when the last request that surely did went out, and its reply
-    came.
+    may: when the last request that may have fed went out. plays: the last such that does not also
+    silence it: how long the amplifier may play follows from it. fade [s]: longest ramp of a silence
+    without reply since. since, confirmed_at: when the last request that surely did went out, and
+    its reply came.
     """
 
     delay: float = 0.0
     watchdog: float = 0.0
     may: float = -math.inf
+    plays: float = -math.inf
+    fade: float = 0.0
     since: float = -math.inf
     confirmed_at: float = -math.inf
 
     @property
     def latest(self) -> float:
-        """When the watchdog may have been fed last [s].
-
-        A request without reply may still be under way; what is confirmed has arrived.
-        """
-        latest = self.may + self.delay
-        return min(latest, self.confirmed_at) if self.may <= self.since else latest
+        """When the watchdog may have been fed last [s]."""
+        return self._arrived(self.may)
 
     @property
     def may_play_until(self) -> float:
         """When the watchdog must have silenced the amplifier [s]."""
-        return self.latest + self.watchdog + SILENCING
+        return self._arrived(self.plays) + self.watchdog + self.fade + SILENCING
+
+    def sent(self, now: float) -> None:
+        """Note a request that may feed and let it play on, sent at a time [s]."""
+        self.may = self.plays = now
+        self.fade = 0.0
+
+    def unheard(self, ramp: float, now: float) -> None:
+        """Note a silence along a ramp [s], sent at a time [s] to one that does not reply.
+
+        If it is heard that is within the time of the watchdog, and the ramp follows: repeated for
+        as long as there is no reply, it does not put off when the amplifier must be silent.
+        """
+        self.may = now
+        self.fade = max(self.fade, ramp)
+
+    def confirmed(self, sent_at: float, now: float) -> None:
+        """Note at a time [s] the reply to a request that fed, sent at another [s]."""
+        self.since, self.confirmed_at = sent_at, now
+        if sent_at > self.plays:
+            self.plays, self.fade = sent_at, 0.0
+
+    def _arrived(self, sent_at: float) -> float:
+        """When a request that was sent at a time [s] has arrived at the latest [s].
+
+        One without reply may still be under way; what is confirmed has arrived.
+        """
+        latest = sent_at + self.delay
+        return min(latest, self.confirmed_at) if sent_at <= self.since else latest
 
     def problem(self, left: float, sent_at: float, now: float) -> str | None:
         """Describe an impossible time that is left [s] in a reply to a request; None if possible.

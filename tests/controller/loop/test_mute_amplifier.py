@@ -1,0 +1,27 @@
+"""A mute amplifier in the control loop: what is said of it, and what the others do."""
+
+import asyncio
+
+import pytest
+
+from controller_bench import FINGER, FarEnd, running
+from drivers.errors import LinkError
+from drivers.host.group import GroupState
+from virtual_loop import in_virtual_time
+
+
+@in_virtual_time
+async def test_mute_amplifier_is_lost_though_the_finger_was_lifted() -> None:
+    """Silence that it does not hear, repeated, does not put off when it must have fallen silent."""
+    local = [FarEnd(baud=921_600), FarEnd(baud=921_600)]
+    async with running("a", "b", far_ends=local) as bench:
+        await bench.hold(FINGER, seconds=0.2)
+        bench.far_ends[1].is_deaf = True
+        began = asyncio.get_running_loop().time()
+        bench.touch()
+        with pytest.raises(LinkError):
+            async with asyncio.timeout(3.0):
+                await bench.ended()
+        assert bench.controller.group_state is GroupState.LOST
+        assert asyncio.get_running_loop().time() - began <= 0.6
+        assert not any(bench.far_ends[0].levels)

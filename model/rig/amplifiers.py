@@ -25,7 +25,7 @@ class RigCheck(Protocol):
         """
 
 
-_CHECK = "drivers.rig_check:check_links"
+_CHECK = "drivers.by_hand.rig_check:check_links"
 """By name: this package does not import the one beside it."""
 
 

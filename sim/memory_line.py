@@ -1,4 +1,4 @@
-"""Simulated amplifiers of protocol 3 in this process, by URLs `sim://`.
+"""Simulated amplifiers in this process, by URLs `sim://`.
 
 Requests and replies are the bytes of a serial line. Not modelled: transmission time.
 """
@@ -12,7 +12,6 @@ from drivers.errors import LinkError
 from drivers.hardware import number_below
 from drivers.host.serial_wire import SerialWire
 from drivers.wires.address import WireAddress
-from sim.amplifier.contract import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.shared_rig import SimulationUrl, opened
@@ -114,7 +113,7 @@ class SimulatedAddress(WireAddress):
         The last port of a rig that is closed ends its simulation.
         """
         async with contextlib.AsyncExitStack() as stack:
-            context, name = await stack.enter_async_context(opened(self._url, Amplifier))
+            context, name = await stack.enter_async_context(opened(self._url))
             device = context.devices.get(name)
             if not isinstance(device, AmplifierDevice):
                 device = AmplifierDevice(context.bench, name)

@@ -20,7 +20,6 @@ from model.errors import InputError
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from sim.bench.bench import Bench, keep_time
-from sim.bench.bench_amplifier import AmplifierMaker
 from sim.control.context import SimulationContext
 from sim.control.server import control_socket
 from sim.plant.imperfections import Imperfections, draw_imperfections
@@ -67,9 +66,7 @@ class SimulationUrl:
 
 
 @asynccontextmanager
-async def opened(
-    url: SimulationUrl, make_amplifier: AmplifierMaker
-) -> AsyncIterator[tuple[SimulationContext, str]]:
+async def opened(url: SimulationUrl) -> AsyncIterator[tuple[SimulationContext, str]]:
     """The simulation of a URL while this lasts, and the name of its amplifier.
 
     Raises CommandError, LinkError.
@@ -77,7 +74,7 @@ async def opened(
     try:
         rig = load_rig(url.rig)
         name = url.select(tuple(rig.amplifiers))
-        shared = _shared(url, make_amplifier)
+        shared = _shared(url)
         context = await shared.acquire(rig, url.seed)
     except (InputError, OSError) as error:
         raise CommandError(f"{url.text}: {error}") from error
@@ -87,24 +84,23 @@ async def opened(
         await shared.release()
 
 
-def _shared(url: SimulationUrl, make_amplifier: AmplifierMaker) -> "_SharedRig":
+def _shared(url: SimulationUrl) -> "_SharedRig":
     """That of open amplifiers of the rig and control, or a new one."""
     if url.control is None and url.amplifier is None:
-        return _SharedRig(None, make_amplifier)
+        return _SharedRig(None)
     control = url.control and url.control.resolve()
-    key = (url.rig.resolve(), control, url.seed, make_amplifier)
+    key = (url.rig.resolve(), control, url.seed)
     found = _rigs.get(key)
     if found is None:
-        found = _rigs[key] = _SharedRig(url.control, make_amplifier)
+        found = _rigs[key] = _SharedRig(url.control)
     return found
 
 
 class _SharedRig:
     """A rig in time and its control, from the first amplifier opened to the last closed."""
 
-    def __init__(self, control: Path | None, make_amplifier: AmplifierMaker) -> None:
+    def __init__(self, control: Path | None) -> None:
         self._control = control
-        self._make_amplifier = make_amplifier
         self._lock = asyncio.Lock()
         self._users = 0
         self._context: SimulationContext | None = None
@@ -135,8 +131,7 @@ class _SharedRig:
 
     def _make(self, rig: Rig, seed: int | None) -> Bench:
         imperfections = Imperfections() if seed is None else draw_imperfections(rig, seed=seed)
-        make = self._make_amplifier
-        return Bench(rig, now=clock.now(), imperfections=imperfections, make_amplifier=make)
+        return Bench(rig, now=clock.now(), imperfections=imperfections)
 
 
 _rigs: WeakValueDictionary[object, _SharedRig] = WeakValueDictionary()

@@ -1,4 +1,4 @@
-"""One simulated amplifier of protocol 3: requests in, replies out; time is passed in.
+"""One simulated amplifier: requests in, replies out; time is passed in.
 
 Requests and replies are the values of their records (`drivers.protocol.table`), integers of the
 wire. Events happen at their own time: a watchdog that expired between two calls expired when it was

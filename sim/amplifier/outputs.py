@@ -1,4 +1,4 @@
-"""What a channel of an amplifier of protocol 3 plays, as the plate takes it: tones in time."""
+"""What a channel of an amplifier plays, as the plate takes it: tones in time."""
 
 from collections.abc import Sequence
 

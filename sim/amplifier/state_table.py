@@ -1,4 +1,4 @@
-"""State table of protocol 3: which request is allowed in which state, and the state that follows.
+"""State table: which request is allowed in which state, and the state that follows.
 
 Any other request is refused (WRONG_STATE). Transitions without a request are in the amplifier:
 OPERATION_ENABLED to FAULT_REACTION_ACTIVE when the watchdog expires, from there to FAULT once

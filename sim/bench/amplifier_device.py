@@ -1,7 +1,6 @@
-"""A simulated amplifier of protocol 3 as its far ends serve it: on a bench, with faults."""
+"""A simulated amplifier as its far ends serve it: on a bench, with faults."""
 
 from collections.abc import Callable
-from typing import cast
 
 from drivers.protocol.records import Refusal, Values
 from sim.bench.faulted_device import FaultedDevice
@@ -17,22 +16,22 @@ class AmplifierDevice(FaultedDevice):
     @property
     def identity(self) -> Values:
         """Values of its identity."""
-        return cast(Values, self._amplifier.identity)
+        return self._amplifier.identity
 
     @property
     def capabilities(self) -> Values:
         """Values of its capabilities."""
-        return cast(Values, self._amplifier.capabilities)
+        return self._amplifier.capabilities
 
     @property
     def state(self) -> str:
         """Name of its state."""
-        return cast(str, self._amplifier.state)
+        return self._amplifier.state
 
     @property
     def fault(self) -> str:
         """Name of its fault."""
-        return cast(str, self._amplifier.fault)
+        return self._amplifier.fault
 
     @property
     def listeners(self) -> list[Callable[[Values, float], None]]:
@@ -52,7 +51,7 @@ class AmplifierDevice(FaultedDevice):
         """Return the values of the reply to a request at a time [s]; raises Refusal."""
         if self.faults.now("nak_storm", now):
             raise Refusal("it refuses everything", "BUSY")
-        return cast(Values, self._bench.exchange(self.name, name, values, now=now))
+        return self._bench.exchange(self.name, name, values, now=now)
 
     def restart(self, moment: float) -> None:
         """Power-cycle it at a time [s]."""

@@ -11,11 +11,12 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from drivers import clock
+from drivers.protocol.records import Values
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
@@ -27,7 +28,6 @@ from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Motion, terms_of
 from registry.voltage import Law
 from sim.amplifier.contract import Amplifier
-from sim.bench.bench_amplifier import AmplifierMaker, BenchAmplifier
 from sim.bench.placement import Placement
 from sim.bench.reading import ToneReader
 from sim.bench.sensing import PlateSensor, Sensing
@@ -62,7 +62,7 @@ class Bench:
     """A simulated rig at rest at time now [s]; sample_rate [Hz]: of sensors and fingers.
 
     Fingers load the plate as the rig's fingertip. probes: listeners beside them; imperfections: in
-    what the bench differs from the rig; make_amplifier: the kind of its amplifiers. Raises
+    what the bench differs from the rig. Raises
     InputError for unknown channels.
     """
 
@@ -73,7 +73,6 @@ class Bench:
         now: float,
         sample_rate: float = SAMPLE_RATE,
         imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
-        make_amplifier: AmplifierMaker = Amplifier,
     ) -> None:
         imperfections.check(rig)
         self.rig = rig
@@ -92,8 +91,8 @@ class Bench:
         self._contacts: Mapping[str, FingertipLoad] = {}
         self.observers: frozenset[str] = frozenset()  # fingers without weight
         self.loads: Mapping[str, float] = {}  # by finger, relative to the rig's fingertip
-        self.amplifiers: Mapping[str, BenchAmplifier] = {
-            name: make_amplifier(
+        self.amplifiers: Mapping[str, Amplifier] = {
+            name: Amplifier(
                 name, channels=_channel_count(rig, name), is_output=bool(rig.voltage_of(name))
             )
             for name in rig.amplifiers
@@ -173,12 +172,12 @@ class Bench:
         """
         return self._shapes_at(points.tobytes())
 
-    def exchange(self, amplifier: str, *request: Any, now: float) -> Any:
-        """The reply of an amplifier to a request at a time [s]; raises what it raises."""
+    def exchange(self, amplifier: str, name: str, values: Values, *, now: float) -> Values:
+        """Return the values of an amplifier's reply to a request at a time [s]; raises Refusal."""
         if now > self._time:
             self._advance(now)
         try:
-            return self.amplifiers[amplifier].handle(*request, self._time)
+            return self.amplifiers[amplifier].handle(name, values, self._time)
         finally:
             self._update_plant()
 

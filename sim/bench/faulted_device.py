@@ -4,7 +4,7 @@ import asyncio
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 from drivers import clock
 from sim.amplifier.thermal_model import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
@@ -77,10 +77,6 @@ class FaultedDevice:
             timer.cancel()
         self._timers.clear()
 
-    def _fault_of(self, kind: str) -> Any:
-        """The fault in its protocol of a kind of window."""
-        return kind.upper()
-
     def _schedule(self, window: FaultWindow) -> None:
         """Schedule the start, middle and end of a fault window."""
         begin = self.faults.begin + window.at - clock.now()
@@ -115,7 +111,7 @@ class FaultedDevice:
                 for on_boot in self._on_boot:
                     on_boot()
             case ("over_voltage" | "arc" | "over_current" | "channel") as fault, "begin":
-                self._amplifier.trip(self._fault_of(fault), now)
+                self._amplifier.trip(fault.upper(), now)
             case "interlock", "begin" | "end":
                 self._amplifier.set_interlock(now, is_open=edge == "begin")
             case "over_temperature", _:

@@ -1,4 +1,4 @@
-"""Amplifiers of protocol 3 on real wires: pseudo-terminals, and a TCP port of Modbus."""
+"""Amplifiers on real wires: pseudo-terminals, and a TCP port of Modbus."""
 
 from collections.abc import Sequence
 from functools import partial

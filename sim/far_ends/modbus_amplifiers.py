@@ -1,4 +1,4 @@
-"""The amplifiers' side of Modbus in protocol 3, without I/O: bytes in, bytes out.
+"""The amplifiers' side of Modbus, without I/O: bytes in, bytes out.
 
 Each message is a mailbox: written from register 256 n on (tag, words), its reply read from
 256 n + 128 on (tag, result, words). Written without code of the host's side.

@@ -1,4 +1,4 @@
-"""The amplifiers' side of a serial line in protocol 3, without I/O: bytes in, bytes out.
+"""The amplifiers' side of a serial line, without I/O: bytes in, bytes out.
 
 On a shared line amplifiers have one address each, and send no events.
 """

@@ -7,14 +7,11 @@ each amplifier by name. A new kind is a module and a line in `_OPENERS`.
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from sim.bench.amplifier_device import AmplifierDevice
-from sim.bench.faulted_device import FaultedDevice
 from sim.far_ends.amplifier_ends import ModbusLineEnd, ModbusPortEnd, SerialLineEnd
 from sim.far_ends.can_bus.ends import slcan, socketcand
-from sim.far_ends.modbus.end import ModbusRtuEnd, ModbusTcpEnd
-from sim.far_ends.serial_end import SerialEnd
 
 
 @dataclass(frozen=True)
@@ -38,20 +35,20 @@ class Wire:
 FarEnd: TypeAlias = AbstractAsyncContextManager[Mapping[str, str]]
 
 
-def open_wire(wire: Wire, devices: Sequence[FaultedDevice]) -> FarEnd:
+def open_wire(wire: Wire, devices: Sequence[AmplifierDevice]) -> FarEnd:
     """The far end of a wire with these devices; entering it may raise LinkError."""
     return _OPENERS[wire.kind](wire, devices)
 
 
 @asynccontextmanager
 async def open_wires(
-    wires: Mapping[str, Wire], devices: Sequence[FaultedDevice]
+    wires: Mapping[str, Wire], devices: Sequence[AmplifierDevice]
 ) -> AsyncIterator[Mapping[str, str]]:
     """The far ends of devices on several wires, both by name; equal wires are shared.
 
     Yields the URLs by name, in the order of the devices. Raises LinkError.
     """
-    lines: dict[Wire, list[FaultedDevice]] = {}
+    lines: dict[Wire, list[AmplifierDevice]] = {}
     for device in devices:
         lines.setdefault(wires[device.name], []).append(device)
     urls: dict[str, str] = {}
@@ -62,14 +59,14 @@ async def open_wires(
 
 
 @asynccontextmanager
-async def _serial(wire: Wire, devices: Sequence[FaultedDevice]) -> AsyncIterator[Mapping[str, str]]:
+async def _serial(
+    wire: Wire, devices: Sequence[AmplifierDevice]
+) -> AsyncIterator[Mapping[str, str]]:
     lines = [list(devices)] if wire.shared else [[device] for device in devices]
     urls = {}
     async with AsyncExitStack() as stack:
         for line in lines:
-            end = _of_version(line, SerialLineEnd, SerialEnd)(
-                line, baud=wire.speed, unpluggable=wire.unpluggable
-            )
+            end = SerialLineEnd(line, baud=wire.speed, unpluggable=wire.unpluggable)
             stack.callback(end.close)
             end.start()
             urls.update(end.urls)
@@ -78,9 +75,9 @@ async def _serial(wire: Wire, devices: Sequence[FaultedDevice]) -> AsyncIterator
 
 @asynccontextmanager
 async def _modbus_tcp(
-    wire: Wire, devices: Sequence[FaultedDevice]
+    wire: Wire, devices: Sequence[AmplifierDevice]
 ) -> AsyncIterator[Mapping[str, str]]:
-    end = _of_version(devices, ModbusPortEnd, ModbusTcpEnd)(devices, port=wire.port)
+    end = ModbusPortEnd(devices, port=wire.port)
     try:
         await end.start()
         yield end.urls
@@ -90,11 +87,9 @@ async def _modbus_tcp(
 
 @asynccontextmanager
 async def _modbus_rtu(
-    wire: Wire, devices: Sequence[FaultedDevice]
+    wire: Wire, devices: Sequence[AmplifierDevice]
 ) -> AsyncIterator[Mapping[str, str]]:
-    end = _of_version(devices, ModbusLineEnd, ModbusRtuEnd)(
-        devices, speed=wire.speed, unpluggable=wire.unpluggable
-    )
+    end = ModbusLineEnd(devices, speed=wire.speed, unpluggable=wire.unpluggable)
     try:
         end.start()
         yield end.urls
@@ -102,20 +97,15 @@ async def _modbus_rtu(
         end.close()
 
 
-def _socketcand(wire: Wire, devices: Sequence[FaultedDevice]) -> FarEnd:
+def _socketcand(wire: Wire, devices: Sequence[AmplifierDevice]) -> FarEnd:
     return socketcand(devices, port=wire.port, bitrate=wire.speed)
 
 
-def _slcan(wire: Wire, devices: Sequence[FaultedDevice]) -> FarEnd:
+def _slcan(wire: Wire, devices: Sequence[AmplifierDevice]) -> FarEnd:
     return slcan(devices, bitrate=wire.speed, unpluggable=wire.unpluggable)
 
 
-def _of_version(devices: Sequence[FaultedDevice], third: Any, second: Any) -> Any:
-    """What is for the version of the protocol of these devices: 3 or 2."""
-    return third if isinstance(devices[0], AmplifierDevice) else second
-
-
-_OPENERS: Mapping[str, Callable[[Wire, Sequence[FaultedDevice]], FarEnd]] = {
+_OPENERS: Mapping[str, Callable[[Wire, Sequence[AmplifierDevice]], FarEnd]] = {
     "serial": _serial,
     "modbus-tcp": _modbus_tcp,
     "modbus-rtu": _modbus_rtu,

@@ -1,4 +1,4 @@
-"""Decoded messages of protocol 3, the same for every kind of wire."""
+"""Decoded messages, the same for every kind of wire."""
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field

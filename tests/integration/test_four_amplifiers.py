@@ -26,7 +26,6 @@ from model.fem.mesh import Mesh
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.vibration.excitation import Tone
-from sim.amplifier.contract import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.wires import Wire, open_wires
@@ -104,7 +103,7 @@ async def four_amplifiers(wires: Mapping[str, Wire]) -> AsyncIterator[FourAmplif
     live_in_memory()
     rig = load_rig(Path(model.__file__).parents[1] / "examples" / "table.yaml")
     rig = replace(rig, mesh=Mesh(4, 4, rig.plate.length, rig.plate.width))
-    bench = Bench(rig, now=loop.time(), make_amplifier=Amplifier)
+    bench = Bench(rig, now=loop.time())
     devices = {
         name: AmplifierDevice(bench, name, address=number)
         for number, name in enumerate(rig.amplifiers, 1)

@@ -6,13 +6,12 @@ from functools import partial
 from drivers.contents import Tone
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import QUANTITIES
-from sim.amplifier.contract import Amplifier
 from sim.bench.bench import Bench
 
 SESSION = 9
 _Q = QUANTITIES
 
-bench_of = partial(Bench, make_amplifier=Amplifier)
+bench_of = partial(Bench)
 """A bench whose amplifiers speak protocol 3; see `Bench`."""
 
 

@@ -25,7 +25,6 @@ from model.finger.perception import detection_threshold
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
-from sim.amplifier.contract import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.wires import Wire, open_wires
@@ -108,7 +107,7 @@ class Pressed:
     ) -> list[list[Felt]]:
         loop = asyncio.get_running_loop()
         live_in_memory()
-        self._bench = Bench(self.rig, now=loop.time(), make_amplifier=Amplifier)
+        self._bench = Bench(self.rig, now=loop.time())
         device = AmplifierDevice(
             self._bench, "main", address=1, faults=Faults(begin=loop.time(), seed=1)
         )

@@ -54,7 +54,7 @@ class FarSide:
 @asynccontextmanager
 async def far_side(wire: Wire, rig: Rig, *, seed: int = 0) -> AsyncIterator[FarSide]:
     """The amplifiers of a rig behind a wire, without faults until a test injects them."""
-    bench = Bench(rig, now=clock.now(), make_amplifier=Amplifier)
+    bench = Bench(rig, now=clock.now())
     devices = [
         AmplifierDevice(bench, name, address=number, faults=Faults(begin=clock.now(), seed=seed))
         for number, name in enumerate(bench.amplifiers, start=1)

@@ -19,7 +19,6 @@ from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Tone
 from registry.limits import GuardLimits
-from sim.amplifier.contract import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.wires import Wire, open_wires
@@ -132,7 +131,7 @@ async def supervised_chain(
     loop = asyncio.get_running_loop()
     live_in_memory()
     rig = make_rig(names, GuardLimits(40.0, 500.0, 0.5))
-    bench = Bench(rig, now=loop.time(), make_amplifier=Amplifier)
+    bench = Bench(rig, now=loop.time())
     devices = [AmplifierDevice(bench, name, address=at) for at, name in enumerate(names, 1)]
     async with open_wires(dict.fromkeys(names, WIRES[wire]), devices) as urls:
         causes: list[str] = []

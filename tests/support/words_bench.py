@@ -17,7 +17,6 @@ from drivers.host.serial_wire import SerialWire
 from drivers.opening import Lines
 from model.rig.rig import Rig
 from registry.limits import GuardLimits
-from sim.amplifier.contract import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.wires import Wire, open_wire
@@ -72,7 +71,7 @@ class HostedRig:
 
 def make_bench(rig: Rig) -> tuple[Bench, dict[str, AmplifierDevice]]:
     """A bench, and a device for each amplifier at addresses 1, 2, ..., without faults as yet."""
-    bench = Bench(rig, now=clock.now(), make_amplifier=Amplifier)
+    bench = Bench(rig, now=clock.now())
     return bench, {
         name: AmplifierDevice(bench, name, address=number, faults=Faults(begin=clock.now()))
         for number, name in enumerate(bench.amplifiers, 1)

@@ -1,4 +1,4 @@
-"""The amplifiers' side of a CAN bus in protocol 3, without I/O.
+"""The amplifiers' side of a CAN bus, without I/O.
 
 Frames come and go packed (`drivers.codec.can_bus.segments`), those of a message together.
 """

@@ -9,40 +9,29 @@ from drivers import clock
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from drivers.protocol.definition import PROTOCOL
 from sim.bench.amplifier_device import AmplifierDevice
-from sim.bench.faulted_device import FaultedDevice
-from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from sim.far_ends.can_bus.bus import CanBus, Stub
-from sim.far_ends.can_bus.node import CanNode
 from sim.far_ends.can_bus.slcan_adapter import SlcanEnd
 from sim.far_ends.can_bus.socketcand_server import BUS_NAME, SocketcandEnd
 from sim.transport.far_end import Served
 
 _BITRATE: int = PROTOCOL.canopen["bitrate"]
-_PER_NODE: int = PROTOCOL.canopen["channels_per_node"]
 
 
 @asynccontextmanager
-async def nodes_on(bus: CanBus, devices: Sequence[FaultedDevice]) -> AsyncIterator[dict[str, int]]:
+async def nodes_on(
+    bus: CanBus, devices: Sequence[AmplifierDevice]
+) -> AsyncIterator[dict[str, int]]:
     """Put amplifiers on a bus; yields the node of each by name."""
     with contextlib.ExitStack() as stack:
-        numbers = {}
-        number = 1
         for device in devices:
-            if isinstance(device, AmplifierDevice):
-                numbers[device.name] = device.address
-                stack.enter_context(_amplifier_on(bus, device))
-            if not isinstance(device, SimulatedDevice):
-                continue
-            numbers[device.name] = number
-            stack.enter_context(_node_on(bus, device, number))
-            number += -(-device.capabilities.channels // _PER_NODE)
-        yield numbers
+            stack.enter_context(_amplifier_on(bus, device))
+        yield {device.name: device.address for device in devices}
 
 
 @asynccontextmanager
 async def socketcand(
-    devices: Sequence[FaultedDevice], *, port: int = 0, bitrate: int | None = None
+    devices: Sequence[AmplifierDevice], *, port: int = 0, bitrate: int | None = None
 ) -> AsyncIterator[Mapping[str, str]]:
     """Serve amplifiers on one bus by socketcand; yields their URLs by name."""
     bus = CanBus(bitrate)
@@ -73,7 +62,7 @@ async def socketcand(
 
 @asynccontextmanager
 async def slcan(
-    devices: Sequence[FaultedDevice], *, bitrate: int | None = None, unpluggable: bool = False
+    devices: Sequence[AmplifierDevice], *, bitrate: int | None = None, unpluggable: bool = False
 ) -> AsyncIterator[Mapping[str, str]]:
     """Serve amplifiers on one bus behind a serial adapter; yields their URLs by name."""
     bus = CanBus(bitrate)
@@ -91,7 +80,7 @@ async def slcan(
 
 @contextlib.contextmanager
 def _amplifier_on(bus: CanBus, device: AmplifierDevice) -> Iterator[None]:
-    """Put an amplifier of protocol 3 on a bus, at the node of its number."""
+    """Put an amplifier on a bus, at the node of its number."""
 
     def send(frames: bytes) -> None:
         for frame in unpack_frames(frames):
@@ -110,17 +99,4 @@ def _amplifier_on(bus: CanBus, device: AmplifierDevice) -> Iterator[None]:
         yield
     finally:
         served.close()
-        stub.close()
-
-
-@contextlib.contextmanager
-def _node_on(bus: CanBus, device: SimulatedDevice, number: int) -> Iterator[None]:
-    stub = Stub(bus, lambda frame: node.receive(frame), faults=device.faults)
-    node = CanNode(device, number, send=stub.send)
-    device.time = bus.time.now
-    node.start()
-    try:
-        yield
-    finally:
-        node.close()
         stub.close()

@@ -1,4 +1,4 @@
-"""Objects of an amplifier of protocol 3 that are read by SDO.
+"""Objects of an amplifier that are read by SDO.
 
 2000 has the identity: four texts, then the versions. 2001 and 2002 have the words of the replies to
 GetCaps and GetStatus, a subindex each.

@@ -69,7 +69,7 @@ def test_amplifier_with_the_whole_table_passes_loud() -> None:
 @in_virtual_time
 async def test_sensors_on_a_plate_pass(coarse_rig: Rig) -> None:
     """Those at the feet of a rig's actuators, which read what plays."""
-    bench = Bench(coarse_rig, now=clock.now(), make_amplifier=Amplifier)
+    bench = Bench(coarse_rig, now=clock.now())
     (far,) = bench.amplifiers.values()
     assert isinstance(far, Amplifier)
     running = asyncio.ensure_future(keep_time(bench))

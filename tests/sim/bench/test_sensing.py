@@ -1,6 +1,7 @@
 """Sensors of a simulated amplifier: bounded memory, what disturbs, what is forgotten."""
 
 import pytest
+from sim.amplifier.sensor_messages import SensedAmplifier
 
 from drivers.command import CommandSet, DriveCommand
 from drivers.protocol.messages import (
@@ -19,7 +20,6 @@ from drivers.protocol.messages import (
     Stop,
 )
 from model.rig.rig import Rig
-from sim.amplifier.sensor_messages import SensedAmplifier
 from sim.bench.bench import Bench
 from sim.bench.reading import KEPT_SAMPLES
 from wires import on_two_amplifiers

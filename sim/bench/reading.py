@@ -1,7 +1,7 @@
 """A reading of tones at sensors of a bench, by least squares over its window.
 
 The normal equations of all tones and a constant are summed sample by sample, so that tones played
-together do not leak into each other; of the samples only the newest are kept.
+together do not leak into each other.
 """
 
 import math
@@ -13,9 +13,6 @@ import numpy as np
 
 from model.arrays import FloatArray
 from sim.plant.transducer import Transducer, read_accelerations
-
-KEPT_SAMPLES = 16_384  # of each sensor; 1.6 s at 10 kHz
-_COUNTS = 32_767  # of a raw sample at the range
 
 
 @dataclass(frozen=True)
@@ -64,8 +61,6 @@ class ToneReader:
         self._normal = np.zeros((unknowns, unknowns))
         self._right = np.zeros((unknowns, sensors))
         self._is_overloaded = np.zeros(sensors, dtype=bool)
-        self._kept = np.zeros((KEPT_SAMPLES, sensors), dtype=np.int16)
-        self._count = 0
 
     @property
     def shapes(self) -> FloatArray:
@@ -86,11 +81,6 @@ class ToneReader:
         self._normal += columns.T @ columns
         self._right += columns.T @ readings
         self._is_overloaded |= (np.abs(readings) >= self._reach).any(axis=0)
-        counts = np.round(readings / self._reach * _COUNTS).astype(np.int16)
-        last = counts[-KEPT_SAMPLES:]
-        self._count += len(counts)
-        at = np.arange(self._count - len(last), self._count) % KEPT_SAMPLES
-        self._kept[at] = last
         if len(times) and times[-1] + 1 / self._sample_rate > self.end:
             self._on_end(self)
 
@@ -102,17 +92,3 @@ class ToneReader:
         phasors = found[:count] + 1j * found[count : 2 * count]
         phasors *= np.exp(-2j * math.pi * frequencies * self.offset)[:, None]
         return list(zip(self._is_overloaded.tolist(), phasors.T.tolist(), strict=True))
-
-    def samples(self, sensor: int, first: int, *, limit: int) -> tuple[int, int, list[int]]:
-        """At limit so many raw samples from one on, or the oldest kept.
-
-        Returns the number of the first, the number after the newest so far, and the samples.
-        """
-        first = min(max(first, self._count - KEPT_SAMPLES, 0), self._count)
-        numbers = np.arange(first, min(first + limit, self._count))
-        return first, self._count, self._kept[numbers % KEPT_SAMPLES, sensor].tolist()
-
-
-def count_step(reach: float) -> float:
-    """Reading of one count of a raw sample, for a range."""
-    return reach / _COUNTS

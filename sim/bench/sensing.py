@@ -23,7 +23,7 @@ from drivers.protocol.table import (
     sensor_reading,
 )
 from model.arrays import FloatArray
-from sim.bench.reading import Measurement, ToneReader, count_step
+from sim.bench.reading import Measurement, ToneReader
 
 REACH = 2000.0
 """Largest range [m/s²]; the paper's plate stays below with all ERAs at full stroke."""
@@ -120,16 +120,6 @@ class Sensing:
     def sensors(self) -> tuple[PlateSensor, ...]:
         """All sensors, those at its ERAs first."""
         return (*self._feet, *self._others)[:_MAX_SENSORS]
-
-    @property
-    def sample_rate(self) -> float:
-        """Sampling rate of its sensors [Hz]."""
-        return self._plate.sample_rate
-
-    @property
-    def count_steps(self) -> Sequence[float]:
-        """Reading of one count of a raw sample, by sensor."""
-        return [_binary32(count_step(sensor.reach)) for sensor in self.sensors]
 
     @property
     def _frequency_max(self) -> float:

@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -45,7 +44,7 @@ from rig_on_wire import far_side
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultWindow
 from tuio_panel import free_port, panel
-from wires import WIRES, patient
+from wires import WIRES
 
 pytestmark = pytest.mark.real_time
 
@@ -367,8 +366,7 @@ async def test_daemon_exits_when_terminated_over_dead_link(tmp_path: Path) -> No
 async def test_cut_cable_is_reported(tmp_path: Path, wire: str) -> None:
     """Clients get COMM_LOST; reconnected, the daemon stays disarmed and silent."""
     rig = load_rig(write_rig(tmp_path / "bench.yaml"))
-    async with far_side(WIRES[wire], rig) as opened:
-        far = replace(opened, urls={name: patient(url) for name, url in opened.urls.items()})
+    async with far_side(WIRES[wire], rig) as far:
         journal = Journal(far)
         async with (
             daemon_process(tmp_path, far) as daemon,

@@ -52,7 +52,7 @@ _LOADED = (
     "model.studies.run",
     "model.table.build",
     "scipy.ndimage",
-    "sim.backend",
+    "sim.memory_line",
     "sim.process.simulation",
     "typer._adapters",
 )

@@ -23,7 +23,6 @@ from heard import PATIENCE, SENSORS, Control, Heard, hear
 from rig_files import write_rig
 from stream_daemon import RunningDaemon, running_daemon
 from touch_stream import FRAME, Situation, Stream
-from wires import patient
 
 _SETTLED = 0.7  # s; of a pattern, or of silence, before it is measured
 
@@ -112,7 +111,7 @@ async def running_chain(folder: Path, wire: str, *, table: Path) -> AsyncIterato
                 far_end_process(truth, "--wire", f"main={wire}")
             )
             path = far_end.control
-            url = patient(far_end.urls["main"])
+            url = far_end.urls["main"]
         daemon = await stack.enter_async_context(running_daemon(folder, url, table=table))
         await stack.enter_async_context(daemon.client)
         control = await stack.enter_async_context(Control.at(path))

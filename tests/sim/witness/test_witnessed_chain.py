@@ -68,7 +68,11 @@ def test_chain_ends_with_a_hardly_reachable_node(seed: int) -> None:
 
 
 def test_a_fault_is_planted_for_every_rule() -> None:
-    """Each rule of the page has a fault that a test of the witness must report as broken."""
+    """Each rule of the page has a fault that a test of the witness must report as broken.
+
+    But for damage, which one codec for both sides hides, and for identified, since a host that does
+    not identify an amplifier has no limits to play by: conversations written by hand break them.
+    """
     faults, page = ROOT / "tests" / "faults", ROOT / "docs" / "reference" / "witness.md"
     rules = page.read_text(encoding="utf-8").partition("## The rules")[2].partition("## In tests")
     planted = [
@@ -78,4 +82,8 @@ def test_a_fault_is_planted_for_every_rule() -> None:
         if any("tests/sim/witness" in test for test in fault["found_by"])
     ]
     shown = {fault["shows"].removesuffix(": ") for fault in planted if "shows" in fault}
-    assert shown == set(re.findall(r"^\| (\w+) \|", rules[0], flags=re.M)) - {"name"}
+    assert shown == set(re.findall(r"^\| (\w+) \|", rules[0], flags=re.M)) - {
+        "name",
+        "damage",
+        "identified",
+    }

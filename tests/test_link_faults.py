@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sim.amplifier.channels import PlayableSet
 
 from drivers import clock
 from drivers.amplifier import Amplifier
@@ -29,7 +30,6 @@ from long_form import shortly
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from reconnection import reconnect
-from sim.amplifier.channels import PlayableSet
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultKind, FaultWindow
 from virtual_loop import run_virtual

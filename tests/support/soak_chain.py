@@ -16,6 +16,8 @@ from functools import cache
 from typing import Any, TextIO
 
 from controller.group.amplifier_group import GroupState
+from sim.amplifier.sensor_messages import SensedAmplifier
+from sim.bench.simulated_device import SimulatedDevice
 
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer
@@ -29,9 +31,7 @@ from memory_machine import live_in_memory
 from model.rig.rig import Channel, Rig
 from model.table.table import LocalizationTable
 from paper_plate import make_paper_rig
-from sim.amplifier.sensor_messages import SensedAmplifier
 from sim.bench.bench import Bench
-from sim.bench.simulated_device import SimulatedDevice
 from sim.far_ends.wires import Wire, open_wires
 from sim.faults.fault_window import Faults
 from sim.witness.witness import OperatorCommand

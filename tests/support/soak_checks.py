@@ -9,6 +9,8 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 
+from sim.amplifier.amplifier import SimulatedAmplifier
+
 from drivers.protocol.messages import (
     AmplifierEvent,
     AmplifierState,
@@ -23,7 +25,6 @@ from drivers.protocol.messages import (
     Stage,
     Stop,
 )
-from sim.amplifier.amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench
 from sim.waveform import level_of
 from soak_contacts import SourceContacts

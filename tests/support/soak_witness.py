@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from sim.amplifier.amplifier import SimulatedAmplifier
+
 from sim.faults.fault_window import FaultWindow
 from sim.witness.witness import OperatorCommand, Witness
 from soak_contacts import SourceContacts

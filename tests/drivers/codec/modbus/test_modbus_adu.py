@@ -5,6 +5,7 @@ from itertools import pairwise
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sim.far_ends.modbus.unit import ModbusUnit
 
 from drivers.codec.modbus import exchanges
 from drivers.codec.modbus.adu import ModbusResponse, RequestAdu, ResponseReader, build_adu
@@ -19,7 +20,6 @@ from sim.far_ends.modbus.frames import (
     tcp_frame,
 )
 from sim.far_ends.modbus.frames import RequestAdu as FarEndRequest
-from sim.far_ends.modbus.unit import ModbusUnit
 from vendor_pages import ARMED, SET, ScriptedDevice
 
 

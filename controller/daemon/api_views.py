@@ -20,7 +20,7 @@ from controller.sources.contacts import Contact, ContactKey
 from drivers import clock
 from drivers.host.amplifier import Amplifier, Stopped
 from drivers.host.comparison import name_of
-from drivers.host.group import is_lost
+from drivers.host.members import is_lost
 from drivers.protocol.table import FAULTS, QUANTITIES, STATES, STATUS_FLAGS
 from drivers.statistics import LinkStatistics
 

@@ -19,7 +19,7 @@ from controller.loop.validity import Validity, first_lasts, valid_for
 from controller.sources.contacts import Change, Contact, ContactTracker
 from controller.sources.touch import TouchFrame
 from drivers.errors import CommandRefused
-from drivers.host.group import Played
+from drivers.host.joint_sets import Played
 from drivers.host.ledger import is_vibrating
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES

@@ -25,7 +25,8 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import WATCHDOG, Amplifier, Stopped
-from drivers.host.group import Group, GroupState, Played
+from drivers.host.group import Group, GroupState
+from drivers.host.joint_sets import Played
 from drivers.host.timing import HEARTBEAT
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError

@@ -186,15 +186,15 @@ class Amplifier(Dialogue):
         staged = self._admitted = Staged(token, admitted, is_exact=True, until=moment + delay)
         return staged
 
-    async def commit(self, token: int, *, start: JointStart | None = None) -> Values:
-        """Play the staged set; returns the status, which shows its tokens.
+    def commit(self, token: int, *, start: JointStart | None = None) -> "asyncio.Future[Values]":
+        """Play the staged set; the future has the status, which shows its tokens.
 
-        start: together with the commits of other lines. Raises Preempted where a stop or disarm
-        came first, CommandRefused where it is too late for what the ledger has admitted.
+        start: together with the commits of other lines. Or raises Preempted where a stop or
+        disarm came first, CommandRefused where it is too late for what the ledger has admitted.
         """
         values = {"session": self.session, "token": token}
         make = partial(self._while_admitted, token, values)
-        return await self.line.submit(self, Priority.SET, "Commit", values, make=make, start=start)
+        return self.line.submit(self, Priority.SET, "Commit", values, make=make, start=start)
 
     def _while_admitted(self, token: int, values: Values) -> Values:
         """Return the values of a request of the set that is admitted, as long as it is."""

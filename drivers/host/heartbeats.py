@@ -1,0 +1,60 @@
+"""Heartbeats of armed amplifiers, which show as well that they still play what they should.
+
+A watchdog that runs down, and starts anew with each heartbeat, shows that it would silence the
+amplifier: so its status is read just before it is fed. One that does not reply is not fed.
+"""
+
+import asyncio
+from collections.abc import Callable
+
+from drivers import clock
+from drivers.errors import LinkTimeout, Preempted
+from drivers.host.amplifier import Amplifier
+from drivers.host.jobs import Priority
+from drivers.host.joint_sets import seen
+from drivers.host.members import Members, is_lost, round_trip_of
+from drivers.protocol.records import Values
+
+_MAX_STATUS_LOAD = 0.05  # of the line's time, for statuses that show whether the watchdog runs down
+
+
+class Heartbeats:
+    """Heartbeats of the amplifiers of a group; is_armed: whether they may be fed at a moment."""
+
+    def __init__(self, members: Members, is_armed: Callable[[], bool]) -> None:
+        self._members = members
+        self._is_armed = is_armed
+        self._running_read_at: dict[str, float] = {}
+        self._readings: dict[str, asyncio.Future[Values]] = {}  # of amplifiers that do not reply
+
+    async def beat(self) -> None:
+        """Feed the watchdog of every amplifier that replies, and read the status of the others.
+
+        Raises LinkTimeout where one is lost, Preempted where they are armed no longer, and what
+        the requests raise.
+        """
+        amplifiers = self._members.amplifiers.values()
+        await self._members.all([self._beat(each) for each in amplifiers])
+
+    async def _beat(self, amplifier: Amplifier) -> None:
+        if is_lost(amplifier):
+            raise LinkTimeout(amplifier.line.loss or amplifier.silence_cause)
+        if amplifier.silence_cause is None:
+            await self._read_running(amplifier)
+            if not self._is_armed():
+                raise Preempted("a stop or disarm came first")
+            await amplifier.ping()
+            return
+        reading = self._readings.get(amplifier.name)
+        if reading is None or reading.done():
+            reading = asyncio.ensure_future(amplifier.read_status(Priority.HEARTBEAT))
+            reading.add_done_callback(seen)
+            self._readings[amplifier.name] = reading
+
+    async def _read_running(self, amplifier: Amplifier) -> None:
+        """Read a status just before the watchdog is fed, unless the wire is too slow for that."""
+        pause = round_trip_of(amplifier) / _MAX_STATUS_LOAD
+        last, now = self._running_read_at.get(amplifier.name), clock.now()
+        if last is None or now - last >= pause:
+            self._running_read_at[amplifier.name] = now
+            await amplifier.read_status(Priority.HEARTBEAT)

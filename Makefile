@@ -70,9 +70,9 @@ lint: .venv/installed-test
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 
-# A million damaged frames for every codec; `make test` takes a few thousand.
+# A million damaged frames on every kind of line; `make test` takes a few thousand.
 fuzz: .venv/installed-test
-	$(BIN)/python tests/support/mutation.py
+	FRAMES=1000000 $(BIN)/pytest -q tests/drivers/host/test_damaged_frames.py
 
 # Every planted fault (tests/faults) in a copy of the tree, under the tests that must find it;
 # `make test` takes five. Others: make faults FAULTS='--only wire/ --json out/faults.json'

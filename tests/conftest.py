@@ -42,7 +42,6 @@ SLOWEST = (
     "test_firmware_host.py",
     "test_latency_measured.py",
     "test_errors.py",
-    "test_amplifier_contract.py",
     "test_witnessed_chain.py",
     "test_link_faults.py",
     "test_dashboard_losses.py",

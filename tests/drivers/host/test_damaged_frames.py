@@ -1,5 +1,6 @@
 """Both ends of a wire with damaged bytes on their way: the short form, and whatever comes in."""
 
+import os
 import random
 
 import pytest
@@ -12,7 +13,7 @@ from mutation import damage
 from sim.amplifier.contract import Amplifier
 from words_line import KINDS
 
-COUNT = 4_000
+COUNT = int(os.environ.get("FRAMES", "4000"))  # `make fuzz` has a million
 SHAPE = Envelope(50, tuple((100 * knot, 10 * knot) for knot in range(20)))
 LAYERS = [
     LayerSet(0, 20, 500, (Command(0, 2200, 2000, 0), Command(1, 5010, 9000, -9000, onset=SHAPE))),

@@ -140,6 +140,12 @@ class Supervisor:
                 except LinkError as error:
                     lost = self._in_background(self._handle_loss(error))
                     await wait_alive(lost, self._alive)
+                except DriverError:
+                    raise
+                except Exception as error:  # unforeseen: a fault, which can be cleared
+                    _logger.exception("control loop failed, stopping all amplifiers")
+                    await wait_alive(self._fail(error), self._alive)
+                    await asyncio.sleep(ALIVE_INTERVAL)
                 while self.machine.state is DaemonState.COMM_LOST:
                     await self._restore_link()
         finally:

@@ -145,6 +145,31 @@ async def test_amplifier_that_refuses_at_the_start_is_opened_again_later() -> No
 
 
 @in_virtual_time
+async def test_unforeseen_exception_in_the_control_loop_is_a_fault(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Silent before the watchdog expires, latched, and once cleared it plays again."""
+    async with watched() as daemon:
+        await daemon.handle(ARM)
+
+        def fail(*_: object, **__: object) -> None:
+            raise ZeroDivisionError("a bug")
+
+        with monkeypatch.context() as planted:
+            planted.setattr("controller.loop.loop.applied_by", fail)
+            daemon.touch()
+            await asyncio.sleep(0.1)
+        assert daemon.state is DaemonState.FAULT
+        assert "a bug" in daemon.supervisor.machine.cause
+        assert (daemon.far_end.state, {*daemon.far_end.levels}) == (STOPPED, {0})
+        await daemon.handle(CLEAR)
+        await daemon.handle(ARM)
+        daemon.touch_elsewhere()
+        await asyncio.sleep(0.1)
+        assert (daemon.state, any(daemon.far_end.levels)) == (ENABLED, True)
+
+
+@in_virtual_time
 async def test_heartbeats_stop_when_control_loop_hangs() -> None:
     """Neither heartbeats nor signs of life are sent while one cycle of the loop takes 3 s."""
     async with watched() as daemon:

@@ -33,6 +33,8 @@ from registry.plugins import failure_text
 # With no finger left on the plate the end may be short: zero within 20 ms of the lift.
 RELEASE_RAMP = 0.010
 
+ENDED = "the vibration has ended by itself: it was not renewed, or a limit of time was reached"
+
 # s; after a vibration a plate first rings louder than the next onset is at a quiet finger.
 _RING_DOWN = 0.4
 _VALID_FOR = QUANTITIES["valid_for"]
@@ -262,6 +264,14 @@ class Decider:
         due = math.inf if until is None else until
         validity = replace(self._playing.validity, renewal_due=due)
         self._playing = replace(self._playing, validity=validity)
+
+    def ended(self, now: float) -> Decision | None:
+        """Return the end of a playback that has come by itself at a time [s], once; else None."""
+        decision = self._playing.decision
+        if decision is None or not self._playing.drive or now < self._playing.validity.ends_at:
+            return None
+        self._playing = replace(self._playing, drive={})
+        return replace(decision, set=None, pattern=None, refusal=ENDED, triggered_at=now)
 
     def decide(self, now: float) -> Decision | None:
         """Decide at a time [s]; None if nothing changes."""

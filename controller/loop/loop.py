@@ -354,6 +354,10 @@ class Controller:
         if decision is None:
             if not self._group.degraded:
                 await self._renew(now)
+            ended = self._decider.ended(now)
+            if ended is not None:
+                silenced = silenced_by(ended, sent_at=None, now=now)
+                self._report(self._observer.silenced, silenced)
         elif decision.pattern is not None and self._group.degraded:
             self._decider.forget()  # decided again once all amplifiers reply
         else:

@@ -23,12 +23,13 @@ class Validity:
 
     confirmed_until: when its first target would have been lifted, as known when it was sent;
     renewal_due, renewable_until: between these it is renewed if all targets have been confirmed
-    since.
+    since. ends_at: when it has ended by itself unless it was renewed.
     """
 
     confirmed_until: float = math.inf
     renewal_due: float = math.inf
     renewable_until: float = math.inf
+    ends_at: float = math.inf
 
     @classmethod
     def started(cls, valid_for: float, *, confirmed_until: float, now: float) -> "Validity":
@@ -41,6 +42,7 @@ class Validity:
             confirmed_until=confirmed_until,
             renewal_due=math.inf if is_shortened else now + valid_for / 2,
             renewable_until=now + valid_for - _MARGIN / 2,
+            ends_at=now + valid_for,
         )
 
     def is_renewal_due(self, now: float, *, confirmed_until: float) -> bool:

@@ -61,8 +61,8 @@ class Ledger:
         self.lag, self._doubt = 0.0, None
 
     def go_on_from(self, earlier: "Ledger") -> None:
-        """Count the vibrations of an earlier ledger of the same limits, as after a reconnection."""
-        if self.limits == earlier.limits:
+        """Count the vibrations of an earlier ledger of the same rig, as after a reconnection."""
+        if self._configured == earlier._configured:
             self._budget = earlier._budget
 
     def admit(

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import pytest
 
+from controller.loop.decision import ENDED
 from controller.sources.contacts import Change, ContactTracker
 from controller.sources.touch import Touch, TouchFrame
 from controller_bench import FINGER, Bench, Sent, running
@@ -114,3 +115,6 @@ async def test_renewal_keeps_to_the_on_time_limit(on_time: float) -> None:
         sent = vibrations(bench)
         begin, end = sent[0][0], max(time + each.valid_for for time, each in sent)
         assert 0.8 * on_time < end - begin <= on_time
+        # Or it would be shown as if it played on.
+        (silenced,) = [each for each in bench.reports.silenced if each.reason == ENDED]
+        assert end <= silenced.time <= end + 0.06

@@ -143,13 +143,17 @@ def test_what_was_achieved_counts_from_then_on() -> None:
 
 
 def test_other_capabilities_leave_what_was_spent() -> None:
-    """0.9 of one second within ten; a lower level limit does not give it back."""
+    """0.9 of one second within ten; a lower level limit does not give it back, reopened or not."""
     ledger = Ledger(replace(WIDE, duty=0.1), CAN)
     play(ledger, 1, 0.0, Layer(0, (tone(),), ramp=0.0))
     play(ledger, 2, 0.9, Layer(0, (), ramp=0.0))
     ledger.adopt({**CAN, "level_max": 5000})
     refusal(ledger, Layer(0, (tone(level=0.51),)), at=5.0)
     (one,) = ledger.admit([Layer(0, (tone(),), ramp=0.0)], 5.0)
+    assert 0 < one.valid_for <= 100
+    reopened = Ledger(replace(WIDE, duty=0.1), {**CAN, "level_max": 4000})
+    reopened.go_on_from(ledger)
+    (one,) = reopened.admit([Layer(0, (tone(level=0.3),), ramp=0.0)], 5.0)
     assert 0 < one.valid_for <= 100
 
 

@@ -82,7 +82,7 @@ within the rig's limits, and the amplifier is disarmed when the block ends.
 # %%
 rig = era.load_rig(era.example_rig_path())
 with era.open_amplifier(rig, url=url) as amplifier:
-    print(amplifier.identity.product, "with", amplifier.capabilities.channels, "channels")
+    print(amplifier.identity["product"], "with", amplifier.capabilities["channels"], "channels")
     amplifier.arm()
     amplifier.play(era.commands_for(rig, {"SW": era.Drive(110, level=0.1)})["main"], duration=0.1)
 

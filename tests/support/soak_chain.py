@@ -1,7 +1,7 @@
 """One soak run: the whole chain in virtual time, from touch frames to the plate, as its plan says.
 
-Everything between the table and the plate is the project's own: controller, guard, drivers,
-backends, codecs, far ends and amplifiers. Only the lines are memory, and the clock is virtual.
+Everything between the table and the plate is the project's own: controller, ledgers, lines, codecs,
+far ends and amplifiers. Only the lines are memory, and the clock is virtual.
 """
 
 import asyncio
@@ -9,28 +9,25 @@ import hashlib
 import logging
 import random
 from collections import Counter
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, TextIO
 
-from controller.group.amplifier_group import GroupState
-from sim.amplifier.sensor_messages import SensedAmplifier
-from sim.bench.simulated_device import SimulatedDevice
-
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer
 from controller.sources.touch import Touch, TouchFrame
-from drivers.amplifier import Amplifier
-from drivers.backend import Backend
 from drivers.errors import DriverError
-from drivers.protocol.messages import AmplifierEvent, Fault, Reply, Request
-from drivers.registry import open_backend
+from drivers.host.amplifier import Amplifier
+from drivers.host.group import GroupState
+from drivers.opening import Lines
+from drivers.protocol.records import Values
 from memory_machine import live_in_memory
 from model.rig.rig import Channel, Rig
 from model.table.table import LocalizationTable
 from paper_plate import make_paper_rig
+from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.wires import Wire, open_wires
 from sim.faults.fault_window import Faults
@@ -41,6 +38,8 @@ from soak_contacts import SourceContacts
 from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence
 from soak_witness import SoakWitness
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual
+
+Handle = Callable[[str, Values, float], Values]
 
 _ON_THE_WIRE = 0.002  # s; through driver, adapter and back
 # Bytes of a silent set for four channels and what may precede it on the line, there and back.
@@ -146,7 +145,7 @@ class _Run:
         loop.set_exception_handler(self._unhandled)
         self.machine = live_in_memory()
         self.rig = make_soak_rig(self.plan.amplifiers)
-        self.bench = Bench(self.rig, now=loop.time(), make_amplifier=SensedAmplifier)
+        self.bench = Bench(self.rig, now=loop.time())
         self.contacts = SourceContacts()
         self.arm_requests = 0
         self.is_ending = False
@@ -210,30 +209,30 @@ class _Run:
         on_wire = [preceding * 10 / line.speed if line.speed else 0.0 for line in self.plan.lines]
         return RELEASE + max(on_wire) + _ON_THE_WIRE
 
-    def _devices(self) -> dict[str, SimulatedDevice]:
+    def _devices(self) -> dict[str, AmplifierDevice]:
         devices = {}
         for number, name in enumerate(self.bench.amplifiers, start=1):
             faults = Faults(begin=self.loop.time(), seed=self.plan.seed)
-            device = SimulatedDevice(self.bench, name, address=number, faults=faults)
-            device.exchange = self._exchanging(name, device.exchange)  # type: ignore[method-assign]
-            device.listen(
-                lambda event, name=name: self.note("amplifier", name, event.state, event.fault)  # type: ignore[misc]
+            device = AmplifierDevice(self.bench, name, address=number, faults=faults)
+            device.handle = self._handling(name, device.handle)  # type: ignore[method-assign]
+            device.listeners.append(
+                lambda event, at, name=name: self.note(  # type: ignore[misc]
+                    "amplifier", name, event["state"], event["fault"]
+                )
             )
             devices[name] = device
         return devices
 
-    def _exchanging(
-        self, name: str, exchange: Callable[[Request], Reply | None]
-    ) -> Callable[[Request], Reply | None]:
-        def exchanging(request: Request) -> Reply | None:
-            reply = exchange(request)
+    def _handling(self, name: str, handle: Handle) -> Handle:
+        def handling(request: str, values: Values, now: float) -> Values:
             self.counts["requests"] += 1
-            self.checks.exchanged(name, request, reply)
+            reply = handle(request, values, now)  # a refusal changes nothing
+            self.checks.exchanged(name, request)
             return reply
 
-        return exchanging
+        return handling
 
-    async def _play(self, devices: dict[str, SimulatedDevice]) -> None:
+    async def _play(self, devices: dict[str, AmplifierDevice]) -> None:
         """Run the actions."""
         by_number = [*devices.values()]
         for action in self.plan.actions:
@@ -421,13 +420,12 @@ class _Run:
             self.witness.set_stalled(False)
 
     def _make_controller(self) -> Controller:
-        amplifiers = {name: Amplifier(_backend(url)) for name, url in self.urls.items()}
-        for amplifier in amplifiers.values():
-            amplifier.listen(self._amplifier_event)
         return Controller(
             self.rig,
             _table(),
-            amplifiers=amplifiers,
+            lines=Lines,
+            urls=self.urls,
+            connected=self._connected,
             observer=Observer(
                 pattern_applied=self._applied,
                 refused=lambda why: self.note("observer refused", why),
@@ -435,10 +433,14 @@ class _Run:
             ),
         )
 
-    def _amplifier_event(self, event: AmplifierEvent) -> None:
+    def _connected(self, amplifiers: Mapping[str, Amplifier]) -> None:
+        for amplifier in amplifiers.values():
+            amplifier.listeners.append(self._amplifier_event)
+
+    def _amplifier_event(self, event: Values) -> None:
         """Stop all at a fault that an amplifier reports while armed or arming, as a daemon does."""
         controller = self.controller
-        if event.fault is Fault.NONE or controller is None:
+        if not event["fault"] or controller is None:
             return
         if self.arm_requests or controller.group_state is GroupState.ARMED:
             self._spawn(self._call("stop", controller.stop))
@@ -465,7 +467,7 @@ class _Run:
         await asyncio.sleep(_QUIET_END)
         for name, amplifier in self.bench.amplifiers.items():
             self.bench.advance(self.loop.time())
-            if any(amplifier.status(self.loop.time()).levels):
+            if any(amplifier.summary(self.loop.time()).levels):
                 self.checks.violate(f"{name} plays after everything was closed")
         if len(self.loop._scheduled) > _TIMERS_MAX:
             self.checks.violate(f"{len(self.loop._scheduled)} timers wait")
@@ -473,19 +475,6 @@ class _Run:
     def _unhandled(self, loop: Any, context: dict[str, Any]) -> None:
         error = context.get("exception")
         self.checks.violate(f"unhandled: {context['message']} {error!r}")
-
-
-_BACKENDS: dict[str, type[Backend]] = {}
-
-
-def _backend(url: str) -> Backend:
-    """A backend for a URL; its class is cached, since discovery of plugins is slow."""
-    scheme = url.partition("://")[0]
-    if scheme in _BACKENDS:
-        return _BACKENDS[scheme](url)
-    first = open_backend(url)  # constructed once, since construction draws from the run's rng
-    _BACKENDS[scheme] = type(first)
-    return first
 
 
 @contextmanager

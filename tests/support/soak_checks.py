@@ -9,22 +9,9 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 
-from sim.amplifier.amplifier import SimulatedAmplifier
-
-from drivers.protocol.messages import (
-    AmplifierEvent,
-    AmplifierState,
-    Apply,
-    Arm,
-    Commit,
-    Disarm,
-    Nak,
-    Ping,
-    Reply,
-    Request,
-    Stage,
-    Stop,
-)
+from drivers.protocol.records import Values
+from drivers.protocol.table import MESSAGES, STATES
+from sim.amplifier.contract import Amplifier
 from sim.bench.bench import Bench
 from sim.waveform import level_of
 from soak_contacts import SourceContacts
@@ -39,18 +26,13 @@ TOGETHER = 0.6  # s; until all are silent after one of them has a fault
 _REMEMBERED = 16  # tokens since Arm
 STEP = 0.020  # s; check interval while a channel vibrates
 IDLE_STEP = 1.0
-# Those that feed the watchdog, and those with a ramp to silence of their own, which ends it.
-_FEEDING_REQUESTS = (Arm, Ping, Stage, Commit, Apply, Disarm, Stop)
-_FAULTED = (AmplifierState.FAULT, AmplifierState.FAULT_REACTION_ACTIVE)
-_PLAYING = (
-    AmplifierState.OPERATION_ENABLED,
-    AmplifierState.FAULT_REACTION_ACTIVE,
-    AmplifierState.QUICK_STOP_ACTIVE,
-    AmplifierState.SWITCHED_ON,
-)
+# Those with a ramp to silence of their own end what the watchdog would.
+_SILENCING_REQUESTS = ("Disarm", "Stop")
+_FAULTED = (STATES["FAULT"], STATES["FAULT_REACTION_ACTIVE"])
+_PLAYING = ("OPERATION_ENABLED", "FAULT_REACTION_ACTIVE", "QUICK_STOP_ACTIVE", "SWITCHED_ON")
 
 
-Sense = Callable[[str, SimulatedAmplifier], None]
+Sense = Callable[[str, Amplifier], None]
 
 
 class Checks:
@@ -120,26 +102,24 @@ class Checks:
         due = max(self._contacts.last, self._loop.time()) + self._release + 1e-6
         self._releasing = self._loop.call_at(due, self.check)
 
-    def exchanged(self, name: str, request: Request, reply: Reply | None) -> None:
-        """Check after an exchange with an amplifier; reply: None for no reply."""
-        if reply is None or isinstance(reply, Nak):
-            return
+    def exchanged(self, name: str, request: str) -> None:
+        """Check after an amplifier has carried out a request."""
         now = self._loop.time()
         amplifier = self._bench.amplifiers[name]
-        if isinstance(request, Arm):
+        if request == "Arm":
             self._tokens[name].clear()
             self._token[name] = 0
             self._faulted.pop(name, None)
             if not self._arming() and self._plan.is_calm(now - self._begin - 1, now - self._begin):
                 self.violate(f"{name} was armed without a request")
-        token = amplifier.status(max(now, self._bench.time)).token
+        token = amplifier.summary(max(now, self._bench.time)).token
         if token != self._token[name]:
             self._token[name] = token
             if token in self._tokens[name]:
                 self.violate(f"{name} has played token {token} twice")
             self._tokens[name].append(token)
         self._check_limits(name)
-        if isinstance(request, _FEEDING_REQUESTS):
+        if MESSAGES[request].feeds or request in _SILENCING_REQUESTS:
             self._fed[name] = now
             if name not in self._starving:
                 self._expect_silence(name)
@@ -177,8 +157,8 @@ class Checks:
         elif not self._is_closed:
             self._starving[name] = self._loop.call_at(due, self._expect_silence, name)
 
-    def _received(self, name: str, event: AmplifierEvent, at: float) -> None:
-        if event.state in _FAULTED:
+    def _received(self, name: str, event: Values, at: float) -> None:
+        if event["state"] in _FAULTED:
             self._faulted.setdefault(name, at)
         else:
             self._faulted.pop(name, None)
@@ -187,7 +167,7 @@ class Checks:
         limits = self._bench.rig.limits
         amplifier = self._bench.amplifiers[name]
         for output in amplifier.outputs:
-            if len(output) > amplifier.capabilities.voices:
+            if len(output) > amplifier.capabilities["voices"]:
                 self.violate(f"{name} plays {len(output)} voices on a channel")
             for tone in output:
                 if not limits.frequency_min <= tone.frequency <= limits.frequency_max:
@@ -198,7 +178,7 @@ class Checks:
         if not level <= self._bench.rig.limits.level + AUDIBLE:
             self.violate(f"{name} plays at a level of {level:.4f}")
         if amplifier.state not in _PLAYING:
-            self.violate(f"{name} plays at {level:.4f} in {amplifier.state.name}")
+            self.violate(f"{name} plays at {level:.4f} in {amplifier.state}")
         if now - self._fed[name] > WATCHDOG:
             self.violate(f"{name} plays {now - self._fed[name]:.4f} s after it was fed")
         for other, at in self._faulted.items():

@@ -7,8 +7,7 @@ from the controller but when it opens its links and closes them.
 import math
 from collections.abc import Mapping, Sequence
 
-from sim.amplifier.amplifier import SimulatedAmplifier
-
+from sim.amplifier.contract import Amplifier
 from sim.faults.fault_window import FaultWindow
 from sim.witness.witness import OperatorCommand, Witness
 from soak_contacts import SourceContacts
@@ -92,7 +91,7 @@ class SoakWitness:
         lasts = window.lasts + (window.delay if window.fault == "delay" else 0.0)
         self._loop.call_later(lasts, self._over)
 
-    def sense(self, name: str, amplifier: SimulatedAmplifier) -> None:
+    def sense(self, name: str, amplifier: Amplifier) -> None:
         """Show what an amplifier plays now."""
         sense(self._witness, self._loop.time(), name, amplifier)
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from drivers.contents import Layer, Shape, Tone
 from drivers.errors import CommandRefused, LinkError, Preempted
-from drivers.host.group import Group
+from drivers.host.group import Group, GroupState
 from drivers.host.jobs import Priority
 from drivers.protocol.table import STATES
 from listened_line import ListenedLine
@@ -26,7 +26,7 @@ class RandomGroup:
         self.lines = lines
         hosts = {name: host for line in lines for name, host in line.hosts.items()}
         self.group = Group(hosts, watchdog=self.rng.choice((0.25, 0.5)), draw=self.rng.randint)
-        self.is_beating = True
+        self._beating = asyncio.Lock()  # no beat is under way while the loop stalls
 
     def disturb(self, *, is_on: bool) -> None:
         """Lose and double frames on their way from now on, or no longer; the witness is told."""
@@ -65,6 +65,8 @@ class RandomGroup:
         raise AssertionError("the group must open")
 
     async def _step(self) -> None:
+        if self.group.state is GroupState.LOST:
+            await self.group.open()
         if not self.group.is_armed and self.rng.random() < 0.8:
             await self.group.clear()
             await self.group.arm()
@@ -86,9 +88,10 @@ class RandomGroup:
         elif chosen < 0.9:
             await self.group.stop()
         elif chosen < 0.93:
-            self._stall(is_stalled=True)
-            await asyncio.sleep(0.6)
-            self._stall(is_stalled=False)
+            async with self._beating:
+                self._stall(is_stalled=True)
+                await asyncio.sleep(0.6)
+                self._stall(is_stalled=False)
         elif chosen < 0.96:
             line = self.rng.choice(self.lines)
             far = self.rng.choice([*line.far.values()])
@@ -100,7 +103,6 @@ class RandomGroup:
                 await self.group.stop()
 
     def _stall(self, *, is_stalled: bool) -> None:
-        self.is_beating = not is_stalled
         for line in self.lines:
             line.witness.set_stalled(line.loop.time(), is_stalled)
 
@@ -145,9 +147,10 @@ class RandomGroup:
     async def _keep_beating(self) -> None:
         while True:
             await asyncio.sleep(_BEAT)
-            if self.group.is_armed and self.is_beating:
-                with contextlib.suppress(*_FAILURES):
-                    await self.group.beat()
+            async with self._beating:
+                if self.group.is_armed:
+                    with contextlib.suppress(*_FAILURES):
+                        await self.group.beat()
 
     def _alter(self, name: str, data: bytes) -> list[tuple[float, bytes]]:
         chosen = self.rng.random()

@@ -134,7 +134,7 @@ class ApiService:
             cause=machine.cause,
             remedy=machine.remedy,
             amplifiers_state=cast("GroupStateName", self._controller.group_state.name.lower()),
-            assume_energised=machine.assume_energised(now),
+            assume_energised=self._supervisor.assume_energised(now),
             lost_for_s=machine.lost_for(now),
             watchdog_s=machine.watchdog,
             armed_by=lease.owner if lease else None,

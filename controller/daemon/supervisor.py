@@ -176,6 +176,18 @@ class Supervisor:
             await self.handle(DaemonEvent(Trigger.CLOSE, cause))
         self._reports.flush()
 
+    def assume_energised(self, now: float) -> bool:
+        """Whether a lost amplifier may still be playing at a time [s]; over a network for longer.
+
+        There a request without reply may arrive late, and feed its watchdog.
+        """
+        machine, controller = self.machine, self._controller_if_running
+        if machine.state is not DaemonState.COMM_LOST or controller is None:
+            return False
+        known = controller.amplifiers.values()
+        may_play = any(each.feeding.may_play_until > now for each in known)
+        return machine.assume_energised(now) or may_play
+
     async def stop(self, cause: str, remedy: str | None = None) -> Mapping[str, Stopped]:
         """Quick-stop all amplifiers in any state; returns the outcome of each, by name."""
         stopping = self._spawn(self._stop())

@@ -314,6 +314,23 @@ async def test_comm_lost_lasts_while_lost_amplifier_may_play() -> None:
 
 
 @in_virtual_time
+async def test_lost_amplifier_may_play_for_as_long_as_a_network_delivers() -> None:
+    """1 s, in which what was sent last may arrive, and its watchdog of 0.25 s."""
+    async with watched() as daemon:
+        await daemon.handle(ARM)
+        daemon.touch()
+        await asyncio.sleep(0.1)
+        lost = asyncio.get_running_loop().time()
+        daemon.far_end.is_mute = True  # replies do not come back, and then the connection ends
+        await asyncio.sleep(0.08)
+        daemon.cut()
+        await asyncio.sleep(0.5)
+        assert daemon.state is DaemonState.COMM_LOST
+        assert daemon.supervisor.assume_energised(lost + 1.2)
+        assert not daemon.supervisor.assume_energised(lost + 1.6)
+
+
+@in_virtual_time
 async def test_amplifier_that_returns_armed_is_disarmed() -> None:
     """A loss shorter than its watchdog time may have left it armed."""
     async with watched() as daemon:

@@ -180,6 +180,8 @@ class HostRules:
         if is_late and name != "Silence" and not session.is_disturbed(time):
             what = f"control loop stalled since {since:.4f} s, but {name} feeds the watchdog of "
             session.report("heartbeat", time, f"{what}{session.name}")
+        if name == "Arm" and session.is_disturbed(time):
+            session.is_stopped = False  # the replies to it and to Clear may be lost
         if session.is_stopped and name not in ("Arm", "Silence"):
             session.report("stop", time, f"{name} sent after a stop: {session.name}")
         number = request.values["session"]

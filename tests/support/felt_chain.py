@@ -30,7 +30,6 @@ from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
-from sim.amplifier.contract import Amplifier as SimulatedAmplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.control.context import SimulationContext
@@ -144,7 +143,6 @@ class Chain:
             self.truth,
             now=clock.now(),
             imperfections=draw_imperfections(self.truth),
-            make_amplifier=SimulatedAmplifier,
         )
         devices = {
             name: AmplifierDevice(bench, name, address=number)

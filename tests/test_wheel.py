@@ -68,7 +68,6 @@ def test_wheel_holds_the_sources_and_their_data(wheel: Path) -> None:
         "controller/gateway/page/index.html",
         "controller/gateway/page/app.js",
         "controller/gateway/page/style.css",
-        "drivers/protocol/protocol.yaml",
     } <= names
     assert {name.partition(".dist-info/")[2] for name in made} == {
         "METADATA",

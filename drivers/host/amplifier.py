@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from drivers import clock
-from drivers.budget import COMMIT_DELAY
 from drivers.contents import Layer, is_silence
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout, Preempted
+from drivers.host.budget import COMMIT_DELAY
 from drivers.host.comparison import MAX_CONTRADICTIONS, achieved_problem, name_of
 from drivers.host.dialogue import Dialogue, Staged
 from drivers.host.identification import check_capabilities, check_identity

@@ -10,10 +10,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from drivers.budget import COMMIT_DELAY, Budget, Vibration
 from drivers.contents import Layer
 from drivers.errors import CommandRefused
 from drivers.host.bounds import all_bounds, plain_bounds, worst
+from drivers.host.budget import COMMIT_DELAY, Budget, Vibration
 from drivers.host.limits import RATE_CEILING, wire_limits
 from drivers.host.rounding import TOLERANCE, Rounding
 from drivers.playback import playback_of

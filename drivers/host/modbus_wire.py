@@ -88,7 +88,7 @@ class ModbusWire:
             return b"".join(adu.frame for adu in adus)
         self._sizes.setdefault(address, _WIDEST)
         if name == "Hello":
-            self._request = _Request(name, address, 0, self._adu(address, _IDENTITY, None))
+            self._request = _Request(name, address, 0, self._adu(address, _IDENTITY))
         else:
             self._request = self._written(address, name, values)
         return self._request.adu.frame
@@ -131,18 +131,18 @@ class ModbusWire:
         characters = length + _ANSWERS_SIZE + 2 * max(replies)
         return _BITS * characters / self._baud + 4 * self.silence
 
-    def _adu(self, unit: int, read: Read | None, write: Write | None) -> RequestAdu:
+    def _adu(self, unit: int, asked: Read | Write) -> RequestAdu:
         self._number = self._number % 0xFFFF + 1
         self.counters.frames_out += 1
         transaction = 0 if self._is_rtu else self._number
-        return build_adu(read, write, unit=unit, transaction=transaction, is_rtu=self._is_rtu)
+        return build_adu(asked, unit=unit, transaction=transaction, is_rtu=self._is_rtu)
 
     def _written(self, unit: int, name: str, values: Values) -> _Request:
         """Return a request whose write goes first."""
         message = MESSAGES[name]
         tag = self._number % 0xFFFF + 1
         write = Write(message.number * _BOX, (tag, *message.request.pack(values)))
-        return _Request(name, unit, tag, self._adu(unit, None, write))
+        return _Request(name, unit, tag, self._adu(unit, write))
 
     def _arrival(self, request: _Request, response: ModbusResponse) -> Arrival | None:
         """Return what a response to the transaction on the wire means."""
@@ -153,10 +153,10 @@ class ModbusWire:
             if (refusal := _EXCEPTIONS.get(response.exception)) is not None:
                 return Nak(refusal, None)
             return Broken(f"Modbus exception {response.exception}")
-        if request.adu.read is None:
+        if isinstance(request.adu.asked, Write):
             first = MESSAGES[request.name].number * _BOX + _REPLY
             read = Read(first, _reply_registers(request.name, *self._sizes[request.unit]))
-            request.adu = self._adu(request.unit, read, None)
+            request.adu = self._adu(request.unit, read)
             return More(request.adu.frame)
         tag, result, *words = response.registers
         if request.name != "Hello" and tag != request.tag:

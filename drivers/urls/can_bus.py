@@ -1,14 +1,13 @@
 """CAN amplifier URLs, such as can+socketcan://can0#NODE, with the node after the hash sign.
 
-Interfaces of python-can other than these three are can+python-can://INTERFACE/CHANNEL#NODE; see
-also `drivers.backends.can_bus.interfaces`.
+Interfaces of python-can other than these three are can+python-can://INTERFACE/CHANNEL#NODE.
 """
 
 from dataclasses import dataclass
 from typing import Final
 from urllib.parse import unquote
 
-from drivers.codec.can_bus.canopen import BITRATE, CANOPEN
+from drivers.codec.can_bus.canopen import BITRATE
 from drivers.codec.can_bus.segments import NODE_MAX
 from drivers.errors import CommandError
 from drivers.urls.options import device_of, options_of, split_url, whole_number
@@ -23,8 +22,6 @@ _FORMS = (
 )
 _OPTIONS = {  # lowest and highest
     "bitrate": (10_000, 1_000_000),
-    "fd": (1, 8_000_000),  # bit/s of the data of CAN FD
-    "heartbeat": (10, 10_000),  # ms
     "baud": (9_600, 12_000_000),  # of the serial port of an slcan adapter
 }
 _ADAPTER_OPTIONS = {  # of python-can, passed on as they are: which of several adapters it is
@@ -47,8 +44,7 @@ _OWN_SCHEMES = ("slcan", "socketcan", "socketcand")
 class CanBusUrl:
     """A bus: interface as named by python-can, channel, host and port of a server or an adapter.
 
-    bitrate [bit/s]; fd: that of the data in CAN FD frames, 0 for classic frames only; baud of the
-    adapter's serial port; options: of python-can, by name.
+    bitrate [bit/s]; baud of the adapter's serial port; options: of python-can, by name.
     """
 
     interface: str
@@ -56,7 +52,6 @@ class CanBusUrl:
     host: str
     port: int
     bitrate: int
-    fd: int
     baud: int
     options: tuple[tuple[str, str], ...] = ()
 
@@ -70,11 +65,10 @@ class CanBusUrl:
 
 @dataclass(frozen=True)
 class CanUrl:
-    """A CAN amplifier: its bus and node, and the interval [s] of its heartbeat."""
+    """A CAN amplifier: its bus and node."""
 
     bus: CanBusUrl
     node: int
-    heartbeat: float
 
     @classmethod
     def parse(cls, url: str) -> "CanUrl":
@@ -113,12 +107,10 @@ class CanUrl:
             host=host,
             port=port or 0,
             bitrate=_whole(options, "bitrate", default=BITRATE, url=url),
-            fd=_whole(options, "fd", default=0, url=url),
             baud=_whole(options, "baud", default=115_200, url=url),
             options=tuple((name, options[name]) for name in adapter_options if name in options),
         )
-        heartbeat = _whole(options, "heartbeat", default=CANOPEN["heartbeat_ms"], url=url)
-        return cls(bus=bus, node=_node(parts.fragment, url), heartbeat=heartbeat / 1000)
+        return cls(bus=bus, node=_node(parts.fragment, url))
 
 
 def _node(text: str, url: str) -> int:

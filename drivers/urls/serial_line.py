@@ -13,9 +13,10 @@ from drivers.urls.options import device_of, options_of, split_url, whole_number
 
 BAUD: Final = 921_600
 """Of a line whose URL names none [baud]; 8 data bits, no parity, 1 stop bit."""
+ADDRESS: Final = 1
+"""Of an amplifier as it is made."""
 
 _FORM = "serial:///dev/ttyUSB0?baud=921600 (or serial+tcp://HOST:PORT for a serial server)"
-_ADDRESS = 1  # of an amplifier as it is made
 _ADDRESS_MAX = 247  # as of Modbus, so that one label serves both
 _BAUD_MAX = 12_000_000  # the fastest USB adapters
 
@@ -56,6 +57,6 @@ class SerialUrl:
             port=port,
             baud=whole_number(options.get("baud", str(BAUD)), "baud", high=_BAUD_MAX, url=url),
             address=whole_number(
-                options.get("address", str(_ADDRESS)), "address", high=_ADDRESS_MAX, url=url
+                options.get("address", str(ADDRESS)), "address", high=_ADDRESS_MAX, url=url
             ),
         )

@@ -5,7 +5,6 @@ How they are packed: `drivers.codec.can_bus.segments`.
 
 from drivers.codec.can_bus.canopen import frame_time
 from drivers.codec.can_bus.segments import NUMBER_MAX, frames_of
-from drivers.errors import CommandError
 from drivers.hardware import number_below
 from drivers.host.can_wire import CanWire
 from drivers.host.wire import NETWORK_DELAY
@@ -18,8 +17,6 @@ class CanAddress(WireAddress):
 
     def __init__(self, url: str) -> None:
         parsed = CanUrl.parse(url)
-        if parsed.bus.fd:
-            raise CommandError(f"{url!r}: fd must be left out; frames are those of classic CAN")
         self.bus: CanBusUrl = parsed.bus
         self.line, self.number = str(parsed.bus), parsed.node
         self.settings = {

@@ -3,15 +3,14 @@
 from collections.abc import Sequence
 from functools import partial
 
-from drivers.protocol.definition import PROTOCOL
+from drivers.urls.modbus import RTU_BAUD
+from drivers.urls.serial_line import ADDRESS, BAUD
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.far_end import TcpEnd, TerminalEnd
 from sim.transport.loopback import HOST
 
-_SERIAL_BAUD, _MODBUS_BAUD = PROTOCOL.serial.baud, PROTOCOL.modbus["baud"]
-_FIRST_ADDRESS = PROTOCOL.serial.address
 _SERIAL_BITS, _MODBUS_BITS = 10, 11  # of a byte: start, eight data, parity on Modbus, stop
 
 
@@ -29,7 +28,7 @@ class SerialLineEnd(TerminalEnd):
         unpluggable: bool = False,
     ) -> None:
         is_alone = len(devices) == 1
-        by_address = {_FIRST_ADDRESS if is_alone else each.address: each for each in devices}
+        by_address = {ADDRESS if is_alone else each.address: each for each in devices}
         super().__init__(
             devices,
             partial(SerialAmplifiers, by_address),
@@ -38,14 +37,14 @@ class SerialLineEnd(TerminalEnd):
             unpluggable=unpluggable,
         )
         self._addresses = {each.name: address for address, each in by_address.items()}
-        self._baud = baud or _SERIAL_BAUD
+        self._baud = baud or BAUD
 
     @property
     def urls(self) -> dict[str, str]:
         """The URL of each amplifier, by its name."""
         return {
             name: f"serial://{self.port}?baud={self._baud}"
-            + ("" if address == _FIRST_ADDRESS else f"&address={address}")
+            + ("" if address == ADDRESS else f"&address={address}")
             for name, address in self._addresses.items()
         }
 
@@ -72,7 +71,7 @@ class ModbusLineEnd(TerminalEnd):
             unpluggable=unpluggable,
         )
         self._names = {each.name: each.address for each in devices}
-        self._baud = speed or _MODBUS_BAUD
+        self._baud = speed or RTU_BAUD
 
     @property
     def urls(self) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drivers.protocol.definition import PROTOCOL
+from drivers.protocol.table import QUANTITIES
 from model.arrays import FloatArray
 
 _SILENT = 1e-3  # of full stroke
@@ -20,7 +20,7 @@ def frequencies_in(samples: FloatArray, *, rate: float) -> list[float]:
     for channel in samples.T:
         if np.abs(channel).max() >= _SILENT:
             found += _peaks(channel, rate=rate)
-    step = PROTOCOL.quantities.frequency.step
+    step = QUANTITIES["frequency"].step
     tones: list[float] = []
     for frequency in sorted(round(each / step) * step for each in found):
         if not tones or frequency - tones[-1] > _APART:

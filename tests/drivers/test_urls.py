@@ -3,17 +3,17 @@
 import pytest
 
 from drivers.errors import CommandError
-from drivers.registry import open_backend
 from drivers.urls.can_bus import CanBusUrl, CanUrl
 from drivers.urls.modbus import ModbusUrl
 from drivers.urls.serial_line import SerialUrl
+from drivers.wires.known import address_of
 
 TCP, RTU = "modbus+tcp", "modbus+rtu"
 
 
 def bus(interface: str, channel: str, *, server: tuple[str, int] = ("", 0)) -> CanBusUrl:
     """A bus with default options."""
-    return CanBusUrl(interface, channel, *server, bitrate=500_000, fd=0, baud=115_200)
+    return CanBusUrl(interface, channel, *server, bitrate=500_000, baud=115_200)
 
 
 @pytest.mark.parametrize(
@@ -34,20 +34,20 @@ def bus(interface: str, channel: str, *, server: tuple[str, int] = ("", 0)) -> C
         (f"{RTU}:///COM3", ModbusUrl(True, device="COM3", baud=115200, unit=1)),
         (f"{TCP}://gw/3?baud=9600", ModbusUrl(False, host="gw", port=502, baud=9600, unit=3)),
         (f"{RTU}://srv:4001#2", ModbusUrl(True, host="srv", port=4001, unit=2)),
-        ("can+slcan:///dev/ttyACM0", CanUrl(bus("slcan", "/dev/ttyACM0"), 1, 0.05)),
-        ("can+slcan:///COM7", CanUrl(bus("slcan", "COM7"), 1, 0.05)),
+        ("can+slcan:///dev/ttyACM0", CanUrl(bus("slcan", "/dev/ttyACM0"), 1)),
+        ("can+slcan:///COM7", CanUrl(bus("slcan", "COM7"), 1)),
         (
             "can+slcan://10.0.0.7:4001#9",
-            CanUrl(bus("slcan", "", server=("10.0.0.7", 4001)), 9, 0.05),
+            CanUrl(bus("slcan", "", server=("10.0.0.7", 4001)), 9),
         ),
-        ("can+socketcan://can0#127", CanUrl(bus("socketcan", "can0"), 127, 0.05)),
+        ("can+socketcan://can0#127", CanUrl(bus("socketcan", "can0"), 127)),
         (
-            "can+socketcand://10.0.0.7:29536/can1?heartbeat=20#9",
-            CanUrl(bus("socketcand", "can1", server=("10.0.0.7", 29536)), 9, 0.02),
+            "can+socketcand://10.0.0.7:29536/can1#9",
+            CanUrl(bus("socketcand", "can1", server=("10.0.0.7", 29536)), 9),
         ),
         (
-            "can+python-can://virtual/x?bitrate=250000&fd=2000000#2",
-            CanUrl(CanBusUrl("virtual", "x", "", 0, 250_000, 2_000_000, 115_200), 2, 0.05),
+            "can+python-can://virtual/x?bitrate=250000#2",
+            CanUrl(CanBusUrl("virtual", "x", "", 0, 250_000, 115_200), 2),
         ),
     ],
 )
@@ -97,7 +97,7 @@ def test_url_is_parsed(url: str, expected: SerialUrl | ModbusUrl | CanUrl) -> No
                 *("socketcand://:29536/can0#1", "socketcand://host:29536#1"),
                 *("socketcan://can0#0", "socketcan://can0#128", "socketcan://can0#one"),
                 *("socketcan://can0?bitrate=5#1", "socketcan://can0?node=1#1"),
-                *("socketcan://can0?fd=x#1", "socketcand://host:99999/can0#1"),
+                *("socketcan://can0?fd=2000000#1", "socketcand://host:99999/can0#1"),
             )
         ),
     ],
@@ -105,4 +105,4 @@ def test_url_is_parsed(url: str, expected: SerialUrl | ModbusUrl | CanUrl) -> No
 def test_invalid_url_is_refused(url: str, part: str) -> None:
     """The error names the invalid part."""
     with pytest.raises(CommandError, match=part):
-        open_backend(url)
+        address_of(url)

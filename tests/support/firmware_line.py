@@ -1,6 +1,7 @@
 """The firmware on a line of the host, on the clock of a virtual loop: nothing takes real time."""
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
 
 from drivers.codec.can_bus.adapter_text import SlcanReader, slcan_line
@@ -17,8 +18,8 @@ _WAY = 0.0002  # s
 _TURN = 0.001  # s; between two turns of its loop
 
 
-class FirmwareLine:
-    """One amplifier of firmware at address 1 of a line; host: of that line.
+class FirmwarePort:
+    """One amplifier of firmware at address 1 behind a port of a kind of wire.
 
     folder: of its library. is_deaf: nothing of the host arrives.
     """
@@ -28,14 +29,14 @@ class FirmwareLine:
     def __init__(self, kind: str, folder: Path) -> None:
         self.firmware = MovedFirmware(folder)
         self.is_deaf = False
+        self.take: Callable[[bytes], None] = len
+        """Takes what arrives at the host."""
         self._loop = asyncio.get_running_loop()
         self._began = self._loop.time()
         self._line = LINES[kind]
         self._reader = SlcanReader()
         self.firmware.receive(CAN, b"O\r")
         self.firmware.sent(CAN)
-        self.line = Line(KINDS[kind].wire(), self, "line")
-        self.host = Amplifier(self.line, 1, LIMITS, name="a")
         self._turn()
 
     def write(self, data: bytes) -> None:
@@ -67,4 +68,14 @@ class FirmwareLine:
         if self._line == CAN:
             data = pack_frames(self._reader.feed(data))
         if data:
-            self._loop.call_later(_WAY, self.line.received, data)
+            self._loop.call_later(_WAY, lambda: self.take(data))
+
+
+class FirmwareLine(FirmwarePort):
+    """The firmware on a line of the host; host: of its amplifier."""
+
+    def __init__(self, kind: str, folder: Path) -> None:
+        super().__init__(kind, folder)
+        self.line = Line(KINDS[kind].wire(), self, "line")
+        self.take = self.line.received
+        self.host = Amplifier(self.line, 1, LIMITS, name="a")

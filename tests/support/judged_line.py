@@ -19,12 +19,13 @@ from virtual_loop import run_virtual
 KINDS = ("serial", "rtu", "tcp", "can")
 DELAY = 0.0002  # s; of bytes on their way
 _TURN = 0.0005  # s; between looks at what is due
-_CLIENTS: dict[str, Callable[[Port, int], Client]] = {
+CLIENTS: dict[str, Callable[[Port, int], Client]] = {
     "serial": SerialClient,
     "can": CanClient,
     "rtu": partial(ModbusClient, is_rtu=True),
     "tcp": partial(ModbusClient, is_rtu=False),
 }
+"""Clients of the kinds of wires."""
 
 
 class JudgedLine:
@@ -32,7 +33,7 @@ class JudgedLine:
 
     def __init__(self, kind: str, far: Amplifier) -> None:
         self._loop = asyncio.get_running_loop()
-        self.client = _CLIENTS[kind](self, 1)
+        self.client = CLIENTS[kind](self, 1)
         ends = {1: far}
         if kind == "can":
             self._end: SerialAmplifiers | ModbusAmplifiers | CanAmplifiers

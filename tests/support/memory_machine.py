@@ -1,34 +1,17 @@
-"""Serial lines, CAN adapters and workers in memory, for virtual time.
+"""Serial lines in memory, for virtual time.
 
-Backends and far ends write real bytes, which arrive after random delays, sometimes in two pieces.
-Blocking code runs in greenlets instead of threads, whose order would be undefined.
+Hosts and far ends write real bytes, which arrive after random delays, sometimes in two pieces.
 """
 
 import asyncio
-import contextlib
-import contextvars
-import queue
 import random
-from collections import deque
-from collections.abc import Awaitable, Callable, Sequence
-from typing import Any, TypeVar, cast
+from collections.abc import Callable
+from typing import Any
 
-from greenlet import getcurrent, greenlet
-
-from drivers.codec.can_bus.adapter_text import (
-    SlcanReader,
-    SocketcandReader,
-    slcan_line,
-    socketcand_element,
-)
-from drivers.codec.can_bus.canopen import CanFrame
 from drivers.errors import LinkError
-from drivers.hardware import HARDWARE_PROVIDER, Adapter, HardwareProvider, Worker
-from drivers.urls.can_bus import CanBusUrl
+from drivers.hardware import HARDWARE_PROVIDER, HardwareProvider
 from sim.transport.pseudo_terminal import TERMINAL_MAKER, Terminal
 from virtual_loop import VirtualLoop
-
-T = TypeVar("T")
 
 _PASSING = (50e-6, 900e-6)  # s; through driver and adapter
 _SPLIT = 0.1  # share of pieces that arrive in two
@@ -36,7 +19,7 @@ _NOTICED = 0.002  # s; until the host notices a hang-up
 
 
 class MemoryMachine(HardwareProvider):
-    """Ports by name; `make_terminal` is for far ends, the rest for backends."""
+    """Ports by name; `make_terminal` is for far ends, the rest for hosts."""
 
     def __init__(self, loop: VirtualLoop) -> None:
         self._loop = loop
@@ -62,32 +45,6 @@ class MemoryMachine(HardwareProvider):
             raise LinkError(f"serial port {name} cannot be opened: in use by another program")
         port = self._open[name] = MemoryPort(self, terminal, on_data, on_loss)
         return port
-
-    async def open_adapter(
-        self,
-        url: CanBusUrl,
-        *,
-        on_frame: Callable[[CanFrame], None],
-        on_loss: Callable[[str], None],
-    ) -> Adapter:
-        """Open slcan on a line in memory, or socketcand over the loop's network."""
-        if url.interface == "slcan":
-            slcan = _Slcan(on_frame)
-            slcan.port = await self.open_port(url.channel, on_data=slcan.heard, on_loss=on_loss)
-            slcan.port.write(b"C\rS6\rO\r")
-            return slcan
-        try:
-            _, client = await self._loop.create_connection(
-                lambda: _Socketcand(url, on_frame, on_loss), url.host, url.port
-            )
-            async with asyncio.timeout(2.0):
-                await client.is_raw.wait()
-        except OSError as problem:
-            raise LinkError(f"CAN bus {url} cannot be opened: {problem}") from problem
-        return cast(Adapter, client)
-
-    def make_worker(self) -> "GreenletWorker":
-        return GreenletWorker()
 
     def below(self, limit: int) -> int:
         return self._loop.rng.randrange(limit)
@@ -121,7 +78,7 @@ class MemoryMachine(HardwareProvider):
 
 
 def live_in_memory() -> MemoryMachine:
-    """Connect backends and far ends of the running virtual loop in memory."""
+    """Connect hosts and far ends of the running virtual loop in memory."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
     machine = MemoryMachine(loop)
@@ -233,169 +190,3 @@ class MemoryPort:
     def _notice(self) -> None:
         if not self._is_closed:
             self._on_loss(f"serial line {self._terminal.port} was lost (it hung up)")
-
-
-class _Slcan:
-    """A serial adapter for CAN."""
-
-    def __init__(self, on_frame: Callable[[CanFrame], None]) -> None:
-        self.port: MemoryPort
-        self._on_frame = on_frame
-        self._reader = SlcanReader()
-
-    def heard(self, data: bytes) -> None:
-        for frame in self._reader.feed(data):
-            self._on_frame(frame)
-
-    def send(self, frames: Sequence[CanFrame]) -> int:
-        self.port.write(b"".join(map(slcan_line, frames)))
-        return len(frames)
-
-    def close(self) -> None:
-        with contextlib.suppress(LinkError):  # already lost
-            self.port.write(b"C\r")
-        self.port.close()
-
-    async def wait_closed(self) -> None:
-        """Return at once."""
-
-
-class _Socketcand(asyncio.Protocol):
-    """A client of the socketcand daemon."""
-
-    def __init__(
-        self,
-        url: CanBusUrl,
-        on_frame: Callable[[CanFrame], None],
-        on_loss: Callable[[str], None],
-    ) -> None:
-        self.is_raw = asyncio.Event()
-        self._url = url
-        self._on_frame, self._on_loss = on_frame, on_loss
-        self._reader = SocketcandReader()
-        self._answers = 0
-        self._transport: asyncio.Transport | None = None
-        self._is_closed = False
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.Transport, transport)
-
-    def data_received(self, data: bytes) -> None:
-        if not self.is_raw.is_set():
-            for _ in range(data.count(b"< hi >") + data.count(b"< ok >")):
-                self._shake_hands()
-        if not self._is_closed:
-            for frame in self._reader.feed(data):
-                self._on_frame(frame)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._transport = None
-        if not self._is_closed:
-            self._on_loss(f"the CAN bus {self._url} was lost (the socketcand server hung up)")
-
-    def send(self, frames: Sequence[CanFrame]) -> int:
-        if self._transport is None:
-            raise LinkError(f"the CAN bus {self._url} was lost")
-        self._transport.write(b"".join(map(socketcand_element, frames)))
-        return len(frames)
-
-    def close(self) -> None:
-        self._is_closed = True
-        if self._transport is not None:
-            self._transport.close()
-
-    async def wait_closed(self) -> None:
-        """Return at once."""
-
-    def _shake_hands(self) -> None:
-        said = (f"< open {self._url.channel} >", "< rawmode >")
-        if self._answers < len(said) and self._transport is not None:
-            self._transport.write(said[self._answers].encode())
-        else:
-            self.is_raw.set()
-        self._answers += 1
-
-
-class GreenletWorker(Worker):
-    """Runs blocking jobs in greenlets; the event loop runs while one waits."""
-
-    def __init__(self) -> None:  # without a thread
-        self._turn = asyncio.Lock()
-        self._tasks: list[asyncio.Task[Any]] = []
-
-    def submit(self, job: Callable[[], T]) -> "asyncio.Future[T]":
-        task = asyncio.get_running_loop().create_task(self._run(job))
-        self._tasks = [known for known in self._tasks if not known.done()] + [task]
-        return task
-
-    async def close(self) -> None:
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-
-    def make_queue(self) -> "queue.Queue[bytes]":
-        return cast("queue.Queue[bytes]", _GreenletQueue())
-
-    def sleep(self, seconds: float) -> None:
-        _wait_for(asyncio.sleep(seconds))
-
-    async def _run(self, job: Callable[[], T]) -> T:
-        async with self._turn:
-            return await _in_greenlet(job)
-
-
-class _GreenletQueue:
-    """The used part of queue.Queue."""
-
-    def __init__(self) -> None:
-        self._items: deque[bytes] = deque()
-        self._came = asyncio.Event()
-
-    def put(self, item: bytes) -> None:
-        self._items.append(item)
-        self._came.set()
-
-    def get(self, block: bool = True, timeout: float | None = None) -> bytes:
-        """Return the next item; queue.Empty after a timeout [s]."""
-        if not self._items:
-            _wait_for(self._arrival(timeout))
-        return self.get_nowait()
-
-    def get_nowait(self) -> bytes:
-        if not self._items:
-            raise queue.Empty
-        return self._items.popleft()
-
-    def qsize(self) -> int:
-        return len(self._items)
-
-    def empty(self) -> bool:
-        return not self._items
-
-    async def _arrival(self, timeout: float | None) -> None:
-        self._came.clear()
-        try:
-            async with asyncio.timeout(timeout):
-                await self._came.wait()
-        except TimeoutError:
-            pass
-
-
-async def _in_greenlet(job: Callable[[], T]) -> T:
-    """Run blocking code; await what it passes to `_wait_for`."""
-    child = greenlet(job)
-    child.gr_context = contextvars.copy_context()
-    step = child.switch()
-    while not child.dead:
-        try:
-            result = await step
-        except BaseException as error:
-            step = child.throw(error)
-        else:
-            step = child.switch(result)
-    return cast(T, step)
-
-
-def _wait_for(awaitable: Awaitable[T]) -> T:
-    """Wait within blocking code that runs in a greenlet."""
-    parent = getcurrent().parent
-    assert parent is not None
-    return cast(T, parent.switch(awaitable))

@@ -84,9 +84,6 @@ DRIVER_PACKAGES = ("controller/", "drivers/", "era_haptics/", "registry/")
 CONTACT_PACKAGES = ("controller/sources/", "controller/loop/", "sim/")
 """Where `lease`, the word of arming, would mean the timeout of a contact."""
 
-ALLOWED_FILES = ("drivers/link/",)
-"""Their names follow the next version of the protocol."""
-
 ALLOWED = {
     "answers": "JSON of `era table verify` and `era amp discover`: not modal ones",
     "most_at_once": "a key of the configuration file",
@@ -107,8 +104,6 @@ def retired_identifiers() -> Iterator[str]:
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
             file = path.relative_to(ROOT).as_posix()
-            if file.startswith(ALLOWED_FILES):
-                continue
             text = path.read_text("utf-8")
             names = {(path.stem, 1)}
             if any(_replacement(name, file) for name in {*_IDENTIFIER.findall(text)}):

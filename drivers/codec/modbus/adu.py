@@ -12,7 +12,6 @@ from pymodbus.framer import FramerRTU, FramerSocket
 from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
 from pymodbus.pdu.register_message import (
     ReadInputRegistersRequest,
-    ReadWriteMultipleRegistersRequest,
     WriteMultipleRegistersRequest,
 )
 
@@ -57,8 +56,7 @@ class RequestAdu:
     function: int
     frame: bytes
     response_size: int
-    read: Read | None
-    write: Write | None
+    asked: Read | Write
 
 
 @dataclass(frozen=True)
@@ -69,31 +67,19 @@ class ModbusResponse:
     exception: int = 0
 
 
-def build_adu(
-    read: Read | None, write: Write | None, *, unit: int, transaction: int, is_rtu: bool
-) -> RequestAdu:
-    """Build the request that writes, reads, or does both; at least one must be given."""
-    pdu = _pdu(read, write)
+def build_adu(asked: Read | Write, *, unit: int, transaction: int, is_rtu: bool) -> RequestAdu:
+    """Build the request that reads or writes."""
+    pdu: ModbusPDU
+    if isinstance(asked, Read):
+        pdu = ReadInputRegistersRequest(address=asked.address, count=asked.count)
+        size = 2 + 2 * asked.count
+    else:
+        pdu = WriteMultipleRegistersRequest(address=asked.address, registers=[*asked.registers])
+        size = 5
     pdu.dev_id = unit
     pdu.transaction_id = transaction
     frame = (_RTU if is_rtu else _TCP).buildFrame(pdu)
-    size = 5 if read is None else 2 + 2 * read.count
-    return RequestAdu(unit, transaction, pdu.function_code, frame, size, read, write)
-
-
-def _pdu(read: Read | None, write: Write | None) -> ModbusPDU:
-    if write is None:
-        assert read is not None  # noqa: S101  at least one
-        return ReadInputRegistersRequest(address=read.address, count=read.count)
-    registers = list(write.registers)
-    if read is not None:
-        return ReadWriteMultipleRegistersRequest(
-            read_address=read.address,
-            read_count=read.count,
-            write_address=write.address,
-            write_registers=registers,
-        )
-    return WriteMultipleRegistersRequest(address=write.address, registers=registers)
+    return RequestAdu(unit, transaction, pdu.function_code, frame, size, asked)
 
 
 class ResponseReader:
@@ -194,16 +180,15 @@ def _response(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
         return None
     if isinstance(message, ExceptionResponse):
         return ModbusResponse(exception=message.exception_code)
-    if to.read is not None:
+    if isinstance(to.asked, Read):
         return ModbusResponse(tuple(message.registers))
-    assert to.write is not None  # noqa: S101  at least one
-    is_echo = message.count == len(to.write.registers)
-    return ModbusResponse() if is_echo and message.address == to.write.address else None
+    is_echo = message.count == len(to.asked.registers)
+    return ModbusResponse() if is_echo and message.address == to.asked.address else None
 
 
 def _has_form(pdu: bytes, to: RequestAdu) -> bool:
     """Whether function and length are those of a response or exception."""
     if pdu[0] == to.function | _EXCEPTION:
         return len(pdu) == 2 and pdu[1] > 0  # an exception has a code
-    is_long = to.read is None or pdu[1:2] == bytes([2 * to.read.count])
+    is_long = isinstance(to.asked, Write) or pdu[1:2] == bytes([2 * to.asked.count])
     return pdu[0] == to.function and len(pdu) == to.response_size and is_long

@@ -41,7 +41,7 @@ class Frame(NamedTuple):
     address: int
     sequence: int
     payload: bytes
-    version: int = 2
+    version: int
 
     @property
     def type(self) -> int:

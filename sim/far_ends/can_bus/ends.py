@@ -6,16 +6,14 @@ from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 
 from drivers import clock
+from drivers.codec.can_bus.canopen import BITRATE
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
-from drivers.protocol.definition import PROTOCOL
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from sim.far_ends.can_bus.bus import CanBus, Stub
 from sim.far_ends.can_bus.slcan_adapter import SlcanEnd
 from sim.far_ends.can_bus.socketcand_server import BUS_NAME, SocketcandEnd
 from sim.transport.far_end import Served
-
-_BITRATE: int = PROTOCOL.canopen["bitrate"]
 
 
 @asynccontextmanager
@@ -52,7 +50,7 @@ async def socketcand(
         stack.push_async_callback(end.close)
         nodes = await stack.enter_async_context(nodes_on(bus, devices))
         devices[0].on_plug(plug)
-        speed = f"?bitrate={bitrate}" if bitrate not in (None, _BITRATE) else ""
+        speed = f"?bitrate={bitrate}" if bitrate not in (None, BITRATE) else ""
         yield {
             name: f"can+socketcand://127.0.0.1:{end.port}/{BUS_NAME}{speed}#{node}"
             for name, node in nodes.items()
@@ -73,7 +71,7 @@ async def slcan(
         nodes = await stack.enter_async_context(nodes_on(bus, devices))
         devices[0].on_plug(end.plug)
         yield {
-            name: f"can+slcan://{end.path}?bitrate={bitrate or _BITRATE}#{node}"
+            name: f"can+slcan://{end.path}?bitrate={bitrate or BITRATE}#{node}"
             for name, node in nodes.items()
         }
 

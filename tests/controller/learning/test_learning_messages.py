@@ -5,7 +5,7 @@ import pickle
 import pytest
 
 from controller.learning.messages import HEAD, Note, packed, unpacked
-from drivers.command import CommandSet, DriveCommand
+from drivers.contents import Layer, Tone
 
 
 def test_message_has_its_length_before_it() -> None:
@@ -17,6 +17,6 @@ def test_message_has_its_length_before_it() -> None:
 
 def test_no_command_comes_by_a_message() -> None:
     """What an amplifier could play is refused, wherever it stands in it."""
-    command = CommandSet(1, (DriveCommand(0, 110.0, 1.0),), ramp=0.0, valid_for=0.0)
+    layer = Layer(0, (Tone(0, 110.0, 1.0),))
     with pytest.raises(pickle.UnpicklingError, match="drivers"):
-        unpacked(pickle.dumps(Note([command])))  # type: ignore[arg-type]
+        unpacked(pickle.dumps(Note([layer])))  # type: ignore[arg-type]

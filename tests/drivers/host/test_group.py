@@ -210,6 +210,43 @@ def test_stop_overtakes_what_is_queued(wire: str) -> None:
     with_group(test, wire, ("a",))
 
 
+def test_stop_does_not_wait_for_a_reply_that_is_lost(wire: str) -> None:
+    """It is sent within 9 ms of the request, which is given up."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        (host,) = group.amplifiers.values()
+        ends[0].outward = lambda name, data: []
+        reading = asyncio.ensure_future(host.read_status())
+        await asyncio.sleep(0.001)
+        began = ends[0].loop.time()
+        stopping = asyncio.ensure_future(group.stop())
+        await asyncio.sleep(0.02)
+        sent = next(at for at, each in ends[0].sent if each == "1:8" and at >= began)
+        assert sent - began <= 0.009
+        ends[0].outward = lambda name, data: [(0.0002, data)]
+        assert (await stopping)["a"].is_confirmed
+        await reading
+
+    with_group(test, wire, ("a",))
+
+
+def test_mute_amplifier_is_stopped_over_its_open_line(wire: str) -> None:
+    """It hears the host, which hears nothing: silent 10 ms after the stop, unconfirmed."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.apply({"a": [layer(0, tone())]})
+        ends[0].outward = lambda name, data: []
+        with pytest.raises(LinkError):
+            await group.beat()
+        assert ends[0].levels("a") == [0.5, 0.0]
+        stopping = asyncio.ensure_future(group.stop())
+        await asyncio.sleep(0.01)
+        assert ends[0].levels("a") == [0.0, 0.0]
+        assert not (await stopping)["a"].is_confirmed
+
+    with_group(test, wire, ("a",))
+
+
 def test_stop_between_stage_and_commit_commits_nothing(wire: str) -> None:
     """The staged set is dropped by the amplifier, too."""
 
@@ -362,6 +399,24 @@ def test_another_amplifier_or_version_is_refused(wire: str, name: str) -> None:
         host = Amplifier(end.line, 1, end.hosts["a"].limits, name="a", serial_number="SIM-a")
         with pytest.raises(LinkError):
             await host.open()
+
+    run_virtual(run())
+
+
+def test_opening_disarms_what_an_earlier_host_left_armed(wire: str) -> None:
+    """It plays on until then, with a watchdog of 2 s."""
+
+    async def run() -> None:
+        end = MemoryLine(wire, "a")
+        (host,) = end.hosts.values()
+        await host.open()
+        await host.arm(9, 2.0)
+        await host.stage(7, [layer(0, tone())], now=True)
+        await asyncio.sleep(0.02)  # its ramp
+        assert end.levels("a") == [0.5, 0.0]
+        await host.open()
+        assert end.levels("a") == [0.0, 0.0]
+        assert end.far["a"].state == "SWITCH_ON_DISABLED"
 
     run_virtual(run())
 

@@ -5,9 +5,8 @@ import os
 import pytest
 import serial
 
-from drivers.backends.modbus.stream import open_stream
 from drivers.ports import opening
-from drivers.urls.modbus import ModbusUrl
+from drivers.wires.known import address_of
 
 
 class _Port:
@@ -51,8 +50,8 @@ async def test_open_port_sets_low_latency_and_parity(
         return opened[0]
 
     monkeypatch.setattr(opening.serial, "serial_for_url", make)
-    url = ModbusUrl.parse(f"modbus+rtu://{device}?baud=19200&parity=odd&stop=2#1")
-    port = await open_stream(url, lambda data: None, lambda what: None)
+    address = address_of(f"modbus+rtu://{device}?baud=19200&parity=odd&stop=2#1")
+    port = await address.open_port(lambda data: None, lambda what: None)
     (made,) = opened
     assert made.is_low_latency
     asked = {key: made.settings[key] for key in ("baudrate", "parity", "stopbits", "exclusive")}

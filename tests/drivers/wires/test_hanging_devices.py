@@ -12,11 +12,10 @@ import can
 import pytest
 
 from drivers import threads
-from drivers.backends.can_bus import adapter
-from drivers.codec.can_bus.canopen import CanFrame
-from drivers.hardware import Adapter, Port
+from drivers.hardware import Port
 from drivers.ports import opening
 from drivers.urls.can_bus import CanUrl
+from drivers.wires import bus_port
 
 
 class _Hanging:
@@ -55,8 +54,8 @@ class _HangingRead(_Hanging):
         return super().recv(20)
 
 
-HEARD: list[CanFrame] = []
-OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port | Adapter]]] = {
+HEARD: list[bytes] = []
+OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port]]] = {
     "port": partial(
         opening.open_port,
         "/dev/ttyUSB9",
@@ -65,10 +64,10 @@ OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port | Adapter]]] = {
         on_loss=lambda what: None,
     ),
     "adapter": partial(
-        adapter.open_adapter,
-        CanUrl.parse("can+socketcan://can0#1").bus,
-        on_frame=HEARD.append,
-        on_loss=lambda what: None,
+        bus_port.open_bus,
+        CanUrl.parse("can+python-can://pcan/usb#1").bus,
+        HEARD.append,
+        lambda what: None,
     ),
 }
 
@@ -78,7 +77,7 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> I
     """The device that is opened; released after the test."""
     device: _Hanging = request.param()
     monkeypatch.setattr(opening, "_open_port", device.open)
-    monkeypatch.setattr(adapter, "open_bus", device.open)
+    monkeypatch.setattr(bus_port, "_open_bus", device.open)
     monkeypatch.setattr(threads, "CLOSE_TIMEOUT", 0.05)
     HEARD.clear()
     yield device

@@ -1,1 +1,0 @@
-"""Backends: a package for each kind of wire."""

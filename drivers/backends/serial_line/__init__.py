@@ -1,1 +1,0 @@
-"""Backend for amplifiers on a serial line."""

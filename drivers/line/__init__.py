@@ -1,1 +1,0 @@
-"""The sender of one line: the priority queue of its requests."""

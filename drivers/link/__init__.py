@@ -1,1 +1,0 @@
-"""The link to one amplifier: priorities, retries and loss."""

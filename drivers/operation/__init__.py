@@ -1,1 +1,0 @@
-"""Amplifiers in operation: commits, watchdog, comparison of replies with requests."""

@@ -61,12 +61,12 @@ class RecordedWire:
         self._line = line
         self._names = names
         self._add = recorder.add
-        self._asked = line
+        self._peer = line
 
     def request(self, address: int, name: str, values: Values) -> bytes:
         """Return the bytes of a request; see `Wire`."""
-        self._asked = self._names.get(address, self._line)
-        self._record(self._asked, "out", name, values)
+        self._peer = self._names.get(address, self._line)
+        self._record(self._peer, "out", name, values)
         return self._inner.request(address, name, values)
 
     def received(self, data: bytes) -> list[Arrival]:
@@ -76,18 +76,18 @@ class RecordedWire:
             name = type(arrival).__name__
             match arrival:
                 case Reply(values):
-                    self._record(self._asked, "in", name, values)
+                    self._record(self._peer, "in", name, values)
                 case Nak(code, channel):
-                    self._record(self._asked, "in", name, {"code": code, "channel": channel})
+                    self._record(self._peer, "in", name, {"code": code, "channel": channel})
                 case Broken(reason):
-                    self._record(self._asked, "in", name, reason)
+                    self._record(self._peer, "in", name, reason)
                 case Event(address, values):
                     self._record(self._names.get(address, self._line), "event", name, values)
         return arrivals
 
     def withdraw(self) -> None:
         """Take the request off the wire; see `Wire`."""
-        self._record(self._asked, "none", "no reply")
+        self._record(self._peer, "none", "no reply")
         self._inner.withdraw()
 
     def transit(self, words: int) -> float:

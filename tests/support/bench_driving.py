@@ -1,7 +1,6 @@
-"""Drive the amplifiers of a bench, of protocol 3, by requests that must not be refused."""
+"""Drive the amplifiers of a bench by requests that must not be refused."""
 
 from collections.abc import Collection
-from functools import partial
 
 from drivers.contents import Tone
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
@@ -10,9 +9,6 @@ from sim.bench.bench import Bench
 
 SESSION = 9
 _Q = QUANTITIES
-
-bench_of = partial(Bench)
-"""A bench whose amplifiers speak protocol 3; see `Bench`."""
 
 
 def arm(bench: Bench, watchdog: float, *, now: float, name: str = "main") -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench_driving import arm, bench_of, keep_alive, play
+from bench_driving import arm, keep_alive, play
 from drivers.contents import Tone
 from model.arrays import FloatArray
 from model.fem.assembly import assemble
@@ -29,7 +29,7 @@ def test_bench_felt_vibration_agrees_with_the_model(coarse_rig: Rig, is_heavy: b
     masses = (PointLoad(0.1, 0.15, mass=0.05), PointLoad(0.3048, 0.1, mass=0.03))
     rig = replace(coarse_rig, masses=masses if is_heavy else ())
     fingers = {"a": (0.08, 0.06), "b": (0.25, 0.2)}
-    bench = bench_of(rig, now=START)
+    bench = Bench(rig, now=START)
     bench.place_fingers(fingers, now=START)
     commands = (
         Tone(0, 110.0, 1.0),
@@ -58,7 +58,7 @@ def test_bench_felt_vibration_agrees_with_the_model(coarse_rig: Rig, is_heavy: b
 
 def test_bench_watchdog_silences_at_its_time(coarse_rig: Rig) -> None:
     """Noticed two seconds late, the plate has been ringing down since the watchdog ran out."""
-    prompt, late = bench_of(coarse_rig, now=START), bench_of(coarse_rig, now=START)
+    prompt, late = Bench(coarse_rig, now=START), Bench(coarse_rig, now=START)
     for bench in (prompt, late):
         bench.place_fingers({"a": (0.1, 0.1)}, now=START)
         arm(bench, 0.25, now=START)
@@ -94,7 +94,7 @@ def test_bench_record_is_independent_of_when_it_is_read(coarse_rig: Rig) -> None
     """Read every 3 ms, or once at the end: the same samples of a finger; a probe gets its own."""
     records, listeners = [], []
     for is_read in (True, False):
-        bench = bench_of(coarse_rig, now=START)
+        bench = Bench(coarse_rig, now=START)
         bench.place_fingers({"a": (0.1, 0.1)}, now=START)
         arm(bench, 2.0, now=START)
         for step in range(1, 101):
@@ -125,7 +125,7 @@ def test_bench_record_is_independent_of_when_it_is_read(coarse_rig: Rig) -> None
 
 def test_bench_frequencies_of_a_window(coarse_rig: Rig) -> None:
     """A tone counts while it fades in and out, not before or after."""
-    bench = bench_of(coarse_rig, now=0.0)
+    bench = Bench(coarse_rig, now=0.0)
     bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
     arm(bench, 2.0, now=0.0)
     play(bench, Tone(0, 110.0, 1.0), Tone(1, 200.0, 0.0), now=0.1, token=1, ramp=0.02)
@@ -144,7 +144,7 @@ def test_bench_frequencies_of_a_window(coarse_rig: Rig) -> None:
 
 def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
     """A process that was paused for a day comes back to a silent plate, ten seconds recorded."""
-    bench = bench_of(coarse_rig, now=0.0)
+    bench = Bench(coarse_rig, now=0.0)
     bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
     arm(bench, 0.25, now=0.0)
     play(bench, Tone(1, 110.0, 1.0), now=0.1, token=1, ramp=0.02)
@@ -156,7 +156,7 @@ def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
 
 def test_bench_ignores_an_earlier_time(coarse_rig: Rig) -> None:
     """A request stamped before the present is taken now."""
-    bench = bench_of(coarse_rig, now=10.0)
+    bench = Bench(coarse_rig, now=10.0)
     arm(bench, 0.25, now=10.0)
     play(bench, Tone(1, 110.0, 1.0), now=9.0, token=1, ramp=0.02)
     assert bench.time == 10.0

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench_driving import bench_of, keep_alive, play
+from bench_driving import keep_alive, play
 from drivers.contents import Tone
 from model.arrays import FloatArray
 from model.fem.assembly import assemble
@@ -14,6 +14,7 @@ from model.finger.fingertip import fingertip_points
 from model.rig.rig import Rig
 from model.structure.fingertip import Fingertip, FingertipLoad
 from plate_in_time import apart, lock_in
+from sim.bench.bench import Bench
 from sim.sensors.accelerometer import Accelerometer, Accelerometers
 
 A, B = (0.1, 0.07), (0.29, 0.2)
@@ -32,7 +33,7 @@ def expected(rig: Rig, loads: tuple[FingertipLoad, ...]) -> FloatArray:
 def test_bench_fingers_load_the_plate(coarse_rig: Rig) -> None:
     """What A feels alone, after B came, and after B went, each once the plate has settled."""
     tip = Fingertip(2000.0, 3.0, 0.005)
-    bench = bench_of(replace(coarse_rig, fingertip=tip), now=0.0)
+    bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
     bench.place_fingers({"a": A}, now=0.0)
     play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
     for positions in ({"a": A}, {"a": A, "b": B}, {"a": A}):
@@ -49,7 +50,7 @@ def test_bench_fingers_load_the_plate(coarse_rig: Rig) -> None:
 def test_bench_fingers_press_harder_where_they_are(coarse_rig: Rig) -> None:
     """A finger with twice the load and one with half of it, each once the plate has settled."""
     tip = Fingertip(2000.0, 3.0, 0.005)
-    bench = bench_of(replace(coarse_rig, fingertip=tip), now=0.0)
+    bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
     bench.place_fingers({"a": A, "b": B}, now=0.0)
     play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
     truths = []
@@ -66,8 +67,8 @@ def test_bench_fingers_press_harder_where_they_are(coarse_rig: Rig) -> None:
 
 def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:
     """Fingers of a rig with none load nothing; where fingers do, an observer does not."""
-    bare = bench_of(replace(coarse_rig, fingertip=None), now=0.0)
-    observed = bench_of(replace(coarse_rig, fingertip=Fingertip(contact_mass=0.02)), now=0.0)
+    bare = Bench(replace(coarse_rig, fingertip=None), now=0.0)
+    observed = Bench(replace(coarse_rig, fingertip=Fingertip(contact_mass=0.02)), now=0.0)
     bare.place_fingers({"a": A, "b": B}, now=0.0)
     observed.place_fingers({"a": A, "b": B}, now=0.0, observers={"a", "b"})
     for bench in (bare, observed):
@@ -80,7 +81,7 @@ def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:
 def test_bench_sensors_read_through_a_touch(coarse_rig: Rig) -> None:
     """An accelerometer hears the whole time while a finger comes, at every sample, truly."""
     tip = Fingertip(contact_mass=0.005)
-    bench = bench_of(replace(coarse_rig, fingertip=tip), now=0.0)
+    bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
     sensors = Accelerometers(bench)
     sensors.place([Accelerometer("P1", 0.2, 0.03)])
     play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench_driving import bench_of, keep_alive, play
+from bench_driving import keep_alive, play
 from drivers.contents import Tone
 from model.rig.rig import Rig
 from model.structure.fingertip import Fingertip
@@ -43,7 +43,7 @@ def let_solve(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
 def driven(rig: Rig, place: Callable[[Bench], None]) -> Bench:
     """A bench that plays on through a touch at 0.5 s, up to 1.2 s."""
-    bench = bench_of(rig, now=0.0)
+    bench = Bench(rig, now=0.0)
     bench.place_fingers({"a": A}, now=0.0)
     play(bench, Tone(1, 210.0, 1.0), now=bench.time, ramp=0.02, watchdog=2.0)
     keep_alive(bench, 0.5)
@@ -80,7 +80,7 @@ def test_finger_that_is_solved_late_is_felt_as_one_that_is_solved_at_once(rig: R
 
 def test_slide_faster_than_it_is_solved_leaves_out_places_between(rig: Rig) -> None:
     """Of a finger's landing, three moves and its lift, two moves are never solved."""
-    bench = bench_of(rig, now=0.0)
+    bench = Bench(rig, now=0.0)
     for number, at in enumerate((A, B, C, A)):
         bench.begin_placing({"a": at}, now=0.02 * number)
     bench.begin_placing({}, now=0.1)
@@ -95,7 +95,7 @@ async def test_control_replies_while_the_plate_is_solved(
     rig: Rig, let_solve: threading.Event
 ) -> None:
     """A finger comes and the state is read before its plate is solved; what it feels waits."""
-    context = SimulationContext(bench_of(rig, now=0.0))
+    context = SimulationContext(Bench(rig, now=0.0))
 
     async def ask(now: float, **request: object) -> dict[str, object]:
         return await carry_out(context, json.dumps(request).encode(), now=now)

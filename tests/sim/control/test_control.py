@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from bench_driving import bench_of, play
+from bench_driving import play
 from drivers.contents import Tone
 from drivers.errors import LinkError
 from model.rig.rig import Rig
@@ -43,7 +43,7 @@ async def ask(bench: Bench, now: float, **request: Any) -> dict[str, Any]:
 
 async def test_control_places_fingers_and_returns_felt_and_state(coarse_rig: Rig) -> None:
     """Responses have the documented keys and shapes."""
-    bench = bench_of(coarse_rig, now=5.0)
+    bench = Bench(coarse_rig, now=5.0)
     placed = await ask(bench, 5.1, op="fingers", fingers={"7": [0.1, 0.08], "x": [0, 0]})
     assert placed == {"ok": True, "time_s": 5.1}
     play(bench, Tone(0, 110.0, 0.5), now=5.2, token=9, watchdog=2.0)
@@ -72,7 +72,7 @@ async def test_control_places_fingers_and_returns_felt_and_state(coarse_rig: Rig
 
 async def test_control_keeps_loads_of_fingers(coarse_rig: Rig) -> None:
     """Until they lift or get another one; a finger that touches has 1 where none is given."""
-    bench = bench_of(coarse_rig, now=0.0)
+    bench = Bench(coarse_rig, now=0.0)
     loads = []
     for request in (
         {"op": "fingers", "fingers": {"a": [0.1, 0.08], "b": [0, 0]}, "loads": {"a": 2}},
@@ -122,7 +122,7 @@ async def test_control_keeps_loads_of_fingers(coarse_rig: Rig) -> None:
 )
 async def test_control_refuses_an_invalid_line(coarse_rig: Rig, line: bytes) -> None:
     """The response is a short error, and nothing changes."""
-    bench = bench_of(coarse_rig, now=1.0)
+    bench = Bench(coarse_rig, now=1.0)
     await ask(bench, 1.0, op="fingers", fingers={"a": [0.1, 0.1]})
     reply = await carry_out(SimulationContext(bench), line, now=1.0)
     assert reply.keys() == {"error"}
@@ -132,7 +132,7 @@ async def test_control_refuses_an_invalid_line(coarse_rig: Rig, line: bytes) -> 
 
 async def test_control_socket_is_private_and_removed(coarse_rig: Rig, socket_path: Path) -> None:
     """Mode 0600; several lines per connection; no file is left."""
-    bench = bench_of(coarse_rig, now=0.0)
+    bench = Bench(coarse_rig, now=0.0)
     async with control_socket(SimulationContext(bench), socket_path):
         assert mode(socket_path) == 0o600
         reader, writer = await asyncio.open_unix_connection(socket_path)
@@ -149,7 +149,7 @@ async def test_control_socket_is_private_and_removed(coarse_rig: Rig, socket_pat
 
 async def test_control_closes_on_an_endless_line(coarse_rig: Rig, socket_path: Path) -> None:
     """The client gets an error; other connections continue."""
-    bench = bench_of(coarse_rig, now=0.0)
+    bench = Bench(coarse_rig, now=0.0)
     async with control_socket(SimulationContext(bench), socket_path):
         reader, writer = await asyncio.open_unix_connection(socket_path)
         writer.write(b" " * (2 * LINE_MAX))
@@ -168,7 +168,7 @@ async def test_control_replaces_a_stale_socket(coarse_rig: Rig, socket_path: Pat
     """A killed simulation leaves one behind."""
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(socket_path))
-    async with control_socket(SimulationContext(bench_of(coarse_rig, now=0.0)), socket_path):
+    async with control_socket(SimulationContext(Bench(coarse_rig, now=0.0)), socket_path):
         _, writer = await asyncio.open_unix_connection(socket_path)
         writer.close()
         await writer.wait_closed()
@@ -176,7 +176,7 @@ async def test_control_replaces_a_stale_socket(coarse_rig: Rig, socket_path: Pat
 
 async def test_control_refuses_an_unusable_path(coarse_rig: Rig, socket_path: Path) -> None:
     """A missing folder, a long path and a plain file are refused by name."""
-    bench = bench_of(coarse_rig, now=0.0)
+    bench = Bench(coarse_rig, now=0.0)
     plain = socket_path.parent / "plain"
     plain.write_text("kept")
     for path in (socket_path / "deeper", socket_path.parent / ("x" * 200), plain):
@@ -206,7 +206,7 @@ async def test_plate_operation_changes_what_is_felt_and_can_be_undone(coarse_rig
 
 async def felt_after(rig: Rig, imperfections: Imperfections, *changes: dict[str, Any]) -> float:
     """Amplitude under a finger [m/s²] of a vibration on the plate after some changes of it."""
-    bench = bench_of(rig, now=0.0, imperfections=imperfections)
+    bench = Bench(rig, now=0.0, imperfections=imperfections)
     context = SimulationContext(bench)
 
     async def asked(now: float, **request: Any) -> dict[str, Any]:
@@ -237,6 +237,6 @@ async def test_plate_operation_refuses_what_is_no_plate(
     coarse_rig: Rig, request_: dict[str, Any]
 ) -> None:
     """An error, and the plate stays."""
-    bench = bench_of(coarse_rig, now=5.0)
+    bench = Bench(coarse_rig, now=5.0)
     assert "error" in await ask(bench, 5.1, op="plate", **request_)
     assert bench.imperfections == Imperfections()

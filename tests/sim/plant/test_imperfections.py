@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bench_driving import arm, bench_of, keep_alive, play
+from bench_driving import arm, keep_alive, play
 from drivers.contents import Tone
 from model.arrays import FloatArray
 from model.errors import InputError
@@ -17,6 +17,7 @@ from model.rig.uncertainty import Uncertainty
 from model.structure.fingertip import Fingertip
 from plate_in_time import lock_in
 from resting_fingers import FINGERTIP
+from sim.bench.bench import Bench
 from sim.plant.imperfections import (
     ChannelErrors,
     Imperfections,
@@ -48,7 +49,7 @@ def played(
     stop: float | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Times [s] and acceleration [m/s²] in the middle of a finger, commands coming at 0.01 s."""
-    bench = bench_of(rig, now=0.0, imperfections=imperfections)
+    bench = Bench(rig, now=0.0, imperfections=imperfections)
     bench.place_fingers({"a": AT}, now=0.0)
     for name, wanted in commands.items():
         arm(bench, 2.0, now=0.0, name=name)
@@ -109,7 +110,7 @@ def test_imperfections_latency_keeps_the_order_of_commands(two_amplifiers: Rig) 
     """Two sets within the latency: both are played, each as long as it was meant to be."""
     frequencies = []
     for latency in (0.0, 0.05):
-        bench = bench_of(two_amplifiers, now=0.0, imperfections=Imperfections(latency=latency))
+        bench = Bench(two_amplifiers, now=0.0, imperfections=Imperfections(latency=latency))
         bench.place_fingers({"a": AT}, now=0.0)
         arm(bench, 2.0, now=0.0, name="left")
         for token, (frequency, now) in enumerate([(110.0, 0.1), (170.0, 0.12)], start=1):
@@ -270,4 +271,4 @@ def test_imperfections_refuse_unknown_channels(two_amplifiers: Rig) -> None:
     with pytest.raises(InputError, match="channel 7 of amplifier left"):
         Imperfections({Channel("left", 7): ChannelErrors()}).check(two_amplifiers)
     with pytest.raises(InputError, match="middle"):
-        bench_of(two_amplifiers, now=0.0, imperfections=Imperfections(skew={"middle": 0.001}))
+        Bench(two_amplifiers, now=0.0, imperfections=Imperfections(skew={"middle": 0.001}))

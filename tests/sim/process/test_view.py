@@ -3,9 +3,10 @@
 import numpy as np
 from rich.console import Console
 
-from bench_driving import bench_of, play
+from bench_driving import play
 from drivers.contents import Tone
 from model.rig.rig import Rig
+from sim.bench.bench import Bench
 from sim.control.context import SimulationContext
 from sim.process.view import PlateView, draw
 
@@ -25,7 +26,7 @@ def rows_of(text: str) -> list[str]:
 
 def test_view_shows_eras_fingers_and_peaks_in_place(coarse_rig: Rig) -> None:
     """y points upwards; peaks are darkest near the driven ERA; nothing at rest."""
-    bench = bench_of(coarse_rig, now=0.0)
+    bench = Bench(coarse_rig, now=0.0)
     context = SimulationContext(bench, urls={"main": "serial:///dev/pts/7?baud=921600"})
     plate = PlateView(bench)
     bench.probes.append(plate)

@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench_driving import bench_of, play
+from bench_driving import play
 from drivers.contents import Tone
 from full_disk import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig
+from sim.bench.bench import Bench
 from sim.sensors.accelerometer import Accelerometer
 from sim.sensors.recorder import Recorder
 from sim.sensors.recording_file import read_recording
@@ -22,7 +23,7 @@ def test_recorder_records_sensors_and_fingers_without_gaps(
     coarse_rig: Rig, tmp_path: Path, ending: str
 ) -> None:
     """A sensor at the centre of a finger reads what the finger feels."""
-    bench = bench_of(coarse_rig, now=3.0, sample_rate=4000.0)
+    bench = Bench(coarse_rig, now=3.0, sample_rate=4000.0)
     bench.place_fingers({"7": (0.1, 0.08)}, now=3.0)
     path = tmp_path / f"run.{ending}"
     recorder = Recorder(bench, path, sensors=[Accelerometer("P1", 0.1, 0.08)], fingers=["7"])
@@ -50,7 +51,7 @@ def test_recorder_follows_moved_fingers_and_zeroes_lifted_ones(
     coarse_rig: Rig, tmp_path: Path
 ) -> None:
     """The columns are those of the start."""
-    bench = bench_of(coarse_rig, now=0.0)
+    bench = Bench(coarse_rig, now=0.0)
     bench.place_fingers({"a": (0.1, 0.08), "b": (0.2, 0.1)}, now=0.0)
     path = tmp_path / "run.csv"
     recorder = Recorder(bench, path, sensors=[], fingers=["a", "b"])
@@ -70,7 +71,7 @@ def test_recorder_stops_at_its_maximum_size(
 ) -> None:
     """Further samples are dropped, and is_full is set."""
     monkeypatch.setattr("sim.sensors.recorder.max_values", lambda path: 1000)
-    bench = bench_of(coarse_rig, now=0.0)
+    bench = Bench(coarse_rig, now=0.0)
     sensors = [Accelerometer("P1", 0.1, 0.08), Accelerometer("P2", 0.1, 0.1)]
     recorder = Recorder(bench, tmp_path / "run.csv", sensors=sensors, fingers=[])
     bench.advance(0.049)
@@ -84,7 +85,7 @@ def test_recorder_stops_at_its_maximum_size(
 
 def test_recorder_refuses_an_unusable_file_at_the_start(coarse_rig: Rig, tmp_path: Path) -> None:
     """No channels, an unrelated file, a missing folder, and a name too long for the format."""
-    bench = bench_of(coarse_rig, now=0.0)
+    bench = Bench(coarse_rig, now=0.0)
     sensor = Accelerometer("a very long name", 0.1, 0.1)
     letter = tmp_path / "letter.csv"
     letter.write_text("Dear Sir")
@@ -104,7 +105,7 @@ def test_recorder_survives_a_full_disk(coarse_rig: Rig, tmp_path: Path) -> None:
     """The bench continues; the error states the recorded time, and no file is left."""
     path = tmp_path / "run.csv"
     path.write_text("time_s,old")
-    bench = bench_of(coarse_rig, now=0.0, sample_rate=4000.0)
+    bench = Bench(coarse_rig, now=0.0, sample_rate=4000.0)
     recorder = Recorder(bench, path, sensors=[Accelerometer("P1", 0.1, 0.1)], fingers=[])
     bench.advance(0.5)
     with full_disk(at=32_000):  # bytes, those of one second
@@ -121,7 +122,7 @@ def test_recorder_keeps_the_old_file_without_samples(coarse_rig: Rig, tmp_path: 
     """A file is replaced only by a complete one."""
     path = tmp_path / "run.csv"
     path.write_text("time_s,old")
-    bench = bench_of(coarse_rig, now=0.0)
+    bench = Bench(coarse_rig, now=0.0)
     recorder = Recorder(bench, path, sensors=[Accelerometer("P1", 0.1, 0.1)], fingers=[])
     recorder.stop()
     with pytest.raises(InputError, match=path.name):

@@ -302,12 +302,13 @@ async def _kept(subject: Subject, *, keep: bool) -> None:
     await subject.pause_until(first.latest + 0.5 / hertz)
     second = await subject.play(layer(1, tones[1]))
     width = second.latest - second.earliest + first.latest - first.earliest
-    if width * hertz > 0.1:
+    if width * hertz > 0.3:  # as on a slow line: 15 ms of 50
         raise Late("two sets were too far apart in time")
     status = (await subject.request("GetStatus")).values
     seen = status["levels"][0] / 10_000 / subject.level
     await subject.play(layer(0), layer(1))
-    is_met = seen > 0.95 if keep else seen < 0.5
+    highest = 0.05 + math.sin(math.pi * width * hertz)  # of tones so far from opposite phases
+    is_met = seen > 0.95 if keep else seen < highest
     what = f"level of two layers, one begun again half a period later, keep phase {keep}"
-    expect(is_met, what, expected="1" if keep else "about 0", seen=f"{seen:.3f}")
+    expect(is_met, what, expected="1" if keep else f"at most {highest:.3f}", seen=f"{seen:.3f}")
     expect_equal(status["levels"][1:], [0] * (len(subject.channels) - 1), "levels of the others")

@@ -6,7 +6,7 @@ import pytest
 
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, LinkTimeout
-from drivers.host.jobs import Priority
+from drivers.host.jobs import Job, JobQueue, Priority
 from drivers.host.sensors import read_measured
 from drivers.host.serial_wire import SerialWire
 from drivers.protocol.records import Refusal, Values
@@ -116,3 +116,13 @@ async def test_reading_gives_way_to_a_set_at_once() -> None:
     assert end.loop.time() - began < 0.001
     assert len(await reading) == 2
     assert Priority.READING > Priority.OTHER
+
+
+async def test_stop_supersedes_what_feeds_plays_arms_or_acknowledges() -> None:
+    """Of requests that wait; what reads goes on waiting."""
+    queue = JobQueue()
+    for priority in Priority:
+        result = asyncio.get_running_loop().create_future()
+        queue.add(Job(None, priority, "", {}, None, 3, 0.03, 0.0, result))
+    obsolete = {job.priority for job in queue.superseded_by(Priority.STOP, None)}
+    assert obsolete == {Priority.HEARTBEAT, Priority.SET, Priority.ARM, Priority.CLEAR}

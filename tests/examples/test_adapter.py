@@ -34,9 +34,9 @@ from registry.limits import GuardLimits
 async def main():
     limits = GuardLimits(20.0, 900.0, 1.0)
     host = await Lines().amplifier(sys.argv[1], limits, name="a", is_output=True)
-    group = Group({"a": host})
+    group = Group({"a": host}, watchdog=0.25)
     await group.open()
-    await group.arm(0.25)
+    await group.arm()
     await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.5),), 0.0)]})
     print("plays", flush=True)
     while True:
@@ -114,12 +114,12 @@ async def armed(url: str, watchdog: float = 2.0) -> AsyncIterator[tuple[Group, A
     lines = Lines()
     try:
         host = await lines.amplifier(url, LIMITS, name="a", is_output=True)
-        group = Group({"a": host})
+        group = Group({"a": host}, watchdog=watchdog)
         async with asyncio.timeout(PATIENCE):
             while True:  # until the adapter has found the outputs off
                 await group.open()
                 try:
-                    await group.arm(watchdog)
+                    await group.arm()
                     break
                 except CommandRefused:
                     continue

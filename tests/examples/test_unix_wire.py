@@ -72,9 +72,9 @@ async def test_group_plays_behind_a_socket_until_it_is_closed(address: Any, tmp_
             )
             for number in (1, 2)
         }
-        group = Group(amplifiers)
+        group = Group(amplifiers, watchdog=2.0)
         await group.open()
-        await group.arm(2.0)
+        await group.arm()
         layers = [Layer(0, (Tone(0, 100.0, 0.5),), 0.0)]
         await group.apply(dict.fromkeys(amplifiers, layers))
         statuses = [await each.read_status() for each in amplifiers.values()]

@@ -63,8 +63,8 @@ async def test_host_plays_layers_and_stops(line: str, firmware: Path) -> None:
     """Two layers of one commit, one of them silenced; the stop is confirmed by silent channels."""
     with running_firmware(firmware, *options(line)) as (url, _):
         async with opened(url) as amplifier:
-            group = Group({"a": amplifier})
-            await group.arm(2.0)
+            group = Group({"a": amplifier}, watchdog=2.0)
+            await group.arm()
             fingers = [
                 Layer(0, (Tone(0, 100.0, 0.5), Tone(1, 130.0, 0.25)), 0.0),
                 Layer(5, (Tone(1, 250.0, 0.5),), 0.0),

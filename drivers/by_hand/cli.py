@@ -13,7 +13,7 @@ import typer
 from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
 
 if TYPE_CHECKING:
-    from drivers.verdict import CheckResult
+    from drivers.conformance import CheckResult
 
 _T = TypeVar("_T")
 
@@ -268,7 +268,7 @@ def conformance(
     json_: Json = False,
 ) -> None:
     """Check that an amplifier fulfils the contract. Reads only, unless --write is given."""
-    from drivers.verdict import LEVEL, judge
+    from drivers.conformance import LEVEL, judge
 
     level = LEVEL if level is None else level
     show = _no_result if json_ else _show_result

@@ -12,15 +12,15 @@ from pathlib import Path
 import pytest
 
 import era_haptics
+from drivers.conformance import CheckResult, judge, of_kind
+from drivers.conformance.check import run_checks
+from drivers.conformance.serial_client import SerialClient
 from drivers.contents import Layer, Shape, Tone
 from drivers.errors import CommandRefused
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.protocol.table import FAULTS, STATES
-from drivers.verdict import CheckResult, judge, of_kind
-from drivers.verdict.check import run_checks
-from drivers.verdict.serial_client import SerialClient
 from long_form import shortly
 from registry.limits import GuardLimits
 from virtual_loop import run_virtual

@@ -1,12 +1,12 @@
 """One conformance check of a simulated amplifier of protocol 3 on one wire, in virtual time.
 
 Run by the judge of planted faults only: the suite has all checks in turn in
-`tests/drivers/verdict`.
+`tests/drivers/conformance`.
 """
 
 import pytest
 
-from drivers.verdict import CHECKS, Result, of_kind
+from drivers.conformance import CHECKS, Result, of_kind
 from judged_line import KINDS, judged, plain
 
 _CASES = [(kind, check.name) for kind in KINDS for _, check in of_kind(kind)]

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.verdict import LEVEL, CheckResult, of_kind
-from drivers.verdict.check import run_checks
+from drivers.conformance import LEVEL, CheckResult, of_kind
+from drivers.conformance.check import run_checks
 from firmware_line import LINES, FirmwarePort
 from judged_line import CLIENTS
 from virtual_loop import run_virtual

@@ -4,12 +4,12 @@ import asyncio
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from drivers.verdict import CHECKS, LEVEL, CheckResult, of_kind
-from drivers.verdict.can_client import CanClient
-from drivers.verdict.check import run_checks
-from drivers.verdict.client import Client, Port
-from drivers.verdict.modbus_client import ModbusClient
-from drivers.verdict.serial_client import SerialClient
+from drivers.conformance import CHECKS, LEVEL, CheckResult, of_kind
+from drivers.conformance.can_client import CanClient
+from drivers.conformance.check import run_checks
+from drivers.conformance.client import Client, Port
+from drivers.conformance.modbus_client import ModbusClient
+from drivers.conformance.serial_client import SerialClient
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers

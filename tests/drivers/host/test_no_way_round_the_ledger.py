@@ -13,7 +13,7 @@ ON_THE_WAY = sorted(
 )
 
 # Sends sets of its own, and frames damaged on purpose, to amplifiers that it judges.
-VERDICT = ROOT / "drivers" / "verdict"
+CONFORMANCE = ROOT / "drivers" / "conformance"
 
 # Ports of CAN adapters, which take and give packed frames.
 WIRES = ROOT / "drivers" / "wires"
@@ -49,7 +49,7 @@ def test_only_wires_use_encoders() -> None:
     assert wires
     below = {"backends", "codec", "protocol"}
     above = [file for file in users - wires if not below & set(file.parts)]
-    assert {file.parent for file in above} == {VERDICT, WIRES, HOST}
+    assert {file.parent for file in above} == {CONFORMANCE, WIRES, HOST}
     assert [file.name for file in above if file.parent == HOST] == ["amplifier.py"]
 
 
@@ -59,7 +59,7 @@ def test_only_what_a_ledger_admits_is_packed() -> None:
         ast.unparse(call.args[0])
         for file in ON_THE_WAY
         for name, call in calls(file, "pack_layers")
-        if name == "pack_layers" and file.parent != VERDICT
+        if name == "pack_layers" and file.parent != CONFORMANCE
     )
     admitted = [
         ast.unparse(node.targets[0])

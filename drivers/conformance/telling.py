@@ -4,6 +4,10 @@ import asyncio
 from collections.abc import Sequence
 
 from drivers import clock
+from drivers.conformance.check import driving, reading
+from drivers.conformance.client import Client
+from drivers.conformance.findings import Optional, Violation, expect, expect_equal
+from drivers.conformance.subject import NAMES, SLACK, Subject, layer
 from drivers.protocol.records import Record, Refusal, Values
 from drivers.protocol.table import (
     EVENT,
@@ -13,10 +17,6 @@ from drivers.protocol.table import (
     READING_STATES,
     sensor_reading,
 )
-from drivers.verdict.check import driving, reading
-from drivers.verdict.client import Client
-from drivers.verdict.findings import Optional, Violation, expect, expect_equal
-from drivers.verdict.subject import NAMES, SLACK, Subject, layer
 
 _MOMENTARY = ("READY_TO_SWITCH_ON", "SWITCHED_ON", "FAULT_REACTION_ACTIVE")  # may last no time
 _WINDOW = 100  # ms

@@ -13,12 +13,21 @@ import pytest
 
 import era_haptics
 from drivers import clock
+from drivers.conformance import CHECKS, Result, judge, of_kind
+from drivers.conformance.check import Check, CheckResult, Report, run_checks
+from drivers.conformance.expected import (
+    alike,
+    alone,
+    cosine,
+    later,
+    lines,
+    together,
+    unsure,
+    within,
+)
+from drivers.conformance.findings import Violation
+from drivers.conformance.subject import Subject, layer
 from drivers.errors import LinkError
-from drivers.verdict import CHECKS, Result, judge, of_kind
-from drivers.verdict.check import Check, CheckResult, Report, run_checks
-from drivers.verdict.expected import alike, alone, cosine, later, lines, together, unsure, within
-from drivers.verdict.findings import Violation
-from drivers.verdict.subject import Subject, layer
 from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
 from model.rig.rig import Rig
 from sim.amplifier.contract import Amplifier

@@ -6,7 +6,7 @@ that only read come first; the others arm the amplifier and drive its channels.
 
 from collections.abc import Callable
 
-from drivers.verdict import (
+from drivers.conformance import (
     arming,
     can_frames,
     layers,
@@ -22,9 +22,9 @@ from drivers.verdict import (
     voices,
     watchdog,
 )
-from drivers.verdict.check import Check, CheckResult, Report, Result, run_checks
-from drivers.verdict.opening import opened
-from drivers.verdict.subject import LEVEL
+from drivers.conformance.check import Check, CheckResult, Report, Result, run_checks
+from drivers.conformance.opening import opened
+from drivers.conformance.subject import LEVEL
 
 __all__ = ["CHECKS", "LEVEL", "Check", "CheckResult", "Report", "Result", "judge", "of_kind"]
 

@@ -5,14 +5,14 @@ from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 
 from drivers import clock
+from drivers.conformance.check import driving
+from drivers.conformance.client import When
+from drivers.conformance.findings import expect, expect_equal
+from drivers.conformance.parts import long_set
+from drivers.conformance.subject import DRIFT, NAMES, SLACK, Subject, flag, layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import FAULTS
-from drivers.verdict.check import driving
-from drivers.verdict.client import When
-from drivers.verdict.findings import expect, expect_equal
-from drivers.verdict.parts import long_set
-from drivers.verdict.subject import DRIFT, NAMES, SLACK, Subject, flag, layer
 
 _PLACE = "protocol.md#sessions-and-the-watchdog"
 _TRIP, _FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until it begins, lasts, and shows

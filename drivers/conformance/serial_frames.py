@@ -2,13 +2,13 @@
 
 import asyncio
 
+from drivers.conformance.check import driving
+from drivers.conformance.findings import expect, expect_equal
+from drivers.conformance.serial_client import SerialClient
+from drivers.conformance.subject import Subject, layer
 from drivers.protocol.serial_payload import pack_words
 from drivers.protocol.sets import pack_layers
 from drivers.protocol.table import MESSAGES, VERSION
-from drivers.verdict.check import driving
-from drivers.verdict.findings import expect, expect_equal
-from drivers.verdict.serial_client import SerialClient
-from drivers.verdict.subject import Subject, layer
 
 _PLACE = "protocol.md#checks-in-this-order"
 _PING, _SET = MESSAGES["Ping"].number, MESSAGES["Set"].number

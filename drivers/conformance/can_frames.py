@@ -7,12 +7,12 @@ from typing import cast
 from drivers import clock
 from drivers.codec.can_bus.canopen import CANOPEN, cob_id
 from drivers.codec.can_bus.segments import segments
+from drivers.conformance.can_client import CanClient
+from drivers.conformance.check import driving, reading
+from drivers.conformance.findings import Late, Violation, expect, expect_equal
+from drivers.conformance.subject import NAMES, Subject, layer
 from drivers.protocol.sets import pack_layers
 from drivers.protocol.table import MESSAGES
-from drivers.verdict.can_client import CanClient
-from drivers.verdict.check import driving, reading
-from drivers.verdict.findings import Late, Violation, expect, expect_equal
-from drivers.verdict.subject import NAMES, Subject, layer
 
 _PLACE = "can.md#messages-as-frames"
 _PING, _SET = MESSAGES["Ping"].number, MESSAGES["Set"].number

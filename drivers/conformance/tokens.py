@@ -2,12 +2,12 @@
 
 import asyncio
 
+from drivers.conformance.check import driving
+from drivers.conformance.expected import alone, cosine
+from drivers.conformance.findings import expect, expect_equal
+from drivers.conformance.subject import Subject, layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import pack_layers
-from drivers.verdict.check import driving
-from drivers.verdict.expected import alone, cosine
-from drivers.verdict.findings import expect, expect_equal
-from drivers.verdict.subject import Subject, layer
 
 _PLACE = "protocol.md#sets"
 

@@ -3,12 +3,12 @@
 import asyncio
 from collections.abc import Mapping, Sequence
 
+from drivers.conformance.check import driving
+from drivers.conformance.client import When
+from drivers.conformance.expected import Bounds, alone, cosine, later, lines, steady, together
+from drivers.conformance.findings import Optional, expect, expect_equal
+from drivers.conformance.subject import DRIFT, SLACK, Subject, flag, is_silent, layer
 from drivers.protocol.sets import LayerSet
-from drivers.verdict.check import driving
-from drivers.verdict.client import When
-from drivers.verdict.expected import Bounds, alone, cosine, later, lines, steady, together
-from drivers.verdict.findings import Optional, expect, expect_equal
-from drivers.verdict.subject import DRIFT, SLACK, Subject, flag, is_silent, layer
 
 _PLACE = "protocol.md#sets"
 _EARLY = 0.002  # s; by which an end may come later than its time

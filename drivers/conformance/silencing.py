@@ -2,11 +2,11 @@
 
 import asyncio
 
-from drivers.verdict.check import driving
-from drivers.verdict.client import When
-from drivers.verdict.expected import alone, cosine
-from drivers.verdict.findings import expect, expect_equal
-from drivers.verdict.subject import NAMES, SLACK, Subject, flag, is_silent, layer
+from drivers.conformance.check import driving
+from drivers.conformance.client import When
+from drivers.conformance.expected import alone, cosine
+from drivers.conformance.findings import expect, expect_equal
+from drivers.conformance.subject import NAMES, SLACK, Subject, flag, is_silent, layer
 
 _PLACE = "protocol.md#states"
 _SETTLING = 0.01  # s; state and high voltage, once silent

@@ -2,12 +2,12 @@
 
 import asyncio
 
+from drivers.conformance.check import driving
+from drivers.conformance.findings import Late, expect, expect_equal
+from drivers.conformance.subject import SLACK, Subject, layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, pack_layers
 from drivers.protocol.table import MAX_WORDS
-from drivers.verdict.check import driving
-from drivers.verdict.findings import Late, expect, expect_equal
-from drivers.verdict.subject import SLACK, Subject, layer
 
 _PLACE = "protocol.md#sets"
 _LIFE = 1.0  # s; from the first part of a set to its commit

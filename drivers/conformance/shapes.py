@@ -3,8 +3,8 @@
 import math
 
 from drivers import clock
-from drivers.verdict.check import driving
-from drivers.verdict.expected import (
+from drivers.conformance.check import driving
+from drivers.conformance.expected import (
     alike,
     alone,
     cosine,
@@ -15,8 +15,8 @@ from drivers.verdict.expected import (
     together,
     unsure,
 )
-from drivers.verdict.findings import Late, Optional, expect, expect_equal
-from drivers.verdict.subject import Subject, layer, passed
+from drivers.conformance.findings import Late, Optional, expect, expect_equal
+from drivers.conformance.subject import Subject, layer, passed
 
 _PLACE = "protocol.md#what-a-channel-plays"
 _RIGHT = math.pi / 2

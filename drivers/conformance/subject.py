@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivers import clock
+from drivers.conformance.client import Answer, Client, When
+from drivers.conformance.expected import Bounds, alone, steady, within
+from drivers.conformance.findings import Late, Optional, Violation, expect, expect_equal
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
 from drivers.protocol.table import FEATURES, MESSAGES, QUANTITIES, STATES, STATUS_FLAGS
-from drivers.verdict.client import Answer, Client, When
-from drivers.verdict.expected import Bounds, alone, steady, within
-from drivers.verdict.findings import Late, Optional, Violation, expect, expect_equal
 
 LEVEL = 0.2
 """Level of driven channels unless another is given: perceptible, and far from any limit."""

@@ -4,10 +4,9 @@ import asyncio
 import struct
 from typing import cast
 
-from drivers.protocol.table import BY_NUMBER, MAX_WORDS, MESSAGES
-from drivers.verdict.check import driving, reading
-from drivers.verdict.findings import expect, expect_equal
-from drivers.verdict.modbus_client import (
+from drivers.conformance.check import driving, reading
+from drivers.conformance.findings import expect, expect_equal
+from drivers.conformance.modbus_client import (
     BOX,
     EXCEPTION,
     HEAD,
@@ -19,7 +18,8 @@ from drivers.verdict.modbus_client import (
     WRITE,
     ModbusClient,
 )
-from drivers.verdict.subject import Subject, layer
+from drivers.conformance.subject import Subject, layer
+from drivers.protocol.table import BY_NUMBER, MAX_WORDS, MESSAGES
 
 _PLACE = "modbus.md#registers"
 _AREA = HEAD + MAX_WORDS

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol
 
 from drivers import clock
+from drivers.conformance.findings import Violation
 from drivers.errors import LinkError
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REFUSALS
-from drivers.verdict.findings import Violation
 
 REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
 QUIET = 0.03  # s; in which something that must not be replied to would be

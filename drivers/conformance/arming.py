@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping
 
+from drivers.conformance.check import driving
+from drivers.conformance.findings import expect, expect_equal
+from drivers.conformance.subject import NAMES, SLACK, Subject, flag, is_silent, layer
 from drivers.protocol.records import Values
 from drivers.protocol.table import QUANTITIES
-from drivers.verdict.check import driving
-from drivers.verdict.findings import expect, expect_equal
-from drivers.verdict.subject import NAMES, SLACK, Subject, flag, is_silent, layer
 
 _STATES = "protocol.md#states"
 _OFF, _ENABLED = "SWITCH_ON_DISABLED", "OPERATION_ENABLED"

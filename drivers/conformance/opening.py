@@ -4,13 +4,13 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 
+from drivers.conformance.can_client import CanClient
+from drivers.conformance.client import Client, Port
+from drivers.conformance.modbus_client import ModbusClient
+from drivers.conformance.serial_client import SerialClient
 from drivers.errors import LinkError
 from drivers.hardware import number_below
 from drivers.protocol.table import MESSAGES
-from drivers.verdict.can_client import CanClient
-from drivers.verdict.client import Client, Port
-from drivers.verdict.modbus_client import ModbusClient
-from drivers.verdict.serial_client import SerialClient
 from drivers.wires.known import address_of
 
 CLIENTS: Mapping[str, Callable[[Port, int], Client]] = {

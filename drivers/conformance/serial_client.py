@@ -7,11 +7,11 @@ from cobs import cobs
 
 from drivers import clock
 from drivers.codec.serial_line.frame import NEUTRAL, REPLY, Frame, FrameReader, encode_frame
+from drivers.conformance.client import Answer, Client, Heard, Port, expect_reply
+from drivers.conformance.findings import Violation, expect_equal
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import HELLO, pack_words, unpack_identity, unpack_words
 from drivers.protocol.table import EVENT, MAX_WORDS, NAK, VERSION
-from drivers.verdict.client import Answer, Client, Heard, Port, expect_reply
-from drivers.verdict.findings import Violation, expect_equal
 
 _SEQUENCES = 1 << 16
 _SEQUENCE_AT, _CRC_SIZE = 3, 4

@@ -15,12 +15,12 @@ from drivers.codec.can_bus.segments import (
     segments,
     unpack_frames,
 )
+from drivers.conformance.client import Answer, Client, Heard, Port, expect_reply
+from drivers.conformance.findings import Violation, expect_equal
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import HELLO
 from drivers.protocol.table import IDENTITY, NAK
 from drivers.statistics import WireCounters
-from drivers.verdict.client import Answer, Client, Heard, Port, expect_reply
-from drivers.verdict.findings import Violation, expect_equal
 
 NMT: Mapping[str, int] = CANOPEN["nmt"]
 _SETTLING = 0.005  # s; after a command of network management

@@ -3,11 +3,11 @@
 import asyncio
 from dataclasses import replace
 
+from drivers.conformance.check import driving
+from drivers.conformance.expected import Curve, cosine, steady, together
+from drivers.conformance.findings import Late
+from drivers.conformance.subject import Subject, layer
 from drivers.protocol.sets import Command
-from drivers.verdict.check import driving
-from drivers.verdict.expected import Curve, cosine, steady, together
-from drivers.verdict.findings import Late
-from drivers.verdict.subject import Subject, layer
 
 _MAX_VOICES = 24  # voices that are tried
 _SHORTENED = 0.002  # s

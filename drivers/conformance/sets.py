@@ -4,11 +4,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
+from drivers.conformance.check import driving
+from drivers.conformance.findings import Optional, expect, expect_equal
+from drivers.conformance.subject import FULL, Subject, layer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers
-from drivers.verdict.check import driving
-from drivers.verdict.findings import Optional, expect, expect_equal
-from drivers.verdict.subject import FULL, Subject, layer
 
 _PLACE = "protocol.md#sets"
 _SCANNED = 8

@@ -6,10 +6,10 @@ from enum import StrEnum
 from typing import Any, TypeAlias
 
 from drivers import clock
+from drivers.conformance.client import Client
+from drivers.conformance.findings import Late, Optional, Violation
+from drivers.conformance.subject import MAX_ATTEMPTS, Subject
 from drivers.errors import LinkError
-from drivers.verdict.client import Client
-from drivers.verdict.findings import Late, Optional, Violation
-from drivers.verdict.subject import MAX_ATTEMPTS, Subject
 
 Steps: TypeAlias = Callable[[Subject], Awaitable[None]]
 

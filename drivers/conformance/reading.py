@@ -2,6 +2,9 @@
 
 import math
 
+from drivers.conformance.check import driving, reading
+from drivers.conformance.findings import expect, expect_equal
+from drivers.conformance.subject import NAMES, Subject, flag
 from drivers.protocol.serial_payload import speaks
 from drivers.protocol.table import (
     BY_NUMBER,
@@ -11,9 +14,6 @@ from drivers.protocol.table import (
     REACTION,
     VERSION,
 )
-from drivers.verdict.check import driving, reading
-from drivers.verdict.findings import expect, expect_equal
-from drivers.verdict.subject import NAMES, Subject, flag
 
 _UNKNOWN = (19, 24, 29, 63)  # numbers of no message, below those of vendors
 _RANGES = ("frequency", "watchdog", "envelope_step")

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from drivers import clock
+from drivers.conformance.client import QUIET, Answer, Client, Heard, Port, expect_reply
+from drivers.conformance.findings import Violation, expect, expect_equal
 from drivers.protocol.records import Values
 from drivers.protocol.table import MAX_WORDS, MESSAGES
-from drivers.verdict.client import QUIET, Answer, Client, Heard, Port, expect_reply
-from drivers.verdict.findings import Violation, expect, expect_equal
 
 BOX, REPLY = 256, 128  # registers of a message, offset of its reply
 HEAD = 2  # registers of a reply before its words: tag, result

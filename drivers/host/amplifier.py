@@ -146,6 +146,14 @@ class Amplifier(Dialogue):
         self.session, self.feeding.watchdog = session, watchdog
         self._contradictions = self._misachieved = 0
         self.ledger.forget()
+        if status["state"] != _ENABLED:
+            raise CommandRefused(
+                f"amplifier {self.name} must be OPERATION_ENABLED after Arm, got "
+                f"{name_of(STATES, status['state'])}, fault {name_of(FAULTS, status['fault'])}; "
+                "once the cause is gone, clear and arm again",
+                may_play=True,
+                is_disarmed=True,
+            )
         return status
 
     async def stage(self, token: int, layers: Sequence[Layer], *, now: bool = False) -> Staged:

@@ -126,6 +126,32 @@ def test_arm_that_was_busy_after_a_lost_reply_does_not_stay_armed() -> None:
     with_group(test, "serial", ("a",))
 
 
+def test_amplifier_that_is_not_armed_after_arm_is_not_said_to_be() -> None:
+    """It tells a fault in its reply: none stays armed, not even the one that was."""
+
+    async def test(group: Group, ends: list[MemoryLine]) -> None:
+        await group.disarm()
+        for end in ends:
+            for far in end.far.values():
+                far.session = 1  # that of the test never changes, and is not taken twice
+        far = ends[1].far["b"]
+
+        def trip(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
+            reply = handle(name, values, now)
+            if name != "Arm":
+                return reply
+            far.trip("OVER_VOLTAGE", now)
+            return far.status(now)
+
+        altered(far, trip)
+        with pytest.raises(CommandRefused, match="OVER_VOLTAGE"):
+            await group.arm()
+        assert not group.is_armed
+        assert ends[0].far["a"].state != "OPERATION_ENABLED"
+
+    with_group(test, "serial", ("a",), ("b",))
+
+
 def test_arming_anew_stops_what_cannot_be_disarmed() -> None:
     """One has tripped, so the other is to be disarmed first; it ignores that and is stopped."""
 

@@ -64,6 +64,7 @@ async def test_host_plays_layers_and_stops(line: str, firmware: Path) -> None:
     with running_firmware(firmware, *options(line)) as (url, _):
         async with opened(url) as amplifier:
             group = Group({"a": amplifier}, watchdog=2.0)
+            await group.open()
             await group.arm()
             fingers = [
                 Layer(0, (Tone(0, 100.0, 0.5), Tone(1, 130.0, 0.25)), 0.0),

@@ -64,13 +64,17 @@ def _open_port(name: str, baud: int, parity: str, stop: int) -> serial.Serial:
         exclusive=True,
     )
     port.open()
-    # USB adapters delay bytes by 16 ms unless low latency is set; most support it.
-    with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
-        port.set_low_latency_mode(True)
-    connection = connection_of(port)
-    if connection is not None:
-        bound_delay(connection)
-    port.reset_input_buffer()
+    try:
+        # USB adapters delay bytes by 16 ms unless low latency is set; most support it.
+        with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
+            port.set_low_latency_mode(True)
+        connection = connection_of(port)
+        if connection is not None:
+            bound_delay(connection)
+        port.reset_input_buffer()
+    except BaseException:
+        close_port(port)  # else it stays this program's, which could not open it again
+        raise
     return port
 
 

@@ -1,10 +1,13 @@
 """Opening of serial ports."""
 
+import errno
 import os
 
 import pytest
 import serial
 
+from drivers.errors import LinkError
+from drivers.hardware import Port
 from drivers.ports import opening
 from drivers.wires.known import address_of
 
@@ -58,3 +61,29 @@ async def test_open_port_sets_low_latency_and_parity(
     assert asked == {"baudrate": 19200, "parity": parity, "stopbits": 2, "exclusive": True}
     port.close()
     await port.wait_closed()
+
+
+async def test_port_that_fails_amid_its_opening_is_released(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is opened exclusively: else this program could not open it again."""
+    far, near = os.openpty()
+    name = os.ttyname(near)
+
+    async def open_it() -> Port:
+        return await opening.open_port(
+            name, baud=9600, on_data=lambda data: None, on_loss=lambda cause: None
+        )
+
+    def fail(port: serial.Serial) -> None:
+        raise OSError(errno.EIO, "gone")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(serial.Serial, "reset_input_buffer", fail)
+        with pytest.raises(LinkError, match="gone"):
+            await open_it()
+    port = await open_it()
+    port.close()
+    await port.wait_closed()
+    os.close(near)
+    os.close(far)

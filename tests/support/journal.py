@@ -1,14 +1,14 @@
 """What a far end is asked, and how loud it is, moment by moment on the amplifiers' own clock."""
 
-import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 from daemon_bench import until
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import unpack_layers
 from rig_on_wire import FarSide
+from sim.amplifier.contract import Amplifier
 
 FEEDING = ("Ping", "Set", "Commit", "Silence", "Arm", "Disarm", "Stop")
 """What a host that is alive sends while something may play."""
@@ -96,9 +96,15 @@ def energised(far: FarSide) -> list[str]:
 
 def silent_from(far: FarSide) -> float:
     """When [s] every channel of every amplifier is silent, or was; -inf where none ever played."""
+    return max(silent_from_of(far, name) for name in far.devices)
+
+
+def silent_from_of(far: FarSide, name: str) -> float:
+    """The same of one amplifier; what has faded is no longer among its tones."""
     far.summary()
-    outputs = (output for one in far.bench.amplifiers.values() for output in one.outputs)
-    return max((tone.silent_from for output in outputs for tone in output), default=-math.inf)
+    one = cast(Amplifier, far.bench.amplifiers[name])
+    ends = [tone.silent_from for output in one.outputs for tone in output]
+    return max([one._silent_from, *ends])
 
 
 def loudness(far: FarSide) -> float:

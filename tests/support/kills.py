@@ -32,7 +32,7 @@ from daemon_process import (
     NotServing,
     daemon_process,
 )
-from journal import Journal, energised, loudness
+from journal import Journal, energised, loudness, silent_from_of
 from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
 from rig_on_wire import far_side
@@ -131,8 +131,7 @@ async def _kill(wire: str, daemon: DaemonProcess, journal: Journal) -> Kill:
     ends = []
     for name in alive:
         fed = journal.last_fed(name)
-        tones = [one.silent_from for each in far.bench.amplifiers[name].outputs for one in each]
-        ends.append((max(tones, default=fed), fed))
+        ends.append((silent_from_of(far, name), fed))
     await asyncio.sleep(0.05)  # what was still to come would have come
     return Kill(
         wire,

@@ -11,6 +11,7 @@ import pytest
 from controller.api.jsonrpc import ErrorCode
 from controller.cli.daemon import show_status
 from controller.gateway.settings import read_token
+from controller.loop.decision import ENDED
 from controller.loop.intent import NO_CONTACTS
 from daemon_bench import (
     ENABLED,
@@ -137,10 +138,8 @@ async def test_daemon_stays_disarmed_and_latched_after_link_loss_while_armed(
                 *(("degraded", "main"), ("lost", "main")),
             ]
             data = {event.topic: event.data for event in ended}
-            # On a busy machine the finger may time out first.
-            assert (
-                "no reply" in data["silence"]["reason"] or data["silence"]["reason"] == NO_CONTACTS
-            )
+            # Nothing is renewed meanwhile; on a busy machine the finger may time out first.
+            assert data["silence"]["reason"] in (ENDED, NO_CONTACTS)
         assert (await era.status()).drive == {}
         assert await error_code(era.arm("me")) is ErrorCode.WRONG_STATE
         assert await error_code(era.clear()) is ErrorCode.LINK

@@ -57,7 +57,11 @@ class Lines:
                 await opened.close()
                 opened = None
             if opened is None:
-                opened = self._opened[address.line] = await _open(address)
+                before, opened = self._opened, await _open(address)
+                if self._opened is not before:
+                    await opened.close()
+                    raise LinkError(f"{address.line} was closed while it was being opened")
+                self._opened[address.line] = opened
         for setting, value in opened.settings.items():
             if (got := address.settings.get(setting)) != value:
                 raise LinkError(

@@ -8,10 +8,12 @@ import pytest
 
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, LinkError, LinkTimeout
+from drivers.hardware import HARDWARE_PROVIDER, HardwareProvider, Port
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
 from registry.limits import GuardLimits
+from virtual_loop import in_virtual_time
 from word_wires import WORD_WIRES
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
@@ -34,6 +36,49 @@ async def read_for_ever(amplifier: Amplifier) -> None:
     async with asyncio.timeout(5.0):
         while True:
             await amplifier.read_status()
+
+
+class SlowHardware(HardwareProvider):
+    """Opens a port in half a second; closed: how many were closed."""
+
+    is_blocked = False
+    closed = 0
+
+    async def open_port(self, name: str, **_: object) -> Port:
+        """Open a port, which is this one."""
+        await asyncio.sleep(0.5)
+        return self
+
+    def below(self, limit: int) -> int:
+        """The lowest number."""
+        return 0
+
+    def write(self, data: bytes) -> None:
+        """Nothing is there."""
+
+    def poll(self) -> None:
+        """Nothing has come."""
+
+    def close(self) -> None:
+        """Count it."""
+        self.closed += 1
+
+    async def wait_closed(self) -> None:
+        """It is closed."""
+
+
+@in_virtual_time
+async def test_line_that_is_closed_while_it_is_opened_stays_closed() -> None:
+    """As by a shutdown during a reconnection; else the port would stay open, and taken."""
+    hardware = SlowHardware()
+    HARDWARE_PROVIDER.set(hardware)
+    lines = Lines()
+    opening = asyncio.ensure_future(lines.amplifier("serial:///dev/x?address=1", LIMITS, name="x"))
+    await asyncio.sleep(0.1)
+    await lines.close()
+    with pytest.raises(LinkError, match="closed"):
+        await opening
+    assert hardware.closed == 1
 
 
 @pytest.mark.real_time

@@ -64,12 +64,12 @@ class Group:
         self._watchdog = watchdog
         self._draw = draw
         first = draw(_TOKEN.minimum, _TOKEN.maximum)
-        self._sets = JointSets(self._members, first, lambda: self._silences.count)
         self._heartbeats = Heartbeats(self._members, lambda: self.is_armed)
         self._stopping = Stopping(self.amplifiers)
         self._arming_lock = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
         self._silences = Silences()
+        self._sets = JointSets(self._members, first, self._silences)
         self._arming = Arming(self._members, self._silences, self.stop)
         self._stops = self._cleared = 0  # stops so far, and at the last clear
         self._may_be_armed = False  # since the amplifiers were opened
@@ -200,7 +200,7 @@ class Group:
             self._limit.reschedule(clock.now())
 
     def _check_armed(self) -> None:
-        if not self.is_armed:
+        if self.state is not GroupState.ARMED:
             raise CommandRefused("the amplifiers must be armed; clear a stop, then arm")
 
     async def _exchange(self, exchange: Coroutine[Any, Any, _T]) -> _T:

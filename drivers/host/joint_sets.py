@@ -1,13 +1,14 @@
 """Sets of several amplifiers: staged on all of them, then committed at one moment, or on none."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 from drivers.contents import Layer, is_silence
 from drivers.errors import CommandRefused, Preempted
 from drivers.host.amplifier import Amplifier
+from drivers.host.arming import Silences
 from drivers.host.comparison import name_of
 from drivers.host.dialogue import Staged
 from drivers.host.jobs import Priority
@@ -36,12 +37,9 @@ class Played:
 
 
 class JointSets:
-    """Sets of the amplifiers of a group, under tokens from a first one on.
+    """Sets of the amplifiers of a group, under tokens from a first one on."""
 
-    silences: the count of stops and disarms so far.
-    """
-
-    def __init__(self, members: Members, token: int, silences: Callable[[], int]) -> None:
+    def __init__(self, members: Members, token: int, silences: Silences) -> None:
         self.is_incomplete = False
         """Whether possibly only some amplifiers have committed the last set."""
         self.token = token
@@ -52,7 +50,7 @@ class JointSets:
     async def play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | CommandRefused:
         """Stage and commit layers by amplifier; a refusal before the first commit is returned."""
         amplifiers = self._members.amplifiers
-        before = self._silences()
+        before = self._silences.count
         if self.token % INTERVAL == 0:
             self.token = await close_gaps(amplifiers.values(), self.token)
         self.token = token = token_after(self.token)
@@ -75,7 +73,7 @@ class JointSets:
             return _merged(refusals)
         staged = self._members.checked(results)
         if not is_silent:
-            if self._silences() != before:
+            if self._silences.count != before:
                 raise Preempted("a stop or disarm came first")
             self.is_incomplete = len(layers) > 1
             await self._commit(several, staged)

@@ -90,7 +90,7 @@ def test_entry_points_lead_into_the_wheel(wheel: Path) -> None:
         for group in points.sections()
         for value in dict(points[group]).values()
     }
-    assert len(modules) > 10
+    assert len(modules) > 8
     assert [
         module
         for module in sorted(modules)

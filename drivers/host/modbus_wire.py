@@ -131,11 +131,11 @@ class ModbusWire:
         characters = length + _ANSWERS_SIZE + 2 * max(replies)
         return _BITS * characters / self._baud + 4 * self.silence
 
-    def _adu(self, unit: int, asked: Read | Write) -> RequestAdu:
+    def _adu(self, unit: int, transfer: Read | Write) -> RequestAdu:
         self._number = self._number % 0xFFFF + 1
         self.counters.frames_out += 1
         transaction = 0 if self._is_rtu else self._number
-        return build_adu(asked, unit=unit, transaction=transaction, is_rtu=self._is_rtu)
+        return build_adu(transfer, unit=unit, transaction=transaction, is_rtu=self._is_rtu)
 
     def _written(self, unit: int, name: str, values: Values) -> _Request:
         """Return a request whose write goes first."""
@@ -153,7 +153,7 @@ class ModbusWire:
             if (refusal := _EXCEPTIONS.get(response.exception)) is not None:
                 return Nak(refusal, None)
             return Broken(f"Modbus exception {response.exception}")
-        if isinstance(request.adu.asked, Write):
+        if isinstance(request.adu.transfer, Write):
             first = MESSAGES[request.name].number * _BOX + _REPLY
             read = Read(first, _reply_registers(request.name, *self._sizes[request.unit]))
             request.adu = self._adu(request.unit, read)

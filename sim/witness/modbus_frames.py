@@ -1,4 +1,4 @@
-"""Modbus ADUs in a stream of bytes, TCP and RTU, from docs/reference/wire-modbus.md."""
+"""Modbus ADUs in a stream of bytes, TCP and RTU, from docs/reference/modbus.md."""
 
 import struct
 from abc import ABC, abstractmethod

@@ -33,9 +33,9 @@ def test_host_that_vanishes_leaves_silence(kind: str, replaying: Path) -> None:
 
     async def run() -> None:
         end = FirmwareLine(kind, replaying)
-        group = Group({"a": end.host})
+        group = Group({"a": end.host}, watchdog=WATCHDOG)
         await group.open()
-        await group.arm(WATCHDOG)
+        await group.arm()
         await group.apply({"a": layers()})
         for _ in range(4):
             await asyncio.sleep(0.05)
@@ -61,10 +61,10 @@ def test_stop_is_confirmed_once_it_is_silent(kind: str, replaying: Path) -> None
 
     async def run() -> None:
         end = FirmwareLine(kind, replaying)
-        group = Group({"a": end.host})
+        group = Group({"a": end.host}, watchdog=WATCHDOG)
         await group.open()
         for _ in range(2):
-            await group.arm(WATCHDOG)
+            await group.arm()
             await group.apply({"a": layers()})
             await asyncio.sleep(0.03)
             assert max((await end.host.read_status())["levels"]) > 2000

@@ -56,7 +56,7 @@ class RequestAdu:
     function: int
     frame: bytes
     response_size: int
-    asked: Read | Write
+    transfer: Read | Write
 
 
 @dataclass(frozen=True)
@@ -67,19 +67,21 @@ class ModbusResponse:
     exception: int = 0
 
 
-def build_adu(asked: Read | Write, *, unit: int, transaction: int, is_rtu: bool) -> RequestAdu:
+def build_adu(transfer: Read | Write, *, unit: int, transaction: int, is_rtu: bool) -> RequestAdu:
     """Build the request that reads or writes."""
     pdu: ModbusPDU
-    if isinstance(asked, Read):
-        pdu = ReadInputRegistersRequest(address=asked.address, count=asked.count)
-        size = 2 + 2 * asked.count
+    if isinstance(transfer, Read):
+        pdu = ReadInputRegistersRequest(address=transfer.address, count=transfer.count)
+        size = 2 + 2 * transfer.count
     else:
-        pdu = WriteMultipleRegistersRequest(address=asked.address, registers=[*asked.registers])
+        pdu = WriteMultipleRegistersRequest(
+            address=transfer.address, registers=[*transfer.registers]
+        )
         size = 5
     pdu.dev_id = unit
     pdu.transaction_id = transaction
     frame = (_RTU if is_rtu else _TCP).buildFrame(pdu)
-    return RequestAdu(unit, transaction, pdu.function_code, frame, size, asked)
+    return RequestAdu(unit, transaction, pdu.function_code, frame, size, transfer)
 
 
 class ResponseReader:
@@ -180,15 +182,15 @@ def _response(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
         return None
     if isinstance(message, ExceptionResponse):
         return ModbusResponse(exception=message.exception_code)
-    if isinstance(to.asked, Read):
+    if isinstance(to.transfer, Read):
         return ModbusResponse(tuple(message.registers))
-    is_echo = message.count == len(to.asked.registers)
-    return ModbusResponse() if is_echo and message.address == to.asked.address else None
+    is_echo = message.count == len(to.transfer.registers)
+    return ModbusResponse() if is_echo and message.address == to.transfer.address else None
 
 
 def _has_form(pdu: bytes, to: RequestAdu) -> bool:
     """Whether function and length are those of a response or exception."""
     if pdu[0] == to.function | _EXCEPTION:
         return len(pdu) == 2 and pdu[1] > 0  # an exception has a code
-    is_long = isinstance(to.asked, Write) or pdu[1:2] == bytes([2 * to.asked.count])
+    is_long = isinstance(to.transfer, Write) or pdu[1:2] == bytes([2 * to.transfer.count])
     return pdu[0] == to.function and len(pdu) == to.response_size and is_long

@@ -72,7 +72,7 @@ def test_report_includes_files_of_daemon(tmp_path: Path) -> None:
     assert "daemon" in daemon
     found = json.loads(report.files["versions.json"])
     assert found["packages"]["numpy"][0].isdigit()
-    assert "SerialBackend" in found["plug-ins"]["backends"]["serial"]
+    assert "SimulatedAddress" in found["plug-ins"]["wires"]["sim"]
 
 
 def test_versions_list_packages_of_plug_ins(

@@ -61,7 +61,7 @@ async def test_interrupt_stops_all_amplifiers(tmp_path: Path) -> None:
         process.send_signal(2)
         assert (await ended(process))[0] == 130
         await until_state(era, "QUICK_STOP_ACTIVE")
-        assert not any(bench.far.device.status().levels)
+        assert not any(bench.far.summary().levels)
 
 
 async def test_killed_client_lifts_its_fingers(tmp_path: Path) -> None:

@@ -23,17 +23,16 @@ _BEAT = 0.1  # s
 
 async def linear_amplifier(lines: Lines, url: str) -> Amplifier:
     """The amplifier of a URL, whose full level is its output; nothing is sent."""
-    opened = await lines.amplifier(url, LIMITS, name="a")
-    return Amplifier(opened.line, opened.address, LIMITS, name="a", is_output=True)
+    return await lines.amplifier(url, LIMITS, name="a", is_output=True)
 
 
 async def main(url: str, channels: int) -> None:
     """Acknowledge a fault, arm and play."""
     amplifier = await linear_amplifier(Lines(), url)
-    group = Group({"a": amplifier})
+    group = Group({"a": amplifier}, watchdog=WATCHDOG)
     await group.open()
     await group.clear()
-    await group.arm(WATCHDOG)
+    await group.arm()
     sys.stdout.write("armed\n")
     sys.stdout.flush()
     tones = (Tone(n, 1000.0, 0.5, (30.0 * n + 180) % 360 - 180) for n in range(channels))

@@ -110,7 +110,7 @@ async def kill_daemons(
                             _live(daemon, random.Random(chance.random()), armed)
                         )
                         if not is_early:
-                            await asyncio.wait_for(armed.wait(), STARTING)
+                            await _first(armed, living, daemon)
                         await asyncio.sleep(chance.uniform(0.0, LONGEST_LIFE))
                         done.append(await _kill(name, daemon, journal))
                         living.cancel()
@@ -118,6 +118,15 @@ async def kill_daemons(
                         if tell is not None:
                             tell(done[-1])
             return done
+
+
+async def _first(armed: asyncio.Event, living: "asyncio.Task[None]", daemon: DaemonProcess) -> None:
+    """Wait until it is armed; raises NotServing where its client has ended before."""
+    waiting = asyncio.create_task(armed.wait())
+    await asyncio.wait((waiting, living), timeout=STARTING, return_when=asyncio.FIRST_COMPLETED)
+    waiting.cancel()
+    if not armed.is_set():
+        raise NotServing(str(daemon.log))
 
 
 async def _kill(wire: str, daemon: DaemonProcess, journal: Journal) -> Kill:

@@ -187,7 +187,7 @@ class Controller:
             )
             decider.prepare()
         except BaseException:
-            await self._close()
+            await self.close()
             raise
         self._missing = frozenset()
         self._decider_if_open = decider
@@ -231,21 +231,15 @@ class Controller:
 
     async def close(self) -> None:
         """Ramp to zero in 50 ms, confirm it by reading back, disarm and close; ends `run`."""
-        await self._close()
-
-    async def _close(self) -> None:
         self._wake.set()
         if self._lines_if_open is not None and self._group.lost_by:
             self._missing = frozenset(self._group.lost_by)
         try:
             await self._group.close(CLOSING_RAMP)
         finally:
-            await self._close_lines()
-
-    async def _close_lines(self) -> None:
-        lines, self._lines_if_open = self._lines_if_open, None
-        if lines is not None:
-            await lines.close()
+            lines, self._lines_if_open = self._lines_if_open, None
+            if lines is not None:
+                await lines.close()
 
     async def run(self) -> None:
         """Run the loop until `close` or cancellation; raises LinkError when an amplifier is lost.

@@ -21,9 +21,9 @@ from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import STOP_RAMP, WATCHDOG, Amplifier
 from drivers.host.comparison import name_of
 from drivers.host.jobs import Priority
-from drivers.host.sensors import check_tones, measure_tones, read_sensors
+from drivers.host.sensors import check_tones, measure_tones, read_measured, read_sensors
 from drivers.host.timing import check_watchdog
-from drivers.protocol.table import FAULTS, FEATURES, QUANTITIES, STATES
+from drivers.protocol.table import FAULTS, LATCHED, QUANTITIES, STATES, has_feature
 from drivers.urls.address import with_address
 
 _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
@@ -37,7 +37,6 @@ _SENSOR_UNITS = {
     "FORCE": "N",
     "VOLTAGE": "V",
 }
-_LATCHED = ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT")
 
 
 async def identify(url: str) -> dict[str, Any]:
@@ -59,16 +58,10 @@ async def status(url: str) -> dict[str, Any]:
     async with identified(url) as amplifier:
         now = await amplifier.read_status()
         faults = await request(amplifier, "GetFaults", {})
-        measured: list[dict[str, Any]] = []
-        if _has(amplifier, "electrical"):
-            for row in (await request(amplifier, "GetMeasured", {}))["channels"]:
-                voltage, current = QUANTITIES["channel_voltage"], QUANTITIES["channel_current"]
-                measured.append(
-                    {
-                        "voltage_v": voltage.from_wire(row["channel_voltage"]),
-                        "current_a": current.from_wire(row["channel_current"]),
-                    }
-                )
+        measured = [
+            {"voltage_v": voltage, "current_a": current}
+            for voltage, current in await read_measured(amplifier)
+        ]
         return {
             "url": url,
             **status_rows(now),
@@ -172,7 +165,7 @@ async def set_address(url: str, address: int, serial_number: str | None) -> dict
     if serial_number is None:
         async with identified(url) as amplifier:
             serial_number = amplifier.identity["serial_number"]
-            if not _has(amplifier, "address"):
+            if not has_feature(amplifier.capabilities, "address"):
                 raise CommandError("the address of this amplifier cannot be set over its wire")
             state = name_of(STATES, (await amplifier.read_status())["state"])
             if state != "SWITCH_ON_DISABLED":
@@ -253,14 +246,10 @@ async def _arm(amplifier: Amplifier, watchdog: float, url: str) -> None:
         await amplifier.arm(random_session(), watchdog)
     except CommandRefused as refused:
         now = await amplifier.read_status()
-        state = name_of(STATES, now["state"])
-        if state not in _LATCHED:
+        if now["state"] not in LATCHED:
             raise
         raise CommandRefused(
-            f"the amplifier does not arm: state {state}, fault {name_of(FAULTS, now['fault'])}; "
-            f"once the cause is gone: era amp clear {shlex.quote(url)}"
+            f"the amplifier does not arm: state {name_of(STATES, now['state'])}, fault "
+            f"{name_of(FAULTS, now['fault'])}; once the cause is gone: era amp clear "
+            f"{shlex.quote(url)}"
         ) from refused
-
-
-def _has(amplifier: Amplifier, feature: str) -> bool:
-    return bool(amplifier.capabilities["features"] >> FEATURES[feature] & 1)

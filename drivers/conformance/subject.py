@@ -12,7 +12,7 @@ from drivers.conformance.expected import Bounds, alone, steady, within
 from drivers.conformance.findings import Late, Optional, Violation, expect, expect_equal
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
-from drivers.protocol.table import FEATURES, MESSAGES, QUANTITIES, STATES, STATUS_FLAGS
+from drivers.protocol.table import MESSAGES, QUANTITIES, STATES, STATUS_FLAGS, has_feature
 
 LEVEL = 0.2
 """Level of driven channels unless another is given: perceptible, and far from any limit."""
@@ -185,7 +185,7 @@ class Subject:
 
     def has(self, feature: str) -> bool:
         """Whether it states a feature."""
-        return bool(self.can["features"] >> FEATURES[feature] & 1)
+        return has_feature(self.can, feature)
 
     def require(self, feature: str) -> None:
         """Raise Optional without a feature."""

@@ -21,6 +21,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import (
     FAULTS,
+    LATCHED,
     MAX_WORDS,
     QUANTITIES,
     STATES,
@@ -38,7 +39,6 @@ SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENABLED = STATES["OPERATION_ENABLED"]
-_LATCHED = tuple(STATES[name] for name in ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT"))
 PART_BYTES = 2 * MAX_WORDS
 """Of the longest part of a set."""
 
@@ -364,6 +364,6 @@ class Amplifier(Dialogue):
 
 def is_stopping(status: Values, before: int | None) -> bool:
     """Whether a status shows that a stop was carried out since a latch was the newest."""
-    if before is None or status["state"] not in _LATCHED:
+    if before is None or status["state"] not in LATCHED:
         return False
     return status["latch"] > 0 and is_newer_token(status["latch"], before)

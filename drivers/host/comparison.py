@@ -9,7 +9,7 @@ from drivers.host.feeding import Feeding
 from drivers.host.ledger import Ledger
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import FEATURES, QUANTITIES, STATES, STATUS_FLAGS
+from drivers.protocol.table import QUANTITIES, STATES, STATUS_FLAGS, has_feature
 
 MAX_CONTRADICTIONS = 2
 """Contradictions in a row that are a fault; a single one may be a moment between two sets."""
@@ -58,7 +58,7 @@ def _level_problem(status: Values, ledger: Ledger, sent_at: float, now: float) -
         return f"levels must be {playback.channels}, got {len(status['levels'])}"
     can = ledger.capabilities
     tolerance = _STEPS * max(can["level_step"], 1)
-    is_measured = can["features"] >> FEATURES["levels_measured"] & 1
+    is_measured = has_feature(can, "levels_measured")
     is_steady = playback.next_due - 2 * ledger.lag > now
     for channel, level in enumerate(status["levels"]):
         highest, is_settled = 0.0, is_steady

@@ -11,8 +11,7 @@ from drivers import clock
 from drivers.errors import LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.jobs import Priority
-from drivers.host.joint_sets import seen
-from drivers.host.members import Members, is_lost, round_trip_of
+from drivers.host.members import Members, is_lost, round_trip_of, seen
 from drivers.protocol.records import Values
 
 _MAX_STATUS_LOAD = 0.05  # of the line's time, for statuses that show whether the watchdog runs down

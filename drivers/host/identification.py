@@ -3,7 +3,7 @@
 from drivers.errors import LinkError
 from drivers.protocol.records import Values
 from drivers.protocol.serial_payload import speaks
-from drivers.protocol.table import FEATURES, VERSION
+from drivers.protocol.table import VERSION, has_feature
 
 _POSITIVE = ("frequency_step", "level_step", "phase_step")
 _FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")
@@ -43,7 +43,7 @@ def check_capabilities(can: Values, name: str, *, is_output: bool | None) -> Non
             raise LinkError(
                 f"amplifier {name}: {each}_min must be at most {each}_max, got {low} and {high}"
             )
-    has_output = bool(can["features"] >> FEATURES["output"] & 1)
+    has_output = has_feature(can, "output")
     if is_output is not None and has_output is not is_output:
         raise LinkError(
             f"amplifier {name}: full level must be {_FULL_LEVEL[is_output]} as in the rig file, "

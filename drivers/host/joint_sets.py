@@ -14,7 +14,7 @@ from drivers.host.dialogue import Staged
 from drivers.host.jobs import Priority
 from drivers.host.joint_start import JointStart
 from drivers.host.line import Line
-from drivers.host.members import Members
+from drivers.host.members import Members, seen
 from drivers.host.token_gaps import INTERVAL, close_gaps
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
@@ -123,12 +123,6 @@ class JointSets:
             for number, layers in zip(inexact, read, strict=True):
                 achieved[number] = layers
         return Played(self.token, dict(zip(names, achieved, strict=True)), sent_at)
-
-
-def seen(sent: "asyncio.Future[Values]") -> None:
-    """Retrieve an error that nobody awaits: what each amplifier says afterwards decides."""
-    if not sent.cancelled():
-        sent.exception()
 
 
 def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:

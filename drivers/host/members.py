@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from drivers import clock
 from drivers.errors import LinkError, LinkTimeout
 from drivers.host.amplifier import PART_BYTES, Amplifier
+from drivers.protocol.records import Values
 
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
 _T = TypeVar("_T")
@@ -121,3 +122,9 @@ async def to_completion(work: Coroutine[Any, Any, _T]) -> _T:
     if cancellation is not None:
         raise cancellation
     return task.result()
+
+
+def seen(sent: "asyncio.Future[Values]") -> None:
+    """Retrieve an error that nobody awaits: what each amplifier says afterwards decides."""
+    if not sent.cancelled():
+        sent.exception()

@@ -16,12 +16,12 @@ from drivers.host.comparison import name_of
 from drivers.host.jobs import Priority
 from drivers.protocol.records import Record, Refusal, Rows, Values
 from drivers.protocol.table import (
-    FEATURES,
     NO_CHANNEL,
     QUANTITIES,
     READING_STATES,
     SENSOR_UNITS,
     UNKNOWN_PLACE,
+    has_feature,
     sensor_reading,
 )
 
@@ -74,7 +74,7 @@ class Reading:
 
 async def read_sensors(amplifier: Amplifier) -> tuple[Sensor, ...]:
     """Read what its sensors measure, and where; empty if it has none."""
-    if not amplifier.capabilities["features"] >> FEATURES["sensors"] & 1:
+    if not has_feature(amplifier.capabilities, "sensors"):
         return ()
     found: list[Sensor] = []
     while True:
@@ -89,7 +89,7 @@ async def read_sensors(amplifier: Amplifier) -> tuple[Sensor, ...]:
 
 async def read_measured(amplifier: Amplifier) -> list[tuple[float, float]]:
     """Read voltage [V] and current [A] of each channel; empty if it does not measure them."""
-    if not amplifier.capabilities["features"] >> FEATURES["electrical"] & 1:
+    if not has_feature(amplifier.capabilities, "electrical"):
         return []
     rows = (await _request(amplifier, "GetMeasured", {}))["channels"]
     voltages = [_Q["channel_voltage"].from_wire(row["channel_voltage"]) for row in rows]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from drivers.host.amplifier import Amplifier, Stopped
 from drivers.host.jobs import Priority
 from drivers.host.line import Line
+from drivers.host.members import seen
 from drivers.protocol.records import Values
 
 _logger = logging.getLogger(__name__)
@@ -64,7 +65,7 @@ class Stopping:
             first = next(iter(self._amplifiers.values()))
             values = {"ramp": first.wire_ramp(ramp)}
             sent = line.submit(None, Priority.STOP, "Stop", values)
-            sent.add_done_callback(_seen)
+            sent.add_done_callback(seen)
             self._broadcasts[line] = sent
 
     def _stop(self, name: str, ramp: float) -> "asyncio.Future[Stopped]":
@@ -81,9 +82,3 @@ class Stopping:
             return result
         until = self._amplifiers[name].feeding.may_play_until
         return Stopped(False, until, f"{type(result).__name__}: {result}")
-
-
-def _seen(sent: "asyncio.Future[Values]") -> None:
-    """Retrieve the error of a broadcast: each amplifier is stopped by itself as well."""
-    if not sent.cancelled():
-        sent.exception()

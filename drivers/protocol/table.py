@@ -43,6 +43,10 @@ STATES: Mapping[str, int] = {
         )
     )
 }
+LATCHED: Final = tuple(
+    STATES[name] for name in ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT")
+)
+"""States that a stop or a fault leads to, until it is cleared."""
 FAULTS: Mapping[str, int] = {
     name: number
     for number, name in enumerate(
@@ -282,3 +286,8 @@ def nak_of(refusal: Refusal, number: int) -> list[int]:
     """Return the words of the Nak to a request with a message's number."""
     channel = NO_CHANNEL if refusal.channel is None else refusal.channel
     return NAK_RECORD.pack({"request": number, "code": REFUSALS[refusal.code], "channel": channel})
+
+
+def has_feature(capabilities: Values, name: str) -> bool:
+    """Whether capabilities state a feature, of FEATURES."""
+    return bool(capabilities["features"] >> FEATURES[name] & 1)

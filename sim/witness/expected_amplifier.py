@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import (
+    LATCHED,
     MESSAGES,
     QUANTITIES,
     REACTION,
@@ -33,7 +34,7 @@ from sim.witness.expected_state import (
     ExpectedState,
 )
 from sim.witness.set_replies import achieved_problem
-from sim.witness.unanswered import ENABLED, LATCHED, Sent, is_carried_out
+from sim.witness.unanswered import ENABLED, Sent, is_carried_out
 from sim.witness.violation import ReportViolation
 
 _WARM = QUANTITIES["temperature"].to_wire(60.0)  # from here on an amplifier may derate

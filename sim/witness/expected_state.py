@@ -3,12 +3,12 @@
 import math
 
 from drivers.protocol.records import Values
-from drivers.protocol.table import FAULTS, QUANTITIES, STATES
+from drivers.protocol.table import FAULTS, LATCHED, QUANTITIES, STATES
 from drivers.protocol.tokens import is_newer_token
 from sim.witness.expected_outputs import ExpectedOutputs, Interval
 from sim.witness.reports import fault_list_problem
 from sim.witness.set_replies import SetReplies
-from sim.witness.unanswered import ENABLED, LATCHED, Unanswered
+from sim.witness.unanswered import ENABLED, Unanswered
 from sim.witness.violation import ReportViolation
 from sim.witness.watchdog import Watchdog
 

@@ -7,14 +7,14 @@ from collections.abc import Collection, Hashable, Mapping, Sequence
 
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.table import LATCHED, QUANTITIES
 from sim.witness.amplifier_session import AmplifierSession, is_vibrating
 from sim.witness.config import TimeLimits
 from sim.witness.deadlines import Deadlines, KnownInputs
 from sim.witness.decoded import A_READ, BROADCAST, FEEDING, HELLO, Request
 from sim.witness.delays import Delays
 from sim.witness.set_rules import ExpectedSets, check_expected, check_set
-from sim.witness.unanswered import LATCHED, Sent
+from sim.witness.unanswered import Sent
 from sim.witness.watched_wire import WatchedWire
 
 _IN_FLIGHT = 0.001  # s; from the host's write until a frame is seen

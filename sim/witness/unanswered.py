@@ -4,12 +4,10 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 
 from drivers.protocol.records import Values
-from drivers.protocol.table import STATES
+from drivers.protocol.table import LATCHED, STATES
 from sim.witness.decoded import Request
 
 ENABLED = STATES["OPERATION_ENABLED"]
-LATCHED = tuple(STATES[name] for name in ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT"))
-"""States that a stop or a fault leads to, until it is cleared."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,6 @@ from controller.daemon.states import ENERGISED, DaemonState, StateMachine
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches, TouchInputs
 from controller.learning.learning import Learning, observed
-from controller.loop.lines import Lines as HostLines
 from controller.loop.loop import Controller
 from controller.sources.touch import TouchFrame
 from drivers import clock
@@ -63,7 +62,7 @@ class Daemon:
         log: LogThread,
         manager: ServiceManager,
         dashboard: str | None,
-        lines: Callable[[], HostLines] = Lines,
+        lines: Callable[[], Lines] = Lines,
         watchdog: float = WATCHDOG,
     ) -> None:
         self._config = config

@@ -11,12 +11,12 @@ from controller.diagnosis.common_start import start_together
 from controller.diagnosis.interleaved_tones import Interleaved, Step, interleaved
 from controller.diagnosis.plate_sensors import PlateSensor, PlateSensors, plate_sensors
 from controller.diagnosis.tone_player import TonePlayer
-from controller.loop.lines import Lines
 from controller.loop.routing import Drive
 from drivers import clock
 from drivers.errors import CommandError, CommandRefused
 from drivers.host.sensors import Reading, measure_tones
 from drivers.host.timing import HEARTBEAT
+from drivers.opening import Lines
 from model.arrays import ComplexArray, FloatArray
 from model.choice import best_first, best_of
 from model.errors import InputError

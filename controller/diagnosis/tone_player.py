@@ -8,11 +8,11 @@ import math
 from collections.abc import Callable, Mapping
 
 from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
-from controller.loop.lines import Lines
 from controller.loop.routing import Drive, route, tones_by_era
 from drivers.errors import CommandRefused
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
+from drivers.opening import Lines
 from drivers.protocol.table import QUANTITIES
 from model.rig.rig import Rig
 from model.vibration.excitation import Excitation

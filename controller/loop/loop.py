@@ -9,7 +9,6 @@ from typing import ParamSpec
 from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
 from controller.loop.decision import RELEASE_RAMP, Decider, Decision
 from controller.loop.intent import BuzzNewestContact, IntentSource
-from controller.loop.lines import Lines
 from controller.loop.observer import Observer, applied_by, silenced_by
 from controller.loop.plate_set import PlateSet
 from controller.sources.contacts import Change
@@ -28,6 +27,7 @@ from drivers.host.amplifier import WATCHDOG, Amplifier, Stopped
 from drivers.host.group import Group, GroupState
 from drivers.host.joint_sets import Played
 from drivers.host.timing import HEARTBEAT
+from drivers.opening import Lines
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.rig.rig import Rig

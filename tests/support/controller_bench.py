@@ -17,6 +17,7 @@ from drivers.errors import LinkError
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.line import Line
 from drivers.host.serial_wire import SerialWire
+from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, unpack_layers
 from drivers.protocol.table import NO_CHANNEL, QUANTITIES
@@ -220,10 +221,11 @@ class FarEnd:
         return [time for time, name, _ in self.asked if name in names]
 
 
-class BenchLines:
+class BenchLines(Lines):
     """The lines of far ends by URL."""
 
     def __init__(self, far_ends: Mapping[str, Any]) -> None:
+        super().__init__()
         self._far_ends = far_ends
 
     async def amplifier(

@@ -15,7 +15,6 @@ import os
 import socket
 import sys
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import serial
 from pythonosc.osc_packet import OscPacket
@@ -25,7 +24,8 @@ from drivers.codec.serial_line.frame import Frame, encode_frame
 from drivers.host.serial_wire import SerialWire
 from drivers.protocol.serial_payload import pack_words
 from drivers.protocol.table import MESSAGES, VERSION
-from drivers.urls.serial_line import SerialUrl
+from drivers.urls import Place
+from drivers.wires.serial_line import SerialAddress
 
 SETS = 100
 
@@ -71,12 +71,11 @@ class Flooded(asyncio.Protocol):
                 json.loads(line)
 
 
-def _opened(url: SerialUrl) -> serial.Serial | socket.socket:
+def _opened(place: Place) -> serial.Serial | socket.socket:
     """Open the wire: a port, or a connection to a serial server."""
-    if url.is_local:
-        return serial.Serial(url.port, url.baud, timeout=0, exclusive=True)
-    place = urlsplit(url.port)
-    line = socket.create_connection((place.hostname or "", place.port or 0))
+    if place.device:
+        return serial.Serial(place.device, place.baud, timeout=0, exclusive=True)
+    line = socket.create_connection((place.host, place.port))
     line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     line.setblocking(False)
     return line
@@ -84,9 +83,9 @@ def _opened(url: SerialUrl) -> serial.Serial | socket.socket:
 
 async def main() -> None:
     loop = asyncio.get_running_loop()
-    parsed = SerialUrl.parse(sys.argv[2])
-    with _opened(parsed) as port:
-        arm = SerialWire(parsed.baud, sequence=0).request(1, "Arm", arm_values())
+    place = SerialAddress(sys.argv[2]).place
+    with _opened(place) as port:
+        arm = SerialWire(place.baud, sequence=0).request(1, "Arm", arm_values())
         os.write(port.fileno(), arm)
         loop.add_reader(port.fileno(), os.read, port.fileno(), 4096)
         transport, _ = await loop.create_datagram_endpoint(

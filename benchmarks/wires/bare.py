@@ -18,9 +18,10 @@ from drivers.host.can_wire import CanWire
 from drivers.host.serial_wire import SerialWire
 from drivers.protocol.records import Values
 from drivers.protocol.table import MESSAGES
-from drivers.urls.can_bus import CanUrl
-from drivers.urls.modbus import ModbusUrl
-from drivers.urls.serial_line import SerialUrl
+from drivers.wires.modbus import ModbusAddress
+from drivers.wires.serial_line import SerialAddress
+from drivers.wires.slcan import SlcanAddress
+from drivers.wires.socketcand import SocketcandAddress
 
 _BOX, _REPLY_AT = 256, 128  # registers of a message, and from there to its reply
 _REPLY_HEAD = 2  # tag, result
@@ -28,12 +29,12 @@ _REPLY_HEAD = 2  # tag, result
 
 def bare_serial(url: str, sets: Sequence[Values]) -> list[float]:
     """pyserial: write the frame, read until the zero that ends the reply."""
-    parsed = SerialUrl.parse(url)
-    wire = SerialWire(parsed.baud, sequence=0)
+    place = SerialAddress(url).place
+    wire = SerialWire(place.baud, sequence=0)
     arm = wire.request(1, "Arm", arm_values())
     requests = [wire.request(1, "Set", values) for values in sets]
     times = []
-    with serial.Serial(parsed.port, parsed.baud, timeout=1, exclusive=True) as port:
+    with serial.Serial(place.device, place.baud, timeout=1, exclusive=True) as port:
         _exchange(port, arm)
         time.sleep(0.1)  # until the event of having been armed has come
         port.reset_input_buffer()
@@ -53,14 +54,15 @@ def _exchange(port: serial.Serial, request: bytes) -> None:
 
 def bare_modbus(url: str, sets: Sequence[Values]) -> list[float]:
     """pymodbus's own client: write the message, then read its reply."""
-    return asyncio.run(_with_pymodbus(ModbusUrl.parse(url), sets))
+    return asyncio.run(_with_pymodbus(ModbusAddress(url), sets))
 
 
-async def _with_pymodbus(url: ModbusUrl, sets: Sequence[Values]) -> list[float]:
+async def _with_pymodbus(address: ModbusAddress, sets: Sequence[Values]) -> list[float]:
+    place = address.place
     client = (
-        AsyncModbusSerialClient(url.device, baudrate=url.baud, timeout=1)
-        if url.device
-        else AsyncModbusTcpClient(url.host, port=url.port, timeout=1)
+        AsyncModbusSerialClient(place.device, baudrate=place.baud, timeout=1)
+        if place.device
+        else AsyncModbusTcpClient(place.host, port=place.port, timeout=1)
     )
     await client.connect()
     times: list[float] = []
@@ -69,9 +71,9 @@ async def _with_pymodbus(url: ModbusUrl, sets: Sequence[Values]) -> list[float]:
         message = MESSAGES[name]
         words = [tag, *message.request.pack(values)]
         begin = time.perf_counter()
-        await client.write_registers(message.number * _BOX, words, device_id=url.unit)
+        await client.write_registers(message.number * _BOX, words, device_id=address.number)
         reply = await client.read_holding_registers(
-            message.number * _BOX + _REPLY_AT, count=_REPLY_HEAD + count, device_id=url.unit
+            message.number * _BOX + _REPLY_AT, count=_REPLY_HEAD + count, device_id=address.number
         )
         times.append(time.perf_counter() - begin)
         assert reply.registers[:_REPLY_HEAD] == [tag, 0]
@@ -85,11 +87,12 @@ async def _with_pymodbus(url: ModbusUrl, sets: Sequence[Values]) -> list[float]:
 
 def bare_can(url: str, sets: Sequence[Values]) -> list[float]:
     """python-can: send the frames of a set, receive until its reply is whole."""
-    parsed = CanUrl.parse(url)
-    wire = CanWire(parsed.bus.bitrate, sequence=0)
+    is_slcan = url.startswith("can+slcan")
+    parsed = SlcanAddress(url) if is_slcan else SocketcandAddress(url)
+    wire = CanWire(parsed.bitrate, sequence=0)
 
     def made(name: str, values: Values) -> list[can.Message]:
-        frames = unpack_frames(wire.request(parsed.node, name, values))
+        frames = unpack_frames(wire.request(parsed.number, name, values))
         return [
             can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False)
             for frame in frames
@@ -100,10 +103,10 @@ def bare_can(url: str, sets: Sequence[Values]) -> list[float]:
     times = []
     with _open(parsed) as bus:
         for first in (hello, arm):
-            _carry(bus, first, parsed.node)
+            _carry(bus, first, parsed.number)
         for request in requests:
             begin = time.perf_counter()
-            _carry(bus, request, parsed.node)
+            _carry(bus, request, parsed.number)
             times.append(time.perf_counter() - begin)
     return times
 
@@ -120,21 +123,21 @@ def _carry(bus: can.BusABC, request: Sequence[can.Message], node: int) -> None:
             left = frames_of(data[3]) - 1 if data[1] == 0 else (left or 0) - 1
 
 
-def _open(url: CanUrl) -> can.BusABC:
-    bus = url.bus
-    if bus.interface == "slcan":
+def _open(address: SlcanAddress | SocketcandAddress) -> can.BusABC:
+    place = address.place
+    if isinstance(address, SlcanAddress):
         return can.Bus(
             interface="slcan",
-            channel=bus.channel,
-            bitrate=bus.bitrate,
+            channel=place.device,
+            bitrate=address.bitrate,
             sleep_after_open=0,
             ignore_config=True,
         )
     return can.Bus(
         interface="socketcand",
-        channel=bus.channel,
-        host=bus.host,
-        port=bus.port,
+        channel=address.channel,
+        host=place.host,
+        port=place.port,
         tcp_tune=True,
         ignore_config=True,
     )

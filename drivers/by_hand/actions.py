@@ -24,7 +24,7 @@ from drivers.host.jobs import Priority
 from drivers.host.sensors import check_tones, measure_tones, read_measured, read_sensors
 from drivers.host.timing import check_watchdog
 from drivers.protocol.table import FAULTS, LATCHED, QUANTITIES, STATES, has_feature
-from drivers.urls.address import with_address
+from drivers.urls import with_address
 
 _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
 _STOP_TIMEOUT = 2.0  # s; for boards that restart when their port is opened

@@ -12,12 +12,12 @@ from serial.tools.list_ports import comports
 
 from drivers.codec.can_bus.canopen import BITRATE
 from drivers.discovery.slcan import detect_slcan
-from drivers.urls import can_bus, modbus, serial_line
+from drivers.urls import ADDRESS, BAUD, RTU_BAUD
 
 _NETWORK = Path("/sys/class/net")
 _CAN_TYPE = "280"  # ARPHRD_CAN of Linux
 _UNDESCRIBED = "n/a"  # by pyserial
-_SPEEDS = (serial_line.BAUD, 115_200)
+_SPEEDS = (BAUD, 115_200)
 _GROUP_MAY = 0o060  # read and write
 
 
@@ -65,7 +65,7 @@ def _serial_ports() -> Iterator[Candidate]:
     for port in sorted(comports()):
         path = port.device
         urls = tuple(f"serial://{_absolute(path)}?baud={speed}" for speed in _SPEEDS)
-        urls += (f"modbus+rtu://{_absolute(path)}?baud={modbus.RTU_BAUD}#{modbus.UNIT}",)
+        urls += (f"modbus+rtu://{_absolute(path)}?baud={RTU_BAUD}#{ADDRESS}",)
         description = "serial port" if port.description == _UNDESCRIBED else port.description
         yield Candidate(path, description, urls, _permission_remedy(path), is_serial=True)
 
@@ -100,6 +100,6 @@ def _can_interfaces() -> Iterator[Candidate]:
             continue
         name = interface.name
         is_up = (interface / "operstate").read_text(encoding="ascii").strip() != "down"
-        urls = (f"can+socketcan://{name}#{can_bus.NODE}",)
+        urls = (f"can+socketcan://{name}#{ADDRESS}",)
         remedy = f"interface is down: sudo ip link set {name} up type can bitrate {BITRATE}"
         yield Candidate(name, "CAN interface", urls, remedy=None if is_up else remedy)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import serial
 
-from drivers.codec.can_bus.adapter_text import SlcanReader
+from drivers.codec.can_bus.adapter_text import SLCAN, TextReader
 from drivers.codec.can_bus.canopen import BITRATE, cob_id
 from drivers.codec.can_bus.segments import NODE_MAX
 
@@ -86,7 +86,7 @@ def _text_until(line: serial.Serial, end: re.Pattern[bytes]) -> bytes:
 
 def _heard(line: serial.Serial) -> Iterator[int]:
     """Yield the nodes whose heartbeats are received."""
-    reader, deadline = SlcanReader(), time.monotonic() + _LISTENING_TIME
+    reader, deadline = TextReader(SLCAN), time.monotonic() + _LISTENING_TIME
     nodes = {cob_id("heartbeat", node): node for node in range(1, NODE_MAX + 1)}
     while time.monotonic() < deadline:
         for frame in reader.feed(line.read(max(1, line.in_waiting))):

@@ -1,1 +1,1 @@
-"""Serial ports of this machine, for every wire that is one."""
+"""What carries bytes: serial ports of this machine, and TCP connections."""

@@ -1,6 +1,7 @@
-"""Opening of serial ports, USB adapters and serial servers, named as in pyserial."""
+"""Opening of what carries bytes: serial ports and USB adapters of this machine, and TCP ports."""
 
 import contextlib
+import errno
 import os
 from collections.abc import Callable
 
@@ -8,15 +9,10 @@ import serial
 
 from drivers.errors import LinkError, system_message
 from drivers.hardware import HARDWARE_PROVIDER, Port
-from drivers.ports.tcp import bound_delay
-from drivers.ports.watched import (
-    READ_TIMEOUT,
-    WatchedPort,
-    close_port,
-    connection_of,
-    remedy_of,
-)
+from drivers.ports.serial_port import READ_TIMEOUT, SerialPort
+from drivers.ports.tcp import open_connection
 from drivers.threads import in_thread
+from drivers.urls import Place
 
 _FAILURES: tuple[type[Exception], ...] = (OSError, ValueError)  # of pyserial, at opening
 with contextlib.suppress(ImportError):  # Windows has no terminals
@@ -24,65 +20,73 @@ with contextlib.suppress(ImportError):  # Windows has no terminals
 
     _FAILURES += (termios.error,)
 
+_NO_PERMISSION = (
+    "no permission; add the user to the group that owns the port "
+    "(often dialout: sudo usermod -aG dialout $USER) and log in again"
+)
+_UNKNOWN = "check its name, the plug, its speed and its parity"
+_IN_USE = "in use by another program; close that one"
+_REMEDIES = {
+    errno.ENOENT: "no such port; plug in the adapter and check its name in /dev",
+    errno.EACCES: _NO_PERMISSION,
+    errno.EPERM: _NO_PERMISSION,
+    errno.EAGAIN: _IN_USE,
+    errno.EBUSY: _IN_USE,
+}
+
 
 async def open_port(
-    name: str,
-    *,
-    baud: int,
-    parity: str = serial.PARITY_NONE,
-    stop: int = 1,
-    on_data: Callable[[bytes], None],
-    on_loss: Callable[[str], None],
+    place: Place, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
 ) -> Port:
-    """Open a port, exclusively if the system can; raises LinkError.
+    """Open a device, exclusively if the system can, or connect; raises LinkError.
 
-    parity, stop bits: as named by pyserial. on_data: called with received bytes; on_loss: called
-    once with the cause of a loss.
+    on_data: called with received bytes; on_loss: called once with the cause of a loss.
     """
+    if place.host:
+        return await open_connection(place.host, place.port, on_data, on_loss)
+    name = place.device
     hardware = HARDWARE_PROVIDER.get()
     if hardware is not None:
         return await hardware.open_port(name, on_data=on_data, on_loss=on_loss)
     try:
         port = await in_thread(
-            lambda: _open_port(name, baud, parity, stop), name=f"era-open {name}", undo=close_port
+            lambda: _open_device(place), name=f"era-open {name}", undo=lambda port: port.close()
         )
     except _FAILURES as error:
-        raise LinkError(_why_not_open(name, error)) from error
-    return WatchedPort(port, name, on_data, on_loss)
+        raise LinkError(
+            f"serial port {name} cannot be opened: {_remedy_of(error)} (the system says: "
+            f"{system_message(error)})"
+        ) from error
+    return SerialPort(port, name, on_data, on_loss)
 
 
-def _open_port(name: str, baud: int, parity: str, stop: int) -> serial.Serial:
+def _open_device(place: Place) -> serial.Serial:
     # A pseudo-terminal has no parity and may refuse all settings if one is given.
-    is_pseudo = os.path.realpath(name).startswith("/dev/pts/")
-    port = serial.serial_for_url(
-        name,
-        do_not_open=True,
-        baudrate=baud,
-        parity=serial.PARITY_NONE if is_pseudo else parity,
-        stopbits=stop,
+    is_pseudo = os.path.realpath(place.device).startswith("/dev/pts/")
+    port = serial.Serial(
+        place.device,
+        baudrate=place.baud,
+        parity=serial.PARITY_NONE if is_pseudo else place.parity,
+        stopbits=place.stop,
         timeout=READ_TIMEOUT,
         exclusive=True,
     )
-    port.open()
     try:
         # USB adapters delay bytes by 16 ms unless low latency is set; most support it.
         with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
             port.set_low_latency_mode(True)
-        connection = connection_of(port)
-        if connection is not None:
-            bound_delay(connection)
         port.reset_input_buffer()
     except BaseException:
-        close_port(port)  # else it stays this program's, which could not open it again
+        port.close()  # else it stays this program's, which could not open it again
         raise
     return port
 
 
-def _why_not_open(port: str, error: Exception) -> str:
-    remedy = remedy_of(error)
-    if remedy is None and port.startswith("socket://"):
-        remedy = "no server there; check the address, and that the serial server runs"
-    elif remedy is None:
-        remedy = "check its name, the plug, its speed and its parity"
-    said = system_message(error)
-    return f"serial port {port} cannot be opened: {remedy} (the system says: {said})"
+def _remedy_of(error: BaseException | None) -> str:
+    """Return the remedy for an opening error by the error code of it or its cause."""
+    while error is not None:
+        code = getattr(error, "errno", None)
+        if code is not None:
+            return _REMEDIES.get(code, _UNKNOWN)
+        error = error.__cause__ or error.__context__
+    return _UNKNOWN

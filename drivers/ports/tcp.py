@@ -38,18 +38,6 @@ async def open_connection(
         ) from error
 
 
-def bound_delay(connection: socket.socket) -> None:
-    """Send small frames at once, and give up the connection that does not take them in time.
-
-    Without it a frame waits up to 40 ms for the acknowledgement of the one before, and what a
-    broken network keeps may arrive minutes later.
-    """
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux
-        timeout = round(1000 * NETWORK_DELAY)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, timeout)
-
-
 class _Connection(asyncio.Protocol):
     """A TCP connection."""
 
@@ -63,8 +51,17 @@ class _Connection(asyncio.Protocol):
         self._transport: asyncio.Transport  # set when connected
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Send small frames at once, and give up the connection that does not take them in time.
+
+        Without it a frame waits up to 40 ms for the acknowledgement of the one before, and what a
+        broken network keeps may arrive minutes later.
+        """
         self._transport = cast(asyncio.Transport, transport)
-        bound_delay(transport.get_extra_info("socket"))
+        connection = transport.get_extra_info("socket")
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux
+            timeout = round(1000 * NETWORK_DELAY)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, timeout)
 
     def data_received(self, data: bytes) -> None:
         if not self._is_closed:

@@ -2,18 +2,18 @@
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from typing import final
 
 from drivers.errors import LinkError
-from drivers.hardware import Port
+from drivers.wires.port_above import PortAbove
 
 _FRAME_MAX = 256  # bytes
 _BROADCAST = b"\0"
 
 
 @final
-class SilentPort:
+class SilentPort(PortAbove):
     """A port that sends a frame once the line was silent for a time [s]; implements `Port`.
 
     byte_time [s]; on_data: called with what is received. A frame waits at most for the longest
@@ -27,16 +27,6 @@ class SilentPort:
         self._free_from = self._loop.time() + silence
         self._waiting: list[tuple[float, bytes]] = []  # until when [s] at most, frame
         self._timer: asyncio.TimerHandle | None = None
-        self._port: Port  # set once open
-
-    async def open(self, open_port: Callable[[Callable[[bytes], None]], Awaitable[Port]]) -> None:
-        """Open the port below, by a function of what takes its data; raises LinkError."""
-        self._port = await open_port(self._heard)
-
-    @property
-    def is_blocked(self) -> bool:
-        """Whether it has not taken all bytes yet."""
-        return self._port.is_blocked
 
     def write(self, data: bytes) -> None:
         """Send a frame as soon as the line was silent; raises LinkError."""
@@ -45,20 +35,13 @@ class SilentPort:
         self._waiting = [*kept, (latest, data)]
         self._send()
 
-    def poll(self) -> None:
-        """Hand over what has come and was not read yet."""
-        self._port.poll()
-
     def close(self) -> None:
-        """Close it; no callback is called afterwards."""
+        """Close it; what waits is not sent."""
         self._waiting.clear()
-        self._port.close()
+        super().close()
 
-    async def wait_closed(self) -> None:
-        """Wait until it is closed."""
-        await self._port.wait_closed()
-
-    def _heard(self, data: bytes) -> None:
+    def received(self, data: bytes) -> None:
+        """Take what was received, and count it as noise on the line."""
         self._free_from = max(self._free_from, self._loop.time() + self._silence)
         self._on_data(data)
 
@@ -74,7 +57,7 @@ class SilentPort:
                 return
             del self._waiting[0]
             self._free_from = now + len(frame) * self._byte_time + self._silence
-            self._port.write(frame)
+            self.below.write(frame)
 
     def _due(self) -> None:
         self._timer = None

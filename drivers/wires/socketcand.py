@@ -4,26 +4,37 @@ import asyncio
 import re
 from collections.abc import Callable
 
-from drivers.codec.can_bus.adapter_text import SocketcandReader, socketcand_element
+from drivers.codec.can_bus.adapter_text import SOCKETCAND
 from drivers.errors import LinkError
 from drivers.hardware import Port
-from drivers.ports.tcp import open_connection
+from drivers.host.wire import NETWORK_DELAY
+from drivers.ports.opening import open_port
+from drivers.urls import AmplifierUrl
 from drivers.wires.can_address import CanAddress
 from drivers.wires.text_port import TextPort
 
+_FORM = "can+socketcand://HOST:PORT/can0?bitrate=500000#NODE"
 _GREETING_TIMEOUT = 2.0  # s
-_IS_FRAME = re.compile(rb"\s*< (fd)?frame ")
+_IS_FRAME = re.compile(rb"\s*< frame ")
 
 
 class SocketcandAddress(CanAddress):
     """A node on a bus that a socketcand server has."""
+
+    def __init__(self, url: str) -> None:
+        parsed = AmplifierUrl(url, _FORM, known=("bitrate",))
+        self.place, self.channel = parsed.server(has_path=True), parsed.path.strip("/")
+        if not self.channel:
+            raise parsed.refused("bus must be named")
+        line = f"can+socketcand://{self.place.name}/{self.channel}"
+        super().__init__(parsed, line, delay=NETWORK_DELAY, settings={})
 
     async def open_port(
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
     ) -> Port:
         """Connect, and open the bus in raw mode; raises LinkError."""
         greeting = _Greeting()
-        port = TextPort(SocketcandReader(), socketcand_element, on_data)
+        port = TextPort(SOCKETCAND, on_data)
 
         def received(data: bytes) -> None:
             (port.received if greeting.is_over else greeting.received)(data)
@@ -31,11 +42,11 @@ class SocketcandAddress(CanAddress):
         def lost(cause: str) -> None:
             (on_loss if greeting.is_over else greeting.lost)(cause)
 
-        port.below = await open_connection(self.bus.host, self.bus.port, received, lost)
+        port.below = await open_port(self.place, received, lost)
         try:
             async with asyncio.timeout(_GREETING_TIMEOUT):
                 await greeting.expect(b"< hi >")
-                port.below.write(f"< open {self.bus.channel} >".encode())
+                port.below.write(f"< open {self.channel} >".encode())
                 await greeting.expect(b"< ok >")
                 port.below.write(b"< rawmode >")
                 await greeting.expect(b"< ok >")

@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 
-from drivers.urls.modbus import RTU_BAUD
-from drivers.urls.serial_line import ADDRESS, BAUD
+from drivers.urls import ADDRESS, BAUD, RTU_BAUD
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Callable
 from pathlib import Path
 
-from drivers.codec.can_bus.adapter_text import SlcanReader, slcan_line
+from drivers.codec.can_bus.adapter_text import SLCAN, TextReader
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
@@ -34,7 +34,7 @@ class FirmwarePort:
         self._loop = asyncio.get_running_loop()
         self._began = self._loop.time()
         self._line = LINES[kind]
-        self._reader = SlcanReader()
+        self._reader = TextReader(SLCAN)
         self.firmware.receive(CAN, b"O\r")
         self.firmware.sent(CAN)
         self._turn()
@@ -42,7 +42,7 @@ class FirmwarePort:
     def write(self, data: bytes) -> None:
         """Send bytes of the host."""
         if self._line == CAN:
-            data = b"".join(slcan_line(frame) for frame in unpack_frames(data))
+            data = b"".join(SLCAN.encode(frame) for frame in unpack_frames(data))
         self._loop.call_later(_WAY, self._arrived, data)
 
     def poll(self) -> None:

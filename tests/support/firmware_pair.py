@@ -4,7 +4,7 @@ import random
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from drivers.codec.can_bus.adapter_text import SlcanReader, slcan_line
+from drivers.codec.can_bus.adapter_text import SLCAN, TextReader
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import REPLY, REQUEST, pack_frames, segments, unpack_frames
 from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
@@ -95,7 +95,7 @@ class Pair:
         self.firmware.move(self.time)
         pieces = [data]
         if self.wire == "can":
-            pieces = [slcan_line(frame) for frame in unpack_frames(data)]
+            pieces = [SLCAN.encode(frame) for frame in unpack_frames(data)]
         for piece in pieces:
             self.firmware.receive(self._line, piece)
         self.amplifier.tick(self.moment)
@@ -106,7 +106,7 @@ class Pair:
             return [*_of_frames(made)], [*_of_frames(expected)]
         if self.wire == "tcp":
             return [*_of_areas(made)], [*_of_areas(expected)]
-        return [*_of_can(SlcanReader().feed(made))], [*_of_can(unpack_frames(expected))]
+        return [*_of_can(TextReader(SLCAN).feed(made))], [*_of_can(unpack_frames(expected))]
 
 
 def _of_frames(data: bytes) -> Iterator[Sent]:

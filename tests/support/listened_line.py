@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Mapping
 from typing import Any
 
-from drivers.codec.can_bus.adapter_text import slcan_line
+from drivers.codec.can_bus.adapter_text import SLCAN
 from drivers.codec.can_bus.segments import unpack_frames
 from sim.witness.capture import Direction
 from sim.witness.witness import Witness
@@ -84,7 +84,7 @@ class ListenedLine(MemoryLine):
     def heard(self, direction: Direction, data: bytes) -> None:
         """Let the witness hear bytes, frames of a bus as the text of an adapter."""
         if self._kind == "can":
-            data = b"".join(map(slcan_line, unpack_frames(data)))
+            data = b"".join(map(SLCAN.encode, unpack_frames(data)))
         self.witness.record_bytes(self.name, direction, self.loop.time(), data)
 
     async def keep_sensing(self) -> None:

@@ -1,8 +1,7 @@
 """Frames on a CAN bus, and the numbers of CANopen (CiA 301) that amplifiers and hosts agree on."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 BLOCK: Final = 8
 """Bytes of a classic frame."""
@@ -46,9 +45,8 @@ CANOPEN: Mapping[str, Any] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class CanFrame:
-    """A data frame with an 11-bit identifier; fd: sent as CAN FD."""
+class CanFrame(NamedTuple):
+    """A data frame with an 11-bit identifier."""
 
     id: int
     data: bytes

@@ -16,7 +16,7 @@ from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.table import FEATURES, STATES
 from drivers.trace import tracing
-from drivers.urls.address import with_address
+from drivers.urls import with_address
 from registry.limits import GuardLimits
 from word_wires import WORD_WIRES, FarSide
 

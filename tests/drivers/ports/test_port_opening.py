@@ -9,6 +9,7 @@ import serial
 from drivers.errors import LinkError
 from drivers.hardware import Port
 from drivers.ports import opening
+from drivers.urls import Place
 from drivers.wires.known import address_of
 
 
@@ -21,9 +22,6 @@ class _Port:
         self.is_low_latency = False
         self.in_waiting = 0
         self._read, self._write = os.pipe()
-
-    def open(self) -> None:
-        """Do nothing."""
 
     def set_low_latency_mode(self, low_latency: bool) -> None:
         self.is_low_latency = low_latency
@@ -52,7 +50,7 @@ async def test_open_port_sets_low_latency_and_parity(
         opened.append(_Port(port, **settings))
         return opened[0]
 
-    monkeypatch.setattr(opening.serial, "serial_for_url", make)
+    monkeypatch.setattr(opening.serial, "Serial", make)
     address = address_of(f"modbus+rtu://{device}?baud=19200&parity=odd&stop=2#1")
     port = await address.open_port(lambda data: None, lambda what: None)
     (made,) = opened
@@ -72,7 +70,7 @@ async def test_port_that_fails_amid_its_opening_is_released(
 
     async def open_it() -> Port:
         return await opening.open_port(
-            name, baud=9600, on_data=lambda data: None, on_loss=lambda cause: None
+            Place(name, baud=9600), lambda data: None, lambda cause: None
         )
 
     def fail(port: serial.Serial) -> None:

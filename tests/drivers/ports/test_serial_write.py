@@ -11,8 +11,7 @@ import pytest
 import serial
 
 from drivers.errors import LinkError
-from drivers.ports.watched import WatchedPort
-from drivers.ports.writing import make_writer
+from drivers.ports.serial_port import SerialPort
 
 TIMEOUT = 5.0  # s; for what is expected
 
@@ -45,7 +44,7 @@ async def read_until(far: int, end: bytes) -> bytes:
 async def test_blocked_port_takes_the_newest_frame(ends: tuple[serial.Serial, int]) -> None:
     """Unsent bytes of an older one are dropped; the newest follows without another call."""
     port, far = ends
-    watched = WatchedPort(port, "/dev/ttyUSB9", lambda data: None, lambda what: None)
+    watched = SerialPort(port, "/dev/ttyUSB9", lambda data: None, lambda what: None)
     watched.write(b"a" * (1 << 20))
     assert watched.is_blocked
     watched.write(b"b" * (1 << 20))
@@ -62,7 +61,7 @@ async def test_closed_port_is_a_link_error(ends: tuple[serial.Serial, int]) -> N
     """And the loss is reported once."""
     port, far = ends
     losses: list[str] = []
-    watched = WatchedPort(port, "/dev/ttyUSB9", lambda data: None, losses.append)
+    watched = SerialPort(port, "/dev/ttyUSB9", lambda data: None, losses.append)
     watched.write(b"a" * (1 << 20))
     os.close(os.dup(far))
     os.dup2(os.open(os.devnull, os.O_RDWR), far)  # hangs up
@@ -77,13 +76,22 @@ async def test_port_without_a_descriptor_is_written_by_a_thread() -> None:
     """A port that takes nothing for seconds does not block the caller."""
     entered, taken = threading.Semaphore(0), threading.Semaphore(0)
     written: list[bytes] = []
-    errors: asyncio.Queue[OSError] = asyncio.Queue()
+    losses: asyncio.Queue[str] = asyncio.Queue()
 
-    class Server:
-        name = "server"
+    class Device:
+        in_waiting = 0
 
         def fileno(self) -> int:
             raise OSError("no descriptor")
+
+        def read(self, size: int) -> bytes:
+            return b""
+
+        def cancel_read(self) -> None:
+            """Do nothing."""
+
+        def close(self) -> None:
+            """Do nothing."""
 
         def write(self, data: bytes) -> None:
             entered.release()
@@ -92,13 +100,13 @@ async def test_port_without_a_descriptor_is_written_by_a_thread() -> None:
             if data == b"stop":
                 raise ConnectionResetError("gone")
 
-    writer = make_writer(Server(), errors.put_nowait)  # type: ignore[arg-type]
-    writer.write(b"one")
+    port = SerialPort(Device(), "COM3", lambda data: None, losses.put_nowait)  # type: ignore[arg-type]
+    port.write(b"one")
     assert await asyncio.to_thread(entered.acquire, timeout=TIMEOUT)
     for data in (b"two", b"stop"):
-        assert writer.is_blocked
-        writer.write(data)
+        assert port.is_blocked
+        port.write(data)
     taken.release(2)
-    assert isinstance(await asyncio.wait_for(errors.get(), TIMEOUT), ConnectionResetError)
+    assert "serial line COM3 was lost (gone)" in await asyncio.wait_for(losses.get(), TIMEOUT)
     assert written == [b"one", b"stop"]
-    writer.close()
+    await port.wait_closed()

@@ -14,7 +14,7 @@ import pytest
 from drivers import threads
 from drivers.hardware import Port
 from drivers.ports import opening
-from drivers.urls.can_bus import CanUrl
+from drivers.urls import Place
 from drivers.wires import bus_port
 
 
@@ -58,14 +58,14 @@ HEARD: list[bytes] = []
 OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port]]] = {
     "port": partial(
         opening.open_port,
-        "/dev/ttyUSB9",
-        baud=9600,
-        on_data=lambda data: None,
-        on_loss=lambda what: None,
+        Place("/dev/ttyUSB9", baud=9600),
+        lambda data: None,
+        lambda what: None,
     ),
     "adapter": partial(
         bus_port.open_bus,
-        CanUrl.parse("can+python-can://pcan/usb#1").bus,
+        "can+python-can://pcan/usb",
+        {"interface": "pcan"},
         HEARD.append,
         lambda what: None,
     ),
@@ -76,8 +76,8 @@ OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port]]] = {
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[_Hanging]:
     """The device that is opened; released after the test."""
     device: _Hanging = request.param()
-    monkeypatch.setattr(opening, "_open_port", device.open)
-    monkeypatch.setattr(bus_port, "_open_bus", device.open)
+    monkeypatch.setattr(opening, "_open_device", device.open)
+    monkeypatch.setattr(can, "Bus", lambda **how: device.open())
     monkeypatch.setattr(threads, "CLOSE_TIMEOUT", 0.05)
     HEARD.clear()
     yield device

@@ -7,7 +7,6 @@ import pytest
 from can.interfaces import BACKENDS
 
 from drivers.errors import CommandError, LinkError
-from drivers.wires.bus_port import _open_bus
 from drivers.wires.known import address_of
 from drivers.wires.python_can import PythonCanAddress
 
@@ -41,14 +40,22 @@ def address(interface: str, query: str = "") -> PythonCanAddress:
 
 
 @pytest.mark.parametrize("interface", INTERFACES)
-def test_interface_is_opened_by_its_name(interface: str, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_interface_is_opened_by_its_name(
+    interface: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With its channel, a number as one, the bit rate and the options that tell adapters apart."""
     opened: dict[str, Any] = {}
-    monkeypatch.setattr(can, "Bus", lambda **how: opened.update(how))
+
+    def open_bus(**how: object) -> None:
+        opened.update(how)
+        raise OSError("no adapter")
+
+    monkeypatch.setattr(can, "Bus", open_bus)
     options = OPTIONS.get(interface, {})
     more = "".join(f"&{name}={value}" for name, value in options.items())
     found = address(interface, f"?bitrate=250000{more}")
-    _open_bus(found.bus)
+    with pytest.raises(LinkError, match="no adapter"):
+        await found.open_port(lambda data: None, lambda cause: None)
     assert found.number == 3
     assert (opened["interface"], opened["channel"]) == (interface, CHANNELS.get(interface, 0))
     assert (opened["bitrate"], opened["receive_own_messages"]) == (250_000, False)

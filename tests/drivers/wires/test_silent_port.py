@@ -38,12 +38,8 @@ async def opened() -> tuple[SilentPort, Below]:
     """A port at 19 200 baud."""
     assert ModbusWire(19_200, is_rtu=True, number=0).silence == pytest.approx(SILENCE)
     below = Below()
-
-    async def open_below(heard: object) -> Below:
-        return below
-
     port = SilentPort(SILENCE, BYTE, lambda data: None)
-    await port.open(open_below)
+    port.below = below
     await asyncio.sleep(1.0)
     return port, below
 
@@ -61,7 +57,7 @@ async def test_frame_waits_for_the_line_to_be_silent() -> None:
     (first, _), (second, _), (third, _) = below.sent
     assert second - first == pytest.approx((6 + 3.5) * BYTE)
     assert third - second == pytest.approx((8 + 3.5) * BYTE)
-    port._heard(b"reply")
+    port.received(b"reply")
     heard = loop.time()
     port.write(b"\1fourth")
     await asyncio.sleep(0.1)
@@ -85,10 +81,10 @@ async def test_noise_does_not_keep_a_stop_waiting_for_ever() -> None:
     port, below = await opened()
     loop = asyncio.get_running_loop()
     begin = loop.time()
-    port._heard(b"?")
+    port.received(b"?")
     port.write(b"\1stop")
     while not below.sent:
         assert loop.time() < begin + 1.0
         await asyncio.sleep(BYTE)
-        port._heard(b"?")
+        port.received(b"?")
     assert below.sent[0][0] - begin == pytest.approx((256 + 3.5) * BYTE, abs=BYTE)

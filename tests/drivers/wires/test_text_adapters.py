@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager, suppress
 
 import pytest
 
-from drivers.codec.can_bus.adapter_text import SlcanReader
+from drivers.codec.can_bus.adapter_text import SLCAN
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from drivers.errors import LinkError
@@ -117,8 +117,8 @@ async def test_slcan_is_closed_then_opened_at_its_bit_rate_and_closed_at_the_end
         port = await address_of(url).open_port(lambda data: None, lambda cause: None)
         port.write(pack_frames([FRAME]))
         port.close()
-        text = os.read(master, 100)
         await port.wait_closed()
+        text = os.read(master, 100)
     finally:
         os.close(master)
         os.close(slave)
@@ -135,7 +135,7 @@ async def test_line_that_was_cut_off_is_ended_before_the_next_frame() -> None:
         def write(self, data: bytes) -> None:
             self.written += data
 
-    port = TextPort(SlcanReader(), lambda frame: b"t1850\r", lambda data: None, cut_off=b"\r")
+    port = TextPort(SLCAN, lambda data: None, cut_off=b"\r")
     port.below = below = Blocked()  # type: ignore[assignment]
     port.write(pack_frames([FRAME]))
-    assert below.written == b"\rt1850\r"
+    assert below.written == b"\rt18580102030405060708\r"

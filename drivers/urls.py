@@ -1,0 +1,128 @@
+"""URLs of amplifiers, taken apart: SCHEME://PLACE?NAME=VALUE&...#NUMBER."""
+
+import re
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+from drivers.errors import CommandError
+
+ADDRESS: Final = 1
+"""Address, unit or node of an amplifier as it is made."""
+BAUD: Final = 921_600
+"""Of a serial line whose URL names none [baud]; 8 data bits, no parity, 1 stop bit."""
+RTU_BAUD: Final = 115_200
+"""Of a Modbus line whose URL names none [baud]; 8 data bits, even parity, 1 stop bit."""
+ADDRESS_MAX: Final = 247
+"""Of a unit, and of an address on a serial line, so that one label serves both."""
+
+_BAUD_MAX = 12_000_000  # the fastest USB adapters
+_DIGITS_MAX = 9  # more are out of every range, and int() refuses thousands of them
+
+
+@dataclass(frozen=True)
+class Place:
+    """What carries bytes: a serial device of this machine, or a port of the network.
+
+    baud, parity (as named by pyserial) and stop bits are those of the device, or of the line behind
+    a gateway; baud is 0 if unknown.
+    """
+
+    device: str = ""
+    host: str = ""
+    port: int = 0
+    baud: int = 0
+    parity: str = "N"
+    stop: int = 1
+
+    @property
+    def name(self) -> str:
+        """Name of the line in messages."""
+        return self.device or f"{self.host}:{self.port}"
+
+    @property
+    def byte_time(self) -> float:
+        """How long a byte takes [s], with start, parity and stop bits; 0 if unknown."""
+        return (9 + (self.parity != "N") + self.stop) / self.baud if self.baud else 0.0
+
+
+class AmplifierUrl:
+    """A URL, from which a wire takes the parts that it has; CommandError for an invalid one.
+
+    form: valid URLs, for messages; known: names of the options.
+    """
+
+    def __init__(self, url: str, form: str, known: Collection[str] = ()) -> None:
+        self._url, self._form = url, form
+        scheme, _, rest = url.partition("://")
+        self.scheme = scheme.lower()
+        try:
+            parts = urlsplit(f"//{rest}")
+            self.host, self.port = parts.hostname or "", parts.port or 0
+        except ValueError as error:
+            raise self.refused(f"URL must be valid: {error}") from None
+        self.place, self.number = parts.netloc, parts.fragment
+        # /dev/ttyUSB0, or COM3 of /COM3
+        self.path = re.sub(r"^/(?=COM\d+$)", "", unquote(parts.path), flags=re.IGNORECASE)
+        pairs = parse_qsl(parts.query, keep_blank_values=True)
+        self.options = dict(pairs)
+        if unknown := sorted(self.options.keys() - set(known)):
+            raise self.refused(
+                f"option {', '.join(unknown)} is unknown; known are {', '.join(known) or 'none'}"
+            )
+        if len(pairs) > len(self.options):
+            raise self.refused("an option must not be repeated")
+
+    def refused(self, why: str) -> CommandError:
+        """Return the error for a URL that is invalid: why, as `X must be Y`."""
+        return CommandError(f"{self._url!r}: {why}; use {self._form}")
+
+    def whole(self, text: str, name: str, high: int, *, low: int = 1) -> int:
+        """Parse an integer of a range, as which a part of the URL stands."""
+        is_number = text.isascii() and text.isdigit() and len(text) <= _DIGITS_MAX
+        if not (is_number and low <= int(text) <= high):
+            raise self.refused(f"{name} must be an integer of {low} to {high}, got {text!r}")
+        return int(text)
+
+    def whole_option(self, name: str, default: int, high: int, *, low: int = 1) -> int:
+        """Parse an option that is an integer of a range."""
+        return self.whole(self.options.get(name, str(default)), name, high, low=low)
+
+    def choice(self, name: str, default: str, choices: Collection[str]) -> str:
+        """Return an option that is one of these words."""
+        text = self.options.get(name, default)
+        if text not in choices:
+            raise self.refused(f"{name} must be one of {', '.join(choices)}, got {text!r}")
+        return text
+
+    def device(self, baud: int) -> Place:
+        """Return the serial device that the path names; baud: where no option names it."""
+        if self.place or not self.path.strip("/"):
+            raise self.refused("port must be named")
+        return Place(self.path, baud=self._baud(baud))
+
+    def server(self, *, port: int = 0, has_path: bool = False) -> Place:
+        """Return the port of the network; port: the default; has_path: of what is behind it."""
+        port = self.port or port
+        if not (self.host and port) or (self.path.strip("/") and not has_path):
+            raise self.refused("host and port must be named")
+        return Place(host=self.host, port=port, baud=self._baud(0))
+
+    def _baud(self, default: int) -> int:
+        return self.whole_option("baud", default, _BAUD_MAX) if "baud" in self.options else default
+
+
+def with_address(url: str, address: int) -> str:
+    """Return the URL with another address, unit or node; CommandError for a wire without any."""
+    scheme = url.partition("://")[0]
+    if scheme in ("serial", "serial+tcp"):
+        kept = re.sub(r"(?<=[?&])address=\d+&?", "", url).rstrip("?&")
+        return f"{kept}{'&' if '?' in kept else '?'}address={address}"
+    if scheme == "modbus+tcp":
+        place, _, options = url.partition("?")
+        host = "/".join(place.split("/")[:3])
+        return f"{host}/{address}" + (f"?{options}" if options else "")
+    if scheme == "modbus+rtu" or scheme.startswith("can"):
+        return f"{url.partition('#')[0]}#{address}"
+    raise CommandError(f"amplifiers at {url} have no address that can be set")

@@ -1,1 +1,0 @@
-"""Parsers of amplifier URLs, one per wire."""

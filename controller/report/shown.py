@@ -62,9 +62,8 @@ def _keys_of_dumps() -> frozenset[str]:
 
 
 def _fields_of(record: Record) -> set[str]:
-    names: set[str] = set()
+    names = set(record.names)
     for field in record.fields:
-        names.update(field.names)
         if isinstance(field, Rows):
             names |= _fields_of(field.record)
     return names

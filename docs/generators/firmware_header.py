@@ -127,7 +127,7 @@ def _layout(name: str, record: Record) -> str:
     """Return the places of the fields of a record up to the first of variable length."""
     places, bits, at = dict[str, int](), dict[str, int](), 0
     for field in record.fields:
-        places["BITS" if isinstance(field, Bits) else field.names[0]] = at
+        places["BITS" if isinstance(field, Bits) else field.name] = at
         if isinstance(field, Bits):
             bits = _bits(field)
             at += 1

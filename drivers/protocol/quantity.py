@@ -6,8 +6,6 @@ from functools import cached_property
 
 from drivers.errors import CommandError
 
-_STRUCT_CODES = {"u8": "B", "u16": "H", "u32": "I", "i16": "h"}
-
 # Sums of floats may exceed a range by rounding: a thousandth of a step is allowed.
 _TOLERANCE = 1e-3
 
@@ -16,7 +14,7 @@ _TOLERANCE = 1e-3
 class WireQuantity:
     """A kind of number on the wire: an integer of `per_unit` steps per unit, within a range.
 
-    wire: u8, u16, u32 or i16; minimum, maximum: as integers; wraps: an angle, modulo 360.
+    wire: u16, u32 or i16; minimum, maximum: as integers; wraps: an angle, modulo 360.
     """
 
     name: str
@@ -26,11 +24,6 @@ class WireQuantity:
     minimum: int
     maximum: int
     wraps: bool = False
-
-    @cached_property
-    def struct_code(self) -> str:
-        """Format character of `struct`."""
-        return _STRUCT_CODES[self.wire]
 
     @cached_property
     def step(self) -> float:
@@ -68,12 +61,8 @@ class WireQuantity:
         return round(scaled)
 
     def from_wire(self, integer: int) -> float:
-        """Decode an integer in range (see `holds`) to a value [unit]."""
+        """Decode an integer to a value [unit]."""
         return integer / self.per_unit
-
-    def holds(self, integer: int) -> bool:
-        """Whether an integer from the wire is in range."""
-        return self.minimum <= integer <= self.maximum
 
     def quantise(self, value: float) -> float:
         """Return the value [unit] that arrives when this one is sent."""

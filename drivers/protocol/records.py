@@ -7,15 +7,17 @@ what follows their fields is ignored.
 """
 
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
-from typing import Any, Protocol
+from typing import Any
 
 from drivers.errors import FrameError
 from drivers.protocol.quantity import WireQuantity
 
 WORD = 0x10000
+_CODES = {"channel": "BAD_CHANNEL", "token": "BAD_TOKEN"}
+"""Of Naks, by quantity; others are BAD_VALUE."""
+_TEXT_MAX = 32  # bytes
 _REAL_MAX = (2 - 2**-23) * 2.0**127  # of IEEE 754 binary32
 
 Values = dict[str, Any]
@@ -30,55 +32,12 @@ class Refusal(FrameError):
         self.channel = channel
 
 
-class Field(Protocol):
-    """A field of a record: appends its words, or reads them from an index on."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of its values."""
-
-    def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
-        """Append the words of its values."""
-
-    def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
-        """Add its values; returns the index behind its words. Raises Refusal."""
-
-
 @dataclass(frozen=True, slots=True)
 class Number:
     """An integer of a quantity: one word, or two with the high one first for u32."""
 
     name: str
     quantity: WireQuantity
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The one name."""
-        return (self.name,)
-
-    def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
-        """Append the integer; ValueError for one out of range."""
-        value = values[self.name]
-        if not self.quantity.minimum <= value <= self.quantity.maximum:
-            raise ValueError(_out_of_range(self.quantity, self.name, value))
-        if self.quantity.wire == "u32":
-            words.append(value >> 16)
-        words.append(value % WORD)
-
-    def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
-        """Read the integer."""
-        quantity = self.quantity
-        value = words[at]
-        if quantity.wire == "u32":
-            at += 1
-            value = value * WORD + words[at]
-        elif quantity.minimum < 0 and value >= WORD // 2:
-            value -= WORD
-        if not quantity.minimum <= value <= quantity.maximum:
-            code = {"channel": "BAD_CHANNEL", "token": "BAD_TOKEN"}.get(quantity.name, "BAD_VALUE")
-            raise Refusal(_out_of_range(quantity, self.name, value), code)
-        values[self.name] = value
-        return at + 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,42 +46,12 @@ class Bits:
 
     parts: tuple[tuple[str, int], ...]
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parts."""
-        return tuple(name for name, _ in self.parts)
-
-    def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
-        """Append the word; ValueError for a value that does not fit."""
-        word = 0
-        for name, bits in self.parts:
-            value = int(values.get(name, 0))
-            if not 0 <= value < 1 << bits:
-                raise ValueError(f"{name} must be 0 to {(1 << bits) - 1}, got {value}")
-            word = word << bits | value
-        words.append(word)
-
-    def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
-        """Read the word."""
-        word = words[at]
-        for name, bits in reversed(self.parts):
-            values[name] = word & (1 << bits) - 1
-            word >>= bits
-        if word:
-            raise Refusal(f"unused bits beside {self.parts[0][0]} must be 0")
-        return at + 1
-
 
 @dataclass(frozen=True, slots=True)
 class Real:
     """A number of type f32: finite and not negative, two words."""
 
     name: str
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The one name."""
-        return (self.name,)
 
     def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
         """Append the number."""
@@ -145,34 +74,35 @@ class Text:
     """A text of at most 32 bytes of UTF-8: its length, then two bytes a word, the first high."""
 
     name: str
-    max_bytes: int = 32
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The one name."""
-        return (self.name,)
 
     def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
         """Append the text, cut at its longest length between two characters."""
-        raw = values[self.name].encode()[: self.max_bytes].decode(errors="ignore").encode()
+        raw = self.encoded(values)
         words.append(len(raw))
         words.extend(word for (word,) in struct.iter_unpack(">H", raw + b"\0" * (len(raw) % 2)))
 
     def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
         """Read the text."""
-        length = words[at]
-        end = at + 1 + (length + 1) // 2
-        if length > self.max_bytes or end > len(words):
-            raise Refusal(f"{self.name} must have at most {self.max_bytes} bytes", "BAD_LENGTH")
-        raw = b"".join(word.to_bytes(2, "big") for word in words[at + 1 : end])[:length]
+        end = at + 1 + (words[at] + 1) // 2
+        raw = struct.pack(f">{len(words[at + 1 : end])}H", *words[at + 1 : end])
+        self.read(raw[: words[at]], words[at], values)
+        return end
+
+    def encoded(self, values: Mapping[str, Any]) -> bytes:
+        """Return the bytes of the text, cut at its longest length between two characters."""
+        text: str = values[self.name]
+        return text.encode()[:_TEXT_MAX].decode(errors="ignore").encode()
+
+    def read(self, raw: bytes, length: int, values: Values) -> None:
+        """Read the text from its bytes, of which there must be a number."""
+        if length != len(raw) or length > _TEXT_MAX:
+            raise Refusal(f"{self.name} must have at most {_TEXT_MAX} bytes", "BAD_LENGTH")
         try:
-            text = raw.decode("utf-8")
+            values[self.name] = raw.decode("utf-8")
         except UnicodeDecodeError:
             raise Refusal(f"{self.name} must be UTF-8") from None
-        if not text.isprintable():
+        if not values[self.name].isprintable():
             raise Refusal(f"{self.name} must not have control characters")
-        values[self.name] = text
-        return end
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,19 +113,15 @@ class Numbers:
     count: str
     quantity: WireQuantity
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The one name."""
-        return (self.name,)
-
     def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
         """Append the integers; ValueError for another count, or one out of range."""
         numbers = values[self.name]
         if len(numbers) != values[self.count]:
             raise ValueError(f"{self.name} must be {values[self.count]}, got {len(numbers)}")
+        low, high = self.quantity.minimum, self.quantity.maximum
         for number in numbers:
-            if not self.quantity.minimum <= number <= self.quantity.maximum:
-                raise ValueError(_out_of_range(self.quantity, self.name, number))
+            if not low <= number <= high:
+                raise ValueError(_out_of_range(self.name, low, high, number))
         words.extend(numbers)
 
     def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
@@ -204,9 +130,10 @@ class Numbers:
         if end > len(words):
             raise IndexError
         numbers = list(words[at:end])
+        low, high = self.quantity.minimum, self.quantity.maximum
         for number in numbers:
-            if not self.quantity.minimum <= number <= self.quantity.maximum:
-                raise Refusal(_out_of_range(self.quantity, self.name, number))
+            if not low <= number <= high:
+                raise Refusal(_out_of_range(self.name, low, high, number))
         values[self.name] = numbers
         return end
 
@@ -218,11 +145,6 @@ class Rows:
     name: str
     count: str | int
     record: "Record"
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The one name; its value is a list of dictionaries."""
-        return (self.name,)
 
     def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
         """Append all records."""
@@ -249,11 +171,6 @@ class Rest:
 
     name: str
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The one name."""
-        return (self.name,)
-
     def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
         """Append the words."""
         words.extend(values[self.name])
@@ -264,66 +181,71 @@ class Rest:
         return len(words)
 
 
-class Run:
+Field = Number | Bits | Real | Text | Numbers | Rows | Rest
+
+
+@dataclass(frozen=True, slots=True)
+class _Word:
+    """The word of a field, or the two of an u32: name, least, greatest and bits of each part."""
+
+    parts: tuple[tuple[str, int, int, int], ...]
+    quantity: WireQuantity | None
+    is_long: bool
+
+    @classmethod
+    def of(cls, field: Number | Bits) -> "_Word":
+        """Lay out a field."""
+        if isinstance(field, Bits):
+            parts = tuple((name, 0, (1 << bits) - 1, bits) for name, bits in field.parts)
+            return cls(parts, None, False)
+        each = field.quantity
+        is_long = each.wire == "u32"
+        part = (field.name, each.minimum, each.maximum, 32 if is_long else 16)
+        return cls((part,), each, is_long)
+
+
+class _Run:
     """Numbers and shared words that follow each other, in one loop: the codec's hot path."""
 
-    def __init__(self, fields: Sequence[Number | Bits]) -> None:
-        self.names = tuple(name for field in fields for name in field.names)
-        self._fields = tuple(map(_parts_of, fields))
+    def __init__(self, fields: Iterable[Number | Bits]) -> None:
+        self._words = tuple(map(_Word.of, fields))
 
     def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
         """Append the words; ValueError for a value out of range, KeyError for no number."""
-        for _, parts, is_number in self._fields:
+        for each in self._words:
             word = 0
-            for name, low, high, bits in parts:
-                value = values[name] if is_number else values.get(name, 0)
+            for name, low, high, bits in each.parts:
+                value = values.get(name, 0) if each.quantity is None else values[name]
                 if not low <= value <= high:
-                    raise ValueError(f"{name} must be {low} to {high}, got {value}")
+                    raise ValueError(_out_of_range(name, low, high, value))
                 word = word << bits | value % (1 << bits)
-            words.append(word)
+            if each.is_long:
+                words.append(word >> 16)
+            words.append(word % WORD)
 
     def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
         """Read the words; raises Refusal for one out of range."""
-        for field, parts, is_number in self._fields:
+        for each in self._words:
             word = words[at]
-            name, low, high, _ = parts[0]
-            if not is_number:
-                for name, _, high, bits in reversed(parts):
+            if each.quantity is None:
+                for name, _, high, bits in reversed(each.parts):
                     values[name] = word & high
                     word >>= bits
                 if word:
-                    raise Refusal(f"unused bits beside {parts[0][0]} must be 0")
+                    raise Refusal(f"unused bits beside {name} must be 0")
             else:
-                if low < 0 and word >= WORD // 2:
+                name, low, high, _ = each.parts[0]
+                if each.is_long:
+                    at += 1
+                    word = word * WORD + words[at]
+                elif low < 0 and word >= WORD // 2:
                     word -= WORD
                 if not low <= word <= high:
-                    field.unpack(words, at, values)  # raises
+                    code = _CODES.get(each.quantity.name, "BAD_VALUE")
+                    raise Refusal(_out_of_range(name, low, high, word), code)
                 values[name] = word
             at += 1
         return at
-
-
-def _parts_of(
-    field: Number | Bits,
-) -> tuple[Number | Bits, tuple[tuple[str, int, int, int], ...], bool]:
-    """Return name, least, greatest and bits of each part of a word, and whether it is a number."""
-    if isinstance(field, Bits):
-        return field, tuple((name, 0, (1 << bits) - 1, bits) for name, bits in field.parts), False
-    quantity = field.quantity
-    return field, ((field.name, quantity.minimum, quantity.maximum, 16),), True
-
-
-def _is_word(field: Field) -> bool:
-    return isinstance(field, Bits) or (isinstance(field, Number) and field.quantity.wire != "u32")
-
-
-def _in_runs(fields: Sequence[Field]) -> Iterator[Field]:
-    """Yield fields, with single words that follow each other as runs."""
-    for is_word, several in groupby(fields, _is_word):
-        if is_word:
-            yield Run([field for field in several if isinstance(field, Number | Bits)])
-        else:
-            yield from several
 
 
 class Record:
@@ -334,13 +256,13 @@ class Record:
 
     def __init__(self, *fields: Field) -> None:
         self.fields = fields
-        self._compiled: tuple[Field, ...] = tuple(_in_runs(fields))
-        self.names = tuple(name for field in fields for name in field.names)
-        self.append = self._compiled[0].pack if len(self._compiled) == 1 else self._append_all
+        self.names = tuple(name for field in fields for name in _names(field))
+        self._codecs = tuple(_codecs(fields))
+        self.append = self._codecs[0].pack if len(self._codecs) == 1 else self._append_all
 
     def _append_all(self, values: Mapping[str, Any], words: list[int]) -> None:
-        for field in self._compiled:
-            field.pack(values, words)
+        for codec in self._codecs:
+            codec.pack(values, words)
 
     def pack(self, values: Mapping[str, Any]) -> list[int]:
         """Return the words of values."""
@@ -352,8 +274,8 @@ class Record:
         """Read the values from an index on, and the index behind them; raises Refusal."""
         values: Values = {}
         try:
-            for field in self._compiled:
-                at = field.unpack(words, at, values)
+            for codec in self._codecs:
+                at = codec.unpack(words, at, values)
         except IndexError:
             raise Refusal("message is too short", "BAD_LENGTH") from None
         return values, at
@@ -366,5 +288,27 @@ class Record:
         return values
 
 
-def _out_of_range(quantity: WireQuantity, name: str, value: int) -> str:
-    return f"{name} must be {quantity.minimum} to {quantity.maximum}, got {value}"
+def _names(field: Field) -> Iterator[str]:
+    if isinstance(field, Bits):
+        yield from (name for name, _ in field.parts)
+    else:
+        yield field.name
+
+
+def _codecs(fields: Iterable[Field]) -> Iterator[_Run | Real | Text | Numbers | Rows | Rest]:
+    """Yield what packs and unpacks fields: of words that follow each other together."""
+    run: list[Number | Bits] = []
+    for field in fields:
+        if isinstance(field, Number | Bits):
+            run.append(field)
+            continue
+        if run:
+            yield _Run(run)
+            run = []
+        yield field
+    if run:
+        yield _Run(run)
+
+
+def _out_of_range(name: str, low: int, high: int, value: int) -> str:
+    return f"{name} must be {low} to {high}, got {value}"

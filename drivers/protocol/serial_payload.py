@@ -6,14 +6,14 @@ versions u16 · vendor · product · serial number · firmware, each a length u8
 import struct
 from collections.abc import Sequence
 
-from drivers.protocol.records import Refusal, Values
+from drivers.protocol.records import Refusal, Text, Values
+from drivers.protocol.table import IDENTITY
 
 HELLO = 1
 """Its number."""
 BROADCAST = 0
 """The address of all amplifiers on a line."""
-_TEXTS = ("vendor", "product", "serial_number", "firmware")
-_TEXT_MAX = 32
+_TEXTS = [field for field in IDENTITY.fields if isinstance(field, Text)]
 
 
 def pack_words(words: Sequence[int]) -> bytes:
@@ -30,25 +30,21 @@ def unpack_words(payload: bytes) -> tuple[int, ...]:
 
 def pack_identity(identity: Values) -> bytes:
     """Return the payload of the reply; texts are cut at 32 bytes."""
-    raw = [identity[name].encode()[:_TEXT_MAX].decode(errors="ignore").encode() for name in _TEXTS]
-    texts = b"".join(bytes([len(text)]) + text for text in raw)
-    return int(identity["versions"]).to_bytes(2, "little") + texts
+    texts = [field.encoded(identity) for field in _TEXTS]
+    return int(identity["versions"]).to_bytes(2, "little") + b"".join(
+        bytes([len(text)]) + text for text in texts
+    )
 
 
 def unpack_identity(payload: bytes) -> Values:
     """Read the payload; what follows is ignored. Raises Refusal."""
     identity: Values = {"versions": int.from_bytes(payload[:2], "little")}
     at = 2
-    for name in _TEXTS:
-        end = at + 1 + payload[at] if at < len(payload) else at
-        if end > len(payload) or end == at or end - at > _TEXT_MAX + 1:
-            raise Refusal(f"{name} must have at most {_TEXT_MAX} bytes", "BAD_LENGTH")
-        try:
-            identity[name] = payload[at + 1 : end].decode("utf-8")
-        except UnicodeDecodeError:
-            raise Refusal(f"{name} must be UTF-8") from None
-        if not identity[name].isprintable():
-            raise Refusal(f"{name} must not have control characters")
+    for field in _TEXTS:
+        if at >= len(payload):
+            raise Refusal(f"{field.name} must not be missing", "BAD_LENGTH")
+        end = at + 1 + payload[at]
+        field.read(payload[at + 1 : end], payload[at], identity)
         at = end
     return identity
 

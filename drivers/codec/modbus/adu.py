@@ -1,15 +1,15 @@
 """Modbus ADUs of register requests, over TCP and RTU; the only module that imports pymodbus.
 
-Its framers and PDUs are used, its client is not: over RTU it credits a late response to the next
-request, it closes a TCP connection after a damaged response, and it discards partial data when the
-next request goes out. Responses are therefore parsed by `ResponseReader`.
+Its framers and requests are used, its client is not: over RTU it credits a late response to the
+next request, it closes a TCP connection after a damaged response, and it discards partial data when
+the next request goes out. Responses are therefore parsed by `ResponseReader`.
 """
 
+import struct
 from dataclasses import dataclass
 
-from pymodbus.exceptions import ModbusException
 from pymodbus.framer import FramerRTU, FramerSocket
-from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
+from pymodbus.pdu import DecodePDU, ModbusPDU
 from pymodbus.pdu.register_message import (
     ReadInputRegistersRequest,
     WriteMultipleRegistersRequest,
@@ -17,9 +17,8 @@ from pymodbus.pdu.register_message import (
 
 from drivers.statistics import WireCounters
 
-_DECODER = DecodePDU(False)
-_RTU = FramerRTU(_DECODER)
-_TCP = FramerSocket(_DECODER)
+_RTU = FramerRTU(DecodePDU(False))
+_TCP = FramerSocket(DecodePDU(False))
 _MBAP = 7  # transaction, protocol, length, unit
 _LENGTH_MAX = 254  # unit and PDU
 _RTU_MAX = 256
@@ -48,15 +47,21 @@ class Read:
 class RequestAdu:
     """A request to one unit: its frame, and what identifies its response.
 
-    transaction: of a TCP frame, 0 for RTU; response_size: of the response PDU [bytes].
+    transaction: of a TCP frame, 0 for RTU; head: the first bytes of the PDU of the response; size
+    of that PDU [bytes].
     """
 
     unit: int
     transaction: int
-    function: int
     frame: bytes
-    response_size: int
     transfer: Read | Write
+    head: bytes
+    size: int
+
+    @property
+    def function(self) -> int:
+        """Function code."""
+        return self.head[0]
 
 
 @dataclass(frozen=True)
@@ -72,16 +77,17 @@ def build_adu(transfer: Read | Write, *, unit: int, transaction: int, is_rtu: bo
     pdu: ModbusPDU
     if isinstance(transfer, Read):
         pdu = ReadInputRegistersRequest(address=transfer.address, count=transfer.count)
-        size = 2 + 2 * transfer.count
+        head, size = bytes([pdu.function_code, 2 * transfer.count]), 2 + 2 * transfer.count
     else:
+        count = len(transfer.registers)
         pdu = WriteMultipleRegistersRequest(
             address=transfer.address, registers=[*transfer.registers]
         )
-        size = 5
+        head, size = struct.pack(">BHH", pdu.function_code, transfer.address, count), 5
     pdu.dev_id = unit
     pdu.transaction_id = transaction
     frame = (_RTU if is_rtu else _TCP).buildFrame(pdu)
-    return RequestAdu(unit, transaction, pdu.function_code, frame, size, transfer)
+    return RequestAdu(unit, transaction, frame, transfer, head, size)
 
 
 class ResponseReader:
@@ -166,31 +172,15 @@ class ResponseReader:
             return 5
         if function in _READS:
             size = 5 + count
-            return size if not start or (to is not None and size == to.response_size + 3) else 0
+            return size if not start or (to is not None and size == to.size + 3) else 0
         return 8 if function in _WRITES else 0
 
 
 def _response(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
     """Decode a PDU as the response to a request; None if it is not."""
-    if not _has_form(pdu, to):
+    if len(pdu) == 2 and pdu[0] == to.function | _EXCEPTION and pdu[1]:
+        return ModbusResponse(exception=pdu[1])
+    if len(pdu) != to.size or not pdu.startswith(to.head):
         return None
-    try:
-        message = _DECODER.decode(pdu)
-    except ModbusException:
-        return None
-    if message is None:
-        return None
-    if isinstance(message, ExceptionResponse):
-        return ModbusResponse(exception=message.exception_code)
-    if isinstance(to.transfer, Read):
-        return ModbusResponse(tuple(message.registers))
-    is_echo = message.count == len(to.transfer.registers)
-    return ModbusResponse() if is_echo and message.address == to.transfer.address else None
-
-
-def _has_form(pdu: bytes, to: RequestAdu) -> bool:
-    """Whether function and length are those of a response or exception."""
-    if pdu[0] == to.function | _EXCEPTION:
-        return len(pdu) == 2 and pdu[1] > 0  # an exception has a code
-    is_long = isinstance(to.transfer, Write) or pdu[1:2] == bytes([2 * to.transfer.count])
-    return pdu[0] == to.function and len(pdu) == to.response_size and is_long
+    values = pdu[len(to.head) :]
+    return ModbusResponse(struct.unpack(f">{len(values) // 2}H", values))

@@ -10,7 +10,6 @@ at the next zero. The leading zero ends preceding noise; empty frames are ignore
 import struct
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from cobs import cobs
@@ -54,14 +53,6 @@ class Frame(NamedTuple):
         return bool(self.kind & REPLY)
 
 
-@dataclass
-class FrameCounters:
-    """Received frames: good ones, and those with an invalid checksum, length or form."""
-
-    good: int = 0
-    invalid_frames: int = 0
-
-
 def encode_frame(frame: Frame) -> bytes:
     """Encode a frame with its delimiters; ValueError for a payload that is too long."""
     if len(frame.payload) > PAYLOAD_MAX:
@@ -78,68 +69,42 @@ def frame_length(payload_length: int) -> int:
 
 
 class FrameReader:
-    """Splits a stream of bytes into frames; invalid pieces are counted and skipped.
+    """Splits a stream of bytes into frames; invalid pieces are skipped.
 
     Buffers at most one frame. on_invalid: called with each invalid piece, of an overlong one with
     its beginning.
     """
 
     def __init__(self, *, on_invalid: Callable[[bytes], None] = lambda piece: None) -> None:
-        self.counters = FrameCounters()
         self._on_invalid = on_invalid
-        self._stuffed = bytearray()
-        self._skipping = False
+        self._rest = b""
+        self._is_skipping = False  # to the end of an overlong piece
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that these bytes complete, in order."""
         frames = []
-        *ended, rest = bytes(data).split(b"\0")
+        *ended, rest = (self._rest + data).split(b"\0")
         for piece in ended:
-            if self._stuffed or self._skipping or len(piece) > _STUFFED_MAX:
-                self._append(piece)
-                frame = self._finish()
-            elif piece:  # nearly always
+            if piece and not self._is_skipping:  # a leading zero has nothing before it
                 frame = self._decoded(piece)
-            else:
-                continue  # a leading zero
-            if frame is not None:
-                frames.append(frame)
-        if rest:
-            self._append(rest)
+                if frame is not None:
+                    frames.append(frame)
+            self._is_skipping = False
+        if len(rest) > _STUFFED_MAX and not self._is_skipping:
+            self._on_invalid(rest[:_STUFFED_MAX])
+            self._is_skipping = True
+        self._rest = b"" if self._is_skipping else rest
         return frames
-
-    def _append(self, piece: bytes) -> None:
-        if self._skipping:
-            return
-        if len(self._stuffed) + len(piece) > _STUFFED_MAX:
-            self._count_invalid(bytes(self._stuffed + piece)[:_STUFFED_MAX])
-            self._skipping = True
-            self._stuffed.clear()
-            return
-        self._stuffed += piece
-
-    def _finish(self) -> Frame | None:
-        stuffed = bytes(self._stuffed)
-        self._stuffed.clear()
-        skipped, self._skipping = self._skipping, False
-        if skipped or not stuffed:
-            return None
-        return self._decoded(stuffed)
 
     def _decoded(self, stuffed: bytes) -> Frame | None:
         """Decode a frame without its delimiters; None if it is damaged."""
         try:
-            content = cobs.decode(stuffed)
+            content = cobs.decode(stuffed) if len(stuffed) <= _STUFFED_MAX else b""
         except cobs.DecodeError:
             content = b""
         body, crc = content[: -_CRC.size], content[-_CRC.size :]
         if len(content) < _OVERHEAD or _CRC.unpack(crc) != (zlib.crc32(body),):
-            self._count_invalid(stuffed)
+            self._on_invalid(stuffed[:_STUFFED_MAX])
             return None
-        self.counters.good += 1
         kind, version, address, sequence = _HEADER.unpack_from(body)
         return Frame(kind, address, sequence, body[_HEADER.size :], version)
-
-    def _count_invalid(self, piece: bytes) -> None:
-        self.counters.invalid_frames += 1
-        self._on_invalid(piece)

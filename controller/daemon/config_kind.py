@@ -9,7 +9,7 @@ from controller.daemon.config_sections import DaemonSection
 from drivers.by_hand.rig_check import check_links
 from model.config.document import Document
 from model.config.kinds import CheckedFile
-from model.rig.voltage_costs import voltage_costs
+from model.rig.gain_notes import gain_notes
 
 
 class DaemonKind:
@@ -35,7 +35,7 @@ class DaemonKind:
             f"socket {config.socket}{hint}"
         )
         note = rig.uncertainty.note
-        notes = [*layout_warnings, *voltage_costs(rig), *([note] if note else [])]
+        notes = [*layout_warnings, *gain_notes(rig), *([note] if note else [])]
         return CheckedFile(line, [*warnings, *notes])
 
     def example(self) -> str:

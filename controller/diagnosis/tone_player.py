@@ -42,7 +42,7 @@ class TonePlayer:
         """Open all amplifiers, disarmed; what they can play. Raises DriverError, InputError."""
         self.amplifiers = {
             name: await self._lines.amplifier(
-                url, self._rig.limits, name=name, is_output=bool(self._rig.voltage_of(name))
+                url, self._rig.limits, name=name, is_output=name in self._rig.outputs
             )
             for name, url in self._urls.items()
         }

@@ -109,7 +109,7 @@ class Decider:
         self._tracker = ContactTracker(rig.plate)
         self._intent_source = intent_source
         self._intent_due: float | None = None  # when the intent may change without a touch
-        self._selector = Selector(table, None if timing is None else timing.levels, rig.voltage)
+        self._selector = Selector(table, None if timing is None else timing.levels)
         self._builder = SetBuilder(
             rig,
             support=capabilities.envelope_support,

@@ -200,7 +200,7 @@ class Controller:
                 self._rig.limits,
                 name=name,
                 serial_number=self._serial_numbers.get(name),
-                is_output=bool(self._rig.voltage_of(name)),
+                is_output=name in self._rig.outputs,
             )
         except LinkError:
             self._missing = frozenset({name})
@@ -382,8 +382,7 @@ class Controller:
                 decision.pattern,
                 drive=drive,
                 sent_at=sent_at,
-                # Bases do not follow a ramp of the voltage as is predicted.
-                timing=None if self._rig.voltage else self._timing,
+                timing=self._timing,
             )
             self._report(self._observer.pattern_applied, applied)
             return

@@ -3,9 +3,8 @@
 import contextlib
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -19,11 +18,9 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.table.effect_level import EffectLevels
 from model.table.pattern import Pattern
 from model.table.question import Question
-from model.table.second_harmonic import add_second_harmonic, with_second_harmonic
 from model.table.table import LocalizationTable
 from model.vibration.peak import peak_acceleration
 from registry.plugins import failure_text
-from registry.voltage import VoltageDrive
 
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
 # radius is still within the disc that the pattern was chosen for.
@@ -73,19 +70,11 @@ class Selector:
     A pattern stays as long as its targets and their levels do, no contact has moved more than 8 mm,
     and none has another load, which changes by a factor of 1.5 or more. A quiet contact that lifts
     leaves it as it is: a change would be felt. So does any move, any load and any new quiet contact
-    while a short pulse plays. levels: None for steady levels only. voltage: of the rig, whose
-    harmonics are in the measures of patterns.
+    while a short pulse plays. levels: None for steady levels only.
     """
 
-    def __init__(
-        self,
-        table: LocalizationTable,
-        levels: EffectLevels | None = None,
-        voltage: Mapping[str, VoltageDrive] = MappingProxyType({}),
-    ) -> None:
+    def __init__(self, table: LocalizationTable, levels: EffectLevels | None = None) -> None:
         self._table = table
-        self._voltage = voltage
-        self._has_harmonics = any(drive.bias for drive in voltage.values())
         self._levels = levels
         self._current = Selection((), (), None, None)
 
@@ -141,7 +130,7 @@ class Selector:
         if not targets:
             return Selection((), quiet, None, intent.reason)
         try:
-            answer = self._with_harmonic(self._query(targets, quiet, capabilities))
+            answer = self._query(targets, quiet, capabilities)
             predictions = self._held_back(targets, self._predict(targets, quiet, answer), answer)
         except InputError as error:
             return Selection(targets, quiet, None, str(error))
@@ -166,14 +155,6 @@ class Selector:
                 if answer.felt_db_sl >= max(levels) - _STEP_SHORT_OF:
                     return answer
         return query_table(self._table, targets, quiet, capabilities, self._levels)
-
-    def _with_harmonic(self, answer: TableAnswer) -> TableAnswer:
-        """Return an answer that includes what a bias adds at twice its frequencies."""
-        if not self._has_harmonics:
-            return answer
-        found = with_second_harmonic(answer.pattern, answer.question, self._table, self._voltage)
-        louder = found.level_db_sl - answer.pattern.level_db_sl
-        return replace(answer, pattern=found, felt_db_sl=answer.felt_db_sl + louder)
 
     def _continued(self, targets: tuple[tuple[Contact, Target], ...]) -> float | None:
         """Return the frequency [Hz] that plays if only levels of its targets change; else None."""
@@ -219,15 +200,6 @@ class Selector:
         frequencies, all_fields = self._table.amplitudes(
             pattern.excitation, points, contacts=question.contacts, loads=question.loads
         )
-        if self._has_harmonics:
-            frequencies, all_fields = add_second_harmonic(
-                pattern.excitation,
-                (frequencies, all_fields),
-                points,
-                question,
-                self._table,
-                self._voltage,
-            )
         ends = np.cumsum([len(disc) for disc in discs])[: len(targets)]
         *fields, at_quiet = np.split(all_fields, ends, axis=1)
         loudest = peak_acceleration(at_quiet)

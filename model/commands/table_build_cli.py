@@ -117,11 +117,6 @@ def build(
     )
     if note := rig.uncertainty.note:
         print(note)
-    if rig.voltage:
-        print(
-            "tables know no voltages: answers of `era table` reach the full stroke, where an "
-            "amplifier of voltage may reach less, and lack the second harmonic of a bias"
-        )
     print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
     _warn(warning)
     print(next_line("era", "table", "show", output))

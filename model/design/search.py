@@ -95,7 +95,7 @@ class DesignProblem:
 
     def rig_with(self, positions: FloatArray) -> Rig:
         """The rig with ERAs at positions, without wiring."""
-        return replace(self.rig, eras=self.eras(positions), wiring={}, amplifiers={}, voltage={})
+        return replace(self.rig, eras=self.eras(positions), wiring={}, amplifiers={})
 
 
 @dataclass(frozen=True, eq=False)

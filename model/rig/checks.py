@@ -1,7 +1,6 @@
 """Checks of a rig across its sections."""
 
 import math
-from collections.abc import Iterator
 
 from model.config.document import key_name
 from model.config.sections import Validation
@@ -15,12 +14,10 @@ from model.rig.sections import (
     MassSection,
     PlateSection,
     RigSection,
-    VoltageSection,
 )
 from model.spectral.mesh import SpectralMesh
 from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
-from registry.voltage import HIGHEST_FELT, Law
 
 STIFF_MOUNT = 1e6
 """Stiffness [N/m] from which the dent of a point force in the plate counts beside the mount's own.
@@ -45,7 +42,6 @@ def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> Non
             _check_on_plate(validation, ("masses", name, "at"), plate, place, what="mass")
     _check_feet(validation, names)
     _check_wiring(validation, names)
-    _check_voltages(validation, names)
     for name in names:
         if {"damping", "damping_ratio"} <= validation.mapping(("eras", name)).keys():
             validation.add(
@@ -199,71 +195,6 @@ def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) ->
             )
 
 
-def _check_voltages(validation: Validation[RigSection], names: tuple[str, ...]) -> None:
-    """Check the `voltage` sections of ERAs: by themselves, and those of one amplifier."""
-    limits = validation.part(("limits",), LimitsSection) or LimitsSection()
-    driven: dict[str | None, list[str]] = {}
-    for name in names:
-        amplifier = validation.mapping(("eras", name)).get("amplifier")
-        driven.setdefault(None if amplifier is None else str(amplifier), []).append(name)
-    for amplifier, several in driven.items():
-        given = [name for name in several if _has(validation, name, "voltage")]
-        if amplifier is None:
-            for name in given:
-                validation.add(
-                    ("eras", name, "voltage"), "is for ERAs with an amplifier only; remove it"
-                )
-            continue
-        for name in several if given else ():
-            if name not in given:
-                validation.add(
-                    ("eras", name, "voltage"),
-                    f"missing; ERA {given[0]} of the same amplifier has it: levels of an amplifier "
-                    "are all of a voltage, or all of motion",
-                )
-                continue
-            section = validation.part(("eras", name, "voltage"), VoltageSection)
-            for key, problem in _voltage_problems(section, limits) if section else ():
-                validation.add(("eras", name, "voltage", key), problem)
-
-
 def _has(validation: Validation[RigSection], name: str, key: str) -> bool:
     """Whether an ERA has a key that is not empty."""
     return validation.mapping(("eras", name)).get(key) is not None
-
-
-def _voltage_problems(section: VoltageSection, limits: LimitsSection) -> Iterator[tuple[str, str]]:
-    """Keys and problems of a `voltage` section."""
-    low, high = limits.frequency
-    first, last = section.response[0][0], section.response[-1][0]
-    has_harmonic = section.bias and section.law is Law.QUADRATIC
-    highest = max(high, min(2 * high, HIGHEST_FELT)) if has_harmonic else high
-    if low < first or highest > last:
-        harmonic = " and, with a bias, its second harmonic" if has_harmonic else ""
-        yield (
-            "response",
-            f"must cover limits.frequency{harmonic}, {low:g} to {highest:g} Hz, got {first:g} to "
-            f"{last:g} Hz; narrow the limits, or measure the rest",
-        )
-    if section.bias and section.law is Law.LINEAR:
-        yield "bias", "is for `law: quadratic` only; remove it"
-    if section.bias >= section.maximum:
-        yield "bias", f"must be less than maximum, {section.maximum:g}, got {section.bias:g}"
-    if section.minimum and not section.bias:
-        yield "minimum", "is for a bias only; remove it"
-    if section.bias and section.minimum >= section.bias:
-        yield "minimum", f"must be less than bias, {section.bias:g}, got {section.minimum:g}"
-    if section.static is not None and section.law is Law.LINEAR:
-        yield "static", "is for `law: quadratic` only; remove it"
-    elif section.static is not None and section.static * section.bias**2 >= 1:
-        yield (
-            "static",
-            f"must leave stroke beside the bias, below {1 / section.bias**2:.4g}, got "
-            f"{section.static:g}; lower bias, or give the ERA its greater stroke",
-        )
-    if section.law is Law.QUADRATIC and not section.bias and limits.slew is not None:
-        yield (
-            "law",
-            "must have a bias under limits.slew, since without one the force rises up to 1.3 times "
-            "as steeply as the ramp; give a bias, or remove limits.slew",
-        )

@@ -17,7 +17,6 @@ from model.rig.parts import (
     mass_of,
     plate_of,
     uncertainty_of,
-    voltage_drive_of,
 )
 from model.rig.rig import Channel, Rig
 from model.rig.sections import RigSection
@@ -79,11 +78,11 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
         uncertainty=uncertainty_of(section.uncertainty),
         fingertip=fingertip_of(section.fingertip),
         threshold=section.threshold,
-        voltage={
-            name: voltage_drive_of(era.voltage, section.limits)
-            for name, era in section.eras.items()
-            if era.voltage is not None
-        },
+        outputs=frozenset(
+            name
+            for name, amplifier in section.amplifiers.items()
+            if amplifier.full_level == "output"
+        ),
     )
 
 

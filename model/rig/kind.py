@@ -9,8 +9,8 @@ from model.fem.elements.element import SHEAR_CORRECTION
 from model.rig.amplifiers import check_amplifiers
 from model.rig.checks import STIFF_MOUNT
 from model.rig.file import example_rig_path, rig_of, rig_schema
+from model.rig.gain_notes import gain_notes
 from model.rig.rig import Rig
-from model.rig.voltage_costs import voltage_costs
 from model.structure.laminate_section import slide_frequency
 from model.structure.support import support_problem
 
@@ -43,7 +43,7 @@ class RigKind:
         if rig is None or problems:
             raise ConfigError(document.source, problems)
         note = rig.uncertainty.note
-        costs = [*voltage_costs(rig), *_air_costs(rig), *_layer_costs(rig), *_point_costs(rig)]
+        costs = [*gain_notes(rig), *_air_costs(rig), *_layer_costs(rig), *_point_costs(rig)]
         return CheckedFile(_summary(rig), [*warnings, *costs, *([note] if note else [])])
 
     def example(self) -> str:

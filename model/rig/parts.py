@@ -11,7 +11,6 @@ from model.rig.sections import (
     MaterialSection,
     PlateSection,
     UncertaintySection,
-    VoltageSection,
 )
 from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era, damping_from_ratio
@@ -23,7 +22,6 @@ from model.structure.material import Material
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 from registry.limits import GuardLimits
-from registry.voltage import VoltageDrive
 
 
 def plate_of(section: PlateSection, *, frequency_max: float) -> Plate:
@@ -97,19 +95,6 @@ def era_of(name: str, section: EraSection, plate: Plate, *, era_count: int) -> E
         stroke=section.stroke,
         foot=section.foot,
         gains=tuple((f, size, math.radians(phase)) for f, size, phase in section.gains or ()),
-    )
-
-
-def voltage_drive_of(section: VoltageSection, limits: LimitsSection) -> VoltageDrive:
-    """The way from a voltage to motion, over the frequencies that are played."""
-    return VoltageDrive(
-        response=tuple((f, size, math.radians(phase)) for f, size, phase in section.response),
-        law=section.law,
-        bias=section.bias,
-        maximum=section.maximum,
-        frequencies=limits.frequency,
-        minimum=section.minimum,
-        static=section.static,
     )
 
 

@@ -19,7 +19,6 @@ from model.structure.laminate import Laminate
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 from registry.limits import GuardLimits
-from registry.voltage import VoltageDrive
 
 # m; two bolts cannot be closer
 SAME_POINT = 1e-6
@@ -41,8 +40,8 @@ class Rig:
     masses: on the plate, ERAs without an amplifier among them, whose names are supports; laminate:
     of which the plate is made, also where its layers are solved as a homogeneous one; uncertainty:
     of its parameters; fingertip: load of each finger on the plate, None for weightless ones;
-    threshold: name of the set of detection thresholds (`model.finger.perception`); voltage: of ERAs
-    behind amplifiers of voltage, by name.
+    threshold: name of the set of detection thresholds (`model.finger.perception`); outputs: the
+    amplifiers whose full level is an output, to which bases move by their gains, not a motion.
     """
 
     plate: Plate
@@ -56,8 +55,8 @@ class Rig:
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
     fingertip: Fingertip | None = field(default_factory=Fingertip)
     threshold: str = DEFAULT_THRESHOLD
-    voltage: Mapping[str, VoltageDrive] = field(default_factory=dict)
     supports: tuple[str, ...] = ()
+    outputs: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         """Check that ERAs and masses are on the plate, and places and names of ERAs unique."""
@@ -88,14 +87,6 @@ class Rig:
             if era.name == name:
                 return era
         raise KeyError(name)
-
-    def voltage_of(self, amplifier: str) -> dict[int, VoltageDrive]:
-        """What the ERAs of an amplifier of voltage make of it, by channel; empty for motion."""
-        return {
-            self.wiring[name].number: drive
-            for name, drive in self.voltage.items()
-            if self.wiring[name].amplifier == amplifier
-        }
 
     @property
     def fingerprint(self) -> str:

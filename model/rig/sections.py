@@ -38,7 +38,6 @@ from model.rig.uncertainty import Uncertainty
 from model.structure.laminate import Bond
 from model.structure.materials import material, material_names
 from registry.suggestions import did_you_mean
-from registry.voltage import Law
 
 
 class _MaterialByName:
@@ -197,17 +196,6 @@ class PlateSection(Section):
     ]
 
 
-class VoltageSection(Section):
-    """The way from the voltage of an amplifier to the motion of an ERA, see `VoltageDrive`."""
-
-    response: Annotated[list[GainRow], Field(min_length=1, max_length=2000), AfterValidator(_gains)]
-    law: Annotated[Law, Strict(strict=False)] = Law.LINEAR
-    bias: Annotated[float, Quantity(RATIO, at_least=0, below=1)] = 0.0
-    maximum: Annotated[float, Quantity(RATIO, above=0, at_most=1)] = 1.0
-    minimum: Annotated[float, Quantity(RATIO, at_least=-1, below=1)] = 0.0
-    static: Annotated[float, Quantity(RATIO, above=0, at_most=1000)] | None = None
-
-
 class EraSection(Section):
     """One ERA; without an amplifier it only supports the plate.
 
@@ -216,11 +204,7 @@ class EraSection(Section):
 
     model_config = ConfigDict(
         json_schema_extra={
-            "dependentRequired": {
-                "amplifier": ["channel"],
-                "channel": ["amplifier"],
-                "voltage": ["amplifier"],
-            }
+            "dependentRequired": {"amplifier": ["channel"], "channel": ["amplifier"]}
         }
     )
 
@@ -234,7 +218,6 @@ class EraSection(Section):
     gains: Annotated[list[GainRow], Field(max_length=2000), AfterValidator(_gains)] | None = None
     amplifier: Identifier | None = None
     channel: Annotated[int, Field(ge=0, le=255)] | None = None
-    voltage: VoltageSection | None = None
 
 
 class MassSection(Section):
@@ -246,9 +229,10 @@ class MassSection(Section):
 
 
 class AmplifierSection(Section):
-    """The URL of an amplifier."""
+    """An amplifier: its URL, and what its full level is."""
 
     url: Annotated[str, AfterValidator(_url)]
+    full_level: Literal["motion", "output"] = "motion"
 
 
 class UncertaintySection(Section):

@@ -36,9 +36,7 @@ def judge_finalists(
     chosen = scored.finalists(finalists, groups=groups)
     sets = contacts.sets(JUDGED_SETS, seed=SETS_SEED + JUDGED_SEED)
     rigs = {
-        case: replace(
-            rig, eras=scored.cases.eras_of(case, rig.eras), wiring={}, amplifiers={}, voltage={}
-        )
+        case: replace(rig, eras=scored.cases.eras_of(case, rig.eras), wiring={}, amplifiers={})
         for case in chosen
     }
     judged: dict[int, Judged] = {}

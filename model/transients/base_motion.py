@@ -62,13 +62,6 @@ Motion: TypeAlias = Sequence[Term | Fade]
 """The motion of a base, the sum of its parts."""
 
 
-def terms_of(motion: Motion) -> list[Term]:
-    """The same motion in terms alone."""
-    return [
-        term for part in motion for term in (part.terms() if isinstance(part, Fade) else (part,))
-    ]
-
-
 class BaseMotions:
     """Sets of motions of all ERAs' bases, in terms that ascend in omega.
 

@@ -25,8 +25,7 @@ from model.structure.actuator import Era
 from model.structure.fingertip import FingertipLoad, check_loads
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad, footprints_of
-from model.transients.base_motion import Motion, terms_of
-from registry.voltage import Law
+from model.transients.base_motion import Motion
 from sim.amplifier.contract import Amplifier
 from sim.bench.placement import Placement
 from sim.bench.reading import ToneReader
@@ -36,7 +35,6 @@ from sim.plant.fingers import KEPT, Fingers, Position, Record
 from sim.plant.imperfections import Imperfections, PlateErrors, delayed, draw_noise, realised
 from sim.plant.loaded_plates import LoadedPlate
 from sim.plant.plant import SAMPLE_RATE, Plant
-from sim.plant.voltage import moved_by_voltage
 from sim.waveform import Output
 
 _TICK = 0.01  # s; of `keep_time`
@@ -92,9 +90,7 @@ class Bench:
         self.observers: frozenset[str] = frozenset()  # fingers without weight
         self.loads: Mapping[str, float] = {}  # by finger, relative to the rig's fingertip
         self.amplifiers: Mapping[str, Amplifier] = {
-            name: Amplifier(
-                name, channels=_channel_count(rig, name), is_output=bool(rig.voltage_of(name))
-            )
+            name: Amplifier(name, channels=_channel_count(rig, name), is_output=name in rig.outputs)
             for name in rig.amplifiers
         }
         self._sensing = [
@@ -116,14 +112,13 @@ class Bench:
             name: deque() for name in rig.amplifiers
         }
         self._applied_outputs: list[Output] = [()] * len(rig.eras)  # by ERA
-        self._drives = [rig.voltage.get(era.name) for era in rig.eras]
         self._errors = [imperfections.errors_of(era.name, rig) for era in rig.eras]
         self._noise = [draw_noise(seed=imperfections.seed, number=n) for n in range(len(rig.eras))]
         self._shapes_at = lru_cache(_MAX_SHAPES)(
             lambda points: self._plant.reduced.at(np.frombuffer(points).reshape(-1, 2))
         )
-        # Outputs that moved a base, with the index of the ERA and the time of their end [s].
-        self._played: deque[tuple[int, Output, float]] = deque()
+        # Outputs that moved a base, with the time of their end [s].
+        self._played: deque[tuple[Output, float]] = deque()
 
     @property
     def time(self) -> float:
@@ -371,23 +366,19 @@ class Bench:
             while waiting and waiting[0][0] <= self._time:
                 _, index, playing = waiting.popleft()
                 self._apply(index, playing)
-        while self._played and self._played[0][2] < self._time - KEPT:
+        while self._played and self._played[0][1] < self._time - KEPT:
             self._played.popleft()
 
     def _apply(self, index: int, playing: Output) -> None:
         """Let an output move the base of an ERA from now on."""
         self._plant.set_input(index, self._motion(index, playing), since=self._time)
-        self._played.append((index, self._applied_outputs[index], self._time))
+        self._played.append((self._applied_outputs[index], self._time))
         self._applied_outputs[index] = playing
 
     def _motion(self, index: int, playing: Output) -> Motion:
         """The base motion of an ERA by the output of its channel, imperfections included."""
-        era, drive = self.rig.eras[index], self._drives[index]
-        stroke = era.stroke if drive is None else 1.0
-        motion: Motion = [part for tone in playing for part in tone.motion(stroke=stroke)]
-        if drive is not None:
-            motion = moved_by_voltage(terms_of(motion), drive, stroke=era.stroke)
-        errors = self._errors[index]
+        era, errors = self.rig.eras[index], self._errors[index]
+        motion: Motion = [part for tone in playing for part in tone.motion(stroke=era.stroke)]
         motion = realised(motion, errors)
         if errors.noise and playing:
             end = max(tone.silent_from for tone in playing)
@@ -397,31 +388,15 @@ class Bench:
 
     def _frequencies(self, since: float, until: float) -> list[float]:
         """The frequencies [Hz] at which bases were moved by commands in a window."""
-        ended = [
-            (index, tone, min(end, tone.silent_from))
-            for index, output, end in self._played
-            for tone in output
-        ]
-        present = [
-            (index, tone, tone.silent_from)
-            for index, output in enumerate(self._applied_outputs)
-            for tone in output
-        ]
+        present = [(output, math.inf) for output in self._applied_outputs]
         return sorted(
             {
-                frequency
-                for index, tone, end in ended + present
-                if tone.start < until and end > since
-                for frequency in self._moved_at(index, tone.frequency)
+                tone.frequency
+                for output, end in [*self._played, *present]
+                for tone in output
+                if tone.start < until and min(end, tone.silent_from) > since
             }
         )
-
-    def _moved_at(self, index: int, frequency: float) -> tuple[float, ...]:
-        """The frequencies [Hz] at which a tone of a channel moves its ERA."""
-        drive = self._drives[index]
-        if drive is None or drive.law is Law.LINEAR:
-            return (frequency,)
-        return (2 * frequency,) if drive.is_halved else (frequency, 2 * frequency)
 
 
 def _tabulated(solve: Callable[[], LoadedPlate], sample_rate: float) -> LoadedPlate:

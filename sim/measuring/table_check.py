@@ -89,7 +89,7 @@ def _recorder(
         (name,) = {channel.amplifier for channel in desk.rig.wiring.values()}
         amplifier = stack.enter_context(
             BlockingAmplifier(
-                settings.url, limits=desk.rig.limits, is_output=bool(desk.rig.voltage_of(name))
+                settings.url, limits=desk.rig.limits, is_output=name in desk.rig.outputs
             )
         )
         amplifier.arm()

@@ -27,10 +27,6 @@ pytestmark = [
 ]
 
 CHANNELS = 4
-OF_VOLTAGE = (
-    "amplifier: main,",
-    "amplifier: main, voltage: {response: [[20, 1, 0], [1000, 1, 0]]},",
-)
 SERVER_BACK = 20.0  # s
 
 
@@ -47,9 +43,10 @@ async def test_lost_server_is_a_fault_and_comes_back_disarmed(
         capture_on(name, "looking", 1).close()  # once the server is up
         options = ("--device", "jack", "--channels", str(CHANNELS), "--link", str(tmp_path / "amp"))
         amp = SoftAmp(*options, environment=server.environment, log=tmp_path / "log")
-        far = SimpleNamespace(urls={"main": amp.url})
+        far = SimpleNamespace(urls={})
+        change = ('main: {url: "sim://"}', f'main: {{url: "{amp.url}", full_level: output}}')
         async with (
-            daemon_at(far, tmp_path, changes=(OF_VOLTAGE,)) as daemon,
+            daemon_at(far, tmp_path, changes=(change,)) as daemon,
             await daemon.client() as era,
             holding(era, PLACE),
         ):

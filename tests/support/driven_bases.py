@@ -4,11 +4,12 @@ import cmath
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
 from model.arrays import FloatArray
-from model.transients.base_motion import Fade, Motion, Term, terms_of
+from model.transients.base_motion import Fade, Motion, Term
 from sim.waveform import ShapedTone
 
 
@@ -23,7 +24,8 @@ class Base:
 def motion_of(motion: Motion, times: FloatArray) -> FloatArray:
     """Displacement [m] at times (n,) [s] by the definition of a term."""
     y = np.zeros(len(times))
-    for term in terms_of(motion):
+    parts = [part.terms() if isinstance(part, Fade) else (part,) for part in motion]
+    for term in chain.from_iterable(parts):
         tau = times - term.start
         value = (term.c0 + term.c1 * tau) * np.exp(1j * term.omega * tau)
         y += np.where((times >= term.start) & (times < term.end), value.imag, 0.0)

@@ -11,10 +11,14 @@ RIG = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"
 
 
 def test_gains_are_rewritten_wherever_yaml_wraps_the_line() -> None:
-    """An ERA with a voltage is longer than a line; some of these lengths break it at its gains."""
-    text = RIG.read_text("utf-8")
-    for zeros in range(0, 12, 2):
-        longer = text.replace("stroke: 100 um", f"stroke: 0.0001{zeros * '0'}")
+    """An ERA of several short lines becomes a long one; some lengths break it at its gains."""
+    lines = RIG.read_text("utf-8").splitlines()
+    text = "\n".join(line for line in lines if not line.startswith("#"))
+    text = text.replace("main", 32 * "m")
+    for zeros in range(8, 29, 4):
+        longer = text.replace(
+            "0.05, bolt_mass: 0, stroke: 100 um", f"0.05,\n     stroke: 0.0001{zeros * '0'}"
+        )
         document = parse_document("rig.yaml", longer)
         rig = rig_of(document)
         gains = ((50.0, 1.25, 0.5), (60.0, 1.5, 0.25))

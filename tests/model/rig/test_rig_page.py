@@ -23,7 +23,6 @@ from model.rig.sections import (
     PlateSection,
     RigSection,
     UncertaintySection,
-    VoltageSection,
 )
 from model.structure.materials import KNOWN_MATERIALS
 
@@ -36,7 +35,6 @@ SECTIONS = {
     "air_gap": AirGapSection,
     "material": MaterialSection,
     "eras": EraSection,
-    "voltage": VoltageSection,
     "masses": MassSection,
     "amplifiers": AmplifierSection,
     "limits": LimitsSection,

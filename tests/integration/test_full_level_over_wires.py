@@ -11,18 +11,10 @@ from drivers.opening import Lines
 from long_form import shortly
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
-from registry.voltage import VoltageDrive
 from rig_on_wire import far_side
 from virtual_loop import in_virtual_time
 from wires import WIRES
 from witnessed_chain import OneTable
-
-
-@pytest.fixture
-def voltage_rig(coarse_rig: Rig) -> Rig:
-    """The paper's rig behind a linear amplifier: half a stroke by its full output."""
-    flat = VoltageDrive(((20.0, 0.5, 0.0), (1000.0, 0.5, 0.0)))
-    return replace(coarse_rig, voltage={era.name: flat for era in coarse_rig.eras})
 
 
 @pytest.mark.parametrize("of_rig", [False, True])
@@ -30,11 +22,11 @@ def voltage_rig(coarse_rig: Rig) -> Rig:
 @pytest.mark.parametrize("wire", shortly(WIRES, ["serial", "can+slcan"]))
 @in_virtual_time
 async def test_motion_and_output_are_not_taken_for_each_other(
-    wire: str, of_amplifier: bool, of_rig: bool, coarse_rig: Rig, voltage_rig: Rig
+    wire: str, of_amplifier: bool, of_rig: bool, coarse_rig: Rig
 ) -> None:
     """An amplifier opens, for touches and for measurements, where its full level is the rig's."""
     live_in_memory()
-    rigs = {False: coarse_rig, True: voltage_rig}
+    rigs = {False: coarse_rig, True: replace(coarse_rig, outputs=frozenset(coarse_rig.amplifiers))}
     rig = rigs[of_rig]
     async with far_side(WIRES[wire], rigs[of_amplifier]) as far:
         controller = Controller(rig, OneTable(rig.plate), lines=Lines, urls=far.urls)

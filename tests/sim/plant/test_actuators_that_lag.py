@@ -1,0 +1,99 @@
+"""Onsets behind actuators that resonate: what gains predict, and what bases do that follow late."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lsim
+
+from model.arrays import FloatArray
+from model.finger.contrast import contrast_db
+from model.finger.felt_band import felt_part
+from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.rig import Rig
+from model.structure.point_load import footprints_of
+from model.table.build import build_table
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.table.timing import Timing
+from model.transients.measures import ONSET_WINDOW
+from sim.plant.plant import Plant
+from sim.plant.sampled import SampledPlant
+
+RATE = 48_000.0
+PAIRS = (((0.06, 0.04), (0.22, 0.16)), ((0.15, 0.1), (0.28, 0.03)), ((0.25, 0.2), (0.05, 0.15)))
+ABOVE = ((560.0, 0.3), (640.0, 0.2), (720.0, 0.4), (800.0, 0.25))
+"""Resonance [Hz] and damping ratio of each actuator, as behind a sound card."""
+WITHIN = ((180.0, 0.12), (260.0, 0.1), (340.0, 0.2), (420.0, 0.15))
+"""The same with resonances among the frequencies that are played."""
+
+
+def gain(frequencies: FloatArray, resonance: float, ratio: float) -> FloatArray:
+    """Motion of a base by an output, as of a damped oscillator."""
+    x = frequencies / resonance
+    return np.asarray(1 / (1 - x**2 + 2j * ratio * x))
+
+
+def driven_by(rig: Rig, pattern: Pattern, times: FloatArray) -> FloatArray:
+    """What an onset would move the bases by, (n, eras) [m], if they followed at once."""
+    bases = np.zeros((len(times), len(rig.eras)))
+    for number, era in enumerate(rig.eras):
+        if pattern.onset and era.name in pattern.onset:
+            envelope = pattern.onset[era.name]
+            amplitude, frequency = envelope.amplitude(times), envelope.frequency
+        elif not pattern.onset and era.name in pattern.excitation:
+            tone = pattern.excitation[era.name]
+            rise = (1 - np.cos(np.pi * np.clip(times / pattern.ramp, 0, 1))) / 2
+            amplitude, frequency = rise * tone.phasor, tone.frequency
+        else:
+            continue
+        bases[:, number] = (amplitude * np.exp(2j * np.pi * frequency * times)).imag
+    return bases
+
+
+@pytest.mark.parametrize("actuators", [ABOVE, WITHIN])
+@pytest.mark.parametrize("is_shaped", [True, False])
+def test_contrast_of_an_onset_behind_actuators_that_lag(
+    coarse_rig: Rig, is_shaped: bool, actuators: tuple[tuple[float, float], ...]
+) -> None:
+    """That of their equation of motion within 1 dB of the one that gains predict.
+
+    But for a shaped onset through resonances that are played, which loses up to 6 dB.
+    """
+    rows = np.arange(30.0, 521.0, 5.0)
+    eras = tuple(
+        replace(
+            era,
+            gains=tuple(
+                zip(rows, abs(gain(rows, *each)), np.angle(gain(rows, *each)), strict=True)
+            ),
+        )
+        for era, each in zip(coarse_rig.eras, actuators, strict=True)
+    )
+    rig = replace(coarse_rig, eras=eras, fingertip=None)
+    table = build_table(rig, frequencies=np.arange(80.0, 401.0, 40.0))
+    timing = Timing(table)
+    reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras), frequency_max=1000.0)
+    times = (np.arange(round(ONSET_WINDOW * RATE)) + 1) / RATE
+    for target, quiet in PAIRS:
+        question = Question((target,), (quiet,), level_db_sl=15.0, envelopes=True)
+        pattern = timing.with_envelopes(
+            question, table.query(question), onset=is_shaped, ending=False
+        )
+        predicted = timing.with_transient_measures(question, pattern).transient_contrast_db
+        bases = driven_by(rig, pattern, times)
+        for number, (resonance, ratio) in enumerate(actuators):
+            omega = 2 * np.pi * resonance
+            system = ([omega**2], [1, 2 * ratio * omega, omega**2])
+            _, moved, _ = lsim(system, np.append(0.0, bases[:, number]), np.append(0.0, times))
+            bases[:, number] = moved[1:]
+        plant = Plant(reduced, coarse_rig.eras)
+        discs = [fingertip_points(*at, rig.plate) for at in (target, quiet)]
+        felt = SampledPlant(plant, rate=RATE).advance(
+            bases, shapes=plant.reduced.at(np.concatenate(discs))
+        )
+        peaks = np.split(np.abs(felt_part(felt, RATE)).max(axis=0), [len(discs[0])])
+        weights = [fingertip_weights(*target, rig.plate)]
+        lost = predicted - contrast_db(peaks[:1], peaks[1], weights)
+        assert -1 < lost < (6 if is_shaped and actuators is WITHIN else 1)

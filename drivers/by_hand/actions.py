@@ -9,6 +9,7 @@ from typing import Any
 from drivers import clock
 from drivers.by_hand.reaching import (
     identified,
+    keep_alive,
     random_session,
     reached,
     request,
@@ -193,7 +194,7 @@ async def clear(url: str) -> dict[str, Any]:
 
 
 async def drive(
-    url: str, *, channel: int, frequency: float, level: float, duration: float
+    url: str, channel: int, frequency: float, level: float, duration: float
 ) -> dict[str, Any]:
     """Drive one channel for a time [s]; ends silent and disarmed."""
     limit = QUANTITIES["valid_for"].high
@@ -214,26 +215,18 @@ async def drive(
             await _arm(amplifier, watchdog, url)
             await amplifier.stage(_TOKEN, [layer], now=True)
             achieved = await request(amplifier, "GetAchieved", {"layer": layer.number})
-            end = clock.now() + duration
-            while (left := end - clock.now()) > 0:
-                await asyncio.sleep(min(watchdog / 5, left))
-                await amplifier.ping()
+            await keep_alive(amplifier, duration, watchdog / 5)
         finally:
             # An amplifier that cannot be reached is stopped by its watchdog.
             with contextlib.suppress(DriverError):
                 await amplifier.disarm(_RAMP)
         after = await amplifier.read_status()
-    tones = ("frequency", "level", "phase")
     played = [
         {
             "channel": row["channel"],
-            **dict(
-                zip(
-                    ("frequency_hz", "level", "phase_deg"),
-                    (QUANTITIES[name].from_wire(row[name]) for name in tones),
-                    strict=True,
-                )
-            ),
+            "frequency_hz": QUANTITIES["frequency"].from_wire(row["frequency"]),
+            "level": QUANTITIES["level"].from_wire(row["level"]),
+            "phase_deg": QUANTITIES["phase"].from_wire(row["phase"]),
         }
         for row in achieved["commands"]
     ]

@@ -11,19 +11,18 @@ falls silent.
 import asyncio
 import threading
 from collections.abc import Coroutine, Sequence
+from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import Any, TypeVar
 
-from drivers import clock
-from drivers.by_hand.reaching import random_session, request
+from drivers.by_hand.reaching import keep_alive, random_session, reached, request
 from drivers.by_hand.rows import capability_rows, fault_rows, status_rows
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused
-from drivers.host.amplifier import WATCHDOG, Amplifier
+from drivers.host.amplifier import WATCHDOG
 from drivers.host.dialogue import Staged
 from drivers.host.sensors import Reading, Sensor, measure_tones, read_sensors
 from drivers.host.timing import HEARTBEAT
-from drivers.opening import Lines
 from drivers.protocol.table import STATES
 from drivers.protocol.tokens import token_after
 from registry.limits import GuardLimits
@@ -42,9 +41,8 @@ class BlockingAmplifier:
     """
 
     def __init__(self, url: str, *, limits: GuardLimits, is_output: bool | None = None) -> None:
-        self._url = url
-        self._limits = limits
-        self._is_output = is_output
+        self._reached = reached(url, limits=limits, is_output=is_output)
+        self._opened = AsyncExitStack()
         self._token = 1
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name=f"amplifier {url}")
@@ -52,7 +50,8 @@ class BlockingAmplifier:
     def __enter__(self) -> "BlockingAmplifier":
         self._thread.start()
         try:
-            self._lines, self._amplifier = self._wait(self._open())
+            self._amplifier = self._wait(self._opened.enter_async_context(self._reached))
+            self._wait(self._amplifier.open())
         except BaseException:
             self._end()
             raise
@@ -68,10 +67,7 @@ class BlockingAmplifier:
             if self._amplifier.line.loss is None:
                 self._wait(self._amplifier.disarm())
         finally:
-            try:
-                self._wait(self._lines.close())
-            finally:
-                self._end()
+            self._end()
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -136,33 +132,14 @@ class BlockingAmplifier:
         Raises CommandRefused if the amplifier stops by itself, or its replies contradict requests.
         """
         played = self.apply(tones, ramp=ramp, valid_for=duration)
-        self._wait(self._keep_alive(duration))
+        self._wait(keep_alive(self._amplifier, duration, HEARTBEAT))
         return played
-
-    async def _open(self) -> tuple[Lines, Amplifier]:
-        lines = Lines()
-        try:
-            url = self._url
-            amplifier = await lines.amplifier(
-                url, self._limits, name=url, is_output=self._is_output
-            )
-            await amplifier.open()
-        except BaseException:
-            await lines.close()
-            raise
-        return lines, amplifier
 
     async def _applied(self, tones: Sequence[Tone], ramp: float, valid_for: float) -> Staged:
         _require_tones(tones)
         self._token = token_after(self._token)
         layer = Layer(0, tuple(tones), ramp, valid_for)
         return await self._amplifier.stage(self._token, [layer], now=True)
-
-    async def _keep_alive(self, duration: float) -> None:
-        end = clock.now() + duration
-        while (left := end - clock.now()) > 0:
-            await asyncio.sleep(min(HEARTBEAT, left))
-            await self._amplifier.ping()
 
     async def _measured(self, frequencies: Sequence[float], window: float) -> Reading:
         is_armed = (await self._amplifier.read_status())["state"] == _ENABLED
@@ -184,9 +161,12 @@ class BlockingAmplifier:
             raise
 
     def _end(self) -> None:
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
+        try:
+            self._wait(self._opened.aclose())
+        finally:
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._thread.join()
+            self._loop.close()
 
 
 def _require_tones(tones: object) -> None:

@@ -93,72 +93,40 @@ def discover(
     json_: Json = False,
 ) -> None:
     """List serial ports, CAN interfaces and the amplifiers on them."""
-    from drivers.by_hand.discovery import identify_all
-    from drivers.discovery.places import candidates, with_slcan
+    from drivers.by_hand.discovery import discover as discovered
 
-    found_ports = [with_slcan(candidate) if slcan else candidate for candidate in candidates()]
-    probed = [
-        candidate
-        for candidate in found_ports
-        if candidate.remedy is None and not candidate.is_slcan
-    ]
-    usable = [one for candidate in probed for one in candidate.urls]
-    found = _run(identify_all([*(url or []), *(usable if probe else [])]), trace)
-    who = {one.url: one.identity for one in found if one.identity is not None}
-    unusable = {one.url: one.problem for one in found if not one.was_sent}
-    rows = [
-        {
-            "place": candidate.name,
-            "description": candidate.description,
-            "urls": list(candidate.urls),
-            "heard": list(candidate.urls) if candidate.is_slcan else [],
-            "answers": [one for one in candidate.urls if one in who],
-            "remedy": candidate.remedy
-            or next((unusable[one] for one in candidate.urls if one in unusable), None),
-        }
-        for candidate in found_ports
-    ]
-    amplifiers = [
-        {"url": at, **{name: one[name] for name in ("vendor", "product", "serial_number")}}
-        for at, one in who.items()
-    ]
+    result, problems = _run(discovered(url or [], probes=probe, slcan=slcan), trace)
     if json_:
-        print(json.dumps({"places": rows, "amplifiers": amplifiers}))
+        print(json.dumps(result))
         return
-    for row in rows:
+    for row in result["places"]:
         print(f"{row['place']}  {row['description']}")
         if row["remedy"]:
             print(f"  {row['remedy']}")
-    if not rows:
+    if not result["places"]:
         print("no serial port and no CAN interface found; plug in an adapter and try again")
-    for one in found:
-        if one.identity is None and one.url in (url or []):
-            print(f"{one.url}: {one.problem}")
-    for amplifier in amplifiers:
-        print("  ".join(str(value) for value in amplifier.values()))
-    heard = [one for candidate in found_ports if candidate.is_slcan for one in candidate.urls]
-    if not amplifiers and heard:
-        print(f"Next: era amp identify {shlex.quote(heard[0])}")
-    elif not amplifiers:
+    for where, problem in problems.items():
+        print(f"{where}: {problem}")
+    for amplifier in result["amplifiers"]:
+        print("  ".join(amplifier.values()))
+    reached = [amplifier["url"] for amplifier in result["amplifiers"]]
+    reached += [heard for row in result["places"] for heard in row["heard"]]
+    if not reached:
         print("no amplifier found")
-    else:
-        print(f"Next: era amp identify {shlex.quote(amplifiers[0]['url'])}")
+        return
+    print(f"Next: era amp identify {shlex.quote(reached[0])}")
 
 
-@amp.command()
-def identify(url: Url, trace: Trace = None, json_: Json = False) -> None:
-    """Show identity, capabilities and wire times."""
-    from drivers.by_hand import actions
+def _add_plain(name: str, about: str) -> None:
+    """Add a command that has no options of its own: an action of that name."""
 
-    _show(_run(actions.identify(url), trace), as_json=json_)
+    @amp.command(name, help=about)
+    def run(url: Url, trace: Trace = None, json_: Json = False) -> None:
+        _act(name, url, trace=trace, json_=json_)
 
 
-@amp.command()
-def status(url: Url, trace: Trace = None, json_: Json = False) -> None:
-    """Show state, levels and faults."""
-    from drivers.by_hand import actions
-
-    _show(_run(actions.status(url), trace), as_json=json_)
+_add_plain("identify", "Show identity, capabilities and wire times.")
+_add_plain("status", "Show state, levels and faults.")
 
 
 @amp.command()
@@ -172,20 +140,10 @@ def drive(
     json_: Json = False,
 ) -> None:
     """Drive one channel, then disarm."""
-    from drivers.by_hand import actions
-
-    driven = actions.drive(
-        url, channel=channel, frequency=frequency, level=level, duration=duration
-    )
-    _show(_run(driven, trace), as_json=json_)
+    _act("drive", url, channel, frequency, level, duration, trace=trace, json_=json_)
 
 
-@amp.command()
-def sensors(url: Url, trace: Trace = None, json_: Json = False) -> None:
-    """Show what the sensors measure, and where."""
-    from drivers.by_hand import actions
-
-    _show_sensors(_run(actions.sensors(url), trace), as_json=json_)
+_add_plain("sensors", "Show what the sensors measure, and where.")
 
 
 @amp.command()
@@ -200,9 +158,7 @@ def measure(
     json_: Json = False,
 ) -> None:
     """Measure amplitude and phase of tones at every sensor. Changes nothing that plays."""
-    from drivers.by_hand import actions
-
-    _show_sensors(_run(actions.measure(url, frequency, window), trace), as_json=json_)
+    _act("measure", url, frequency, window, trace=trace, json_=json_)
 
 
 @amp.command()
@@ -211,10 +167,7 @@ def stop(url: Url, trace: Trace = None, json_: Json = False) -> None:
 
     Exit status 0 only if the amplifier confirms that it is silent, else 3.
     """
-    from drivers.by_hand import actions
-
-    result = _run(actions.stop(url), trace, needs_trace=False)
-    _show(result, as_json=json_)
+    result = _act("stop", url, trace=trace, json_=json_, needs_trace=False)
     if result["silence"] != "confirmed_silent":
         raise typer.Exit(EXIT_STATUS[LinkError])
     if not json_:
@@ -235,17 +188,10 @@ def address(
     json_: Json = False,
 ) -> None:
     """Change the address, unit or node of an amplifier."""
-    from drivers.by_hand import actions
-
-    _show(_run(actions.set_address(url, new, serial_number), trace), as_json=json_)
+    _act("set_address", url, new, serial_number, trace=trace, json_=json_)
 
 
-@amp.command()
-def clear(url: Url, trace: Trace = None, json_: Json = False) -> None:
-    """Acknowledge a stop or fault. Leaves the amplifier disarmed."""
-    from drivers.by_hand import actions
-
-    _show(_run(actions.clear(url), trace), as_json=json_)
+_add_plain("clear", "Acknowledge a stop or fault. Leaves the amplifier disarmed.")
 
 
 @amp.command()
@@ -271,7 +217,7 @@ def conformance(
     from drivers.conformance import LEVEL, judge
 
     level = LEVEL if level is None else level
-    show = _no_result if json_ else _show_result
+    show = (lambda result: None) if json_ else _show_result
     report = _run(judge(url, drives=False, level=level, on_result=show), trace)
     if not write and not json_ and sys.stdin.isatty():
         write = typer.confirm(
@@ -289,10 +235,6 @@ def conformance(
             print(f"Next: era amp conformance {shlex.quote(url)} --write")
     if report.overall == "failed":
         raise typer.Exit(1)
-
-
-def _no_result(result: "CheckResult") -> None:
-    """Show nothing."""
 
 
 def _show_result(result: "CheckResult") -> None:
@@ -319,25 +261,26 @@ def _run(work: Coroutine[Any, Any, _T], trace: Path | None, *, needs_trace: bool
         return asyncio.run(work)
 
 
-def _show(result: dict[str, Any], *, as_json: bool) -> None:
-    if as_json:
+def _act(
+    action: str, *arguments: object, trace: Path | None, json_: bool, needs_trace: bool = True
+) -> dict[str, Any]:
+    """Run an action and show its result: as rows, then a line for each sensor."""
+    from drivers.by_hand import actions
+
+    work = getattr(actions, action)(*arguments)
+    result: dict[str, Any] = _run(work, trace, needs_trace=needs_trace)
+    if json_:
         print(json.dumps(result))
-        return
-    width = max(len(key) for key in result)
-    for key, value in result.items():
+        return result
+    rows = {key: value for key, value in result.items() if key != "sensors"}
+    width = max(map(len, rows))
+    for key, value in rows.items():
         print(f"{key:{width}}  {in_words(value)}")
-
-
-def _show_sensors(result: dict[str, Any], *, as_json: bool) -> None:
-    """Show a result with a line for each sensor."""
-    if as_json:
-        print(json.dumps(result))
-        return
-    _show({key: value for key, value in result.items() if key != "sensors"}, as_json=False)
-    for one in result["sensors"]:
+    for one in result.get("sensors", ()):
         print(in_words(one))
-    if not result["sensors"]:
+    if result.get("sensors") == []:
         print("no sensors")
+    return result
 
 
 def in_words(value: Any) -> str:

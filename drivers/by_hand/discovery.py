@@ -1,35 +1,68 @@
-"""Identification of amplifiers at URLs; only identify requests are sent, no output is driven."""
+"""What this machine can reach; only identify requests are sent, no output is driven."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from drivers.by_hand.reaching import identified
+from drivers.discovery.places import Candidate, candidates, with_slcan
 from drivers.errors import DriverError, FrameError, LinkTimeout
 from drivers.protocol.records import Values
 
-
-@dataclass(frozen=True)
-class IdentifyResult:
-    """Result of an identify request at a URL: the identity, or the problem.
-
-    was_sent: whether the request was sent, so that the problem is a missing reply.
-    """
-
-    url: str
-    identity: Values | None
-    problem: str | None = None
-    was_sent: bool = True
+Found = Mapping[str, Values | DriverError]
+"""By URL the identity of the amplifier there, or what is wrong."""
 
 
-async def identify_all(urls: Iterable[str]) -> list[IdentifyResult]:
+async def identify_all(urls: Iterable[str]) -> Found:
     """Identify the amplifiers at these URLs, one after the other."""
-    return [await _identify(url) for url in urls]
+    found: dict[str, Values | DriverError] = {}
+    for url in urls:
+        try:
+            async with identified(url) as amplifier:
+                found[url] = amplifier.identity
+        except DriverError as problem:
+            found[url] = problem
+    return found
 
 
-async def _identify(url: str) -> IdentifyResult:
-    try:
-        async with identified(url) as amplifier:
-            return IdentifyResult(url, amplifier.identity)
-    except DriverError as problem:
-        was_sent = isinstance(problem, LinkTimeout | FrameError)
-        return IdentifyResult(url, None, str(problem), was_sent=was_sent)
+async def discover(
+    urls: Sequence[str], *, probes: bool, slcan: bool
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """List ports, interfaces and the amplifiers on them; returns that, and problems by URL.
+
+    urls: identified too; probes: every port is sent identify requests; slcan: CAN adapters on
+    serial ports are detected.
+    """
+    places = [with_slcan(place) if slcan else place for place in candidates()]
+    probed = [
+        url
+        for place in places
+        if probes and place.remedy is None and not place.is_slcan
+        for url in place.urls
+    ]
+    found = await identify_all([*urls, *probed])
+    amplifiers = [
+        {"url": url, **{name: identity[name] for name in ("vendor", "product", "serial_number")}}
+        for url, identity in found.items()
+        if not isinstance(identity, DriverError)
+    ]
+    rows = [_row(place, found) for place in places]
+    problems = {url: str(found[url]) for url in urls if isinstance(found[url], DriverError)}
+    return {"places": rows, "amplifiers": amplifiers}, problems
+
+
+def _row(place: Candidate, found: Found) -> dict[str, Any]:
+    replies = {url: found[url] for url in place.urls if url in found}
+    unusable = (
+        str(reply)
+        for reply in replies.values()
+        # Others were sent a request, and did not reply to it.
+        if isinstance(reply, DriverError) and not isinstance(reply, LinkTimeout | FrameError)
+    )
+    return {
+        "place": place.name,
+        "description": place.description,
+        "urls": list(place.urls),
+        "heard": list(place.urls) if place.is_slcan else [],
+        "answers": [url for url, who in replies.items() if not isinstance(who, DriverError)],
+        "remedy": place.remedy or next(unusable, None),
+    }

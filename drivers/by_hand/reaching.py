@@ -1,15 +1,17 @@
 """The amplifier at a URL, for one action; and what its wire carries."""
 
+import asyncio
 import math
 import secrets
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
+from drivers import clock
 from drivers.host.amplifier import Amplifier
 from drivers.host.jobs import Priority
 from drivers.host.limits import FREQUENCY_FLOOR
-from drivers.host.timing import TAKEN_WORDS, set_words, shortest_watchdog
+from drivers.host.timing import shortest_watchdog
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.table import QUANTITIES
@@ -22,13 +24,17 @@ CEILINGS = GuardLimits(FREQUENCY_FLOOR, QUANTITIES["frequency"].high, 1.0)
 
 @asynccontextmanager
 async def reached(
-    url: str, *, limits: GuardLimits = CEILINGS, serial_number: str | None = None
+    url: str,
+    *,
+    limits: GuardLimits = CEILINGS,
+    serial_number: str | None = None,
+    is_output: bool | None = None,
 ) -> AsyncIterator[Amplifier]:
     """Open the line of an amplifier while the context lasts; nothing is sent."""
     lines = Lines()
     try:
         yield await lines.amplifier(
-            url, limits, name=url, serial_number=serial_number, is_output=None
+            url, limits, name=url, serial_number=serial_number, is_output=is_output
         )
     finally:
         await lines.close()
@@ -49,6 +55,14 @@ async def request(
     return await amplifier.line.submit(amplifier, priority, name, values)
 
 
+async def keep_alive(amplifier: Amplifier, duration: float, interval: float) -> None:
+    """Feed the watchdog for a time, at an interval [s]."""
+    end = clock.now() + duration
+    while (left := end - clock.now()) > 0:
+        await asyncio.sleep(min(interval, left))
+        await amplifier.ping()
+
+
 def random_session() -> int:
     """Draw the number of a session, so that it is not taken for another host's."""
     quantity = QUANTITIES["session"]
@@ -57,8 +71,7 @@ def random_session() -> int:
 
 def round_trip(url: str, amplifier: Amplifier) -> float:
     """Return how long a set of all channels and its reply take on the wire [s]; 0 if unknown."""
-    words = set_words(amplifier.capabilities["channels"])
-    return address_of(url).exchange_time(words, TAKEN_WORDS)
+    return address_of(url).set_time(amplifier.capabilities["channels"])
 
 
 def wire_rows(url: str, amplifier: Amplifier) -> dict[str, Any]:

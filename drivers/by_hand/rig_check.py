@@ -8,10 +8,8 @@ from drivers.host.amplifier import WATCHDOG
 from drivers.host.limits import FREQUENCY_FLOOR
 from drivers.host.timing import (
     MAX_LOSS_DETECTION_TIME,
-    TAKEN_WORDS,
     check_watchdog,
     loss_detection_time,
-    set_words,
 )
 from drivers.protocol.table import QUANTITIES
 from drivers.wires.address import WireAddress
@@ -39,7 +37,7 @@ def check_links(
     for name, url in urls.items():
         try:
             address = address_of(url)
-            check_watchdog(WATCHDOG, _round_trip(address, channels.get(name, 0)))
+            check_watchdog(WATCHDOG, address.set_time(channels.get(name, 0)))
         except CommandError as error:
             errors[name] = str(error)
             continue
@@ -72,11 +70,6 @@ def remaining_contrast(frequency: float, skew: float) -> float:
     return max(0.0, -20.0 * math.log10(2.0 * math.sin(phase / 2.0)))
 
 
-def _round_trip(address: WireAddress, channels: int) -> float:
-    """Return how long a set of these channels and its reply take [s]."""
-    return address.exchange_time(set_words(channels), TAKEN_WORDS)
-
-
 def _ceiling_warnings(limits: GuardLimits) -> list[str]:
     """Warn of limits beyond what is played whatever the configuration says."""
     low, high = limits.frequency_min, limits.frequency_max
@@ -98,7 +91,7 @@ def _late_loss_warnings(
     limit = MAX_LOSS_DETECTION_TIME
     warnings = []
     for names in lines.values():
-        took = loss_detection_time(_round_trip(addresses[name], channels[name]) for name in names)
+        took = loss_detection_time(addresses[name].set_time(channels[name]) for name in names)
         if took > limit:
             warnings.append(
                 f"{', '.join(names)}: loss of the amplifiers may be detected only after "

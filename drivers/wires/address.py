@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 
 from drivers.hardware import Port
+from drivers.host.timing import TAKEN_WORDS, set_words
 from drivers.host.wire import Wire
 
 
@@ -25,6 +26,10 @@ class WireAddress(ABC):
     @abstractmethod
     def exchange_time(self, words: int, reply: int) -> float:
         """Return how long a request and its reply of so many words take [s]; 0 if unknown."""
+
+    def set_time(self, channels: int) -> float:
+        """Return how long a set of these channels and its reply take [s]; 0 if unknown."""
+        return self.exchange_time(set_words(channels), TAKEN_WORDS)
 
     @abstractmethod
     def make_wire(self) -> Wire:

@@ -28,11 +28,6 @@ class Feeding:
     confirmed_at: float = -math.inf
 
     @property
-    def latest(self) -> float:
-        """When the watchdog may have been fed last [s]."""
-        return self._arrived(self.may)
-
-    @property
     def may_play_until(self) -> float:
         """When the watchdog must have silenced the amplifier [s]."""
         return self._arrived(self.plays) + self.watchdog + self.fade + SILENCING
@@ -60,10 +55,10 @@ class Feeding:
     def _arrived(self, sent_at: float) -> float:
         """When a request that was sent at a time [s] has arrived at the latest [s].
 
-        One without reply may still be under way; what is confirmed has arrived.
+        One without reply may still be under way; what is confirmed came before its reply, and not
+        always in the time of the line: a busy machine may have kept it.
         """
-        latest = sent_at + self.delay
-        return min(latest, self.confirmed_at) if sent_at <= self.since else latest
+        return self.confirmed_at if sent_at <= self.since else sent_at + self.delay
 
     def problem(self, left: float, sent_at: float, now: float) -> str | None:
         """Describe an impossible time that is left [s] in a reply to a request; None if possible.
@@ -71,7 +66,9 @@ class Feeding:
         sent_at: of the request, which is not one that feeds; now: of the reply.
         """
         lowest = self.watchdog - (now - self.since) - REACTION
-        highest = min(self.watchdog, self.watchdog - (sent_at - self.latest)) + REACTION
+        # One that may have fed and was not confirmed may have come just before this request.
+        fed_at = self.confirmed_at if self.may <= self.since else sent_at
+        highest = min(self.watchdog, self.watchdog - (sent_at - fed_at)) + REACTION
         if lowest <= left <= highest:
             return None
         return f"watchdog left must be {max(lowest, 0):.3f} to {highest:.3f} s, got {left:.3f} s"

@@ -10,7 +10,7 @@ from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from sim.amplifier.contract import capabilities
 from virtual_loop import run_virtual
-from words_line import KINDS, LIMITS, MemoryLine
+from words_line import KINDS, LIMITS, MemoryLine, unaltered
 
 
 @pytest.fixture(params=KINDS)
@@ -137,6 +137,34 @@ def test_full_level_must_be_what_the_rig_says(wire: str, is_output: bool) -> Non
         await host.open()
 
     run_virtual(run())
+
+
+def test_request_that_waits_on_a_busy_machine_contradicts_nothing(wire: str) -> None:
+    """It waits 25 ms, ten times what the line needs, before it feeds; two statuses follow.
+
+    Answered or not: a watchdog that was fed later has more left.
+    """
+
+    async def run(is_answered: bool) -> None:
+        end = MemoryLine(wire, "a")
+        group = Group(end.hosts, draw=lambda low, high: 77)
+        await group.open()
+        await group.arm()
+        (host,) = end.hosts.values()
+        end.inward = lambda name, data: [(0.025, data)]
+        if is_answered:
+            await host.ping()
+        else:
+            end.outward = lambda name, data: []
+            with pytest.raises(LinkTimeout):
+                await host.ping()
+        end.inward = end.outward = unaltered
+        for _ in range(2):
+            await host.read_status()
+            await asyncio.sleep(0.02)
+
+    for is_answered in (True, False):
+        run_virtual(run(is_answered))
 
 
 def test_ping_that_a_network_delivers_late_is_accounted_for() -> None:

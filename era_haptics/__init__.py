@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from era_haptics.amplifiers import commands_for as commands_for
     from era_haptics.amplifiers import open_amplifier as open_amplifier
     from era_haptics.calibration import calibrate as calibrate
+    from era_haptics.designs import RankedLayout as RankedLayout
+    from era_haptics.designs import design as design
     from era_haptics.drive import Drive as Drive
     from era_haptics.pictures import draw_map as draw_map
     from era_haptics.pictures import draw_pattern as draw_pattern
     from era_haptics.pictures import draw_playback as draw_playback
     from era_haptics.solved_plate import SolvedPlate as SolvedPlate
-    from era_haptics.studies import RankedLayout as RankedLayout
-    from era_haptics.studies import study as study
     from era_haptics.tables import query as query
     from era_haptics.tables import table as table
     from model.calibration.calibration_result import Calibration as Calibration
@@ -67,7 +67,7 @@ _NAMES = {
     "era_haptics.drive": "Drive",
     "era_haptics.pictures": "draw_map draw_pattern draw_playback",
     "era_haptics.solved_plate": "SolvedPlate",
-    "era_haptics.studies": "RankedLayout study",
+    "era_haptics.designs": "RankedLayout design",
     "era_haptics.tables": "query table",
     "model.calibration.calibration_result": "Calibration",
     "model.errors": "InputError",

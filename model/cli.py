@@ -8,7 +8,6 @@ from model.commands.design_cli import design_app
 from model.commands.figure_cli import figure_app
 from model.commands.plate_cli import plate_app
 from model.commands.plate_show_cli import materials, show
-from model.commands.study_cli import study_app
 from model.commands.table_build_cli import build
 from model.commands.table_cli import query, table_app
 from model.commands.table_export_cli import export, plot
@@ -32,7 +31,6 @@ app.add_typer(config_app, name="config")
 app.add_typer(plate_app, name="plate")
 app.add_typer(design_app)
 app.add_typer(figure_app)
-app.add_typer(study_app)
 app.add_typer(table_app, name="table")
 
 EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2}

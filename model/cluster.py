@@ -12,76 +12,72 @@ _CONNECT_TIMEOUT = 10.0  # s
 # Dask takes long to refuse what is not an address.
 _ADDRESS = re.compile(r"(tcp|tls)://[\w.\-\[\]:]+:\d{1,5}")
 
-Problem = TypeVar("Problem")
 Shared = TypeVar("Shared")
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
-class Cluster:
-    """The workers of a scheduler at an address, for example tcp://192.168.1.5:8786.
+def check_address(address: str) -> None:
+    """Raise InputError for what is not the address of a scheduler."""
+    if not _ADDRESS.fullmatch(address):
+        raise InputError(
+            f"--cluster must be the address that `dask scheduler` prints, for example "
+            f"tcp://192.168.1.5:8786, got {address[:60]!r}"
+        )
 
-    Raises InputError for what is not an address.
+
+def on_cluster(
+    address: str,
+    solve: Callable[[Shared, Task], Result],
+    shared: Shared,
+    tasks: Mapping[int, Task],
+) -> Iterator[tuple[int, Result]]:
+    """Yield numbers of tasks with their results in the order in which they are done.
+
+    address: of a scheduler, for example tcp://192.168.1.5:8786; solve: a function of a module;
+    shared: its first argument. A task whose worker is lost is solved again. Raises InputError where
+    no scheduler answers, it has no workers, or one runs other code.
     """
-
-    def __init__(self, address: str) -> None:
-        if not _ADDRESS.fullmatch(address):
+    try:
+        from distributed import Client, KilledWorker, as_completed
+    except ImportError as error:
+        raise InputError(
+            "--cluster needs Dask, which is not installed; install it in a checkout with  "
+            "pip install -e '.[cluster]'"
+        ) from error
+    try:
+        # Dask has no type annotations.
+        client = Client(address, timeout=_CONNECT_TIMEOUT, set_as_default=False)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"no Dask scheduler answers at {address} ({error}); start one with `dask "
+            "scheduler`, and on every machine `dask worker` with the address it prints"
+        ) from error
+    with client:
+        if not client.scheduler_info(n_workers=-1)["workers"]:
             raise InputError(
-                f"--cluster must be the address that `dask scheduler` prints, for example "
-                f"tcp://192.168.1.5:8786, got {address[:60]!r}"
+                f"the Dask scheduler at {address} has no workers; start `dask worker {address}`"
             )
-        self._address = address
-
-    def solve(
-        self,
-        prepare: Callable[[Problem], Shared],
-        problem: Problem,
-        solve: Callable[[Shared, Task], Result],
-        tasks: Mapping[int, Task],
-    ) -> Iterator[tuple[int, Result]]:
-        """Yield numbers of tasks with their results in the order in which they are done.
-
-        prepare, solve: functions of modules; what the first makes of the problem is the second's
-        first argument. A task whose worker is lost is solved again. Raises InputError where no
-        scheduler answers, it has no workers, or one runs other code.
-        """
-        address = self._address
+        version = code_version()
+        # Held on the cluster, so that the scheduler can repeat it if its worker is lost.
+        held = client.submit(_run_same_code, version, _itself, shared, pure=False)
+        numbers = {
+            client.submit(_run_same_code, version, solve, held, task, pure=False): n
+            for n, task in tasks.items()
+        }
         try:
-            from distributed import Client, KilledWorker, as_completed
-        except ImportError as error:
+            for future in as_completed(numbers, loop=client.loop):  # type: ignore[no-untyped-call]
+                result: Result = future.result()
+                yield numbers.pop(future), result
+        except KilledWorker as error:
             raise InputError(
-                "--cluster needs Dask, which is not installed; install it in a checkout with  "
-                "pip install -e '.[cluster]'"
+                f"workers of the cluster died repeatedly over one task ({error}); perhaps "
+                "they are short of memory"
             ) from error
-        try:
-            # Dask has no type annotations.
-            client = Client(address, timeout=_CONNECT_TIMEOUT, set_as_default=False)  # type: ignore[no-untyped-call]
-        except (OSError, ValueError) as error:
-            raise InputError(
-                f"no Dask scheduler answers at {address} ({error}); start one with `dask "
-                "scheduler`, and on every machine `dask worker` with the address it prints"
-            ) from error
-        with client:
-            if not client.scheduler_info(n_workers=-1)["workers"]:
-                raise InputError(
-                    f"the Dask scheduler at {address} has no workers; start `dask worker {address}`"
-                )
-            version = code_version()
-            # Prepared on the cluster, so that the scheduler can repeat it if its worker is lost.
-            shared = client.submit(_run_same_code, version, prepare, problem, pure=False)
-            numbers = {
-                client.submit(_run_same_code, version, solve, shared, task, pure=False): n
-                for n, task in tasks.items()
-            }
-            try:
-                for future in as_completed(numbers, loop=client.loop):  # type: ignore[no-untyped-call]
-                    result: Result = future.result()
-                    yield numbers.pop(future), result
-            except KilledWorker as error:
-                raise InputError(
-                    f"workers of the cluster died repeatedly over one task ({error}); perhaps "
-                    "they are short of memory"
-                ) from error
+
+
+def _itself(shared: Shared) -> Shared:
+    return shared
 
 
 def _run_same_code(version: str, function: Callable[..., Any], *arguments: Any) -> Any:

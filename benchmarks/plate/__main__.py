@@ -60,14 +60,14 @@ def main() -> None:
 
 
 def study() -> tuple[float, float]:
-    """Seconds and processor seconds of `era study placement` over ten thousand layouts.
+    """Seconds and processor seconds of `era design --layouts` over ten thousand layouts.
 
     From the start of the command, of all its processes.
     """
     with tempfile.TemporaryDirectory() as folder:
         command = [
-            str(Path(sys.executable).with_name("era")), "study", "placement",
-            str(RIG), "--layouts", str(LAYOUTS),
+            str(Path(sys.executable).with_name("era")), "design",
+            str(RIG), "--layouts", f"random:{LAYOUTS}",
             "--workers", str(WORKERS), "-o", folder, "--json",
         ]  # fmt: skip
         started, used = time.perf_counter(), _used()

@@ -1,9 +1,9 @@
-"""`era design`: places of ERAs for the best robust felt contrast."""
+"""`era design`: places of ERAs for the best robust felt contrast, searched or given."""
 
 import json
 import time
 from dataclasses import asdict, replace
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -17,16 +17,16 @@ from model.commands.options import (
     LowestOption,
     MeshOption,
     RigArgument,
-    cluster_at,
 )
 from model.counting import counted
 
 if TYPE_CHECKING:
     from model.config.document import Value
     from model.config.units import Dimension
+    from model.design.run import Machines
     from model.rig.uncertainty import Uncertainty
 
-MAX_STIFFNESSES = 8
+MAX_STIFFNESSES, MAX_ERAS = 9, 32
 
 design_app = typer.Typer()
 
@@ -34,16 +34,27 @@ design_app = typer.Typer()
 @design_app.command()
 def design(
     rig_file: RigArgument,
+    output: FolderOption,
     eras: Annotated[
+        str,
+        typer.Option(
+            metavar="N|LO-HI",
+            help="Number of ERAs, kept ones included; at least 3 with other mounts; default: rig.",
+        ),
+    ] = "",
+    layouts: Annotated[
+        str,
+        typer.Option(
+            metavar="random:N|FILE",
+            help="Rank layouts in place of a search: N at random and those with a name, or a file.",
+        ),
+    ] = "",
+    finalists: Annotated[
         int,
         typer.Option(
-            "--eras",
-            min=1,
-            max=32,
-            help="Number of ERAs, kept ones included; at least 3 with the rig's other mounts.",
+            min=1, max=1000, help="Given layouts, of each number and stiffness, that are judged."
         ),
-    ],
-    output: FolderOption,
+    ] = 5,
     keep: Annotated[
         str, typer.Option(metavar="NAME,NAME", help="ERAs of the rig that stay where they are.")
     ] = "",
@@ -88,7 +99,7 @@ def design(
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find places of ERAs for the best robust felt contrast.
+    """Find places of ERAs for the best robust felt contrast, or rank layouts by it.
 
     Resume an interrupted design.
     """
@@ -97,13 +108,14 @@ def design(
     from model.config.units import LENGTH
     from model.design.area import area_of
     from model.design.contacts import contact_rule
+    from model.design.layouts import layouts_of
     from model.design.outcome import summary, write_design
-    from model.design.run import Design, run_design, worthwhile_count
-    from model.design.search import DesignProblem
+    from model.design.problem import DesignProblem
+    from model.design.run import Runner, rank_layouts, search_layouts, worthwhile_count
     from model.errors import InputError
     from model.rig.file import rig_of
 
-    machines = cluster_at(cluster, workers=workers)
+    machines = _machines(cluster, workers)
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)
     if uncertainty:
@@ -111,52 +123,40 @@ def design(
             document, data={**document.data, "uncertainty": _changed(rig.uncertainty, uncertainty)}
         )
         rig = rig_of(document, mesh=mesh)
+    counts = _counts(eras or str(len(rig.eras)))
     kept = tuple(name.strip() for name in keep.split(",") if name.strip())
     own = [era.name for era in rig.eras]
     for name in kept:
         if name not in own:
             raise InputError(f"--keep must be ERAs of the rig, {', '.join(own)}, got {name!r}")
-    if len(set(kept)) < len(kept) or len(kept) > eras:
+    if len(set(kept)) < len(kept) or len(kept) > counts[0]:
         raise InputError(
-            f"--keep must be at most {eras} different ERAs, as many as --eras, got {keep!r}"
+            f"--keep must be at most {counts[0]} different ERAs, as many as --eras, got {keep!r}"
         )
     distance = _quantity(apart, LENGTH, "--apart")
     if not 0 < distance < max(rig.plate.length, rig.plate.width):
         raise InputError(f"--apart must be above 0 and below the plate's length, got {apart}")
     started = time.perf_counter()
-    problem = DesignProblem(
-        rig=rig,
-        count=eras,
-        kept=kept,
-        area=area_of(where, rig.plate),
-        contacts=contact_rule(contacts, rig.plate),
-        apart=distance,
-        lowest=lowest,
-        seed=seed,
-    )
-    problems = [replace(problem, stiffness=each) for each in _stiffnesses(stiffness)] or [problem]
+    area, contacts_rule = area_of(where, rig.plate), contact_rule(contacts, rig.plate)
+    problems = [
+        DesignProblem(rig, count, area, contacts_rule, kept, distance, lowest, seed, stiffness=each)
+        for count in counts
+        for each in _stiffnesses(stiffness)
+    ]
+    given = {problem: layouts_of(layouts, problem) for problem in problems} if layouts else {}
     output.mkdir(parents=True, exist_ok=True)
-
-    def search(problems: list[DesignProblem], *, starts: int) -> Design:
-        with progress_bar("starts") as update:
-            return run_design(
-                problems,
-                where=_text_of(where),
-                starts=starts,
-                folder=output,
-                workers=workers or 2,
-                cluster=machines,
-                progress=update,
-            )
-
+    runner = Runner(output, machines, progress_bar)
     try:
-        if worth > 0:  # by the first start, which has a layout for each number
-            fewer = worthwhile_count(search(problems, starts=1), worth)
-            problems = [replace(each, count=fewer) for each in problems]
-        found = search(problems, starts=starts)
+        if given:
+            found = rank_layouts(given, finalists=finalists, runner=runner)
+        else:
+            if worth > 0:  # by the first start, which has a layout for each number
+                fewer = worthwhile_count(search_layouts(problems, starts=1, runner=runner), worth)
+                problems = [replace(each, count=fewer) for each in problems]
+            found = search_layouts(problems, starts=starts, runner=runner)
     except KeyboardInterrupt:
         typer.echo(
-            f"era: interrupted; finished starts are in {output}; run the same command to resume",
+            f"era: interrupted; what is finished is in {output}; run the same command to resume",
             err=True,
         )
         raise
@@ -172,6 +172,31 @@ def design(
     print(
         next_line("era", "table", "build", files[0], "-o", output / "table.npz", "--mode", "phased")
     )
+
+
+def _machines(address: str | None, workers: int | None) -> "Machines":
+    """The cluster at an address, or processes. Raises InputError for both."""
+    from model.cluster import check_address, on_cluster
+    from model.errors import InputError
+    from model.processes import on_processes
+
+    if address is None:
+        return partial(on_processes, workers or 2)
+    if workers is not None:
+        raise InputError("only one of --workers and --cluster can be given")
+    check_address(address)
+    return partial(on_cluster, address)
+
+
+def _counts(text: str) -> list[int]:
+    """Numbers of ERAs of N or LO-HI."""
+    from model.errors import InputError
+
+    low, _, high = text.partition("-")
+    ends = [each.strip() for each in (low, high or low)]
+    if not all(each.isdecimal() and 1 <= int(each) <= MAX_ERAS for each in ends):
+        raise InputError(f"--eras must be 1 to {MAX_ERAS}, or LO-HI such as 3-6, got {text!r}")
+    return list(range(int(ends[0]), int(ends[1]) + 1)) or [int(ends[0])]
 
 
 def _changed(before: "Uncertainty", text: str) -> dict[str, "Value"]:
@@ -207,8 +232,8 @@ def _quantity(text: str, dimension: "Dimension", option: str) -> float:
         raise InputError(f"{option} {error}") from None
 
 
-def _stiffnesses(text: str) -> list[float]:
-    """Stiffnesses [N/m] of a list with commas, ascending."""
+def _stiffnesses(text: str) -> list[float] | list[None]:
+    """Stiffnesses [N/m] of a list with commas, ascending; None for that of the rig's."""
     from model.config.units import STIFFNESS
     from model.errors import InputError
 
@@ -221,20 +246,15 @@ def _stiffnesses(text: str) -> list[float]:
         raise InputError(
             f"--stiffness must be at most {MAX_STIFFNESSES} different values above 0, got {text!r}"
         )
-    return sorted(found)
-
-
-def _text_of(where: str) -> str:
-    """What identifies an area: its name, or its file's content."""
-    path = Path(where)
-    return path.read_bytes().hex() if path.is_file() else where
+    return sorted(found) or [None]
 
 
 def _show(result: dict[str, Any], *, own_count: int) -> None:
     """Print places, contrast, starts, and what each ERA buys; own_count: ERAs of the rig."""
     own = f"the rig's own {counted(own_count, 'ERA')}"
+    kept = "starts" if result["starts_db"] else "chunks of layouts"
     print(
-        f"{len(result['eras'])} ERAs in {result['time_s']:.1f} s, {result['resumed']} starts kept"
+        f"{len(result['eras'])} ERAs in {result['time_s']:.1f} s, {result['resumed']} {kept} kept"
     )
     print("name      x / mm   y / mm   dB per mm   load / N")
     for name, era in result["eras"].items():
@@ -253,12 +273,27 @@ def _show(result: dict[str, Any], *, own_count: int) -> None:
                 f"{title}: mean {result[key]['mean']:.1f} dB, median {medians} dB with {quiet} "
                 "quiet fingers"
             )
-    print(
-        f"{len(result['starts_db'])} starts, the worst {result['gap_db']:.1f} dB behind; level "
-        f"reached in {100 * result['reached_share']:.0f} % of {result['sets']} sets"
-    )
+    reached = f"level reached in {100 * result['reached_share']:.0f} % of {result['sets']} sets"
+    if result["starts_db"]:
+        starts = len(result["starts_db"])
+        print(f"{starts} starts, the worst {result['gap_db']:.1f} dB behind; {reached}")
+    else:
+        print(f"{result['layout_count']} layouts, {result['unsupported']} unsupported; {reached}")
+        _show_layouts(result["layouts"])
     for stiffness, value in result["by_stiffness_db"].items():
         print(f"ERAs of {stiffness} N/m: mean {value:.1f} dB")
     counts = list(result["by_count_db"].items())
     print("ERAs      " + "  ".join(f"{count:>5s}" for count, _ in counts))
     print("mean / dB " + "  ".join(f"{value:5.1f}" for _, value in counts))
+
+
+def _show_layouts(layouts: list[dict[str, Any]]) -> None:
+    """Print the first of given layouts."""
+    print("rank  layout                          stiffness  contrast  expected")
+    for each in layouts:
+        contrast = f"{each['contrast_db']['mean']:.1f} dB" if each["contrast_db"] else "-"
+        expected = f"{each['expected_contrast_db']:.1f} dB" if each["supported"] else "-"
+        print(
+            f"{each['rank']:4d}  {each['layout']:28s}  {each['stiffness_n_m'] / 1000:6.4g} kN/m  "
+            f"{contrast:>8s}  {expected:>8s}"
+        )

@@ -1,14 +1,11 @@
 """Options that several commands share."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from model.errors import InputError
-
-if TYPE_CHECKING:
-    from model.cluster import Cluster
 
 RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")]
 TableArgument = Annotated[Path, typer.Argument(metavar="TABLE", help="Table file, e.g. T.npz.")]
@@ -33,15 +30,6 @@ LowestOption = Annotated[
 ClusterOption = Annotated[
     str | None, typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler.")
 ]
-
-
-def cluster_at(address: str | None, *, workers: int | None) -> "Cluster | None":
-    """The cluster at an address, if one is given. Raises InputError beside a number of workers."""
-    from model.cluster import Cluster
-
-    if address is not None and workers is not None:
-        raise InputError("only one of --workers and --cluster can be given")
-    return None if address is None else Cluster(address)
 
 
 ExactOption = Annotated[

@@ -3,8 +3,9 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Protocol
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,25 +36,13 @@ PointSection = Annotated[tuple[Lengths, Lengths], Strict(strict=False)]  # a lis
 PolygonSection = Annotated[list[PointSection], Field(min_length=3, max_length=64)]
 
 
-class Area(Protocol):
-    """A part of the plate."""
-
-    def candidates(self, spacing: float) -> FloatArray:
-        """Places [m] in it, (c, 2), about a spacing [m] apart."""
-
-    def contains(self, points: FloatArray) -> NDArray[np.bool_]:
-        """Whether points [m] (n, 2) are in it, (n,)."""
-
-    def moved(self, place: FloatArray, step: float) -> FloatArray:
-        """Places [m] in it, (m, 2), a step [m] from a place in it."""
-
-
 @dataclass(frozen=True)
 class Edge:
     """The edge of a plate of a length and a width [m]."""
 
     length: float
     width: float
+    text: ClassVar[str] = EDGE
 
     def candidates(self, spacing: float) -> FloatArray:
         """Corners, and places between them."""
@@ -95,8 +84,12 @@ class Edge:
 
 @dataclass(frozen=True)
 class Within:
-    """A part of a plate of a length and a width [m], where a function of points (n, 2) is true."""
+    """A part of a plate of a length and a width [m], where a function of points (n, 2) is true.
 
+    text: what identifies it: its name, or the content of its file.
+    """
+
+    text: str
     length: float
     width: float
     contains: Callable[[FloatArray], NDArray[np.bool_]]
@@ -118,7 +111,7 @@ class Within:
         return places[is_other & self.contains(places)]
 
 
-def area_of(where: str, plate: Plate) -> Area:
+def area_of(where: str, plate: Plate) -> Edge | Within:
     """The area of a name, a picture or a file of polygons.
 
     Raises InputError for a picture that cannot be read or has other proportions than the plate, and
@@ -128,22 +121,20 @@ def area_of(where: str, plate: Plate) -> Area:
     if where == EDGE:
         return Edge(length, width)
     if where == ANYWHERE:
-        return Within(length, width, everywhere)
+        return Within(where, length, width, everywhere)
     path = Path(where)
     if path.suffix.lower() in PICTURES:
-        return Within(length, width, _picture(path, plate))
+        contains = partial(_is_white, _white(path, plate), length, width)
+        return Within(path.read_bytes().hex(), length, width, contains)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(
             f"--where must be {EDGE}, {ANYWHERE}, a picture ({', '.join(PICTURES)}) or a .yaml "
             f"file of polygons, got {where!r}"
         )
-    validation = Validation(
-        read_document(path, if_empty="it must have polygons, each a name with its corners"),
-        _PolygonsSection,
-    )
-    return Within(
-        length, width, _Polygons(tuple(map(_array, validation.finish().polygons.values())))
-    )
+    document = read_document(path, if_empty="it must have polygons, each a name with its corners")
+    polygons = Validation(document, _PolygonsSection).finish().polygons
+    corners = [np.array(polygon, dtype=float) for polygon in polygons.values()]
+    return Within(document.text, length, width, partial(_in_any, corners))
 
 
 def everywhere(points: FloatArray) -> NDArray[np.bool_]:
@@ -151,7 +142,7 @@ def everywhere(points: FloatArray) -> NDArray[np.bool_]:
     return np.ones(len(points), dtype=bool)
 
 
-def candidates_of(area: Area, plate: Plate, *, count: int) -> FloatArray:
+def candidates_of(area: Edge | Within, plate: Plate, *, count: int) -> FloatArray:
     """About a count of candidate places, (c, 2) [m].
 
     Raises InputError for an area without any.
@@ -188,30 +179,19 @@ def in_polygon(polygon: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(inside | (gap.min(axis=1) <= _ON_EDGE))
 
 
-@dataclass(frozen=True, eq=False)
-class _Polygons:
-    """True in any of some polygons (k, 2)."""
-
-    polygons: Sequence[FloatArray]
-
-    def __call__(self, points: FloatArray) -> NDArray[np.bool_]:
-        inside = [in_polygon(each, points) for each in self.polygons]
-        return np.asarray(np.any(inside, axis=0))
+def _in_any(polygons: Sequence[FloatArray], points: FloatArray) -> NDArray[np.bool_]:
+    """Whether points (n, 2) are in any of some polygons (k, 2)."""
+    return np.asarray(np.any([in_polygon(each, points) for each in polygons], axis=0))
 
 
-@dataclass(frozen=True, eq=False)
-class _Picture:
-    """Rows from the top, y = width, down; columns from x = 0."""
-
-    white: NDArray[np.bool_]
-    length: float
-    width: float
-
-    def __call__(self, points: FloatArray) -> NDArray[np.bool_]:
-        rows, columns = self.white.shape
-        column = np.minimum((points[:, 0] / self.length * columns).astype(int), columns - 1)
-        row = np.minimum(((1 - points[:, 1] / self.width) * rows).astype(int), rows - 1)
-        return np.asarray(self.white[row, column])
+def _is_white(
+    white: NDArray[np.bool_], length: float, width: float, points: FloatArray
+) -> NDArray[np.bool_]:
+    """Whether points are in the white: rows from the top, y = width, down; columns from x = 0."""
+    rows, columns = white.shape
+    column = np.minimum((points[:, 0] / length * columns).astype(int), columns - 1)
+    row = np.minimum(((1 - points[:, 1] / width) * rows).astype(int), rows - 1)
+    return np.asarray(white[row, column])
 
 
 class _PolygonsSection(Section):
@@ -220,14 +200,20 @@ class _PolygonsSection(Section):
     polygons: Annotated[dict[Identifier, PolygonSection], Field(min_length=1, max_length=256)]
 
 
-def _array(polygon: Sequence[tuple[float, float]]) -> FloatArray:
-    return np.array(polygon, dtype=float)
+def _white(path: Path, plate: Plate) -> NDArray[np.bool_]:
+    """Pixels brighter than half, (rows, columns), of a picture with the plate's proportions.
 
+    To PROPORTION_TOLERANCE, or half a pixel.
+    """
+    from matplotlib.image import imread
 
-def _picture(path: Path, plate: Plate) -> _Picture:
-    """The white of a picture that has the proportions of the plate, to half a pixel at least."""
-    white = _white(path)
-    rows, columns = white.shape
+    try:
+        pixels = np.asarray(imread(path), dtype=float)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; check its name and folder") from error
+    except (OSError, ValueError, SyntaxError) as error:
+        raise InputError(f"{path}: cannot be read as a picture ({error})") from error
+    rows, columns = pixels.shape[:2]
     expected = columns * plate.width / plate.length
     if abs(rows - expected) > max(PROPORTION_TOLERANCE * expected, 0.5):
         scale = _PICTURE_SIDE / max(plate.length, plate.width)
@@ -237,18 +223,5 @@ def _picture(path: Path, plate: Plate) -> _Picture:
             f"{plate.width:g} m, got {columns} by {rows} pixels; draw the whole plate, without a "
             f"margin, for example on {across} by {up} pixels"
         )
-    return _Picture(white, plate.length, plate.width)
-
-
-def _white(path: Path) -> NDArray[np.bool_]:
-    """Pixels of a picture brighter than half, (rows, columns)."""
-    from matplotlib.image import imread
-
-    try:
-        pixels = np.asarray(imread(path), dtype=float)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; check its name and folder") from error
-    except (OSError, ValueError, SyntaxError) as error:
-        raise InputError(f"{path}: cannot be read as a picture ({error})") from error
     grey = pixels if pixels.ndim == 2 else pixels[..., :3].mean(axis=-1)
     return np.asarray(grey > (127.5 if grey.max() > 1 else 0.5))

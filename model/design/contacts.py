@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field, Strict
 
 from model.arrays import FloatArray, IntArray
 from model.choice import best_of
-from model.config.document import Document, read_document
+from model.config.document import read_document
 from model.config.sections import Quantity, Section, Validation
 from model.config.units import LENGTH
 from model.design.area import PointSection, PolygonSection, everywhere, in_polygon
@@ -116,19 +116,16 @@ class ContactRule:
 def anywhere(plate: Plate) -> ContactRule:
     """One to three quiet fingers and the target anywhere on a plate."""
     whole = _Shape(np.zeros(2), np.array([plate.length, plate.width]), everywhere)
-    return ContactRule(DEFAULT_QUIET, DEFAULT_APART, _Drawn((whole,), plate))
+    return ContactRule(DEFAULT_QUIET, DEFAULT_APART, partial(_drawn, (whole,), plate))
 
 
 def contact_rule(path: Path | None, plate: Plate) -> ContactRule:
-    """The rule of a file, or `anywhere` for None; raises ConfigError for what is wrong in it."""
-    return anywhere(plate) if path is None else load_contacts_file(path, plate)
-
-
-def load_contacts_file(path: Path, plate: Plate) -> ContactRule:
-    """Read the rule of a file: regions, as those of a surface layout, or sets.
+    """The rule of a file, regions as those of a surface layout, or sets; `anywhere` for None.
 
     Raises ConfigError for what is wrong in it.
     """
+    if path is None:
+        return anywhere(plate)
     document = read_document(path, if_empty="it must have regions or sets")
     validation = Validation(document, _ContactsSection)
     for name in validation.mapping(("regions",)):
@@ -144,7 +141,13 @@ def load_contacts_file(path: Path, plate: Plate) -> ContactRule:
             )
     section = validation.finish()
     given = tuple(np.array([each.target, *each.quiet]) for each in section.sets)
-    problems = _off_plate(document, given, plate)
+    problems = [
+        f"sets[{number}] must be on the plate, from (0, 0) to ({plate.length:g}, {plate.width:g}) "
+        f"m, got ({x:g}, {y:g}) m"
+        for number, contacts in enumerate(given)
+        for x, y in contacts.tolist()
+        if not plate.contains(x, y)
+    ]
     if bool(section.sets) == bool(section.regions):
         problems.append(f"must have regions or sets, got {'both' if section.sets else 'neither'}")
     low, high = section.quiet
@@ -155,17 +158,8 @@ def load_contacts_file(path: Path, plate: Plate) -> ContactRule:
     if problems:
         raise InputError(f"{document.source}: {problems[0]}")
     shapes = [_shape(region) for region in section.regions.values()]
-    return ContactRule((low, high), section.apart, _Drawn(shapes, plate), given, text=document.text)
-
-
-def _off_plate(document: Document, sets: Sequence[FloatArray], plate: Plate) -> list[str]:
-    return [
-        f"sets[{number}] must be on the plate, from (0, 0) to ({plate.length:g}, {plate.width:g}) "
-        f"m, got ({x:g}, {y:g}) m"
-        for number, contacts in enumerate(sets)
-        for x, y in contacts.tolist()
-        if not plate.contains(x, y)
-    ]
+    draw = partial(_drawn, shapes, plate)
+    return ContactRule((low, high), section.apart, draw, given, text=document.text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,25 +184,16 @@ class _Shape:
         raise InputError("regions of --contacts must have an area, got one that has none")
 
 
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    """Draws each finger in one of some shapes, each as likely as another."""
-
-    shapes: Sequence[_Shape]
-    plate: Plate
-
-    def __call__(self, rng: np.random.Generator, count: int) -> FloatArray:
-        chosen = rng.integers(len(self.shapes), size=count)
-        return np.array([self.shapes[number].draw(rng, self.plate) for number in chosen])
+def _drawn(
+    shapes: Sequence[_Shape], plate: Plate, rng: np.random.Generator, count: int
+) -> FloatArray:
+    """Draw each finger in one of some shapes, each as likely as another."""
+    chosen = rng.integers(len(shapes), size=count)
+    return np.array([shapes[number].draw(rng, plate) for number in chosen])
 
 
-@dataclass(frozen=True, eq=False)
-class _Circle:
-    at: FloatArray
-    radius: float
-
-    def __call__(self, points: FloatArray) -> NDArray[np.bool_]:
-        return np.asarray(np.hypot(*(points - self.at).T) <= self.radius)
+def _in_circle(at: FloatArray, radius: float, points: FloatArray) -> NDArray[np.bool_]:
+    return np.asarray(np.hypot(*(points - at).T) <= radius)
 
 
 class _RectangleSection(Section):
@@ -261,6 +246,6 @@ def _shape(region: _RegionSection) -> _Shape:
         return _Shape(corners.min(axis=0), corners.max(axis=0), everywhere)
     if region.circle is not None:
         at, radius = np.array(region.circle.at), region.circle.radius
-        return _Shape(at - radius, at + radius, _Circle(at, radius))
+        return _Shape(at - radius, at + radius, partial(_in_circle, at, radius))
     polygon = np.array(region.polygon, dtype=float)
     return _Shape(polygon.min(axis=0), polygon.max(axis=0), partial(in_polygon, polygon))

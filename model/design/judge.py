@@ -13,12 +13,6 @@ from model.table.pattern_choice import UnreachableLevel
 from model.table.question import Question
 from model.table.table import LocalizationTable
 
-JUDGED_SETS = 200
-"""Contact sets by which layouts are judged, other than those of the search."""
-
-JUDGED_SEED = 0x5EED
-"""Added to the seed of a search, whose own sets are others."""
-
 _LEVEL_MARGIN = 0.1  # dB
 
 

@@ -1,6 +1,6 @@
 """Files and summary of a design."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -8,29 +8,56 @@ from typing import Any
 from model.config.document import Value
 from model.config.editing import data_text
 from model.design.pictures import contrast_figure, count_figure
-from model.design.run import Design
-from model.design.support import static_loads
+from model.design.run import Design, Layout
 from model.figures import save_figure
 from model.files.array_file import whole_or_nothing
+from model.files.csv_file import Columns, write_columns
 from model.rig.rig import Channel, Rig
-from model.structure.support import rigid_body_frequencies
+from model.structure.support import rigid_body_frequencies, static_loads
+
+MAX_SHOWN = 10
+"""Layouts in a summary; the CSV file has all."""
 
 MAX_CHANNELS = 4
 """Channels of an amplifier beyond the rig's own ones."""
 
 
 def write_design(folder: Path, design: Design, data: Mapping[str, Value]) -> list[Path]:
-    """Write rig.yaml, contrast.png and count.png; data: of the rig's file.
+    """Write rig.yaml, layouts.csv, contrast.png and count.png; data: of the rig's file.
 
     Raises OSError if the folder cannot be written.
     """
-    rig = folder / "rig.yaml"
+    rig, table = folder / "rig.yaml", folder / "layouts.csv"
     with whole_or_nothing(rig) as stream:
         stream.write(rig_text(design, data).encode())
+    write_columns(table, _columns(design.layouts))
     pictures = {"contrast.png": contrast_figure, "count.png": count_figure}
     for name, figure in pictures.items():
         save_figure(figure(design), folder / name)
-    return [rig, *(folder / name for name in pictures)]
+    return [rig, table, *(folder / name for name in pictures)]
+
+
+def _columns(layouts: Sequence[Layout]) -> Columns:
+    """A row for each layout, in the order of their ranks."""
+    rows = [_row(each) for each in layouts]
+    at = [" ".join(f"({x:.6g};{y:.6g})" for x, y in row["at_m"].values()) for row in rows]
+    columns = {key: ["" if row[key] is None else row[key] for row in rows] for key in rows[0]}
+    contrast = [f"{each.mean_db:.6g}" if each.judged else "" for each in layouts]
+    return {"rank": range(1, len(rows) + 1), **columns, "at_m": at, "contrast_db": contrast}
+
+
+def _row(layout: Layout) -> dict[str, Any]:
+    """A layout for JSON."""
+    found = layout.found
+    eras = layout.problem.eras(found.positions)
+    return {
+        "layout": layout.name,
+        "at_m": {era.name: [era.x, era.y] for era in eras},
+        "stiffness_n_m": eras[-1].stiffness,
+        "supported": found.is_supported,
+        "expected_contrast_db": found.score_db if found.is_supported else None,
+        "contrast_db": layout.judged.summary if layout.judged else None,
+    }
 
 
 def rig_text(design: Design, data: Mapping[str, Value]) -> str:
@@ -70,7 +97,7 @@ def rig_text(design: Design, data: Mapping[str, Value]) -> str:
     added: dict[str, Value] = {name: {"url": "sim://"} for name in used if name not in amplifiers}
     comment = (
         f"# Designed for contrast: {problem.count} ERAs, "
-        f"{design.best.judged.mean_db:.1f} dB over fresh contact sets.\n"
+        f"{design.best.mean_db:.1f} dB over fresh contact sets.\n"
     )
     if added:
         comment += f"# Give the amplifiers {', '.join(added)} the URLs of real ones.\n"
@@ -82,7 +109,7 @@ def summary(design: Design) -> dict[str, Any]:
     problem, best = design.problem, design.best
     eras = problem.eras(best.found.positions)
     rig = problem.rig
-    loads = static_loads(rig, eras)
+    loads = static_loads(rig.plate, eras, loads=rig.masses)
     lowest = float(rigid_body_frequencies(rig.plate, eras, loads=rig.masses)[0])
     return {
         "eras": {
@@ -93,15 +120,21 @@ def summary(design: Design) -> dict[str, Any]:
             }
             for era, sensitivity, load in zip(eras, design.sensitivities, loads, strict=False)
         },
-        "contrast_db": best.judged.summary,
+        "contrast_db": best.answers.summary,
         "own_contrast_db": None if design.own is None else design.own.summary,
-        "reached_share": best.judged.reached_share,
-        "starts_db": [each.judged.mean_db for each in design.starts],
+        "reached_share": best.answers.reached_share,
+        "starts_db": [each.mean_db for each in design.starts],
         "gap_db": design.gap_db,
-        "by_count_db": {str(n): each.judged.mean_db for n, each in design.by_count.items()},
+        "by_count_db": {str(n): each.mean_db for n, each in design.by_count.items()},
         "by_stiffness_db": {
-            f"{stiffness:g}": each.judged.mean_db for stiffness, each in design.by_stiffness.items()
+            f"{stiffness:g}": each.mean_db for stiffness, each in design.by_stiffness.items()
         },
+        "layout_count": len(design.layouts),
+        "unsupported": sum(not each.found.is_supported for each in design.layouts),
+        "layouts": [
+            {"rank": rank, **_row(each)}
+            for rank, each in enumerate(design.layouts[:MAX_SHOWN], start=1)
+        ],
         "lowest_rigid_body_hz": lowest,
         "sets": len(design.sets),
         "resumed": design.resumed_count,

@@ -9,7 +9,7 @@ from model.figures.drawing import COLORS, draw_eras, label_plate
 
 def contrast_figure(design: Design) -> Figure:
     """Robust felt contrast of fresh contact sets at their targets, a panel by quiet fingers."""
-    plate, judged = design.problem.rig.plate, design.best.judged
+    plate, judged = design.problem.rig.plate, design.best.answers
     eras = design.problem.eras(design.best.found.positions)
     ratio = plate.width / plate.length
     kinds = judged.kinds
@@ -40,12 +40,12 @@ def contrast_figure(design: Design) -> Figure:
 def count_figure(design: Design) -> Figure:
     """Contrast against the number of ERAs, with what each buys."""
     counts = list(design.by_count)
-    means = [each.judged.mean_db for each in design.by_count.values()]
+    means = [each.mean_db for each in design.by_count.values()]
     figure = Figure(figsize=(5.2, 3.6), layout="constrained")
     axes = figure.subplots()
     axes.plot(counts, means, "o-", color="black", label="mean")
-    for quiet in design.best.judged.kinds:
-        medians = [each.judged.median_db(quiet) for each in design.by_count.values()]
+    for quiet in design.best.answers.kinds:
+        medians = [each.answers.median_db(quiet) for each in design.by_count.values()]
         axes.plot(counts, medians, "--", marker=".", label=f"{quiet} quiet, median")
     for count, low, high in zip(counts[1:], means, means[1:], strict=False):
         axes.annotate(f"{high - low:+.1f}", (count, high), (0, 7), textcoords="offset points")

@@ -1,244 +1,336 @@
-"""Running a design: several starts on processes, their layouts judged, finished ones kept."""
+"""Running a design: layouts searched or given, judged on processes, finished parts kept."""
 
 import hashlib
-import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from itertools import chain, product
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from model.arrays import FloatArray
-from model.choice import best_of
-from model.cluster import Cluster
-from model.design.judge import JUDGED_SEED, JUDGED_SETS, Judged, judge
-from model.design.search import CANDIDATES, DesignProblem, Found, LayoutSearch
-from model.design.support import MIN_SUPPORTING
+from model.choice import best_by, best_first
+from model.design.judge import Judged, judge
+from model.design.layouts import NamedLayouts
+from model.design.problem import DesignProblem
+from model.design.search import Found, LayoutSearch
 from model.errors import InputError
 from model.files.array_file import Arrays
 from model.files.kept_arrays import keep_arrays, kept_arrays
 from model.processes import on_processes
-from model.version import NUMERICS_VERSION
+from model.structure.support import support_problem
 
 SENSITIVITY_STEP = 0.005
 """Step [m] of an ERA by which the sensitivity to its place is measured."""
 
-_TYPES = {"positions": "<f8", "scores": "<f8", "counts": "<i8", "quiet": "<i8", "answers": "<f8"}
+DEFAULT_FINALISTS = 5
+"""Given layouts of each number and stiffness of ERAs that are judged."""
+
+CHUNK = 100
+"""Given layouts that are scored together, about a second of work."""
+
+Machines: TypeAlias = Callable[..., Iterator[tuple[int, Any]]]
+"""Solves tasks: `model.processes.on_processes` or `model.cluster.on_cluster` somewhere."""
+
+_HERE: Machines = partial(on_processes, 1)
+
+_FOUND = {"positions": "<f8", "scores": "<f8", "counts": "<i8"}
+_JUDGED = {"quiet": "<i8", "contrast_db": "<f8", "level_db_sl": "<f8"}
+
+_search_of = lru_cache(maxsize=4)(LayoutSearch)
 
 
 @dataclass(frozen=True, eq=False)
-class JudgedLayout:
-    """A layout that was found, and what it gives on fresh contact sets."""
+class Layout:
+    """A layout of one problem, and its answers on fresh contact sets if it was judged.
 
+    name: of a given one, or the number of its start.
+    """
+
+    problem: DesignProblem
+    name: str
     found: Found
-    judged: Judged
+    judged: Judged | None = None
 
     @property
     def count(self) -> int:
         """Number of ERAs."""
         return len(self.found.positions)
 
+    @property
+    def answers(self) -> Judged:
+        """Answers of one that was judged."""
+        assert self.judged is not None  # noqa: S101
+        return self.judged
+
+    @property
+    def mean_db(self) -> float:
+        """Mean contrast of one that was judged [dB]."""
+        return self.answers.mean_db
+
 
 @dataclass(frozen=True, eq=False)
 class Design:
     """Result of a design.
 
-    problem: the one with the best answers; starts: the layout of each of its starts; best: of
-    these; by_count: the best found for each number of ERAs; by_stiffness: the best for each
+    layouts: all of them, judged ones first by their mean contrast, then others by score; starts: of
+    these the ends of the searches of the best one's problem, none if layouts were given; by_count:
+    the best judged for each number of ERAs of that problem; by_stiffness: the best for each
     stiffness [N/m] tried; sensitivities (n,): change of the score [dB/m] with the place of each
     ERA of the best; own: the rig's own layout, None if it does not support the plate;
-    resumed_count: of starts.
+    resumed_count: of starts, or chunks of layouts.
     """
 
-    problem: DesignProblem
-    starts: tuple[JudgedLayout, ...]
-    best: JudgedLayout
-    by_count: dict[int, JudgedLayout]
-    by_stiffness: dict[float, JudgedLayout]
+    layouts: tuple[Layout, ...]
+    starts: tuple[Layout, ...]
+    by_count: dict[int, Layout]
+    by_stiffness: dict[float, Layout]
     sensitivities: FloatArray
     own: Judged | None
     sets: list[FloatArray]
     resumed_count: int
 
     @property
+    def best(self) -> Layout:
+        """That of the most contrast of as many ERAs as were sought."""
+        return self.layouts[0]
+
+    @property
+    def problem(self) -> DesignProblem:
+        """That of the best layout."""
+        return self.best.problem
+
+    @property
     def gap_db(self) -> float:
         """How far the worst start is behind the best [dB]."""
-        return self.best.judged.mean_db - min(each.judged.mean_db for each in self.starts)
+        return max((self.best.mean_db - each.mean_db for each in self.starts), default=0.0)
 
 
-def problem_digest(problem: DesignProblem, where: str) -> str:
-    """SHA-256 over all that the layouts of a problem depend on; where: text of its area."""
-    parts = [
-        problem.rig.fingerprint,
-        problem.rig.mesh.to_dict(),
-        list(problem.kept),
-        [problem.rig.limits.frequency_min, problem.rig.limits.frequency_max],
-        where,
-        problem.contacts.text,
-        problem.apart,
-        problem.lowest,
-        problem.count,
-        problem.seed,
-        problem.stiffness,
-        [NUMERICS_VERSION, JUDGED_SETS, *CANDIDATES.values()],
-    ]
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+@contextmanager
+def _unseen(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Progress that is not shown."""
+    yield lambda done, total: None
 
 
-def run_design(
-    problems: Sequence[DesignProblem],
-    *,
-    where: str,
-    starts: int,
-    folder: Path,
-    workers: int = 1,
-    cluster: Cluster | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Design:
+@dataclass
+class Runner:
+    """Solves tasks on machines; what is finished is in files of a folder, None to keep nothing.
+
+    progress: shows what is being done; yields an update(done, total). resumed: how many tasks were
+    finished before, by what they are.
+    """
+
+    folder: Path | None = None
+    machines: Machines = _HERE
+    progress: Callable[[str], AbstractContextManager[Callable[[int, int], None]]] = _unseen
+    resumed: dict[str, int] = field(default_factory=dict)
+
+    def run(
+        self,
+        what: str,
+        solve: Callable[[Any, Any], Arrays],
+        shared: object,
+        tasks: Mapping[str, Any],
+        types: Mapping[str, str],
+    ) -> list[Arrays]:
+        """Arrays (of types) of tasks by the text that says all they depend on, in their order."""
+        paths = {text: self._path(what, text) for text in tasks}
+        done: dict[str, Arrays] = {}
+        for text, path in paths.items():
+            kept = None if path is None else kept_arrays(path, text, types)
+            if kept is not None:
+                done[text] = kept
+        self.resumed[what] = len(done)
+        missing = {number: text for number, text in enumerate(tasks) if text not in done}
+        given = {number: tasks[text] for number, text in missing.items()}
+        with self.progress(what) as update:
+            update(len(done), len(tasks))
+            for number, arrays in self.machines(solve, shared, given) if given else ():
+                path = paths[missing[number]]
+                if path is not None:
+                    keep_arrays(path, missing[number], arrays)
+                done[missing[number]] = arrays
+                update(len(done), len(tasks))
+        return [done[text] for text in tasks]
+
+    def _path(self, what: str, text: str) -> Path | None:
+        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+        return None if self.folder is None else self.folder / f"{what}-{digest}.npz"
+
+
+def search_layouts(problems: Sequence[DesignProblem], *, starts: int, runner: Runner) -> Design:
     """Search from several starts and judge what they find, for problems of different stiffness.
 
     The first start adds one ERA after the other and so gives a layout for each number; the others
-    begin at random. Finished ones are in files of the folder; where: text of the problems' area;
-    cluster: in place of so many workers on this machine.
-    Raises InputError for an area without room, and where no layout supports the plate.
+    begin at random. Raises InputError for an area without room, and where no layout supports the
+    plate.
     """
-    digests = [problem_digest(problem, where) for problem in problems]
     tasks = {
-        number: (problem, start)
-        for number, (problem, start) in enumerate(product(range(len(problems)), range(starts)))
+        f"{problem.text} {start}": (number, start)
+        for number, problem in enumerate(problems)
+        for start in range(starts)
     }
-    texts = {number: f"{digests[one]} {start}" for number, (one, start) in tasks.items()}
-    paths = {
-        number: folder / f"start-{start}-{digests[one][:12]}.npz"
-        for number, (one, start) in tasks.items()
-    }
-    kept = {number: kept_arrays(path, texts[number], _TYPES) for number, path in paths.items()}
-    done: dict[int, Arrays] = {number: found for number, found in kept.items() if found is not None}
-    resumed_count = len(done)
-    progress(len(done), len(tasks))
-    missing = {number: task for number, task in tasks.items() if number not in done}
-    processes = min(workers, max(1, len(missing)))
-    for number, arrays in (
-        on_processes(processes, _start, problems, missing)
-        if cluster is None
-        else cluster.solve(_as_they_are, problems, _start, missing)
-    ):
-        keep_arrays(paths[number], texts[number], arrays)
-        done[number] = arrays
-        progress(len(done), len(tasks))
-    found = [
-        [list(_layouts(done[number])) for number in tasks if tasks[number][0] == one]
-        for one in range(len(problems))
+    solved = runner.run("starts", _start, problems, tasks, _FOUND)
+    layouts = [
+        Layout(problems[number], f"start {start}", found)
+        for (number, start), arrays in zip(tasks.values(), solved, strict=True)
+        for found in _found(arrays)
     ]
-    ends = [[path[-1] for path in each] for each in found]
-    bests = [each[best_of([_mean(end) for end in each])] for each in ends]
-    chosen = best_of([_mean(best) for best in bests])
-    problem, best = problems[chosen], bests[chosen]
-    search = LayoutSearch(problem)
-    sets = judged_sets(problem)
-    by_count: dict[int, JudgedLayout] = {}
-    for layout in [*chain(*found[chosen]), *_one_more(search, best, sets)]:
-        known = by_count.get(layout.count)
-        if known is None or _mean(layout) > _mean(known):
-            by_count[layout.count] = layout
-    return Design(
-        problem,
-        tuple(path[-1] for path in found[chosen]),
-        best,
-        dict(sorted(by_count.items())),
-        {each.stiffness: one for each, one in zip(problems, bests, strict=True) if each.stiffness},
-        search.sensitivities(best.found.positions, step=SENSITIVITY_STEP),
-        _own(problem, sets),
-        sets,
-        resumed_count,
-    )
+    for problem in problems:
+        ends = [each for each in layouts if each.problem is problem and each.count == problem.count]
+        if len(ends) < starts:
+            raise InputError(
+                f"the plate must be supported by {problem.count} ERAs with its lowest rigid-body "
+                f"frequency at least {problem.lowest:g} Hz and weight on each of them, got no such "
+                "layout; add ERAs or stiffer ones, widen --where, or lower --lowest"
+            )
+    judged = _judged(layouts, runner)
+    ends = [each for each in judged if each.count == each.problem.count]
+    best = best_by(ends, lambda each: each.mean_db)
+    further = _search_of(best.problem).one_more(best.found.positions)
+    if further is not None:
+        judged += _judged([Layout(best.problem, "one more", further)], runner)
+    return _design(best, judged, [each for each in ends if each.problem is best.problem], runner)
+
+
+def rank_layouts(
+    given: Mapping[DesignProblem, NamedLayouts], *, finalists: int, runner: Runner
+) -> Design:
+    """Rank given layouts: by score, and the first of each problem by what they are judged.
+
+    Raises InputError where none supports the plate.
+    """
+    problems = list(given)
+    chunks = [
+        (number, dict(list(given[problem].items())[at : at + CHUNK]))
+        for number, problem in enumerate(problems)
+        for at in range(0, len(given[problem]), CHUNK)
+    ]
+    tasks = {
+        f"{problems[number].text} {[[n, p.tolist()] for n, p in chunk.items()]}": (
+            number,
+            list(chunk.values()),
+        )
+        for number, chunk in chunks
+    }
+    solved = runner.run("chunks", _score, problems, tasks, _FOUND)
+    layouts = [
+        Layout(problems[number], name, found)
+        for (number, chunk), arrays in zip(chunks, solved, strict=True)
+        for name, found in zip(chunk, _found(arrays), strict=True)
+    ]
+    order = best_first([each.found.score_db for each in layouts]).tolist()
+    ranked = [layouts[each] for each in order]
+    supported = [each for each in ranked if each.found.is_supported]
+    if not supported:
+        raise InputError(
+            f"a layout must support the plate with its lowest rigid-body frequency at least "
+            f"{problems[0].lowest:g} Hz and weight on each ERA, got {len(layouts)} of which none "
+            "does; add ERAs or stiffer ones, widen --where, or lower --lowest"
+        )
+    chosen = []
+    for problem in problems:
+        chosen += [each for each in supported if each.problem is problem][:finalists]
+    judged = _judged(chosen, runner)
+    rest = [each for each in ranked if each not in chosen]
+    return _design(best_by(judged, lambda each: each.mean_db), judged + rest, [], runner)
 
 
 def worthwhile_count(design: Design, worth: float) -> int:
     """The number of ERAs up to which each further one buys at least so much contrast [dB]."""
-    means = {count: _mean(layout) for count, layout in design.by_count.items()}
+    means = {count: layout.mean_db for count, layout in design.by_count.items()}
     for count in sorted(means):
         if count >= design.problem.count or means.get(count + 1, 0.0) - means[count] < worth:
             return count
     return design.problem.count
 
 
-def _mean(layout: JudgedLayout) -> float:
-    return layout.judged.mean_db
+def _design(best: Layout, layouts: list[Layout], starts: list[Layout], runner: Runner) -> Design:
+    """The result of layouts, of which some were judged, the best among them."""
+    judged = [each for each in layouts if each.judged is not None]
+    order = best_first([each.mean_db for each in judged]).tolist()
+    ranked = [judged[each] for each in order]
+    by_count: dict[int, Layout] = {}
+    by_stiffness: dict[float, Layout] = {}
+    for each in [best, *ranked]:
+        if each.problem is best.problem or not starts:
+            by_count.setdefault(each.count, each)
+        if each.problem.stiffness is not None and each.count == each.problem.count:
+            by_stiffness.setdefault(each.problem.stiffness, each)
+    problem = best.problem
+    rest = [each for each in (*ranked, *layouts) if each is not best]
+    own = None
+    rig = problem.rig
+    if support_problem(rig.plate, rig.eras, loads=rig.masses) is None:
+        (answers,) = runner.run(
+            "answers", _answers, [problem], {f"{problem.text} own": (0, None)}, _JUDGED
+        )
+        own = Judged(**answers)
+    return Design(
+        (best, *dict.fromkeys(rest)),
+        tuple(starts),
+        dict(sorted(by_count.items())),
+        dict(sorted(by_stiffness.items())),
+        _search_of(problem).sensitivities(best.found.positions, step=SENSITIVITY_STEP),
+        own,
+        problem.judged_sets(),
+        runner.resumed.get("starts", 0) + runner.resumed.get("chunks", 0),
+    )
 
 
-def judged_sets(problem: DesignProblem) -> list[FloatArray]:
-    """Fresh contact sets."""
-    return problem.contacts.sets(JUDGED_SETS, seed=problem.seed + JUDGED_SEED)
-
-
-def _as_they_are(problems: Sequence[DesignProblem]) -> Sequence[DesignProblem]:
-    return problems
+def _judged(layouts: Sequence[Layout], runner: Runner) -> list[Layout]:
+    """The layouts with their answers."""
+    problems = list(dict.fromkeys(each.problem for each in layouts))
+    texts = [f"{each.problem.text} {each.found.positions.tolist()}" for each in layouts]
+    tasks = {
+        text: (problems.index(each.problem), each.found.positions)
+        for text, each in zip(texts, layouts, strict=True)
+    }
+    solved = runner.run("answers", _answers, problems, tasks, _JUDGED)
+    answers = dict(zip(tasks, solved, strict=True))
+    return [
+        replace(each, judged=Judged(**answers[text]))
+        for text, each in zip(texts, layouts, strict=True)
+    ]
 
 
 def _start(problems: Sequence[DesignProblem], task: tuple[int, int]) -> Arrays:
-    """Layouts of one start of one problem, the last of the wanted number of ERAs."""
-    problem, number = problems[task[0]], task[1]
-    search = LayoutSearch(problem)
-    if number == 0:
-        found = list(_path(search))
-    else:
-        layout = search.random_layout(np.random.default_rng([problem.seed, number]))
-        found = [search.refine(search.exchange(layout))]
-    found = [each for each in found if each.is_supported]
-    if not found or len(found[-1].positions) < problem.count:
-        raise InputError(
-            f"the plate must be supported by {problem.count} ERAs with its lowest rigid-body "
-            f"frequency at least {problem.lowest:g} Hz and weight on each of them, got no such "
-            "layout; add ERAs or stiffer ones, widen --where, or lower --lowest"
-        )
-    sets = judged_sets(problem)
-    judged = [judge(problem.rig_with(each.positions), sets) for each in found]
+    """Layouts of one start of one problem, the last of the number of ERAs that is sought."""
+    number, start = task
+    problem = problems[number]
+    search = _search_of(problem)
+    if start == 0:
+        return _arrays([each for each in search.path() if each.is_supported])
+    found = search.from_random(np.random.default_rng([problem.seed, start]))
+    return _arrays([found] if found.is_supported else [])
+
+
+def _score(problems: Sequence[DesignProblem], task: tuple[int, list[FloatArray]]) -> Arrays:
+    """Scores of given layouts of one problem."""
+    number, layouts = task
+    return _arrays(_search_of(problems[number]).scored(layouts))
+
+
+def _answers(problems: Sequence[DesignProblem], task: tuple[int, FloatArray | None]) -> Arrays:
+    """What positions of ERAs, None for the rig's own, give on fresh contact sets."""
+    problem, positions = problems[task[0]], task[1]
+    rig = problem.rig if positions is None else problem.rig_with(positions)
+    return vars(judge(rig, problem.judged_sets()))
+
+
+def _arrays(layouts: Sequence[Found]) -> Arrays:
+    positions = [each.positions for each in layouts]
     return {
-        "positions": np.vstack([each.positions for each in found]),
-        "scores": np.array([each.score_db for each in found]),
-        "counts": np.array([len(each.positions) for each in found]),
-        "quiet": judged[0].quiet,
-        "answers": np.array([[each.contrast_db, each.level_db_sl] for each in judged]),
+        "positions": np.vstack([np.empty((0, 2)), *positions]),
+        "scores": np.array([each.score_db for each in layouts], dtype=float),
+        "counts": np.array([len(each) for each in positions], dtype=np.int64),
     }
 
 
-def _path(search: LayoutSearch) -> Iterator[Found]:
-    """Layouts of ever more ERAs, from those kept or as few as support the plate."""
-    layout = search.kept_layout()
-    while len(layout) < search.problem.count:
-        layout = search.add(layout)
-        if len(layout) + search.problem.supports >= MIN_SUPPORTING:
-            layout = search.exchange(layout, sweeps=1 + (len(layout) == search.problem.count))
-            yield search.refine(layout)
-    if len(layout) == len(search.kept_layout()):
-        yield search.refine(layout)
-
-
-def _one_more(
-    search: LayoutSearch, best: JudgedLayout, sets: list[FloatArray]
-) -> list[JudgedLayout]:
-    """The best layout with one ERA more."""
-    found = search.one_more(best.found.positions)
-    if found is None:
-        return []
-    return [JudgedLayout(found, judge(search.problem.rig_with(found.positions), sets))]
-
-
-def _layouts(arrays: Arrays) -> Iterator[JudgedLayout]:
+def _found(arrays: Arrays) -> Iterator[Found]:
     ends = np.cumsum(arrays["counts"])
-    parts = np.split(arrays["positions"], ends[:-1])
-    for positions, score, (contrast, level) in zip(
-        parts, arrays["scores"].tolist(), arrays["answers"], strict=True
-    ):
-        yield JudgedLayout(Found(positions, score), Judged(arrays["quiet"], contrast, level))
-
-
-def _own(problem: DesignProblem, sets: list[FloatArray]) -> Judged | None:
-    from model.structure.support import support_problem
-
-    rig = problem.rig
-    if support_problem(rig.plate, rig.eras, loads=rig.masses) is not None:
-        return None
-    return judge(rig, sets)
+    parts = np.split(arrays["positions"], ends)[:-1]
+    for positions, score in zip(parts, arrays["scores"].tolist(), strict=True):
+        yield Found(positions, score)

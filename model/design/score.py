@@ -9,9 +9,10 @@ ERAs e of dynamic stiffness Z on the plate, a finger f of dynamic stiffness D an
     t_e = G_p - L_p M G_f,  h = -w² t_e z stroke,  r_e = stroke - u_e,  r_f = -u_f
     R = mean_p {h* h^T + dh* dh^T + dc* dc^T + sum_j |s_j w² t_j|² r_j* r_j^T + sigma² diag |h|²}
 
-with dh by thickness and dc by the ERAs' damping, s_j of each ERA's stiffness and the finger's load.
-The score of a set is |h_t w|² / max_q w^H R_q w of the best weights w at the best frequency, less a
-tenth of what they miss the wanted level by: an answer that has to reach it loses little.
+with dh of the plates thicker and thinner by a standard deviation, each solved exactly and counting
+half, dc by the ERAs' damping, s_j of each ERA's stiffness and the finger's load. The score of a set
+is |h_t w|² / max_q w^H R_q w of the best weights w at the best frequency, less a tenth of what they
+miss the wanted level by: an answer that has to reach it loses little.
 """
 
 import math
@@ -22,8 +23,11 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.choice import best_rows
-from model.design.places import DesignPlate, Places
+from model.finger.disc import FIVE_POINTS
+from model.finger.fingertip import fingertips_on
 from model.finger.perception import STRONG_DB_SL, detection_threshold
+from model.reduction.free_plate import solve_free_plate
+from model.rig.rig import Rig
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces, full_strokes
 
@@ -42,6 +46,18 @@ _RIDGE, _LEAST = np.float32(1e-6), np.float32(1e-30)
 
 
 @dataclass(frozen=True, eq=False)
+class Places:
+    """Receptances [m/N] from c places of plates of v thicknesses, the modelled one first.
+
+    at (c, 2) [m]; between (v, f, c, c); to_tips (v, f, m p, c): at the points of m fingertips.
+    """
+
+    at: FloatArray
+    between: Complex64Array
+    to_tips: Complex64Array
+
+
+@dataclass(frozen=True, eq=False)
 class Mounts:
     """ERAs at frequencies (f,): dynamic stiffness, force and base at full stroke, (f, n) each.
 
@@ -56,26 +72,61 @@ class Mounts:
 
 
 class Scorer:
-    """Scores layouts on a plate with contact sets."""
+    """Scores layouts on a rig's plate, solved once, with contact sets on it.
 
-    def __init__(self, plate: DesignPlate, *, level_db_sl: float = STRONG_DB_SL) -> None:
-        rig, omega = plate.rig, plate.omega
-        self._plate = plate
+    frequencies (f,) [Hz]; sets: contacts (fingers, 2) [m] of each, target first.
+    """
+
+    def __init__(self, rig: Rig, frequencies: FloatArray, sets: Sequence[FloatArray]) -> None:
+        self._rig = rig
+        self._frequencies, self._omega = frequencies, 2 * np.pi * frequencies
         uncertainty = rig.uncertainty
-        self._gain_variance = np.float32(uncertainty.gain_variance)
-        self._log_damping = math.log(uncertainty.damping)
-        self._load_std = np.float32(uncertainty.fingertip)
-        self._minus_omega2 = -(omega**2).astype(np.float32)[:, None, None]
+        std = uncertainty.thickness
+        self._thicknesses = (1.0, 1 + std, 1 - std) if std > 0 else (1.0,)
+        self._minus_omega2 = -(self._omega**2).astype(np.float32)[:, None, None]
         tip = rig.fingertip
-        finger = np.zeros(len(omega)) if tip is None else tip.dynamic_stiffness(omega)
-        self._finger = finger.astype(np.complex64)[:, None, None]
-        least = LEVEL_RESERVE * 10 ** (level_db_sl / 20)
-        threshold = detection_threshold(plate.frequencies, rig.threshold)
+        finger = np.zeros(len(frequencies)) if tip is None else tip.dynamic_stiffness(self._omega)
+        self._finger = finger.astype(np.complex64)[:, None]
+        least = LEVEL_RESERVE * 10 ** (STRONG_DB_SL / 20)
+        threshold = detection_threshold(frequencies, rig.threshold)
         self._wanted = (least * threshold).astype(np.float32)
+        self._free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(frequencies.max()))
+        centres, numbers = np.unique(np.vstack(sets), axis=0, return_inverse=True)
+        points, weights = fingertips_on(
+            centres, length=rig.plate.length, width=rig.plate.width, rule=FIVE_POINTS
+        )
+        self._points = points.reshape(-1, 2)
+        self._weights: Float32Array = weights.astype(np.float32)  # (m, p), of the centre first
+        self._groups = _grouped([len(each) for each in sets], numbers.ravel())
+        # Of a fingertip's points from its centre, (v, f, m, p).
+        every, tips = np.arange(len(centres)), self._solved(centres).to_tips
+        tips = tips.reshape(*tips.shape[:2], *weights.shape, -1)
+        self._own = np.moveaxis(tips[:, :, every, :, every], 0, 2)
+
+    def places(self, at: FloatArray) -> Places:
+        """Solve for ERAs at places [m] (c, 2)."""
+        return self._solved(np.column_stack([at, np.full(len(at), self._rig.eras[0].foot)]))
+
+    def _solved(self, footprints: FloatArray) -> Places:
+        solved = [
+            self._free.receptances(
+                footprints,
+                self._points,
+                self._frequencies,
+                loads=self._rig.masses,
+                thickness=thickness,
+            )
+            for thickness in self._thicknesses
+        ]
+        between, to_points = (
+            np.array(each, dtype=np.complex64) for each in zip(*solved, strict=True)
+        )
+        to_tips = np.ascontiguousarray(to_points.swapaxes(2, 3))
+        return Places(footprints[:, :2], between, to_tips)
 
     def mounts(self, eras: Sequence[Era]) -> Mounts:
         """What the score needs of ERAs, whose places do not matter."""
-        omega, uncertainty = self._plate.omega, self._plate.rig.uncertainty
+        omega, uncertainty = self._omega, self._rig.uncertainty
         stiffness = np.array([era.stiffness for era in eras])
         damping = np.array([era.damping for era in eras])
         each = (
@@ -83,74 +134,65 @@ class Scorer:
             drive_forces(eras, omega),
             full_strokes(eras, omega),
             np.broadcast_to(uncertainty.stiffness * stiffness, (len(omega), len(eras))),
-            self._log_damping * 1j * omega[:, None] * damping,
+            math.log(uncertainty.damping) * 1j * omega[:, None] * damping,
         )
         return Mounts(*(values.astype(np.complex64) for values in each))
 
-    def scores(self, places: Places, chosen: IntArray, mounts: Mounts) -> list[FloatArray]:
-        """Score [dB] of the contact sets (s,) of each group for ERAs at chosen places (n,)."""
-        target, power = self.forms(places, chosen, mounts)
-        return [self._group(target, power, fingers) for fingers in self._plate.groups]
-
     def mean(self, places: Places, chosen: IntArray, mounts: Mounts) -> float:
-        """Mean score [dB], each number of fingers counting the same."""
-        return float(np.mean([each.mean() for each in self.scores(places, chosen, mounts)]))
+        """Mean score [dB] of ERAs at chosen places (n,), each number of fingers counting alike."""
+        target, power = self._forms(places, chosen, mounts)
+        scores = [self._score(target, power, fingers) for fingers in self._groups]
+        return float(np.mean([each.mean() for each in scores]))
 
-    def forms(
+    def _forms(
         self, places: Places, chosen: IntArray, mounts: Mounts
     ) -> tuple[Complex64Array, Complex64Array]:
         """Mean fields (f, m, n) [m/s²] at the fingertips, and expected power there (f, m, n, n)."""
-        weights, D, minus_omega2 = self._plate.weights, self._finger, self._minus_omega2
+        uncertainty, weights, D = self._rig.uncertainty, self._weights, self._finger
+        minus_omega2, Z = self._minus_omega2, mounts.stiffness
         m, p = weights.shape
         n = len(chosen)
-        # The plate on the ERAs, without fingers.
-        A = places.between[:, chosen[:, None], chosen]
-        E = places.to_tips[:, :, chosen]
-        f = len(A)
-        K = np.linalg.inv(np.eye(n, dtype=np.float32) + mounts.stiffness[:, :, None] * A)
-        F = K * mounts.force[:, None]
+        # The plates on the ERAs, without fingers; those of other thickness come first.
+        A = places.between[:, :, chosen[:, None], chosen]
+        E = places.to_tips[:, :, :, chosen]
+        v, f = A.shape[:2]
+        K = np.linalg.inv(np.eye(n, dtype=np.float32) + Z[:, :, None] * A)
         G = E @ K
-        motion = -(A @ F)
-        motion.reshape(f, -1)[:, :: n + 1] += mounts.stroke
 
         # The finger, where it rests.
-        G_f = G[:, ::p]
-        L = self._plate.own - (
-            (E[:, ::p] * mounts.stiffness[:, None])[:, :, None] * G.reshape(f, m, p, n)
-        ).sum(axis=3)
-        released = 1 / (1 + D[:, :, 0] * L[:, :, 0])  # (f, m)
-        reaction = (L * (D[:, :, 0] * released)[:, :, None]).reshape(f, m * p, 1)
-        t = G - reaction * np.repeat(G_f, p, axis=1)
-        h = t * (minus_omega2 * mounts.force[:, None])
-        u_f = G_f * mounts.force[:, None]  # without its load, (f, m, n)
+        G_f = G[:, :, ::p]
+        held = (E[:, :, ::p] * Z[:, None])[..., None, :] * G.reshape(v, f, m, p, n)
+        L = self._own - held.sum(axis=-1)
+        released = 1 / (1 + D * L[..., 0])  # (v, f, m)
+        reaction = L * (D * released)[..., None]
+        t = G.reshape(v, f, m, p, n) - reaction[..., None] * G_f[:, :, :, None]
+        scale = minus_omega2 * mounts.force[:, None]
+        fields = t * scale[:, None]
+        h = fields[0]
 
-        parts = [h, (t * (minus_omega2 * mounts.by_damping[:, None])) @ motion]
-        dA = places.between_change
-        if dA is not None and places.tips_change is not None:
-            dE = places.tips_change[:, :, chosen]
-            held = mounts.stiffness[:, :, None] * (dA[:, chosen[:, None], chosen] @ F)
-            change = minus_omega2 * (dE @ F - G @ held)
-            parts.append(change - reaction * np.repeat(change[:, ::p], p, axis=1))
-        root = np.sqrt(weights).reshape(-1, 1)
-        rows = [(each * root).reshape(f, m, p, n) for each in parts]
+        # Changes of the plate as modelled.
+        motion = -(A[0] @ (K[0] * mounts.force[:, None]))
+        motion.reshape(f, -1)[:, :: n + 1] += mounts.stroke
+        t, L, released, G_f = t[0], L[0], released[0], G_f[0]
+        damping = t.reshape(f, -1, n) @ (minus_omega2 * mounts.by_damping[:, :, None] * motion)
+        root = np.sqrt(weights)[..., None]
+        parts = [h, damping.reshape(h.shape), *((fields[1:] - h) * np.float32(math.sqrt(0.5)))]
+        rows = [each * root for each in parts]
         reach = np.sqrt(_mean_power(t, weights)) * -minus_omega2
-        springs = mounts.by_stiffness[:, :, None] * motion
-        rows.append(reach[..., None] * springs[:, None])
-        if self._load_std > 0:
-            by_load = (
-                _mean_power(L.reshape(f, m * p, 1), weights) * np.abs(released)[..., None] ** 2
-            )
-            load = np.sqrt(by_load) * minus_omega2 * (self._load_std * D)
-            rows.append((load * released[..., None] * u_f)[:, :, None])
+        rows.append(reach[..., None] * (mounts.by_stiffness[:, :, None] * motion)[:, None])
+        if uncertainty.fingertip > 0:
+            by_load = np.sqrt(_mean_power(L[..., None], weights)) * np.abs(released)[..., None]
+            load = by_load * np.float32(uncertainty.fingertip) * (D * released)[..., None]
+            rows.append((load * G_f * scale)[:, :, None])
         every = np.concatenate(rows, axis=2)
         power = every.conj().swapaxes(2, 3) @ every
         diagonal = power.reshape(f, m, -1)[..., :: n + 1]
         ridge = _RIDGE / n * diagonal.real.sum(axis=2, keepdims=True)
-        diagonal += self._gain_variance * _mean_power(h, weights) + ridge + _LEAST
-        target = (h.reshape(f, m, p, n) * weights[..., None]).sum(axis=2)
-        return target, power
+        gains = np.float32(uncertainty.gain_variance) * _mean_power(h, weights)
+        diagonal += gains + ridge + _LEAST
+        return (h * weights[..., None]).sum(axis=2), power
 
-    def _group(
+    def _score(
         self, target: Complex64Array, power: Complex64Array, fingers: IntArray
     ) -> FloatArray:
         """Score [dB] of sets (s, k) of fingers, (s,)."""
@@ -195,7 +237,14 @@ class Scorer:
 
 
 def _mean_power(values: Complex64Array, weights: Float32Array) -> Float32Array:
-    """Mean of |values|² (f, m p, n) over fingertips of weights (m, p), (f, m, n)."""
-    power = values.real**2 + values.imag**2
-    f, _, n = power.shape
-    return np.asarray((weights[:, None] @ power.reshape(f, *weights.shape, n))[:, :, 0])
+    """Mean of |values|² (f, m, p, n) over fingertips of weights (m, p), (f, m, n)."""
+    return np.asarray((weights[:, None] @ (values.real**2 + values.imag**2))[:, :, 0])
+
+
+def _grouped(sizes: Sequence[int], numbers: IntArray) -> tuple[IntArray, ...]:
+    """Sets of these sizes, one after the other in numbers, as one array (s, k) for each size."""
+    first = np.cumsum(sizes) - sizes
+    return tuple(
+        numbers[first[np.equal(sizes, size)][:, None] + np.arange(size)]
+        for size in np.unique(sizes).tolist()
+    )

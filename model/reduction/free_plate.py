@@ -23,7 +23,7 @@ from model.reduction.finite_element_modes import finite_element_modes
 from model.reduction.free_modes import RESIDUAL_ORDER, FreeModes, PointSolutions
 from model.reduction.layered_modes import layered_modes
 from model.reduction.spectral_modes import spectral_modes
-from model.reduction.truncation import truncation_slopes, truncation_weights
+from model.reduction.truncation import truncation_weights
 from model.spectral.mesh import SpectralMesh
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
@@ -86,97 +86,45 @@ class FreePlate:
         frequencies: FloatArray,
         *,
         loads: Sequence[Load] = (),
+        thickness: float = 1.0,
     ) -> tuple[ComplexArray, ComplexArray]:
         """Receptances [m/N] between places [m] (c, 2), (f, c, c), and to points (p, 2), (f, c, p).
 
-        Of the free plate with its loads. A study of many layouts of ERAs at these places then
-        solves a system as small as its number of ERAs for each. Raises InputError as
-        `acceleration`.
+        Of the free plate with its loads, so many times as thick: a thin one, whose stiffness goes
+        as the cube of it. Layouts of ERAs at these places are then solved by systems as small as
+        their number of ERAs. Raises InputError as `acceleration`.
         """
         omega = self._omega(frequencies)
-        field = self._field(places, points, loads)
-        free = field(partial(self._modal_receptance, omega))
-        return _loaded(*free, attached_stiffness((), loads, omega))
-
-    def receptance_slopes(
-        self,
-        places: FloatArray,
-        points: FloatArray,
-        frequencies: FloatArray,
-        *,
-        loads: Sequence[Load] = (),
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Derivatives of `receptances` by the logarithm of the thickness, loads as they are.
-
-        Of a thin plate, whose stiffness goes as the cube of it.
-        """
-        omega = self._omega(frequencies)
-        field = self._field(places, points, loads)
-        by_between, by_points = field(partial(self._thickness_slopes, omega))
-        if loads:
-            # With F = D (I + R_ll D)^-1 R_l., dR changes the receptance by (1 - F)^T dR (1 - F).
-            between, to_points = field(partial(self._modal_receptance, omega))
-            n, stiffness = len(places), attached_stiffness((), loads, omega)
-            held = -coupled_forces(
-                between[:, n:, n:], stiffness, stiffness[:, :, None] * between[:, n:, :n]
-            )
-            forces = coupled_forces(
-                between[:, n:, n:], stiffness, stiffness[:, :, None] * to_points[:, n:]
-            )
-            own = np.concatenate([np.broadcast_to(np.eye(n), (len(omega), n, n)), held], axis=1)
-            own = own.swapaxes(1, 2)
-            by_points = own @ by_points - own @ by_between[:, :, n:] @ forces
-            by_between = own @ by_between @ own.swapaxes(1, 2)
-        return by_between, by_points
-
-    def _field(
-        self, places: FloatArray, points: FloatArray, loads: Sequence[Load]
-    ) -> Callable[[_Functions], tuple[ComplexArray, ComplexArray]]:
-        """What functions of frequency give between places and loads, and from these to points.
-
-        functions: from a number of terms to those of modes (f, r) and truncated ones (f, terms).
-        """
         attached = self.modes.solve_at(np.vstack([as_footprints(places), footprints_of(loads)]))
+        functions = partial(self._modal_receptance, omega, thickness=thickness)
         basis = self.modes.basis(attached, points)
         shapes, residual = np.split(basis, [len(self.modes.eigenvalues)], axis=1)
         by_term = residual.reshape(-1, RESIDUAL_ORDER, len(attached.shapes)).T
-
-        def field(functions: _Functions) -> tuple[ComplexArray, ComplexArray]:
-            modal, weights = functions(RESIDUAL_ORDER)
-            to_points = _apply(shapes, modal[:, :, None] * attached.shapes.T)
-            to_points += np.tensordot(weights, by_term, axes=(1, 1))
-            return _between(attached, functions), to_points
-
-        return field
+        modal, weights = functions(RESIDUAL_ORDER)
+        to_points = _apply(shapes, modal[:, :, None] * attached.shapes.T)
+        to_points += np.tensordot(weights, by_term, axes=(1, 1))
+        between = _between(attached, functions)
+        return _loaded(between, to_points, attached_stiffness((), loads, omega))
 
     @cached_property
     def _elasticity(self) -> ModalElasticity:
         modes = self.modes
         return ModalElasticity.of(self.plate, modes.eigenvalues, modes.losses, modes.dispersion)
 
-    def _modal_receptance(self, omega: FloatArray, terms: int) -> tuple[ComplexArray, ComplexArray]:
+    def _modal_receptance(
+        self, omega: FloatArray, terms: int, *, thickness: float = 1.0
+    ) -> tuple[ComplexArray, ComplexArray]:
         """Receptance of each mode (f, r) [s²], and weights of the truncated ones, (f, terms).
 
-        1 / ((1 + i eta) lambda + i loss - omega²) for an eigenvalue lambda at modal mass 1.
+        1 / (h (h² ((1 + i eta) lambda + i loss) - omega²)) for an eigenvalue lambda at modal mass 1
+        of the plate h times as thick.
         """
+        h = thickness
         loss = (1 + 1j * loss_factors(self.plate, omega))[:, None]
-        shifted = np.asarray(omega**2 / loss[:, 0] + self.shift, dtype=complex)
-        weights = truncation_weights(shifted, self.modes.largest_truncated, terms)
-        receptance = 1 / (self._elasticity.stiffness(omega) - (omega**2)[:, None])
-        return np.asarray(receptance, dtype=complex), np.asarray(weights / loss, dtype=complex)
-
-    def _thickness_slopes(self, omega: FloatArray, terms: int) -> tuple[ComplexArray, ComplexArray]:
-        """Derivatives of `_modal_receptance` by the logarithm of the thickness h.
-
-        With stiffness as h³ and mass as h, weights as h^-3 at omega² / h².
-        """
-        stiffness = self._elasticity.stiffness(omega)
-        modal, weights = self._modal_receptance(omega, terms)
-        loss = np.asarray(1 + 1j * loss_factors(self.plate, omega))
-        shifted = np.asarray(omega**2 / loss + self.shift, dtype=complex)
-        slopes = truncation_slopes(shifted, self.modes.largest_truncated, terms)
-        by_weights = -3 * weights - 2 * (omega**2 / loss**2)[:, None] * slopes
-        return -(3 * stiffness - (omega**2)[:, None]) * modal**2, by_weights
+        shifted = np.asarray((omega / h) ** 2 / loss[:, 0] + self.shift, dtype=complex)
+        weights = truncation_weights(shifted, self.modes.largest_truncated, terms) / (loss * h**3)
+        receptance = 1 / (h * (h**2 * self._elasticity.stiffness(omega) - (omega**2)[:, None]))
+        return np.asarray(receptance, dtype=complex), np.asarray(weights, dtype=complex)
 
     def _omega(self, frequencies: FloatArray) -> FloatArray:
         """omega [rad/s] of frequencies [Hz]; raises InputError for those out of range."""

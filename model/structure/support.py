@@ -10,6 +10,8 @@ from model.structure.actuator import Era
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
 
+GRAVITY = 9.81  # m/s²
+
 MIN_RIGID_BODY_FREQUENCY = 1.0
 """Hz. Under its own weight a plate moves by g / omega²: 25 cm in a mode of this frequency."""
 
@@ -22,28 +24,39 @@ def rigid_body_frequencies(
     Heave and two tilts: w = q0 + q1 (x - L/2) + q2 (y - W/2). K = sum k p p', M = plate + sum m
     p p' with p = (1, x - L/2, y - W/2). A mode that no spring holds has frequency 0.
     """
-    attached = [*(PointLoad.of_era(era) for era in eras), *loads]
+    p, stiffness, mass = _attached(plate, eras, loads)
+    K = (p * stiffness) @ p.T
+    M = (p * mass) @ p.T + plate.mass * np.diag([1.0, 1 / 12, 1 / 12])
+    inverse = np.linalg.inv(np.linalg.cholesky(M))
+    eigenvalues = np.linalg.eigvalsh(inverse @ K @ inverse.T)
+    return np.asarray(np.sqrt(np.maximum(eigenvalues, 0.0)) / (2 * np.pi))
+
+
+def static_loads(
+    plate: Plate, eras: Sequence[Era], *, loads: Sequence[PointLoad] = ()
+) -> FloatArray:
+    """Weight [N] of the rigid plate on each ERA, and then on each spring among the loads.
+
+    At least three springs are not in one line. K q = sum of weights p, reactions k p' q.
+    """
+    p, stiffness, mass = _attached(plate, eras, loads)
+    weight = GRAVITY * (p @ mass + [plate.mass, 0, 0])
+    q = np.linalg.solve((p * stiffness) @ p.T, weight)
+    return np.asarray((stiffness * (q @ p))[stiffness > 0])
+
+
+def _attached(
+    plate: Plate, eras: Sequence[Era], loads: Sequence[PointLoad]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Factors p (3, n), stiffness [N/m] and mass [kg] (n,) of what is attached.
+
+    In units of the plate's sides, in which both tilts have the size of the heave.
+    """
+    attached = [*map(PointLoad.of_era, eras), *loads]
     mounts = [(at.x, at.y, at.stiffness, at.mass) for at in attached]
     x, y, stiffness, mass = np.array(mounts, dtype=float).reshape(-1, 4).T
-    return rigid_body_frequencies_of(plate, np.stack([x, y], axis=-1), stiffness, mass)
-
-
-def rigid_body_frequencies_of(
-    plate: Plate, places: FloatArray, stiffness: FloatArray, mass: FloatArray
-) -> FloatArray:
-    """As `rigid_body_frequencies`, (..., 3), of many layouts at once.
-
-    places [m] (..., n, 2), stiffness [N/m] and mass [kg] (..., n) of what is attached.
-    """
-    # In units of the plate's sides both tilts have the size of the heave.
-    tilts = places / [plate.length, plate.width] - 0.5
-    p = np.concatenate([np.ones_like(tilts[..., :1]), tilts], axis=-1)
-    K = (p * stiffness[..., None]).swapaxes(-1, -2) @ p
-    M = (p * mass[..., None]).swapaxes(-1, -2) @ p
-    M += plate.mass * np.diag([1.0, 1 / 12, 1 / 12])
-    inverse = np.linalg.inv(np.linalg.cholesky(M))
-    eigenvalues = np.linalg.eigvalsh(inverse @ K @ inverse.swapaxes(-1, -2))
-    return np.asarray(np.sqrt(np.maximum(eigenvalues, 0.0)) / (2 * np.pi))
+    p = np.stack([np.ones_like(x), x / plate.length - 0.5, y / plate.width - 0.5])
+    return p, stiffness, mass
 
 
 def support_problem(

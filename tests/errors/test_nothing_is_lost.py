@@ -31,9 +31,7 @@ WRITING = {
     "plate map rig.yaml --drive SW=110 -o out.png": "model.vibration.maps.plate_map",
     "calibrate rig.yaml measured.csv -o out.yaml": "model.calibration.calibrate.calibrate",
     "figure 10 rig.yaml -o figures": "model.paper.catalogue.paper_figures",
-    "study placement rig.yaml -o study --layouts 2 --candidates 3x3 --frequencies 60:90:30": (
-        "model.studies.run.run_study"
-    ),
+    "design rig.yaml -o design --layouts random:2": "model.design.run.rank_layouts",
     "report rig.yaml -o out.zip": "controller.report.collect.collect",
 }
 """Commands that write a file, or several into a folder, each with its slow function."""

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.finger.disc import FIVE_POINTS
 from model.finger.fingertip import fingertips_on
-from model.reduction.free_plate import solve_free_plate
+from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
@@ -22,18 +22,22 @@ def dense_score(
     places: FloatArray,
     sets: Sequence[FloatArray],
     frequencies: FloatArray,
-    *,
-    damping: float = 1.0,
 ) -> float:
     """Mean score [dB] by the definition: one dense system for each set, frequency and finger.
 
-    With errors of the gains only and one quiet finger; the best weights are an eigenvector.
-    damping: factor on that of the ERAs, which are like the rig's first, at places (n, 2) [m].
+    With errors of the gains and of the thickness only, whose plates are solved anew, and one quiet
+    finger; the best weights are an eigenvector. ERAs at places (n, 2) [m] are like the first.
     """
-    plate = rig.plate
-    free = solve_free_plate(plate, rig.mesh, frequency_max=float(frequencies.max()))
-    like = replace(rig.eras[0], damping=damping * rig.eras[0].damping)
-    eras = [replace(like, name=str(n), x=x, y=y) for n, (x, y) in enumerate(places)]
+    plate, std = rig.plate, rig.uncertainty.thickness
+    plates = [
+        solve_free_plate(
+            replace(plate, thickness=h * plate.thickness),
+            rig.mesh,
+            frequency_max=float(frequencies.max()),
+        )
+        for h in ((1, 1 + std, 1 - std) if std else (1,))
+    ]
+    eras = [replace(rig.eras[0], name=str(n), x=x, y=y) for n, (x, y) in enumerate(places)]
     omega = 2 * np.pi * frequencies
     z, force = attached_stiffness(eras, (), omega), drive_forces(eras, omega)
     assert rig.fingertip is not None
@@ -45,20 +49,42 @@ def dense_score(
             contacts, length=plate.length, width=plate.width, rule=FIVE_POINTS
         )
         for row in range(len(frequencies)):
-            fields = []
-            for finger, points in zip(contacts, tips, strict=True):
-                at = np.vstack([places, finger])
-                between, to = free.receptances(at, points, frequencies[row : row + 1])
-                stiffness = np.diag([*z[row], tip[row]])
-                applied = np.vstack([np.diag(force[row]), np.zeros(len(places))])
-                forces = np.linalg.solve(np.eye(len(at)) + stiffness @ between[0], applied)
-                fields.append(-(omega[row] ** 2) * to[0].T @ forces)
-            target = weights[0] @ fields[0]
-            quiet = np.sqrt(weights[1])[:, None] * fields[1]
-            R = quiet.conj().T @ quiet
-            R += sigma2 * np.diag((np.abs(quiet) ** 2).sum(axis=0))
+            attached = z[row], tip[row], force[row]
+            target, quiet = (
+                [
+                    _field(free, places, finger, points, frequencies[row], attached)
+                    for free in plates
+                ]
+                for finger, points in zip(contacts, tips, strict=True)
+            )
+            mean = weights[0] @ target[0]
+            root = np.sqrt(weights[1])[:, None]
+            changes = [root * (other - quiet[0]) for other in quiet[1:]]
+            R = sum((0.5 * each.conj().T @ each for each in changes), 0)
+            R = R + (root * quiet[0]).conj().T @ (root * quiet[0])
+            R += sigma2 * np.diag((np.abs(root * quiet[0]) ** 2).sum(axis=0))
             # Largest |h w|² / w^H R w is the one eigenvalue of R^-1 h* h^T.
-            values = np.linalg.eigvals(np.linalg.solve(R, np.outer(target.conj(), target)))
+            values = np.linalg.eigvals(np.linalg.solve(R, np.outer(mean.conj(), mean)))
             best.append(10 * np.log10(np.abs(values).max()))
         found.append(max(best))
     return float(np.mean(found))
+
+
+def _field(
+    free: FreePlate,
+    places: FloatArray,
+    finger: FloatArray,
+    points: FloatArray,
+    frequency: float,
+    attached: tuple[ComplexArray, complex, ComplexArray],
+) -> ComplexArray:
+    """Acceleration at points (p, 2) under a finger on the plate, of each ERA alone: (p, n).
+
+    attached: dynamic stiffness of the ERAs (n,) and of the finger, force of the ERAs (n,).
+    """
+    z, tip, force = attached
+    at = np.vstack([places, finger])
+    between, to = free.receptances(at, points, np.array([frequency]))
+    applied = np.vstack([np.diag(force), np.zeros(len(places))])
+    forces = np.linalg.solve(np.eye(len(at)) + np.diag([*z, tip]) @ between[0], applied)
+    return np.asarray(-((2 * np.pi * frequency) ** 2) * to[0].T @ forces)

@@ -49,7 +49,7 @@ _LOADED = (
     "controller.gateway.serving",
     "model.commands.progress",
     "model.fem.modal",
-    "model.studies.run",
+    "model.design.run",
     "model.table.build",
     "scipy.ndimage",
     "sim.memory_line",

@@ -10,19 +10,21 @@ from pathlib import Path
 
 import numpy as np
 
+from model.design.area import area_of
+from model.design.contacts import anywhere
+from model.design.layouts import layouts_of
+from model.design.problem import DesignProblem
+from model.design.search import LayoutSearch
 from model.drive_modes import DRIVE_MODES
 from model.fem.assembly import assemble
 from model.fem.modal import modes
-from model.studies.solve import solve_cases
 from model.table.build import build_in_parts
 from model.table.query import query_table
 from model.table.question import Question
 from model.table.timing import Timing
 from model.version import NUMERICS_VERSION
-from model.vibration.activation import MEDIAN
 from paper_plate import make_paper_rig
 from small_table import small_problem
-from studies import small_study
 
 RECORD = Path(__file__).parents[1] / "model" / "reference_figures.json"
 
@@ -49,9 +51,10 @@ def reference_figures() -> dict[str, list[float]]:
         "table_discretisation_error": table.discretisation_error,
         "table_shapes": np.linalg.norm(table.shapes[:, :8], axis=0),
     }
-    study, cases = small_study(layouts=8)
-    results = solve_cases(study.solve(), cases)
-    figures["study_medians"] = results.statistics[:, :, MEDIAN].ravel()
+    problem = DesignProblem(rig, 4, area_of("edge", rig.plate), anywhere(rig.plate))
+    layouts = layouts_of("random:8", problem)
+    scored = LayoutSearch(problem).scored(list(layouts.values()))
+    figures["layout_scores_db"] = np.array([each.score_db for each in scored])
     timing = Timing(table)
     for drive_mode in DRIVE_MODES:
         for name, quiet in CONTACTS.items():

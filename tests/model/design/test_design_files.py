@@ -5,7 +5,7 @@ import pytest
 from matplotlib.image import imsave
 
 from model.design.area import area_of
-from model.design.contacts import load_contacts_file
+from model.design.contacts import contact_rule
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 
@@ -78,7 +78,7 @@ def test_regions_off_the_plate_are_refused(tmp_path, shape) -> None:
         f"  off: {{{shape}}}\n"
     )
     with pytest.raises(InputError, match=r"contacts\.yaml:3: regions\.off.*\(0\.3048, 0\.2286\) m"):
-        load_contacts_file(path, PLATE)
+        contact_rule(path, PLATE)
 
 
 def test_contacts_in_regions_of_a_layout(tmp_path) -> None:
@@ -89,7 +89,7 @@ def test_contacts_in_regions_of_a_layout(tmp_path) -> None:
         "  a: {rectangle: {start: [0, 0], end: [5 cm, 5 cm]}, on_press: click}\n"
         "  b: {circle: {at: [20 cm, 10 cm], radius: 4 cm}}\n"
     )
-    rule = load_contacts_file(path, PLATE)
+    rule = contact_rule(path, PLATE)
     for contacts in [*rule.sets(20, seed=1), *rule.pooled_sets(10, seed=1)]:
         assert len(contacts) == 3
         in_a = (contacts <= 0.05).all(axis=1)
@@ -117,7 +117,7 @@ def test_files_of_contacts_that_say_nothing_are_refused(tmp_path, text) -> None:
     path = tmp_path / "contacts.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=r"contacts\.yaml"):
-        load_contacts_file(path, PLATE)
+        contact_rule(path, PLATE)
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,18 @@ import numpy as np
 import pytest
 
 from dense_contrast import GAINS, dense_score
-from model.design import search as search_module
+from model.design import problem as problem_module
 from model.design.area import Edge, Within, area_of, candidates_of, everywhere
 from model.design.contacts import ContactRule, anywhere
 from model.design.judge import judge
-from model.design.search import DesignProblem, LayoutSearch
-from model.design.support import SupportRule, static_loads
+from model.design.layouts import layouts_of
+from model.design.problem import DesignProblem
+from model.design.search import LayoutSearch
+from model.design.support import shortfall
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.structure.actuator import Era
+from model.structure.support import static_loads
 
 
 @cache
@@ -27,26 +30,26 @@ def rig():
 
 def test_search_finds_the_best_of_all_layouts_on_a_coarse_raster(monkeypatch) -> None:
     """The best of some starts is the best of all triples of ERAs that a dense solve gives."""
-    monkeypatch.setitem(search_module.CANDIDATES, True, 7)
-    monkeypatch.setattr(search_module, "SEARCH_FREQUENCIES", 2)
+    monkeypatch.setitem(problem_module.CANDIDATES, True, 7)
+    monkeypatch.setattr(problem_module, "SEARCH_FREQUENCIES", 2)
     # Weights of any kind reach the level, so that it does not matter.
     strong = tuple(replace(era, stroke=0.01) for era in rig().eras)
     loud = replace(rig(), uncertainty=GAINS, eras=strong)
     pairs = tuple(replace(anywhere(loud.plate), quiet=(1, 1)).sets(4, seed=4))
     rule = ContactRule((1, 1), 0.05, lambda rng, n: np.zeros((n, 2)), pairs, "given")
     search = LayoutSearch(problem(rig=loud, count=3, contacts=rule))
-    candidates = candidates_of(search.problem.area, loud.plate, count=8)
+    candidates = search.problem.candidates
     ends = np.array([loud.limits.frequency_min, loud.limits.frequency_max])
     dense = {}
     for triple in combinations(range(len(candidates)), 3):
         places = candidates[list(triple)]
-        if SupportRule(loud, 20.0).shortfall(search.problem.eras(places)) == 0:
+        if search.problem.shortfall(places) == 0:
             dense[triple] = dense_score(loud, places, pairs, ends)
             assert search.value(triple) == pytest.approx(dense[triple], abs=0.05)
     rng = np.random.default_rng(0)
     starts = [
         search.add(search.add(search.add(()))),
-        *(search.random_layout(rng) for _ in range(4)),
+        *(tuple(sorted(rng.choice(8, 3, replace=False).tolist())) for _ in range(4)),
     ]
     found = max(map(search.exchange, starts), key=search.value)
     assert len(dense) >= 20
@@ -66,23 +69,24 @@ def problem(**changes) -> DesignProblem:
 
 def test_further_eras_never_score_less(monkeypatch) -> None:
     """The best layout of ever more ERAs has ever more contrast, and moved places no less."""
-    monkeypatch.setitem(search_module.CANDIDATES, True, 16)
+    monkeypatch.setitem(problem_module.CANDIDATES, True, 16)
     search = LayoutSearch(problem())
-    layout, values = search.kept_layout(), []
+    layout: tuple[int, ...] = ()
+    values = []
     for _ in range(4):
         layout = search.add(layout)
         values.append(search.value(layout))
     assert values == sorted(values)
     found = search.refine(layout)
     assert found.score_db >= search.value(layout) - 1e-3
-    assert search.at(found.positions) == pytest.approx(found.score_db, abs=0.02)
+    (again,) = search.scored([found.positions])
+    assert again.score_db == pytest.approx(found.score_db, abs=0.02)
 
 
 def test_kept_eras_stay_and_all_keep_their_distance() -> None:
     """A start at random, exchanged and moved, leaves what is kept and the least distance."""
     search = LayoutSearch(problem(kept=("SW", "NE"), apart=0.08))
-    layout = search.random_layout(np.random.default_rng(2))
-    found = search.refine(search.exchange(layout, sweeps=1))
+    found = search.from_random(np.random.default_rng(2))
     plate = rig().plate
     assert found.positions[:2].tolist() == [[0, 0], [plate.length, plate.width]]
     gaps = np.linalg.norm(found.positions[:, None] - found.positions, axis=-1)
@@ -93,13 +97,10 @@ def test_kept_eras_stay_and_all_keep_their_distance() -> None:
 @pytest.mark.long
 def test_search_beats_the_rigs_corners_on_fresh_contact_sets(monkeypatch) -> None:
     """Answers of the table for contacts that the search has not seen confirm what it found."""
-    monkeypatch.setitem(search_module.CANDIDATES, True, 24)
+    monkeypatch.setitem(problem_module.CANDIDATES, True, 24)
     case = problem(rig=replace(rig(), uncertainty=GAINS))
     search = LayoutSearch(case)
-    layout = search.kept_layout()
-    for _ in range(4):
-        layout = search.add(layout)
-    found = search.refine(search.exchange(layout, sweeps=1))
+    *_, found = search.path()
     sets = case.contacts.sets(40, seed=99)
     corners = np.array([[era.x, era.y] for era in case.rig.eras])
     ours, theirs = (judge(case.rig_with(at), sets) for at in (found.positions, corners))
@@ -116,12 +117,12 @@ def test_static_loads_of_a_seesaw() -> None:
         for number, (x, y) in enumerate([(0, 0), (length, 0), (length / 2, width)])
     ]
     weight = 9.81 * some.plate.mass
-    assert static_loads(some, eras) == pytest.approx([weight / 4, weight / 4, weight / 2])
-    assert SupportRule(some, 10.0).shortfall(eras) == 0
+    assert static_loads(some.plate, eras) == pytest.approx([weight / 4, weight / 4, weight / 2])
+    assert shortfall(some, eras, lowest=10.0) == 0
     # The centre of mass behind all of them: the plate tips.
     tipping = [replace(era, y=0.2 * era.y) for era in eras]
-    assert SupportRule(some, 1.0).shortfall(tipping) > 0
-    assert SupportRule(some, 1e4).shortfall(eras) > 0
+    assert shortfall(some, tipping, lowest=1.0) > 0
+    assert shortfall(some, eras, lowest=1e4) > 0
 
 
 def test_steps_along_the_edge_turn_its_corners() -> None:
@@ -137,9 +138,9 @@ def test_steps_along_the_edge_turn_its_corners() -> None:
 def test_area_without_room_is_refused() -> None:
     """Too many ERAs too far apart, and no place at all, are named."""
     with pytest.raises(InputError, match=r"room"):
-        LayoutSearch(problem(apart=0.3)).random_layout(np.random.default_rng(0))
+        problem(apart=0.3).random_layout(np.random.default_rng(0))
     plate = rig().plate
-    nowhere = Within(plate.length, plate.width, lambda points: ~everywhere(points))
+    nowhere = Within("none", plate.length, plate.width, lambda points: ~everywhere(points))
     with pytest.raises(InputError, match=r"--where"):
         candidates_of(nowhere, plate, count=20)
 
@@ -152,3 +153,66 @@ def test_era_without_foot_is_like_the_others() -> None:
     eras: tuple[Era, ...] = case.eras(np.zeros((3, 2)))
     assert [era.name for era in eras] == ["E1", "E2", "E3"]
     assert [era.stroke for era in eras] == [5e-5, 1e-4, 1e-4]
+
+
+def test_scores_count_plates_of_other_thickness_exactly(monkeypatch) -> None:
+    """As plates that are solved anew, dense: 4 % of thickness move resonances past a tone."""
+    monkeypatch.setattr(problem_module, "SEARCH_FREQUENCIES", 2)
+    strong = tuple(replace(era, stroke=0.01) for era in rig().eras)
+    loud = replace(rig(), uncertainty=replace(GAINS, thickness=0.04), eras=strong)
+    pairs = tuple(replace(anywhere(loud.plate), quiet=(1, 1)).sets(4, seed=4))
+    rule = ContactRule((1, 1), 0.05, lambda rng, n: np.zeros((n, 2)), pairs, "given")
+    some = problem(rig=loud, contacts=rule)
+    (found,) = LayoutSearch(some).scored([some.own_positions])
+    dense = dense_score(loud, some.own_positions, pairs, some.searched_frequencies)
+    assert found.score_db == pytest.approx(dense, abs=0.05)
+    certain = replace(loud, uncertainty=GAINS)
+    assert dense < dense_score(certain, some.own_positions, pairs, some.searched_frequencies) - 1
+
+
+def test_given_layouts_are_the_rigs_own_named_and_random_ones(tmp_path) -> None:
+    """Each once, in the area and apart; a longer list begins with a shorter one."""
+    some = problem()
+    few, many = layouts_of("random:12", some), layouts_of("random:40", some)
+    assert list(many)[:12] == list(few)
+    assert list(few)[:4] == ["own", "mid-edges", "long edges", "short edges"]
+    assert len(many) == 40
+    assert len({each.round(6).tobytes() for each in many.values()}) == 40
+    assert all(some.are_apart(each) and some.area.contains(each).all() for each in many.values())
+    path = tmp_path / "layouts.yaml"
+    path.write_text("layouts:\n  three: [[0, 0], [30 cm, 0], [15 cm, 22 cm]]\n")
+    given = layouts_of(str(path), replace(some, kept=("NE",)))
+    assert given["three"].tolist() == [[0.3048, 0.2286], [0, 0], [0.3, 0], [0.15, 0.22]]
+
+
+def test_layouts_on_a_small_raster_are_all_there_are(monkeypatch) -> None:
+    """Of four corners and nothing between them three can be chosen in four ways."""
+    monkeypatch.setitem(problem_module.CANDIDATES, True, 4)
+    some = problem(count=3, apart=0.1)
+    count = len(some.candidates)
+    given = layouts_of("random:100", some)
+    random = [each for name, each in given.items() if name.startswith("3-")]
+    named = [each for each in given.values() if some.area.contains(each).all()]
+    choices = [some.candidates[list(each)] for each in combinations(range(count), 3)]
+    assert len(random) + sum(
+        any((np.sort(a, axis=0) == np.sort(b, axis=0)).all() for b in choices)
+        for a in named[: len(named) - len(random)]
+    ) == sum(map(some.are_apart, choices))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "layouts: {}",
+        "layouts: {two: [[0, 0], [0.3, 0]]}",
+        "layouts: {off: [[0, 0], [0.3, 0], [0.9, 0.1]]}",
+        "layouts: {near: [[0, 0], [0.3, 0], [0.31, 0]]}",
+        "places: {}",
+    ],
+)
+def test_files_of_layouts_that_cannot_be_ranked_are_refused(tmp_path, text) -> None:
+    """None, too few ERAs, one off the plate, two too near, another key."""
+    path = tmp_path / "layouts.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"layouts\.yaml"):
+        layouts_of(str(path), problem())

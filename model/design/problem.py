@@ -1,0 +1,175 @@
+"""What is sought: a number of ERAs, where they may stand, and the contacts they serve."""
+
+import json
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from model.arrays import FloatArray, IntArray
+from model.design.area import Edge, Within, candidates_of
+from model.design.contacts import ContactRule
+from model.design.support import DEFAULT_LOWEST, MIN_SUPPORTING, shortfall
+from model.errors import InputError
+from model.rig.rig import Rig
+from model.structure.actuator import Era
+from model.table.table import default_drive_frequencies
+from model.version import NUMERICS_VERSION
+
+CANDIDATES = {True: 48, False: 80}
+"""Candidates along the edge, and over an area."""
+
+SEARCH_FINGERS, SEARCH_FREQUENCIES = 32, 16
+
+JUDGED_SETS = 200
+"""Contact sets by which layouts are judged, other than those of the search."""
+
+DEFAULT_APART = 0.03
+"""Least distance [m] of two ERAs."""
+
+_JUDGED_SEED = 0x5EED  # added to that of a search, whose own sets are others
+
+
+@dataclass(frozen=True, eq=False)
+class DesignProblem:
+    """What is sought.
+
+    kept: ERAs of the rig that stay, by name; count: of all ERAs; apart [m]: least distance of two;
+    lowest [Hz]: least rigid-body frequency; stiffness [N/m]: of ERAs that do not stay, None: that
+    of the rig's. Raises InputError for fewer ERAs than can support the plate.
+    """
+
+    rig: Rig
+    count: int
+    area: Edge | Within
+    contacts: ContactRule
+    kept: tuple[str, ...] = ()
+    apart: float = DEFAULT_APART
+    lowest: float = DEFAULT_LOWEST
+    seed: int = 0
+    stiffness: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the number of ERAs."""
+        if self.count + self.supports < MIN_SUPPORTING:
+            raise InputError(
+                f"--eras must be at least {MIN_SUPPORTING - self.supports} to support the plate, "
+                f"got {self.count}"
+            )
+
+    @property
+    def text(self) -> str:
+        """All that scores and answers depend on."""
+        rig = self.rig
+        parts = [
+            rig.fingerprint,
+            rig.mesh.to_dict(),
+            list(self.kept),
+            [rig.limits.frequency_min, rig.limits.frequency_max],
+            self.area.text,
+            self.contacts.text,
+            self.apart,
+            self.lowest,
+            self.count,
+            self.seed,
+            self.stiffness,
+            [NUMERICS_VERSION, JUDGED_SETS, *CANDIDATES.values()],
+        ]
+        return json.dumps(parts, sort_keys=True)
+
+    @property
+    def supports(self) -> int:
+        """Mounts beside the ERAs."""
+        return sum(load.stiffness > 0 for load in self.rig.masses)
+
+    @property
+    def kept_positions(self) -> FloatArray:
+        """Places [m] of the ERAs that stay, (k, 2)."""
+        eras = [self.rig.era(name) for name in self.kept]
+        return np.array([[era.x, era.y] for era in eras]).reshape(-1, 2)
+
+    @property
+    def own_positions(self) -> FloatArray:
+        """Places [m] of the rig's own ERAs, (eras, 2)."""
+        return np.array([[era.x, era.y] for era in self.rig.eras])
+
+    @property
+    def like(self) -> Era:
+        """The rig's ERA like which those are that do not stay."""
+        return next((era for era in self.rig.eras if era.name not in self.kept), self.rig.eras[0])
+
+    def eras(self, positions: FloatArray) -> tuple[Era, ...]:
+        """ERAs at positions [m] (n, 2): those kept, and more like the first of the others.
+
+        Named E1, E2, ... by names that no kept ERA has.
+        """
+        like = self.like
+        if self.stiffness is not None:
+            like = replace(like, stiffness=self.stiffness)
+        names = (name for number in range(1, 999) if (name := f"E{number}") not in self.kept)
+        return tuple(self.rig.era(name) for name in self.kept) + tuple(
+            replace(like, name=next(names), x=float(x), y=float(y))
+            for x, y in positions[len(self.kept) :]
+        )
+
+    def rig_with(self, positions: FloatArray) -> Rig:
+        """The rig with ERAs at positions, without wiring."""
+        return replace(self.rig, eras=self.eras(positions), wiring={}, amplifiers={})
+
+    def shortfall(self, positions: FloatArray) -> float:
+        """How far ERAs at positions are from supporting the plate, 0 if they do."""
+        return shortfall(self.rig, self.eras(positions), lowest=self.lowest)
+
+    @property
+    def searched_frequencies(self) -> FloatArray:
+        """Frequencies [Hz] of the scores, some of those of the rig's tables, (f,)."""
+        every = default_drive_frequencies(self.rig.limits)
+        chosen = np.linspace(0, len(every) - 1, min(len(every), SEARCH_FREQUENCIES)).round()
+        return np.asarray(every[chosen.astype(int)])
+
+    def judged_sets(self) -> list[FloatArray]:
+        """Contact sets that no search has seen, (fingers, 2) [m] each, target first."""
+        return self.contacts.sets(JUDGED_SETS, seed=self.seed + _JUDGED_SEED)
+
+    @cached_property
+    def candidates(self) -> FloatArray:
+        """Places [m] from which a search begins, (c, 2); raises InputError where there are none."""
+        is_edge = isinstance(self.area, Edge)
+        return candidates_of(self.area, self.rig.plate, count=CANDIDATES[is_edge])
+
+    def open_candidates(self, positions: FloatArray) -> IntArray:
+        """Numbers of candidates far enough from positions (n, 2) [m].
+
+        Raises InputError where there are none.
+        """
+        gaps = np.linalg.norm(self.candidates[:, None] - positions, axis=-1)
+        found = np.flatnonzero(gaps.min(axis=1, initial=np.inf) >= self.apart)
+        if not len(found):
+            raise InputError(
+                f"--where must have room for {self.count} ERAs {1000 * self.apart:g} mm apart, got "
+                f"room for {len(positions)}; enlarge it, or lower --eras or --apart"
+            )
+        return found
+
+    def are_apart(self, positions: FloatArray) -> bool:
+        """Whether positions (n, 2) [m] keep the least distance."""
+        gaps = np.linalg.norm(positions[:, None] - positions, axis=-1)
+        return bool(gaps[np.triu_indices(len(gaps), 1)].min(initial=np.inf) >= self.apart)
+
+    def random_layout(self, rng: np.random.Generator) -> FloatArray:
+        """ERAs at candidates by chance, those kept first, far enough apart: (count, 2) [m].
+
+        Raises InputError where there is no room for so many.
+        """
+        found = self.kept_positions
+        while len(found) < self.count:
+            place = self.candidates[rng.choice(self.open_candidates(found))]
+            found = np.vstack([found, place])
+        return found
+
+
+def spacing_of(places: FloatArray) -> float:
+    """Median distance [m] of places (c, 2) to their nearest neighbour, at most 0.1 m."""
+    gaps = np.linalg.norm(places[:, None] - places, axis=-1)
+    np.fill_diagonal(gaps, np.inf)
+    return float(np.median(np.minimum(gaps.min(axis=1), 0.1)))

@@ -1,1 +1,0 @@
-"""Design studies: placement, number and stiffness of ERAs, over many layouts."""

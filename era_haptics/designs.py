@@ -14,7 +14,7 @@ from model.arguments import (
 )
 from model.design.area import EDGE, area_of
 from model.design.contacts import contact_rule
-from model.design.layouts import layouts_of
+from model.design.layouts import supported_layouts
 from model.design.problem import DEFAULT_APART, DesignProblem
 from model.design.run import DEFAULT_FINALISTS, Layout, Runner, rank_layouts, search_layouts
 from model.design.support import DEFAULT_LOWEST
@@ -81,7 +81,7 @@ def design(
     if layouts is None:
         found = search_layouts([problem], starts=starts, runner=runner)
     else:
-        given = {problem: layouts_of(fspath(layouts), problem)}
+        given = supported_layouts(fspath(layouts), [problem])
         found = rank_layouts(given, finalists=finalists, runner=runner)
     return tuple(map(_ranked, found.layouts))
 

@@ -108,7 +108,7 @@ def design(
     from model.config.units import LENGTH
     from model.design.area import area_of
     from model.design.contacts import contact_rule
-    from model.design.layouts import layouts_of
+    from model.design.layouts import supported_layouts
     from model.design.outcome import summary, write_design
     from model.design.problem import DesignProblem
     from model.design.run import Runner, rank_layouts, search_layouts, worthwhile_count
@@ -143,7 +143,7 @@ def design(
         for count in counts
         for each in _stiffnesses(stiffness)
     ]
-    given = {problem: layouts_of(layouts, problem) for problem in problems} if layouts else {}
+    given = supported_layouts(layouts, problems) if layouts else {}
     output.mkdir(parents=True, exist_ok=True)
     runner = Runner(output, machines, progress_bar)
     try:

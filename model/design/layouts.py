@@ -1,7 +1,7 @@
 """Lists of layouts to be ranked: of a file, or the rig's own, those with a name, random ones."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -36,6 +36,22 @@ class _LayoutsSection(Section):
         dict[str, Annotated[list[PointSection], Field(min_length=1, max_length=32)]],
         Field(min_length=1),
     ]
+
+
+def supported_layouts(
+    text: str, problems: Sequence[DesignProblem]
+) -> dict[DesignProblem, NamedLayouts]:
+    """The `layouts_of` each problem; raises InputError where none supports the plate."""
+    given = {problem: layouts_of(text, problem) for problem in problems}
+    if not any(
+        problem.shortfall(each) == 0 for problem in given for each in given[problem].values()
+    ):
+        raise InputError(
+            f"a layout of --layouts must support the plate with its lowest rigid-body frequency at "
+            f"least {problems[0].lowest:g} Hz and weight on each ERA, got none that does; add ERAs "
+            "or stiffer ones, widen --where, or lower --lowest"
+        )
+    return given
 
 
 def layouts_of(text: str, problem: DesignProblem) -> NamedLayouts:

@@ -198,10 +198,7 @@ def search_layouts(problems: Sequence[DesignProblem], *, starts: int, runner: Ru
 def rank_layouts(
     given: Mapping[DesignProblem, NamedLayouts], *, finalists: int, runner: Runner
 ) -> Design:
-    """Rank given layouts: by score, and the first of each problem by what they are judged.
-
-    Raises InputError where none supports the plate.
-    """
+    """Rank given layouts, some of which support the plate; the first few of each problem are judged."""
     problems = list(given)
     chunks = [
         (number, dict(list(given[problem].items())[at : at + CHUNK]))
@@ -224,12 +221,6 @@ def rank_layouts(
     order = best_first([each.found.score_db for each in layouts]).tolist()
     ranked = [layouts[each] for each in order]
     supported = [each for each in ranked if each.found.is_supported]
-    if not supported:
-        raise InputError(
-            f"a layout must support the plate with its lowest rigid-body frequency at least "
-            f"{problems[0].lowest:g} Hz and weight on each ERA, got {len(layouts)} of which none "
-            "does; add ERAs or stiffer ones, widen --where, or lower --lowest"
-        )
     chosen = []
     for problem in problems:
         chosen += [each for each in supported if each.problem is problem][:finalists]

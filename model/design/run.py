@@ -198,7 +198,7 @@ def search_layouts(problems: Sequence[DesignProblem], *, starts: int, runner: Ru
 def rank_layouts(
     given: Mapping[DesignProblem, NamedLayouts], *, finalists: int, runner: Runner
 ) -> Design:
-    """Rank given layouts, some of which support the plate; the first few of each problem are judged."""
+    """Rank given layouts, some of which support the plate; of each problem the first are judged."""
     problems = list(given)
     chunks = [
         (number, dict(list(given[problem].items())[at : at + CHUNK]))

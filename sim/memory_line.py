@@ -7,7 +7,6 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Sequence
 
-from drivers import clock
 from drivers.errors import LinkError
 from drivers.hardware import number_below
 from drivers.host.serial_wire import SerialWire
@@ -39,7 +38,7 @@ class MemoryPort:
         self._on_data, self._on_loss = on_data, on_loss
         self._end = SerialAmplifiers({each.address: each for each in devices}, self._reply)
         self._wire = TwoWayLine(
-            to_amplifier=lambda data: self._end.receive(data, clock.now()),
+            to_amplifier=self._end.receive,
             to_host=self._deliver,
             faults=self._first.faults,
         )

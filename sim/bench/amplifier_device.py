@@ -1,17 +1,50 @@
-"""A simulated amplifier as its far ends serve it: on a bench, with faults."""
+"""A simulated amplifier as its far ends serve it: on a bench, with faults at their times."""
 
+import asyncio
+import math
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal, TypeAlias
 
+from drivers import clock
 from drivers.protocol.records import Refusal, Values
-from sim.bench.faulted_device import FaultedDevice
+from sim.amplifier.thermal_model import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
+from sim.bench.bench import Bench
+from sim.faults.fault_window import Faults, FaultWindow
 
 
-class AmplifierDevice(FaultedDevice):
-    """An amplifier of a bench by name, as `sim.amplifier.contract.AmplifierPort`.
+class AmplifierDevice:
+    """An amplifier of a bench by name, as `sim.amplifier.contract.AmplifierPort`, with its faults.
 
     Requests advance the bench, and what they change moves its plate. In a storm of Naks it refuses
-    all of them but Hello.
+    all of them but Hello. address: on its wire, from 1; plug_listeners: called when the wire is
+    unplugged (False) and plugged in again (True); boot_listeners: when its supply is back. Its time
+    is that of the running event loop.
     """
+
+    def __init__(
+        self, bench: Bench, name: str, *, address: int = 1, faults: Faults | None = None
+    ) -> None:
+        self.name = name
+        self.address = address
+        self.faults = Faults() if faults is None else faults
+        self._bench = bench
+        self._amplifier = bench.amplifiers[name]
+        self.plug_listeners: list[Callable[[bool], None]] = []
+        self.boot_listeners: list[Callable[[], None]] = []
+        self._unplugged = 0  # active unplug faults
+        self._timers: list[asyncio.TimerHandle] = []
+
+    @property
+    def is_answering(self) -> bool:
+        """Whether it replies at all: neither hung nor without supply."""
+        now = clock.now()
+        return not (self.faults.now("hang", now) or self.faults.now("reboot", now))
+
+    @property
+    def is_plugged(self) -> bool:
+        """Whether its wire is plugged in."""
+        return self._unplugged == 0
 
     @property
     def identity(self) -> Values:
@@ -58,3 +91,83 @@ class AmplifierDevice(FaultedDevice):
         self._bench.advance(moment)
         self._amplifier.restart(moment)
         self._bench.advance(moment)
+
+    def start(self) -> None:
+        """Schedule the fault windows, in the running event loop."""
+        for window in self.faults.windows:
+            self._schedule(window)
+
+    def inject_fault(self, window: FaultWindow) -> None:
+        """Add a fault that begins now, whatever its `at`."""
+        now = clock.now()
+        window = replace(window, at=now - self.faults.begin)
+        self.faults.windows = (*self.faults.windows, window)
+        self._schedule(window)
+
+    def recover(self) -> None:
+        """End all active faults, and cancel the scheduled ones."""
+        self.close()
+        over = clock.now() - self.faults.begin
+        active = [window for window in self.faults.windows if window.at <= over < window.end]
+        self.faults.windows = ()
+        for window in active:
+            self._handle_edge(replace(window, lasts=over - window.at), "end")
+
+    def close(self) -> None:
+        """Cancel the scheduled faults."""
+        for timer in self._timers:
+            timer.cancel()
+        self._timers.clear()
+
+    def _schedule(self, window: FaultWindow) -> None:
+        """Schedule the start, middle and end of a fault window."""
+        begin = self.faults.begin + window.at - clock.now()
+        edges: dict[_Edge, float] = {
+            "begin": begin,
+            "half": begin + window.lasts / 2,
+            "end": begin + window.lasts,
+        }
+        loop = asyncio.get_running_loop()
+        for edge, delay in edges.items():
+            if edge == "begin" and delay <= 0:
+                self._handle_edge(window, edge)
+            elif delay < math.inf:
+                self._timers.append(loop.call_later(delay, self._handle_edge, window, edge))
+
+    def _handle_edge(self, window: FaultWindow, edge: "_Edge") -> None:
+        """Apply an edge (begin, half, end) of a fault window."""
+        now = clock.now()
+        self._bench.advance(now)
+        match window.fault, edge:
+            case "unplug", "begin":
+                self._unplugged += 1
+                if self._unplugged == 1:
+                    self._plug(is_plugged=False)
+            case "unplug", "end":
+                self._unplugged -= 1
+                if self._unplugged == 0:
+                    self._plug(is_plugged=True)
+            case "reboot", "begin":
+                self._amplifier.restart(now)
+            case "reboot", "end":
+                for on_boot in self.boot_listeners:
+                    on_boot()
+            case ("over_voltage" | "arc" | "over_current" | "channel") as fault, "begin":
+                self._amplifier.trip(fault.upper(), now)
+            case "interlock", "begin" | "end":
+                self._amplifier.set_interlock(now, is_open=edge == "begin")
+            case "over_temperature", _:
+                self._amplifier.set_temperature(_TEMPERATURES[edge], now)
+        self._bench.advance(now)
+
+    def _plug(self, *, is_plugged: bool) -> None:
+        for on_plug in [*self.plug_listeners]:
+            on_plug(is_plugged)
+
+
+_Edge: TypeAlias = Literal["begin", "half", "end"]
+_TEMPERATURES: dict[_Edge, float] = {
+    "begin": DERATE_ABOVE + 1,
+    "half": FAULT_ABOVE + 1,
+    "end": AMBIENT,
+}

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from model.errors import InputError
+from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
-from sim.bench.faulted_device import FaultedDevice
 from sim.plant.imperfections import PlateErrors
 from sim.sensors.accelerometer import Accelerometers
 from sim.sensors.recorder import Recorder
@@ -22,7 +22,7 @@ class SimulationContext:
     """
 
     bench: Bench
-    devices: Mapping[str, FaultedDevice] = field(default_factory=dict)
+    devices: Mapping[str, AmplifierDevice] = field(default_factory=dict)
     urls: Mapping[str, str] = field(default_factory=dict)
     step: Callable[[float], Coroutine[Any, Any, None]] | None = None
     recorder: Recorder | None = None
@@ -80,7 +80,7 @@ class SimulationContext:
         recorder.stop()
         return recorder
 
-    def devices_of(self, amplifier: str | None) -> Sequence[FaultedDevice]:
+    def devices_of(self, amplifier: str | None) -> Sequence[AmplifierDevice]:
         """The device of an amplifier, or all devices; InputError for an unknown name."""
         if amplifier is None:
             return tuple(self.devices.values())

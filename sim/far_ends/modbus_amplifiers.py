@@ -7,7 +7,7 @@ Not modelled: parity and collisions on a serial line.
 """
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
@@ -25,9 +25,7 @@ from sim.far_ends.modbus.pdu import (
     registers_read,
     to_write,
 )
-
-FRAME_TIMEOUT = 0.02
-"""Longest pause [s] within an RTU frame: less than the 30 ms after which a host repeats it."""
+from sim.transport.far_end import FarEnd, Send
 
 _MARGIN = 0.001  # s; behind the end of a pause, which must be exceeded
 _BOX = 256  # registers of a message
@@ -41,13 +39,13 @@ _BROADCAST = 0
 _PRESENT = ("GetCaps", "GetStatus", "GetFaults")
 
 
-class ModbusAmplifiers:
+class ModbusAmplifiers(FarEnd):
     """Amplifiers by their units on one line or port; send: called with the bytes for the host."""
 
     def __init__(
         self,
         amplifiers: Mapping[int, AmplifierPort],
-        send: Callable[[bytes], None],
+        send: Send,
         *,
         is_rtu: bool,
     ) -> None:
@@ -55,14 +53,12 @@ class ModbusAmplifiers:
         self._send = send
         self._is_rtu = is_rtu
         self._reader: RtuReader | TcpReader = RtuReader() if is_rtu else TcpReader()
-        if is_rtu:
-            self._reader.timeout = FRAME_TIMEOUT
 
     def receive(self, data: bytes, now: float) -> None:
         """Take bytes from the host at a time [s]."""
         self._take(self._reader.feed(data, now), now)
 
-    def of_connection(self, send: Callable[[bytes], None]) -> "ModbusAmplifiers":
+    def of_connection(self, send: Send) -> "ModbusAmplifiers":
         """Return the same units for another connection; send: see above."""
         other = ModbusAmplifiers({}, send, is_rtu=self._is_rtu)
         other._units = self._units
@@ -182,7 +178,7 @@ class _Unit:
 
 def _written(pdu: bytes) -> tuple[Message, int, Sequence[int]]:
     """Return the message that is written, its tag and words; raises ModbusException."""
-    address, (tag, *words) = to_write(WRITE, pdu[1:])
+    address, (tag, *words) = to_write(pdu[1:])
     number, offset = divmod(address, _BOX)
     if offset or number not in BY_NUMBER or len(words) > MAX_WORDS:
         raise ModbusException(ILLEGAL_ADDRESS)

@@ -3,8 +3,7 @@
 On a shared line amplifiers have one address each, and send no events.
 """
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from drivers.codec.serial_line.frame import NEUTRAL, REPLY, Frame, FrameReader, encode_frame
 from drivers.protocol.records import Refusal, Values
@@ -25,14 +24,13 @@ from drivers.protocol.table import (
     read_request,
 )
 from sim.amplifier.contract import AmplifierPort
+from sim.transport.far_end import FarEnd, Send
 
 
-class SerialAmplifiers:
+class SerialAmplifiers(FarEnd):
     """Amplifiers by their addresses on one line; send: called with the bytes for the host."""
 
-    def __init__(
-        self, amplifiers: Mapping[int, AmplifierPort], send: Callable[[bytes], None]
-    ) -> None:
+    def __init__(self, amplifiers: Mapping[int, AmplifierPort], send: Send) -> None:
         self._amplifiers = dict(amplifiers)
         self._send = send
         self._reader = FrameReader()
@@ -40,11 +38,6 @@ class SerialAmplifiers:
         self._heard = [*amplifiers.values()] if len(amplifiers) == 1 else []
         for amplifier in self._heard:
             amplifier.listeners.append(self._send_event)
-
-    next_event = math.inf
-
-    def tick(self, now: float) -> None:
-        """Do nothing: nothing is due by itself."""
 
     def close(self) -> None:
         """Send no more events."""

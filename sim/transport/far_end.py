@@ -3,95 +3,105 @@
 import asyncio
 import math
 import socket
-from collections.abc import Callable, Sequence
-from typing import Protocol, cast
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Self, cast
 
 from drivers import clock
-from sim.bench.faulted_device import FaultedDevice
+from drivers.errors import LinkError
+from sim.bench.amplifier_device import AmplifierDevice
+from sim.faults.fault_window import Faults
 from sim.transport.line import TwoWayLine
-from sim.transport.loopback import listen, port_of
 from sim.transport.pseudo_terminal import make_terminal
 
+HOST = "127.0.0.1"
 _MAX_CONNECTIONS = 16
 _MAX_UNSENT = 16384  # bytes; then a client that does not read is disconnected
 
 
-class FarEnd(Protocol):
-    """The amplifiers' side of a wire, without I/O."""
+class FarEnd(ABC):
+    """The amplifiers' side of a wire, without I/O; by default nothing is due by itself."""
 
     @property
     def next_event(self) -> float:
         """Time [s] at which it is to be ticked; infinite: never."""
+        return math.inf
 
-    def tick(self, now: float) -> None:
-        """Process what is due by a time [s]."""
-
+    @abstractmethod
     def receive(self, data: bytes, now: float) -> None:
         """Take bytes from the host at a time [s]."""
 
+    def tick(self, now: float) -> None:  # noqa: B027
+        """Process what is due by a time [s]."""
 
-MakeEnd = Callable[[Callable[[bytes], None]], FarEnd]
-"""Makes a far end, of the function that it sends by."""
+    def close(self) -> None:  # noqa: B027
+        """Send nothing more."""
+
+
+Send = Callable[[bytes], None]
+MakeEnd = Callable[[Send], FarEnd]
+"""Makes a far end, of the function that it sends by; no bytes: the connection ends."""
 
 
 class Served:
-    """A far end with its timer; now: the time [s] of what it receives."""
+    """A far end with its timer."""
 
-    def __init__(self, end: FarEnd, now: Callable[[], float] = clock.now) -> None:
+    def __init__(self, end: FarEnd) -> None:
         self._end = end
-        self._now = now
         self._timer: asyncio.TimerHandle | None = None
 
-    def receive(self, data: bytes) -> None:
-        """Take bytes from the host."""
-        self._end.receive(data, self._now())
+    def receive(self, data: bytes, now: float) -> None:
+        """Take bytes from the host at a time [s]."""
+        self._end.receive(data, now)
         self.schedule()
 
     def schedule(self) -> None:
         """Have it ticked when its next event is due."""
-        self.close()
+        self._cancel()
         due = self._end.next_event
         if due < math.inf:
             self._timer = asyncio.get_running_loop().call_at(due, self._tick)
 
     def close(self) -> None:
-        """Stop its timer."""
+        """Close it and stop its timer."""
+        self._end.close()
+        self._cancel()
+
+    def _cancel(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
-            self._timer = None
 
     def _tick(self) -> None:
-        self._timer = None
         self._end.tick(clock.now())
         self.schedule()
 
 
 class TerminalEnd:
-    """A pseudo-terminal in front of devices; faults of frames are those of the first.
+    """A pseudo-terminal in front of a far end, as an asynchronous context.
 
-    bits_per_second: None for no transmission time; unpluggable: see `make_terminal`.
+    device: has the faults of the wire, those of frames if none are given; unpluggable: see
+    `make_terminal`.
     """
 
     def __init__(
         self,
-        devices: Sequence[FaultedDevice],
+        device: AmplifierDevice,
         make_end: MakeEnd,
         *,
-        bits_per_second: int | None,
-        bits_per_byte: float,
-        unpluggable: bool,
+        faults: Faults | None = None,
+        byte_time: float = 0.0,
+        unpluggable: bool = False,
     ) -> None:
-        self._first = devices[0]
         self._line = TwoWayLine(
-            to_amplifier=lambda data: self._served.receive(data),
+            to_amplifier=lambda data, now: self._served.receive(data, now),
             to_host=lambda data: self._terminal.write(data),
-            faults=self._first.faults,
-            bits_per_second=bits_per_second,
-            bits_per_byte=bits_per_byte,
+            faults=device.faults if faults is None else faults,
+            byte_time=byte_time,
         )
         self._served = Served(make_end(self._line.outward.send))
         self._terminal = make_terminal(self._line.inward.send, unpluggable=unpluggable)
-        self._is_unpluggable = unpluggable
+        if unpluggable:
+            device.plug_listeners.append(self._plug)
 
     @property
     def port(self) -> str:
@@ -103,68 +113,74 @@ class TerminalEnd:
         """Replies lost because the host did not read."""
         return self._terminal.dropped
 
-    def start(self) -> None:
+    async def __aenter__(self) -> Self:
         """Serve in the running event loop."""
         self._terminal.listen()
-        if self._is_unpluggable:
-            self._first.on_plug(self._plug)
+        return self
 
-    def close(self) -> None:
-        """Close, in the event loop of `start`."""
+    async def __aexit__(self, *error: object) -> None:
+        """Close."""
         self._line.close()
         self._served.close()
         self._terminal.close()
 
     def _plug(self, is_plugged: bool) -> None:
-        """Unplug the line, or plug it in again."""
         self._line.close()
         self._terminal.plug(is_plugged)
 
 
 class TcpEnd:
-    """A TCP port on the loopback interface in front of devices; 0 for any.
+    """A TCP port on the loopback interface, 0 for any, as an asynchronous context.
 
-    make_end: of each connection. An unplugged port closes its connections, unlike a cable.
+    make_end: of each connection; device, faults: see `TerminalEnd`. An unplugged port closes its
+    connections, unlike a cable. Entering it raises LinkError where the port is in use.
     """
 
     def __init__(
-        self, devices: Sequence[FaultedDevice], make_end: MakeEnd, *, port: int = 0
+        self,
+        device: AmplifierDevice,
+        make_end: MakeEnd,
+        *,
+        faults: Faults | None = None,
+        port: int = 0,
     ) -> None:
         self.port = port
-        self.first = devices[0]
+        self.faults = device.faults if faults is None else faults
         self.make_end = make_end
         self.connections: set[_Connection] = set()
-        self._is_plugged = True
+        self._device = device
         self._server: asyncio.Server | None = None
 
-    async def start(self) -> None:
-        """Listen; raises LinkError where the port is in use."""
-        self._server = await listen(lambda: _Connection(self), self.port)
-        self.port = port_of(self._server)
-        self.first.on_plug(self._plug)
+    @property
+    def is_open(self) -> bool:
+        """Whether it takes one more connection."""
+        return self._device.is_plugged and len(self.connections) < _MAX_CONNECTIONS
 
-    async def close(self) -> None:
+    async def __aenter__(self) -> Self:
+        """Listen."""
+        loop = asyncio.get_running_loop()
+        try:
+            self._server = await loop.create_server(lambda: _Connection(self), HOST, self.port)
+        except OSError as error:
+            raise LinkError(
+                f"port {self.port}: cannot listen: {error.strerror or error}; choose another, or "
+                "0 for any"
+            ) from error
+        self.port = int(self._server.sockets[0].getsockname()[1])
+        self._device.plug_listeners.append(self._plug)
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
         """Stop listening and close the connections."""
-        self._drop_all()
+        self._plug(False)
         if self._server is not None:
             self._server.close()
             await self._server.wait_closed()
 
-    def connected(self, connection: "_Connection") -> None:
-        """Note a new client."""
-        if not self._is_plugged or len(self.connections) >= _MAX_CONNECTIONS:
-            connection.abort()
-        else:
-            self.connections.add(connection)
-
-    def _drop_all(self) -> None:
-        for connection in tuple(self.connections):
-            connection.abort()
-
     def _plug(self, is_plugged: bool) -> None:
-        self._is_plugged = is_plugged
         if not is_plugged:
-            self._drop_all()
+            for connection in tuple(self.connections):
+                connection.transport.abort()
 
 
 class _Connection(asyncio.Protocol):
@@ -172,37 +188,37 @@ class _Connection(asyncio.Protocol):
 
     def __init__(self, port: TcpEnd) -> None:
         self._port = port
-        self._transport: asyncio.Transport | None = None
-        self._line = TwoWayLine(
-            to_amplifier=lambda data: self._served.receive(data),
-            to_host=self._send,
-            faults=port.first.faults,
-            finds_damage=True,
-        )
-        self._served = Served(port.make_end(self._line.outward.send))
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.Transport, transport)
+        self.transport = cast(asyncio.Transport, transport)
+        if not self._port.is_open:
+            self.transport.abort()
+            return
+        self._port.connections.add(self)
         open_socket: socket.socket = transport.get_extra_info("socket")
         open_socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MAX_UNSENT)
-        self._port.connected(self)
+        self._line = TwoWayLine(
+            to_amplifier=lambda data, now: self._served.receive(data, now),
+            to_host=self._send,
+            faults=self._port.faults,
+            finds_damage=True,
+        )
+        self._served = Served(self._port.make_end(self._line.outward.send))
 
     def data_received(self, data: bytes) -> None:
         self._line.inward.send(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._port.connections.discard(self)
-        self._line.close()
-        self._served.close()
-
-    def abort(self) -> None:
-        """Close at once."""
-        if self._transport is not None:
-            self._transport.abort()
+        if self in self._port.connections:
+            self._port.connections.remove(self)
+            self._line.close()
+            self._served.close()
 
     def _send(self, data: bytes) -> None:
-        if self._transport is None or self._transport.is_closing():
+        if self.transport.is_closing():
             return
-        self._transport.write(data)
-        if self._transport.get_write_buffer_size() > _MAX_UNSENT:
-            self._transport.abort()
+        self.transport.write(data)
+        if not data:
+            self.transport.close()
+        elif self.transport.get_write_buffer_size() > _MAX_UNSENT:
+            self.transport.abort()

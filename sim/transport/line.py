@@ -14,31 +14,33 @@ from sim.faults.fault_window import Faults, Toward
 class Line:
     """One direction of a wire, in the running event loop.
 
-    deliver: called with each frame that arrives; bits_per_second: None for no transmission time;
-    bits_per_byte: framing included; finds_damage: see `Faults.pass_on`.
+    deliver: called with each frame that arrives, and when [s]; byte_time: of each byte on the wire
+    [s]; finds_damage: see `Faults.pass_on`.
     """
 
     def __init__(
         self,
-        deliver: Callable[[bytes], None],
+        deliver: Callable[[bytes, float], None],
         *,
         toward: Toward,
         faults: Faults,
-        bits_per_second: float | None = None,
-        bits_per_byte: float = 10.0,
+        byte_time: float = 0.0,
         finds_damage: bool = False,
     ) -> None:
         self._deliver = deliver
         self._finds_damage = finds_damage
         self._toward = toward
         self._faults = faults
-        self._byte_time = bits_per_byte / bits_per_second if bits_per_second else 0.0
+        self._byte_time = byte_time
         self._free_from = 0.0
         self._in_flight: set[asyncio.TimerHandle] = set()
 
-    def send(self, frame: bytes) -> None:
-        """Send a frame; it queues behind earlier ones."""
-        now = clock.now()
+    def send(self, frame: bytes, now: float | None = None) -> None:
+        """Send a frame, which queues behind earlier ones; now: the present time [s] if not given.
+
+        The same time for several lines makes what they carry arrive at one time.
+        """
+        now = clock.now() if now is None else now
         arriving = self._faults.pass_on(
             frame, toward=self._toward, time=now, finds_damage=self._finds_damage
         )
@@ -46,7 +48,7 @@ class Line:
             self._free_from = max(now, self._free_from) + len(data) * self._byte_time
             due = self._free_from + delay
             if due <= now and not self._in_flight:
-                self._deliver(data)
+                self._deliver(data, now)
             else:
                 self._deliver_later(due - now, data)
 
@@ -59,34 +61,30 @@ class Line:
     def _deliver_later(self, delay: float, data: bytes) -> None:
         def arrive() -> None:
             self._in_flight.discard(timer)
-            self._deliver(data)
+            self._deliver(data, clock.now())
 
         timer = asyncio.get_running_loop().call_later(delay, arrive)
         self._in_flight.add(timer)
 
 
 class TwoWayLine:
-    """Both directions: `inward` to the amplifier, `outward` to the host; see `Line`."""
+    """Both directions: `inward` to the amplifier, `outward` to the host; see `Line`.
+
+    to_amplifier: called with frames and times [s]; to_host: with frames.
+    """
 
     def __init__(
         self,
         *,
-        to_amplifier: Callable[[bytes], None],
+        to_amplifier: Callable[[bytes, float], None],
         to_host: Callable[[bytes], None],
         faults: Faults,
-        bits_per_second: float | None = None,
-        bits_per_byte: float = 10.0,
+        byte_time: float = 0.0,
         finds_damage: bool = False,
     ) -> None:
-        make = partial(
-            Line,
-            faults=faults,
-            bits_per_second=bits_per_second,
-            bits_per_byte=bits_per_byte,
-            finds_damage=finds_damage,
-        )
+        make = partial(Line, faults=faults, byte_time=byte_time, finds_damage=finds_damage)
         self.inward = make(to_amplifier, toward="amplifier")
-        self.outward = make(to_host, toward="host")
+        self.outward = make(lambda data, now: to_host(data), toward="host")
 
     def close(self) -> None:
         """Discard the frames in flight."""

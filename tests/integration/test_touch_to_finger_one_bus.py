@@ -21,7 +21,7 @@ from model.finger.grid import Grid
 from model.rig.file import load_rig
 from model.table.build import build_table
 from rig_files import TWO_AMPLIFIERS, write_rig
-from sim.far_ends.can_bus import ends
+from sim.far_ends import wires
 from touch_stream import Stream
 
 STREAM = Stream(
@@ -83,7 +83,7 @@ def played(
         chain = Chain(rig, truths[name].table, rig, TWO if changes else ONE, rig_file)
         with pytest.MonkeyPatch.context() as patch:
             if changes:
-                patch.setattr(ends, "CanBus", restless)
+                patch.setattr(wires, "CanBus", restless)
             results[name] = chain.play(STREAM)
     return results
 

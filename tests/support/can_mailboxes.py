@@ -9,7 +9,7 @@ import heapq
 import itertools
 
 from drivers.codec.can_bus.canopen import CanFrame
-from sim.far_ends.can_bus.bus import CanBus, Listener, Stub
+from sim.far_ends.can_bus.bus import BusNodes, CanBus, Listener
 
 SYNC, PERIOD = CanFrame(0x080, b""), 0.01  # s
 
@@ -28,7 +28,7 @@ class MailboxBus(CanBus):
         self._foreign = asyncio.get_running_loop().call_later(PERIOD, self._sync)
 
     def send(self, frame: CanFrame, *, sender: Listener) -> None:
-        if isinstance(getattr(sender, "__self__", None), Stub) or frame is SYNC:
+        if isinstance(getattr(sender, "__self__", None), BusNodes) or frame is SYNC:
             super().send(frame, sender=sender)
             return
         self.given.append(frame)

@@ -16,10 +16,11 @@ from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from sim.far_ends.can_bus.bus import CanBus
-from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter, SlcanEnd
-from sim.far_ends.can_bus.socketcand_server import SocketcandEnd
+from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter
+from sim.far_ends.can_bus.socketcand import SocketcandClient
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
+from sim.transport.far_end import FarEnd
 from sim.transport.pseudo_terminal import make_terminal
 
 _READ_TIMEOUT = 0.02  # s; after which the thread of a bus notices its end
@@ -114,49 +115,18 @@ class _Nodes:
             self._bus.send(frame, sender=self._listener)
 
 
-class _SlcanServer:
-    """Amplifiers on a bus behind an adapter, as a far end of bytes."""
+class _BusServer:
+    """Amplifiers on a bus of a connection, behind its adapter, as a far end of bytes."""
 
-    def __init__(self, amplifiers: Mapping[int, Amplifier], send: Callable[[bytes], None]) -> None:
+    def __init__(
+        self,
+        make_adapter: Callable[..., FarEnd],
+        amplifiers: Mapping[int, Amplifier],
+        send: Callable[[bytes], None],
+    ) -> None:
         bus = CanBus()
         _Nodes(bus, amplifiers)
-        self._adapter = SlcanAdapter(bus, send)
-
-    def receive(self, data: bytes, now: float) -> None:
-        """Take text from the host."""
-        self._adapter.receive(data)
-
-
-@asynccontextmanager
-async def _slcan(count: int) -> AsyncIterator[FarSide]:
-    bus, amplifiers = CanBus(), _amplifiers(count)
-    end = SlcanEnd(bus)
-    _Nodes(bus, amplifiers)
-    try:
-        path = end.path
-        yield FarSide(
-            amplifiers,
-            lambda node: f"can+slcan://{path}?bitrate=500000#{node}",
-            lambda: end.plug(False),
-        )
-    finally:
-        end.close()
-
-
-@asynccontextmanager
-async def _socketcand(count: int) -> AsyncIterator[FarSide]:
-    bus, amplifiers = CanBus(), _amplifiers(count)
-    end = SocketcandEnd(bus)
-    await end.open()
-    _Nodes(bus, amplifiers)
-    try:
-        yield FarSide(
-            amplifiers,
-            lambda node: f"can+socketcand://127.0.0.1:{end.port}/can0#{node}",
-            end.unplug,
-        )
-    finally:
-        await end.close()
+        self.receive = make_adapter(bus, send).receive
 
 
 @asynccontextmanager
@@ -231,11 +201,21 @@ WORD_WIRES: Mapping[str, Callable[[int], Any]] = {
         partial(ModbusAmplifiers, is_rtu=True),
         lambda port, number: f"modbus+rtu://127.0.0.1:{port}#{number}",
     ),
-    "can+slcan": _slcan,
-    "can+slcan server": lambda count: _server(
-        count, _SlcanServer, lambda port, node: f"can+slcan://127.0.0.1:{port}#{node}"
+    "can+slcan": lambda count: _terminal(
+        count,
+        partial(_BusServer, SlcanAdapter),
+        lambda port, node: f"can+slcan://{port}?bitrate=500000#{node}",
     ),
-    "can+socketcand": _socketcand,
+    "can+slcan server": lambda count: _server(
+        count,
+        partial(_BusServer, SlcanAdapter),
+        lambda port, node: f"can+slcan://127.0.0.1:{port}#{node}",
+    ),
+    "can+socketcand": lambda count: _server(
+        count,
+        partial(_BusServer, SocketcandClient),
+        lambda port, node: f"can+socketcand://127.0.0.1:{port}/can0#{node}",
+    ),
     "can+python-can virtual": lambda count: _python_can(count, "virtual", "plate"),
     "can+python-can udp_multicast": lambda count: _python_can(
         count, "udp_multicast", "239.74.163.2", port=_free_port()

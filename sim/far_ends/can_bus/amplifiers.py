@@ -4,7 +4,7 @@ Frames come and go packed (`drivers.codec.can_bus.segments`), those of a message
 """
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from drivers.codec.can_bus.canopen import CANOPEN, CanFrame, cob_id
 from drivers.codec.can_bus.segments import (
@@ -33,8 +33,7 @@ from drivers.statistics import WireCounters
 from sim.amplifier.contract import SILENCING_RAMP, AmplifierPort
 from sim.far_ends.can_bus.sdo import SdoServer
 from sim.far_ends.can_bus.word_objects import FAULT_NAMES, WordObjects
-
-Send = Callable[[bytes], None]
+from sim.transport.far_end import FarEnd, Send
 
 _NMT: Mapping[str, int] = CANOPEN["nmt"]
 _NMT_STATES: Mapping[str, int] = CANOPEN["nmt_states"]
@@ -44,7 +43,7 @@ _NMT_LENGTH = 2
 _POLL = 0.05  # s; between looks whether a heartbeat is wanted again
 
 
-class CanAmplifiers:
+class CanAmplifiers(FarEnd):
     """Amplifiers by their nodes on one bus; send: called with their frames."""
 
     def __init__(self, amplifiers: Mapping[int, AmplifierPort], send: Send) -> None:

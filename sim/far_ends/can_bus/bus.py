@@ -1,28 +1,22 @@
 """A CAN bus within this process: a frame of one member is received by all others, at one time.
 
-Each amplifier has faults of its own each way; a damaged frame fails its CRC and is dropped. Not
-modelled: arbitration, retransmission, bus-off.
+Not modelled: arbitration, retransmission, bus-off.
 """
 
 import asyncio
-import struct
-import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from drivers import clock
 from drivers.codec.can_bus.canopen import CanFrame
-from sim.faults.fault_window import Faults
-from sim.transport.frame_time import FrameTime
+from drivers.codec.can_bus.segments import pack_frames, unpack_frames
+from sim.bench.amplifier_device import AmplifierDevice
+from sim.far_ends.can_bus.amplifiers import CanAmplifiers
+from sim.transport.far_end import Served
 from sim.transport.line import TwoWayLine
-
-LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
-"""Data lengths by length code; above eight bytes CAN FD only."""
 
 Listener = Callable[[CanFrame], None]
 
 _OVERHEAD = 8  # bytes of a frame beside its data, about, with stuffing and gap
-_HEAD = struct.Struct("<L")
-_FD = 1 << 31
 
 
 class CanBus:
@@ -36,7 +30,6 @@ class CanBus:
         self._bitrate = bitrate
         self._free_from = 0.0
         self._in_flight: set[asyncio.TimerHandle] = set()
-        self.time = FrameTime()
 
     def join(self, listener: Listener) -> None:
         """Add a member."""
@@ -69,52 +62,57 @@ class CanBus:
         self._in_flight.clear()
 
     def _deliver(self, frame: CanFrame, sender: Listener) -> None:
-        with self.time.in_one_frame():
-            for member in tuple(self._members):
-                if member is not sender:
-                    member(frame)
+        for member in tuple(self._members):
+            if member is not sender:
+                member(frame)
 
 
-class Stub:
-    """The connection of one amplifier; receive: called with each frame."""
+class BusNodes:
+    """Amplifiers on a bus, each at the node of its number, with faults of its own each way.
 
-    def __init__(self, bus: CanBus, receive: Listener, *, faults: Faults) -> None:
+    A damaged frame fails its CRC and is dropped. All take a frame at one time, however long a
+    simulation needs.
+    """
+
+    def __init__(self, bus: CanBus, devices: Sequence[AmplifierDevice]) -> None:
         self._bus = bus
-        self._hears = receive
-        self._line = TwoWayLine(to_amplifier=self._arrive, to_host=self._leave, faults=faults)
         self._listener = self._hear  # one object, which identifies the member
+        self._nodes = [self._connect(device) for device in devices]
         bus.join(self._listener)
-
-    def send(self, frame: CanFrame) -> None:
-        """Send a frame of the amplifier."""
-        self._line.outward.send(_to_bytes(frame))
 
     def close(self) -> None:
         """Leave the bus and discard frames in flight."""
         self._bus.leave(self._listener)
-        self._line.close()
+        for line, served in self._nodes:
+            line.close()
+            served.close()
 
     def _hear(self, frame: CanFrame) -> None:
-        self._line.inward.send(_to_bytes(frame))
+        now = clock.now()
+        for line, _ in self._nodes:
+            line.inward.send(pack_frames([frame]), now)
 
-    def _arrive(self, frame_bytes: bytes) -> None:
-        frame = self._checked(frame_bytes)
-        if frame is not None:
-            self._hears(frame)
-
-    def _leave(self, frame_bytes: bytes) -> None:
-        frame = self._checked(frame_bytes)
-        if frame is not None:
+    def _leave(self, data: bytes) -> None:
+        for frame in unpack_frames(data):
             self._bus.send(frame, sender=self._listener)
 
-    def _checked(self, frame_bytes: bytes) -> CanFrame | None:
-        body, check = frame_bytes[:-4], frame_bytes[-4:]
-        if len(body) < _HEAD.size or zlib.crc32(body).to_bytes(4, "little") != check:
-            return None
-        (head,) = _HEAD.unpack_from(body)
-        return CanFrame(head & ~_FD, body[_HEAD.size :], fd=bool(head & _FD))
+    def _connect(self, device: AmplifierDevice) -> tuple[TwoWayLine, Served]:
+        def send(frames: bytes) -> None:
+            for frame in unpack_frames(frames):
+                line.outward.send(pack_frames([frame]))
 
+        def boot() -> None:
+            end.start(clock.now())
+            served.schedule()
 
-def _to_bytes(frame: CanFrame) -> bytes:
-    body = _HEAD.pack(frame.id | (_FD if frame.fd else 0)) + frame.data
-    return body + zlib.crc32(body).to_bytes(4, "little")
+        line = TwoWayLine(
+            to_amplifier=lambda data, now: served.receive(data, now),
+            to_host=self._leave,
+            faults=device.faults,
+            finds_damage=True,
+        )
+        end = CanAmplifiers({device.address: device}, send)
+        served = Served(end)
+        device.boot_listeners.append(boot)
+        boot()
+        return line, served

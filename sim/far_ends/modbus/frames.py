@@ -8,8 +8,8 @@ import struct
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-FRAME_TIMEOUT = 0.04
-"""Longest pause [s] within an RTU frame: less than the 50 ms after which a host repeats it."""
+FRAME_TIMEOUT = 0.02
+"""Longest pause [s] within an RTU frame: less than the 30 ms after which a host repeats it."""
 
 TCP_TIMEOUT = 1.0
 """Longest pause [s] within a TCP frame, whose segments may be delayed."""
@@ -62,16 +62,11 @@ def tcp_frame(request: RequestAdu, pdu: bytes) -> bytes:
 class Reader(ABC):
     """Splits a stream of bytes into requests; timeout [s]: the longest pause within one."""
 
-    timeout = FRAME_TIMEOUT
+    timeout: float
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._last = 0.0
-
-    @property
-    def has_partial_frame(self) -> bool:
-        """Whether part of a frame is buffered."""
-        return bool(self._buffer)
 
     @property
     def gives_up_at(self) -> float:
@@ -83,19 +78,24 @@ class Reader(ABC):
         found = self.pause(now)
         self._last = now
         self._buffer += data
-        return found + self._take()
+        while (request := self._next()) is not None:
+            found.append(request)
+        return found
 
     def pause(self, now: float) -> list[RequestAdu]:
-        """Discard a partial frame after a timeout; requests behind it are returned."""
-        is_late = bool(self._buffer) and now - self._last > self.timeout
-        return self._give_up() if is_late else []
+        """Discard a partial frame after a timeout; requests that it ends are returned."""
+        if not self._buffer or now - self._last <= self.timeout:
+            return []
+        found = self._ended()
+        self._buffer.clear()
+        return found
 
     @abstractmethod
-    def _take(self) -> list[RequestAdu]:
-        """The complete requests, in order."""
+    def _next(self) -> RequestAdu | None:
+        """Take the next complete request."""
 
-    def _give_up(self) -> list[RequestAdu]:
-        self._buffer.clear()
+    def _ended(self) -> list[RequestAdu]:
+        """The requests in what is buffered, if nothing follows."""
         return []
 
 
@@ -104,66 +104,52 @@ class TcpReader(Reader):
 
     timeout = TCP_TIMEOUT
 
-    def _take(self) -> list[RequestAdu]:
-        found = []
-        while len(self._buffer) >= _MBAP.size:
-            transaction, protocol, length, unit = _MBAP.unpack_from(self._buffer)
-            if protocol != 0 or not 2 <= length <= _LENGTH_MAX:
-                self._give_up()  # the next frame cannot be found
-                break
-            end = _MBAP.size - 1 + length
-            if len(self._buffer) < end:
-                break
-            found.append(RequestAdu(unit, bytes(self._buffer[_MBAP.size : end]), transaction))
-            del self._buffer[:end]
-        return found
+    def _next(self) -> RequestAdu | None:
+        if len(self._buffer) < _MBAP.size:
+            return None
+        transaction, protocol, length, unit = _MBAP.unpack_from(self._buffer)
+        if protocol != 0 or not 2 <= length <= _LENGTH_MAX:
+            self._buffer.clear()  # the next frame cannot be found
+            return None
+        end = _MBAP.size - 1 + length
+        if len(self._buffer) < end:
+            return None
+        pdu = bytes(self._buffer[_MBAP.size : end])
+        del self._buffer[:end]
+        return RequestAdu(unit, pdu, transaction)
 
 
 class RtuReader(Reader):
     """Requests on a serial line: the function determines the length, the CRC confirms it.
 
-    After a damaged frame the next valid one is searched at every byte; a frame of an unknown
+    Behind a damaged frame the next valid one is searched at every byte; a frame of an unknown
     function ends with the pause after it.
     """
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._is_out_of_sync = False
+    timeout = FRAME_TIMEOUT
 
-    def _take(self) -> list[RequestAdu]:
-        found = []
-        while len(self._buffer) >= _MIN_LENGTH:
-            start = self._find_next_frame() if self._is_out_of_sync else 0
-            size = _rtu_size(self._buffer, start)
-            if size is None or start + size > len(self._buffer):
-                break
-            request = _checked(bytes(self._buffer[start : start + size]))
-            if request is None:
-                self._is_out_of_sync = True
-                continue
-            self._is_out_of_sync = False
-            found.append(request)
-            del self._buffer[: start + size]
-        if len(self._buffer) > _MAX_LENGTH:
-            self._is_out_of_sync = True
-            del self._buffer[:-_MAX_LENGTH]
-        return found
+    def _next(self) -> RequestAdu | None:
+        size = _rtu_size(self._buffer, 0)
+        is_whole = size is not None and size <= len(self._buffer)
+        return self._search() if is_whole or len(self._buffer) > _MAX_LENGTH else None
 
-    def _find_next_frame(self) -> int:
-        """Offset of the next valid frame, or the end."""
+    def _search(self) -> RequestAdu | None:
+        """Take the first valid request, with what is before it."""
         for start in range(len(self._buffer) - _MIN_LENGTH + 1):
             size = _rtu_size(self._buffer, start)
-            if size and _checked(bytes(self._buffer[start : start + size])):
-                return start
-        return len(self._buffer)
+            request = size and _checked(bytes(self._buffer[start : start + size]))
+            if request:
+                del self._buffer[: start + (size or 0)]
+                return request
+        del self._buffer[:-_MAX_LENGTH]
+        return None
 
-    def _give_up(self) -> list[RequestAdu]:
-        whole = None if self._is_out_of_sync else _checked(bytes(self._buffer))
-        self._is_out_of_sync = whole is None
-        found = self._take() if whole is None else [whole]
-        self._buffer.clear()
-        self._is_out_of_sync = False
-        return found
+    def _ended(self) -> list[RequestAdu]:
+        whole = _checked(bytes(self._buffer))
+        found = []
+        while whole is None and (request := self._search()) is not None:
+            found.append(request)
+        return found if whole is None else [whole]
 
 
 def _rtu_size(data: bytearray, start: int) -> int | None:

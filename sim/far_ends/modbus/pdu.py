@@ -3,9 +3,9 @@
 import struct
 from collections.abc import Sequence
 
-READ_HOLDING, READ_INPUT, WRITE, READ_WRITE = 3, 4, 16, 23
+READ_HOLDING, READ_INPUT, WRITE = 3, 4, 16
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
-_READ_MAX, _WRITE_MAX, _WRITE_BESIDE_READ_MAX = 125, 123, 121
+_READ_MAX, _WRITE_MAX = 125, 123
 
 
 class ModbusException(Exception):
@@ -32,13 +32,12 @@ def check_range(address: int, count: int, *, end: int) -> None:
         raise ModbusException(ILLEGAL_ADDRESS)
 
 
-def to_write(function: int, body: bytes) -> tuple[int, Sequence[int]]:
+def to_write(body: bytes) -> tuple[int, Sequence[int]]:
     """The address and the words of a write."""
-    maximum = _WRITE_MAX if function == WRITE else _WRITE_BESIDE_READ_MAX
     if len(body) < 5:
         raise ModbusException(ILLEGAL_VALUE)
     address, count, size = struct.unpack_from(">HHB", body)
-    if not (1 <= count <= maximum and size == 2 * count == len(body) - 5):
+    if not (1 <= count <= _WRITE_MAX and size == 2 * count == len(body) - 5):
         raise ModbusException(ILLEGAL_VALUE)
     return address, struct.unpack(f">{count}H", body[5:])
 

@@ -35,7 +35,7 @@ class Adapter:
         self._bus = CanBus()
         self._bus.join(self.on_bus.append)
         self._adapter = FarAdapter(self._bus, lambda data: void(os.write(self._far, data)))
-        self.receive: Callable[[bytes], None] = self._adapter.receive
+        self.receive: Callable[[bytes], None] = lambda data: self._adapter.receive(data, 0.0)
         self._loop = asyncio.new_event_loop()
         self._loop.add_reader(self._far, self._read)
         self._thread = threading.Thread(target=self._run)

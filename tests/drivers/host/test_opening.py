@@ -17,7 +17,7 @@ from virtual_loop import in_virtual_time
 from word_wires import WORD_WIRES
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
-SERVED = [name for name in WORD_WIRES if name.endswith(("tcp", "server"))]
+SERVED = [name for name in WORD_WIRES if name.endswith(("tcp", "server", "socketcand"))]
 CUT = [name for name in WORD_WIRES if "python-can" not in name]
 
 

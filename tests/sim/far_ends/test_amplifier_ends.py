@@ -6,15 +6,18 @@ import os
 import socket
 import struct
 import tty
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from functools import partial
 
 import pytest
 
 from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.errors import LinkError
 from model.rig.rig import Rig
-from sim.far_ends.amplifier_ends import ModbusLineEnd, ModbusPortEnd, SerialLineEnd
+from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
+from sim.far_ends.serial_amplifiers import SerialAmplifiers
+from sim.transport.far_end import FarEnd, TcpEnd, TerminalEnd
 from words_bench import make_bench
 
 TIMEOUT = 15.0  # s; of a busy machine
@@ -25,19 +28,21 @@ HELLO = encode_frame(Frame(kind=1, address=1, sequence=1, payload=b"", version=0
 Client = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
-@asynccontextmanager
-async def tcp_end(rig: Rig) -> AsyncIterator[ModbusPortEnd]:
+def tcp_end(rig: Rig, port: int = 0) -> TcpEnd:
     """The amplifier of a rig on a TCP port."""
-    end = ModbusPortEnd(list(make_bench(rig)[1].values()))
-    await end.start()
-    try:
-        yield end
-    finally:
-        await end.close()
+    device = make_bench(rig)[1]["main"]
+    registers = ModbusAmplifiers({1: device}, lambda data: None, is_rtu=False)
+    return TcpEnd(device, registers.of_connection, port=port)
+
+
+def terminal_end(rig: Rig, make_end: Callable[..., FarEnd]) -> TerminalEnd:
+    """The amplifier of a rig on a pseudo-terminal."""
+    device = make_bench(rig)[1]["main"]
+    return TerminalEnd(device, partial(make_end, {1: device}))
 
 
 @asynccontextmanager
-async def client(end: ModbusPortEnd) -> AsyncIterator[Client]:
+async def client(end: TcpEnd) -> AsyncIterator[Client]:
     """A connection to it."""
     reader, writer = await asyncio.open_connection("127.0.0.1", end.port)
     try:
@@ -115,22 +120,17 @@ async def test_seventeenth_connection_is_closed_at_once(coarse_rig: Rig) -> None
 async def test_port_in_use_is_refused(coarse_rig: Rig) -> None:
     """LinkError with the port and what to do."""
     async with tcp_end(coarse_rig) as end:
-        second = ModbusPortEnd(list(make_bench(coarse_rig)[1].values()), port=end.port)
         with pytest.raises(LinkError, match=f"port {end.port}: .*choose another"):
-            await second.start()
+            await tcp_end(coarse_rig, end.port).__aenter__()
 
 
 async def test_frame_of_unknown_function_ends_with_silence(coarse_rig: Rig) -> None:
     """Over RTU its length is not known: exception 1 comes once the line was silent."""
-    end = ModbusLineEnd(list(make_bench(coarse_rig)[1].values()))
-    end.start()
-    fd = opened(end.port)
-    try:
+    async with terminal_end(coarse_rig, partial(ModbusAmplifiers, is_rtu=True)) as end:
+        fd = opened(end.port)
         os.write(fd, _with_check(bytes([1, 0x41, 1, 2, 3])))
         assert await read(fd, 5) == _with_check(bytes([1, 0xC1, 1]))
-    finally:
         os.close(fd)
-        end.close()
 
 
 def _with_check(body: bytes) -> bytes:
@@ -145,9 +145,7 @@ def _with_check(body: bytes) -> bytes:
 
 async def test_serial_line_outlives_its_hosts(coarse_rig: Rig) -> None:
     """Hosts come and go; one that does not read loses replies, which are counted."""
-    end = SerialLineEnd(list(make_bench(coarse_rig)[1].values()))
-    end.start()
-    try:
+    async with terminal_end(coarse_rig, SerialAmplifiers) as end:
         for _ in range(3):
             fd = opened(end.port)
             os.write(fd, HELLO)
@@ -165,5 +163,3 @@ async def test_serial_line_outlives_its_hosts(coarse_rig: Rig) -> None:
                     os.write(fd, HELLO)
                 await asyncio.sleep(0)
         os.close(fd)
-    finally:
-        end.close()

@@ -103,10 +103,10 @@ def test_line_delivers_frames_at_its_speed_until_closed(is_closed: bool) -> None
         assert isinstance(loop, SteppedLoop)
         arrived: list[float] = []
         line = Line(
-            lambda data: arrived.append(loop.time()),
+            lambda data, now: arrived.append(loop.time()),
             toward="host",
             faults=Faults(),
-            bits_per_second=10_000,
+            byte_time=1e-3,
         )
         line.send(FRAME)
         line.send(FRAME)

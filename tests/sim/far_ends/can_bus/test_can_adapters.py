@@ -4,25 +4,22 @@ import asyncio
 import os
 import tty
 from collections.abc import AsyncIterator
+from functools import partial
 
 import can
 import pytest
 
 from drivers.codec.can_bus.canopen import CanFrame
-from drivers.errors import LinkError
+from model.rig.rig import Rig
 from sim.far_ends.can_bus.bus import CanBus
-from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter, SlcanEnd
-from sim.far_ends.can_bus.socketcand_server import SocketcandEnd
+from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter
+from sim.far_ends.can_bus.socketcand import SocketcandClient
+from sim.faults.fault_window import Faults
+from sim.transport.far_end import TcpEnd, TerminalEnd
+from words_bench import make_bench
 
 TIMEOUT = 5.0  # s; for a loaded machine, not an expectation
 FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))
-
-
-def message(frame: CanFrame) -> can.Message:
-    """As python-can has it."""
-    return can.Message(
-        arbitration_id=frame.id, data=frame.data, is_fd=frame.fd, is_extended_id=False
-    )
 
 
 class Member:
@@ -53,12 +50,11 @@ def bus() -> CanBus:
 
 
 @pytest.fixture
-async def server(bus: CanBus) -> AsyncIterator[SocketcandEnd]:
+async def server(bus: CanBus, coarse_rig: Rig) -> AsyncIterator[TcpEnd]:
     """A socketcand server on a free port."""
-    end = SocketcandEnd(bus)
-    await end.open()
-    yield end
-    await end.close()
+    device = make_bench(coarse_rig)[1]["main"]
+    async with TcpEnd(device, partial(SocketcandClient, bus), faults=Faults()) as end:
+        yield end
 
 
 class Talk:
@@ -84,7 +80,7 @@ class Talk:
 
 
 @pytest.fixture
-async def talk(server: SocketcandEnd) -> AsyncIterator[Talk]:
+async def talk(server: TcpEnd) -> AsyncIterator[Talk]:
     """Greeted."""
     talk = Talk(*await asyncio.open_connection("127.0.0.1", server.port))
     await talk.says("< hi >")
@@ -110,7 +106,7 @@ async def test_socketcand_session(bus: CanBus, talk: Talk) -> None:
     "nonsense",
     [
         *("< send 123 3 1 2 >", "< send 800 0 >", "< send 00000123 0 >", "< send x 1 1 >"),
-        *("< send 123 9 1 2 3 4 5 6 7 8 9 >", "< fdsend 123 00 9 1 2 3 4 5 6 7 8 9 >", "<>", ">"),
+        *("< send 123 9 1 2 3 4 5 6 7 8 9 >", "<>", ">"),
         *("a" * 2000, "< send 123 1 100 >", "\x00\xff< send"),
     ],
 )
@@ -123,13 +119,6 @@ async def test_socketcand_ignores_malformed_frames(bus: CanBus, talk: Talk, nons
         talk.writer.write(b"< send 123 1 5 >< echo >")
         assert (await talk.reader.readuntil(b"< echo >")).endswith(b"< echo >")
     assert member.heard == [CanFrame(0x123, b"\x05")]
-
-
-async def test_socketcand_refuses_a_port_in_use(server: SocketcandEnd) -> None:
-    """LinkError with the port and what to do."""
-    words = f"port {server.port}"
-    with pytest.raises(LinkError, match=words):
-        await SocketcandEnd(CanBus(), port=server.port).open()
 
 
 async def test_socketcand_refuses_another_bus(talk: Talk) -> None:
@@ -154,21 +143,21 @@ async def test_socketcand_disconnects_a_client_that_does_not_read(bus: CanBus, t
 
 
 @pytest.fixture
-async def adapter(bus: CanBus) -> AsyncIterator[SlcanEnd]:
+async def adapter(bus: CanBus, coarse_rig: Rig) -> AsyncIterator[TerminalEnd]:
     """A serial adapter."""
-    end = SlcanEnd(bus)
-    yield end
-    end.close()
+    device = make_bench(coarse_rig)[1]["main"]
+    async with TerminalEnd(device, partial(SlcanAdapter, bus), faults=Faults()) as end:
+        yield end
 
 
-async def test_slcan_serves_python_can_with_fd(bus: CanBus, adapter: SlcanEnd) -> None:
+async def test_slcan_serves_python_can(bus: CanBus, adapter: TerminalEnd) -> None:
     """Its own interface sets the bit rate, opens the channel, sends and hears."""
     member = Member(bus)
 
     def connect() -> can.BusABC:
         return can.Bus(
             interface="slcan",
-            channel=adapter.path,
+            channel=adapter.port,
             bitrate=500_000,
             sleep_after_open=0,
             ignore_config=True,
@@ -176,16 +165,15 @@ async def test_slcan_serves_python_can_with_fd(bus: CanBus, adapter: SlcanEnd) -
 
     client = await asyncio.to_thread(connect)
     try:
-        sent = CanFrame(0x481, bytes(48), fd=True)
-        await asyncio.to_thread(client.send, message(sent))
-        assert await member.hears(1) == [sent]
-        member.send(sent)
+        sent = can.Message(arbitration_id=FRAME.id, data=FRAME.data, is_extended_id=False)
+        await asyncio.to_thread(client.send, sent)
+        assert await member.hears(1) == [FRAME]
+        member.send(FRAME)
         received = None
         async with asyncio.timeout(TIMEOUT):
             while received is None:
                 received = await asyncio.to_thread(client.recv, 1.0)
-        assert (received.arbitration_id, bytes(received.data)) == (sent.id, sent.data)
-        assert received.is_fd
+        assert (received.arbitration_id, bytes(received.data)) == (FRAME.id, FRAME.data)
     finally:
         await asyncio.to_thread(client.shutdown)
 
@@ -195,7 +183,7 @@ def answers(adapter_bus: CanBus, text: bytes) -> tuple[bytes, list[CanFrame]]:
     written: list[bytes] = []
     adapter = SlcanAdapter(adapter_bus, written.append)
     member = Member(adapter_bus)
-    adapter.receive(text)
+    adapter.receive(text, 0.0)
     adapter.close()
     return b"".join(written), member.heard
 
@@ -220,15 +208,15 @@ def test_slcan_replies_like_lawicel(
     assert answers(bus, text) == (written, sent)
 
 
-async def test_slcan_host_may_reconnect(bus: CanBus, adapter: SlcanEnd) -> None:
+async def test_slcan_host_may_reconnect(bus: CanBus, adapter: TerminalEnd) -> None:
     """The port outlives its users, and a closed channel passes nothing on."""
     member = Member(bus)
     for _ in range(3):
-        port = os.open(adapter.path, os.O_RDWR | os.O_NOCTTY)
+        port = os.open(adapter.port, os.O_RDWR | os.O_NOCTTY)
         tty.setraw(port)
         os.write(port, b"C\rS6\rO\rt1230\rC\r")
         await member.hears(1)
         member.heard.clear()
         os.close(port)
     member.send(FRAME)
-    assert adapter._port.dropped == 0
+    assert adapter.dropped_replies == 0

@@ -5,7 +5,6 @@ Frames are written as identifier and data in hexadecimal digits.
 
 import random
 from collections.abc import Iterator
-from types import SimpleNamespace
 
 import canopen
 import pytest
@@ -15,7 +14,6 @@ from canopen.sdo.exceptions import SdoAbortedError
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from sim.amplifier.contract import Amplifier
-from sim.far_ends.can_bus import sdo
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 
 START = (0x000, "0100")
@@ -221,9 +219,8 @@ class Reader(canopen.Network):
 
 
 @pytest.fixture
-def read(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> Iterator[SdoClient]:
+def read(bus: Bus) -> Iterator[SdoClient]:
     """Its client of the objects of node 1."""
-    monkeypatch.setattr(sdo, "clock", SimpleNamespace(now=lambda: 0.0))
     node = canopen.RemoteNode(1, canopen.ObjectDictionary())
     node.associate_network(Reader(bus))
     yield node.sdo

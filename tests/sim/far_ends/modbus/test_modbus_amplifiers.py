@@ -12,8 +12,8 @@ from pymodbus.client import AsyncModbusTcpClient
 
 from drivers.protocol.table import MESSAGES, REFUSALS, STATES
 from sim.amplifier.contract import Amplifier
-from sim.far_ends.modbus.frames import crc
-from sim.far_ends.modbus_amplifiers import FRAME_TIMEOUT, ModbusAmplifiers
+from sim.far_ends.modbus.frames import FRAME_TIMEOUT, crc
+from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 
 STATUS = 256 * 9 + 128
 

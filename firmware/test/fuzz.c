@@ -19,7 +19,7 @@
 #include <string.h>
 
 static struct amplifier amplifier;
-static uint64_t seed = 1;
+static uint64_t seed;
 static unsigned long mutated, events;
 
 static uint32_t any(uint32_t below)
@@ -78,27 +78,16 @@ static uint16_t mutate(uint8_t *bytes, uint16_t length, uint16_t length_max)
     mutated++;
     for (uint32_t count = 1 + any(3); count > 0; count--) {
         uint16_t at = (uint16_t)any(length + 1u);
-        switch (any(4)) {
-        case 0:
-            if (at < length)
-                bytes[at] = (uint8_t)any(256);
-            break;
-        case 1:
-            if (at < length)
-                bytes[at] ^= (uint8_t)(1u << any(8));
-            break;
-        case 2:
-            if (length < length_max) {
-                memmove(bytes + at + 1, bytes + at, length - at);
-                bytes[at] = (uint8_t)any(256);
-                length++;
-            }
-            break;
-        default:
-            if (at < length) {
-                memmove(bytes + at, bytes + at + 1, length - at - 1u);
-                length--;
-            }
+        uint32_t what = any(4);
+        if (what < 2 && at < length) {
+            bytes[at] ^= (uint8_t)(what == 0 ? any(256) : 1u << any(8));
+        } else if (what == 2 && length < length_max) {
+            memmove(bytes + at + 1, bytes + at, length - at);
+            bytes[at] = (uint8_t)any(256);
+            length++;
+        } else if (what == 3 && at < length) {
+            memmove(bytes + at, bytes + at + 1, length - at - 1u);
+            length--;
         }
     }
     return length;
@@ -113,11 +102,6 @@ static void arm_again(void)
     amplifier_stop(&amplifier, 0);
     amplifier_clear(&amplifier, amplifier.latch);
     message_handle(&amplifier, MESSAGE_ARM, arm, ARM_WORDS, &reply);
-}
-
-static uint16_t some_token(void)
-{
-    return (uint16_t)(amplifier.committed + (any(4) ? 1 : any(3)));
 }
 
 static uint16_t some_phase(void)
@@ -167,7 +151,7 @@ static uint8_t some_request(struct words *words)
         type == MESSAGE_PING)
         put(words, any(16) ? amplifier.session : (uint16_t)any(4));
     if (type == MESSAGE_SET || type == MESSAGE_COMMIT)
-        put(words, some_token());
+        put(words, (uint16_t)(amplifier.committed + (any(4) ? 1 : any(3))));
     if (type == MESSAGE_SET) {
         uint32_t parts = any(4) ? 1 : 1 + any(4);
         put(words, (uint16_t)(any(parts) << SET_INDEX_SHIFT | parts << SET_PARTS_SHIFT | (any(4) > 0)));
@@ -192,35 +176,20 @@ static uint8_t some_request(struct words *words)
 
 static void fuzz_serial(struct serial *serial)
 {
-    uint8_t frame[400], line[420];
+    uint8_t frame[400] = {0}, line[420];
     struct words words;
-    uint8_t type = some_request(&words);
-    uint16_t length = 5, code = 0, out = 1;
-    frame[0] = type;
+    uint16_t length = SERIAL_HEADER;
+    frame[0] = some_request(&words);
     frame[1] = any(32) ? PROTOCOL_VERSION : (uint8_t)any(4);
     frame[2] = any(8) ? 1 : 0;
-    frame[3] = frame[4] = (uint8_t)any(256);
     for (uint16_t i = 0; i < words.count; i++) {
         frame[length++] = (uint8_t)words.words[i];
         frame[length++] = (uint8_t)(words.words[i] >> 8);
     }
-    length = mutate(frame, length, 300);
-    uint32_t crc = any(8) ? crc32_of(frame, length) : any(65536);
-    for (int i = 0; i < 4; i++)
-        frame[length++] = (uint8_t)(crc >> 8 * i);
-    for (uint16_t i = 0; i < length; i++) { // stuffed with COBS
-        if (frame[i] != 0 && out - code < 255) {
-            line[out++] = frame[i];
-            continue;
-        }
-        line[code] = (uint8_t)(out - code);
-        code = out++;
-    }
-    line[code] = (uint8_t)(out - code);
-    line[out++] = 0;
+    length = serial_finish(frame, mutate(frame, length, 300), line);
     if (any(8) == 0)
-        out = mutate(line, out, sizeof line);
-    for (uint16_t i = 0; i < out; i++) {
+        length = mutate(line, length, sizeof line);
+    for (uint16_t i = 0; i < length; i++) {
         uint16_t size = serial_byte(serial, line[i]);
         require(size == 0 || (size >= 12 && size <= SERIAL_STUFFED_MAX + 2), "size of a reply");
     }
@@ -339,9 +308,8 @@ int main(int count, char **arguments)
     static struct rtu rtu;
     static struct can_node node;
     static struct slcan slcan;
-    unsigned long played[3] = {0, 0, 0}, frames = count > 1 ? strtoul(arguments[1], NULL, 10) : 20000;
-    if (count > 2)
-        seed = strtoull(arguments[2], NULL, 10);
+    unsigned long played[3] = {0}, frames = count > 1 ? strtoul(arguments[1], NULL, 10) : 20000;
+    seed = count > 2 ? strtoull(arguments[2], NULL, 10) : 1;
     amplifier_init(&amplifier, "FUZZ-1", notify);
     serial_init(&serial, &amplifier, 1);
     modbus_init(&modbus, &amplifier, 1);

@@ -24,7 +24,7 @@ static struct mbap connection;
 static uint64_t now, samples_counted; // us, and those made of them
 static int16_t samples_made[SAMPLES_MAX];
 static uint32_t samples_length; // of all channels, not fetched yet
-static bool is_high_voltage, is_interlock_open;
+static bool is_interlock_open;
 static uint8_t addresses[LINES];
 
 void moved_begin(void)
@@ -145,30 +145,9 @@ uint32_t board_silence(enum line line)
     return (uint32_t)(now - lines[line].heard_at);
 }
 
-void board_high_voltage(bool on)
-{
-    is_high_voltage = on;
-}
-
-int16_t board_temperature(void)
-{
-    return 250;
-}
-
-uint16_t board_voltage(void)
-{
-    return is_high_voltage ? 1800 : 0;
-}
-
 bool board_interlock_open(void)
 {
     return is_interlock_open;
-}
-
-enum fault board_fault(uint8_t *channel)
-{
-    *channel = NO_CHANNEL;
-    return FAULT_NONE;
 }
 
 const char *board_serial_number(void)

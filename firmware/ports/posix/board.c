@@ -1,21 +1,33 @@
 // SPDX-License-Identifier: MIT
 //
-// A program in the place of a board: lines are pseudo-terminals, samples go to a file or pipe.
+// The amplifier as a program: lines are pseudo-terminals, samples go to a file or pipe. Options;
+// without any it is --serial:
 //
-// Its outputs are numbers and its high voltage is 1800 V by definition.
+//     --serial              serve the serial protocol on a pseudo-terminal; prints its URL
+//     --modbus-rtu          serve Modbus RTU on a pseudo-terminal; prints its URL
+//     --modbus-tcp PORT     serve Modbus TCP on 127.0.0.1, 0 being any port; prints its URL
+//     --slcan               serve CAN as text on a pseudo-terminal; prints its URL
+//     --samples FILE        write the samples: 16-bit integers, the channels one after another
+//     --addresses FILE      keep the addresses that hosts set
+//     --serial-number TEXT  of the amplifier
+//     --until-eof           end with standard input
+//
+// The signal USR1 opens its interlock, and closes it again.
 
 #define _XOPEN_SOURCE 700
 
 #include "board.h"
-#include "line.h"
+#include "loop.h"
 #include "modbus_tcp.h"
-#include "options.h"
 
+#include <fcntl.h>
 #include <poll.h>
 #include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <termios.h>
+#include <time.h>
 #include <unistd.h>
 
 #define LINES 3
@@ -28,11 +40,23 @@ static const char *serial_number = "FW-1";
 static const char *addresses_path; // of the file that stands for memory without supply
 static uint8_t addresses[LINES] = {1, 1, 1};
 static bool ends_with_input;
-static bool is_high_voltage;
 static volatile sig_atomic_t is_interlock_open;
 static FILE *samples_file;
 static uint64_t started_at; // us
 static uint64_t samples_counted;
+
+static void fail(const char *what)
+{
+    perror(what);
+    exit(1);
+}
+
+static uint64_t microseconds(void)
+{
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (uint64_t)now.tv_sec * 1000000 + (uint64_t)now.tv_nsec / 1000;
+}
 
 uint64_t board_microseconds(void)
 {
@@ -98,21 +122,6 @@ uint32_t board_silence(enum line line)
     return (uint32_t)(microseconds() - heard_at[line]);
 }
 
-void board_high_voltage(bool on)
-{
-    is_high_voltage = on;
-}
-
-int16_t board_temperature(void)
-{
-    return 250;
-}
-
-uint16_t board_voltage(void)
-{
-    return is_high_voltage ? 1800 : 0;
-}
-
 bool board_interlock_open(void)
 {
     return is_interlock_open;
@@ -122,12 +131,6 @@ static void move_interlock(int number)
 {
     (void)number;
     is_interlock_open = !is_interlock_open;
-}
-
-enum fault board_fault(uint8_t *channel)
-{
-    *channel = NO_CHANNEL;
-    return FAULT_NONE;
 }
 
 const char *board_serial_number(void)
@@ -171,6 +174,29 @@ static void usage(const char *program)
     exit(2);
 }
 
+// A descriptor to read and write without blocking; `path` gets the name that a host opens.
+static int open_terminal(const char **path)
+{
+    int near = posix_openpt(O_RDWR | O_NOCTTY);
+    if (near < 0 || grantpt(near) < 0 || unlockpt(near) < 0)
+        fail("pseudo-terminal");
+    *path = strdup(ptsname(near));
+    // The far side stays open, so that a host that closes it does not hang up the line.
+    int far = open(*path, O_RDWR | O_NOCTTY);
+    struct termios raw;
+    if (far < 0 || tcgetattr(far, &raw) < 0)
+        fail(*path);
+    raw.c_iflag = 0;
+    raw.c_oflag = 0;
+    raw.c_lflag = 0;
+    raw.c_cflag = CS8 | CREAD | CLOCAL;
+    raw.c_cc[VMIN] = 1;
+    raw.c_cc[VTIME] = 0;
+    if (tcsetattr(far, TCSANOW, &raw) < 0 || fcntl(near, F_SETFL, O_NONBLOCK) < 0)
+        fail(*path);
+    return near;
+}
+
 // separator: what precedes the address in a URL.
 static void open_line(enum line line, const char *scheme, const char *separator)
 {
@@ -182,7 +208,7 @@ static void open_line(enum line line, const char *scheme, const char *separator)
     printf("\n");
 }
 
-void board_open(int count, char **arguments)
+static void board_open(int count, char **arguments)
 {
     for (int i = 1; i < count; i++) {
         const char *option = arguments[i], *value = i + 1 < count ? arguments[i + 1] : NULL;
@@ -191,8 +217,9 @@ void board_open(int count, char **arguments)
         } else if (strcmp(option, "--modbus-rtu") == 0) {
             open_line(LINE_MODBUS, "modbus+rtu://", "#");
         } else if (strcmp(option, "--modbus-tcp") == 0 && value != NULL) {
-            int port = atoi(arguments[++i]);
-            port = tcp_open((uint16_t)port);
+            int port = tcp_open((uint16_t)atoi(arguments[++i]));
+            if (port < 0)
+                fail("listen");
             printf("modbus+tcp://127.0.0.1:%d/%u\n", port, addresses[LINE_MODBUS]);
         } else if (strcmp(option, "--slcan") == 0) {
             open_line(LINE_CAN, "can+slcan://", "#");
@@ -216,4 +243,15 @@ void board_open(int count, char **arguments)
     struct sigaction moves = {.sa_handler = move_interlock, .sa_flags = SA_RESTART};
     sigaction(SIGUSR1, &moves, NULL);
     started_at = microseconds();
+}
+
+int main(int count, char **arguments)
+{
+    board_open(count, arguments);
+    loop_init();
+    for (;;) {
+        loop_once();
+        tcp_serve(loop_modbus());
+        board_wait();
+    }
 }

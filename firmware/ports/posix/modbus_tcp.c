@@ -3,10 +3,10 @@
 #define _XOPEN_SOURCE 700
 
 #include "modbus_tcp.h"
-#include "line.h"
 #include "loop.h"
 #include "mbap.h"
 
+#include <arpa/inet.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <netinet/in.h>
@@ -21,10 +21,19 @@ static struct host {
     struct mbap mbap;
 } hosts[TCP_HOSTS];
 
-uint16_t tcp_open(uint16_t port)
+int tcp_open(uint16_t port)
 {
-    listening = listen_at(&port);
-    return port;
+    struct sockaddr_in address = {.sin_family = AF_INET, .sin_port = htons(port)};
+    socklen_t size = sizeof address;
+    int yes = 1;
+    address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    listening = socket(AF_INET, SOCK_STREAM, 0);
+    if (listening < 0 || setsockopt(listening, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes) < 0 ||
+        bind(listening, (struct sockaddr *)&address, size) < 0 || listen(listening, 1) < 0 ||
+        getsockname(listening, (struct sockaddr *)&address, &size) < 0 ||
+        fcntl(listening, F_SETFL, O_NONBLOCK) < 0)
+        return -1;
+    return ntohs(address.sin_port);
 }
 
 void tcp_watch(struct pollfd watched[TCP_WATCHED])

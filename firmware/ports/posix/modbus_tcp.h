@@ -12,8 +12,8 @@
 #define TCP_HOSTS 4
 #define TCP_WATCHED (TCP_HOSTS + 1)
 
-// Listen at a port of 127.0.0.1; 0: any. Return the port.
-uint16_t tcp_open(uint16_t port);
+// Listen at a port of 127.0.0.1; 0: any. Return the port, or -1 where that fails.
+int tcp_open(uint16_t port);
 
 // Fill in what to wait for.
 void tcp_watch(struct pollfd watched[TCP_WATCHED]);

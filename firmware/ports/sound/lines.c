@@ -2,7 +2,7 @@
 
 #define _XOPEN_SOURCE 700
 
-#include "lines.h"
+#include "engine.h"
 
 #include <errno.h>
 #include <fcntl.h>

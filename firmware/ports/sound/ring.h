@@ -5,8 +5,10 @@
 #ifndef RING_H
 #define RING_H
 
+#include "counters.h"
+
+#include <stdbool.h>
 #include <stddef.h>
-#include <stdint.h>
 
 #define RECORD_MAX 264
 #define RING_SIZE 64 // records
@@ -25,11 +27,26 @@ struct ring {
 };
 
 // The record to fill in, or null while the ring is full; then ring_push it.
-struct record *ring_free(struct ring *ring);
-void ring_push(struct ring *ring);
+static inline struct record *ring_free(struct ring *ring)
+{
+    bool is_full = ring->written - GET(ring->taken) == RING_SIZE;
+    return is_full ? NULL : &ring->records[ring->written % RING_SIZE];
+}
+
+static inline void ring_push(struct ring *ring)
+{
+    SET(ring->written, ring->written + 1);
+}
 
 // The oldest record, or null; then ring_pop it.
-const struct record *ring_first(const struct ring *ring);
-void ring_pop(struct ring *ring);
+static inline const struct record *ring_first(const struct ring *ring)
+{
+    return ring->taken == GET(ring->written) ? NULL : &ring->records[ring->taken % RING_SIZE];
+}
+
+static inline void ring_pop(struct ring *ring)
+{
+    SET(ring->taken, ring->taken + 1);
+}
 
 #endif

@@ -8,9 +8,7 @@
 #define SOUND_H
 
 #include "engine.h"
-#include "lines.h"
 
-#define SOUND_VERSION 1
 #define SOUND_CHANNELS_MAX (AMPLIFIERS_MAX * CHANNELS_MAX)
 
 // Start the engine of this process and its lines; 0, or the number of an error.

@@ -1,0 +1,28 @@
+// SPDX-License-Identifier: MIT
+//
+// What a board measures, of one whose outputs are numbers: 25 degrees, 1800 V, no fault.
+
+#include "board.h"
+
+static bool is_high_voltage;
+
+void board_high_voltage(bool on)
+{
+    is_high_voltage = on;
+}
+
+int16_t board_temperature(void)
+{
+    return 250;
+}
+
+uint16_t board_voltage(void)
+{
+    return is_high_voltage ? 1800 : 0;
+}
+
+enum fault board_fault(uint8_t *channel)
+{
+    *channel = NO_CHANNEL;
+    return FAULT_NONE;
+}

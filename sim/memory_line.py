@@ -96,10 +96,6 @@ class SimulatedAddress(WireAddress):
         self.line, self.number = url, 1
         self.settings = {"protocol": "serial"}
 
-    def exchange_time(self, words: int, reply: int) -> float:
-        """Return 0: there is no transmission time."""
-        return 0.0
-
     def make_wire(self) -> SerialWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""
         return SerialWire(0, sequence=number_below(1 << 16))

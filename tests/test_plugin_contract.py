@@ -109,7 +109,6 @@ KINDS = [
         "from era_haptics.plugins.wires import CommandError as Refused, WireAddress\n"
         "class THING(WireAddress):\n"
         f"{URL_CLASS}"
-        "    def exchange_time(self, words, reply): return 0.0\n"
         "    def make_wire(self): pass\n"
         "    async def open_port(self, on_data, on_loss): pass\n",
         "a class derived from WireAddress",
@@ -119,7 +118,6 @@ KINDS = [
         fails="from era_haptics.plugins.wires import WireAddress\n"
         "class THING(WireAddress):\n"
         "    def __init__(self, url): self.line, self.number, self.settings = url, 1, {}\n"
-        "    def exchange_time(self, words, reply): return 0.0\n"
         "    def make_wire(self): pass\n"
         "    async def open_port(self, on_data, on_loss): raise KeyError('open')\n",
         use=lambda found: asyncio.run(found.open_port(None, None)),

@@ -94,9 +94,14 @@ class RecordedWire:
         """See `Wire.transit`."""
         return self._inner.transit(words)
 
-    def round_trip(self, name: str, length: int) -> float:
-        """See `Wire.round_trip`."""
-        return self._inner.round_trip(name, length)
+    def exchange_time(self, words: int, reply: int) -> float:
+        """See `Wire.exchange_time`."""
+        return self._inner.exchange_time(words, reply)
+
+    @property
+    def busy(self) -> float:
+        """See `Wire.busy`."""
+        return self._inner.busy
 
     def _record(self, link: str, direction: str, message: str, content: object = "") -> None:
         """Record a message; a stop depends on no record."""

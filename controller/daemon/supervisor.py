@@ -398,7 +398,8 @@ class Supervisor:
         for _ in range(_MAX_READ_BACKS):
             if before_each is not None:
                 await before_each()
-            problem = find_problem(await self._controller.group.statuses())
+            group = self._controller.group
+            problem = find_problem(await group.statuses(), group.amplifiers)
             if problem is None or self.machine.state is not initial_state:
                 break
             await asyncio.sleep(READ_BACK_INTERVAL)
@@ -455,12 +456,12 @@ class Supervisor:
             except Exception:
                 _rate_limited_logger.exception("status read failed")
             else:
-                problem, state = find_problem(statuses), self.machine.state
+                problem, state = find_problem(statuses, group.amplifiers), self.machine.state
                 if problem is not None and state is DaemonState.READY_TO_SWITCH_ON:
                     fault = DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE)
                     await self._in_background(self.handle(fault))
                 elif (
-                    not are_silent(statuses)
+                    not are_silent(statuses, group.amplifiers)
                     and state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
                     and not self.machine.is_acknowledged  # a clear reads back for itself
                 ):

@@ -302,8 +302,9 @@ class Controller:
     @property
     def _is_heartbeat_due(self) -> bool:
         """Whether to feed the watchdogs now; pending silence has priority."""
-        is_time = self.group_state is GroupState.ARMED and clock.now() >= self._heartbeat_due
-        return is_time and not self._decider.is_silence_pending
+        if self.group_state is not GroupState.ARMED or self._decider.is_silence_pending:
+            return False
+        return clock.now() >= min(self._heartbeat_due, self._group.lost_from)
 
     @property
     def _decider(self) -> Decider:
@@ -448,7 +449,7 @@ class Controller:
         if due is not None:
             until = min(until, due)
         if self.group_state is GroupState.ARMED:
-            until = min(until, self._heartbeat_due)
+            until = min(until, self._heartbeat_due, self._group.lost_from)
         pause = max(0.0, until - now)
         timer = asyncio.get_running_loop().call_later(pause, self._wake.set)
         try:

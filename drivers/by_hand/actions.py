@@ -50,7 +50,7 @@ async def identify(url: str) -> dict[str, Any]:
             **identity,
             "versions": [version for version in range(16) if versions >> version & 1],
             **capability_rows(amplifier.capabilities),
-            **wire_rows(url, amplifier),
+            **wire_rows(amplifier),
         }
 
 
@@ -69,7 +69,7 @@ async def status(url: str) -> dict[str, Any]:
             "measured": measured,
             "faults": fault_rows(faults),
             "last_round_trip_s": amplifier.round_trip,
-            **wire_rows(url, amplifier),
+            **wire_rows(amplifier),
         }
 
 
@@ -210,7 +210,7 @@ async def drive(
             raise CommandError(str(refused)) from refused  # bad input, not a refusal
         lowest = QUANTITIES["watchdog"].from_wire(amplifier.capabilities["watchdog_min"])
         watchdog = max(WATCHDOG, lowest)
-        check_watchdog(watchdog, round_trip(url, amplifier))
+        check_watchdog(watchdog, round_trip(amplifier))
         try:
             await _arm(amplifier, watchdog, url)
             await amplifier.stage(_TOKEN, [layer], now=True)

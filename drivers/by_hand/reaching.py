@@ -11,11 +11,10 @@ from drivers import clock
 from drivers.host.amplifier import Amplifier
 from drivers.host.jobs import Priority
 from drivers.host.limits import FREQUENCY_FLOOR
-from drivers.host.timing import shortest_watchdog
+from drivers.host.timing import TAKEN_WORDS, set_words, shortest_watchdog
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.table import QUANTITIES
-from drivers.wires.known import address_of
 from registry.limits import GuardLimits
 
 CEILINGS = GuardLimits(FREQUENCY_FLOOR, QUANTITIES["frequency"].high, 1.0)
@@ -69,14 +68,15 @@ def random_session() -> int:
     return quantity.minimum + secrets.randbelow(quantity.maximum - quantity.minimum + 1)
 
 
-def round_trip(url: str, amplifier: Amplifier) -> float:
+def round_trip(amplifier: Amplifier) -> float:
     """Return how long a set of all channels and its reply take on the wire [s]; 0 if unknown."""
-    return address_of(url).set_time(amplifier.capabilities["channels"])
+    words = set_words(amplifier.capabilities["channels"])
+    return amplifier.line.wire.exchange_time(words, TAKEN_WORDS)
 
 
-def wire_rows(url: str, amplifier: Amplifier) -> dict[str, Any]:
+def wire_rows(amplifier: Amplifier) -> dict[str, Any]:
     """Return limits by the wire's speed; empty where that is unknown."""
-    takes = round_trip(url, amplifier)
+    takes = round_trip(amplifier)
     if not takes:
         return {}
     return {

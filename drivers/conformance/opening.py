@@ -10,7 +10,7 @@ from drivers.conformance.modbus_client import ModbusClient
 from drivers.conformance.serial_client import SerialClient
 from drivers.errors import LinkError
 from drivers.hardware import number_below
-from drivers.protocol.table import MESSAGES
+from drivers.protocol.table import MAX_WORDS
 from drivers.wires.known import address_of
 
 CLIENTS: Mapping[str, Callable[[Port, int], Client]] = {
@@ -51,8 +51,7 @@ async def opened(url: str) -> AsyncIterator[Client]:
     try:
         client = behind.client = CLIENTS[protocol](port, address.number)
         client.session = number_below(1 << 16)
-        request = client.request(MESSAGES["GetCaps"].number, ())
-        client.transit = address.make_wire().round_trip("GetCaps", len(request))
+        client.transit = address.make_wire().exchange_time(0, MAX_WORDS)
         yield client
     finally:
         port.close()

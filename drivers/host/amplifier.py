@@ -16,13 +16,13 @@ from drivers.host.identification import check_capabilities, check_identity
 from drivers.host.jobs import Priority
 from drivers.host.joint_start import JointStart
 from drivers.host.ledger import Ledger
-from drivers.host.line import ATTEMPTS, REPLY_TIMEOUT, Line
+from drivers.host.line import Line
+from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import (
     FAULTS,
     LATCHED,
-    MAX_WORDS,
     QUANTITIES,
     STATES,
 )
@@ -39,8 +39,6 @@ SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENABLED = STATES["OPERATION_ENABLED"]
-PART_BYTES = 2 * MAX_WORDS
-"""Of the longest part of a set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +108,7 @@ class Amplifier(Dialogue):
         elif can != self.capabilities:
             self._ledger.adopt(can)
         self.identity, self.capabilities = identity, can
+        self._overtimes.clear()
         self._serial_number = identity["serial_number"]
         self.latch = None
         return await self.read_status()
@@ -212,7 +211,7 @@ class Amplifier(Dialogue):
     @property
     def _commit_delay(self) -> float:
         """Longest time [s] from the admission of a set until it is committed."""
-        waiting = len(self.line.members) * self.line.wire.round_trip("Set", PART_BYTES)
+        waiting = len(self.line.members) * self.exchange_time("Set")
         return max(COMMIT_DELAY, ATTEMPTS * waiting)
 
     async def read_achieved(self, one: LayerSet) -> LayerSet:
@@ -248,7 +247,7 @@ class Amplifier(Dialogue):
         """
         status = await self._request("Disarm", {"ramp": self.wire_ramp(ramp)}, Priority.SILENCE)
         end = clock.now() + ramp + CONFIRM_TIMEOUT
-        while status["state"] == _ENABLED or not self._is_silent(status):
+        while status["state"] == _ENABLED or not self.is_silent(status):
             if clock.now() > end or status["state"] == _ENABLED:
                 raise CommandRefused(f"amplifier {self.name} is not silent after a disarm")
             await asyncio.sleep(_INTERVAL)
@@ -300,7 +299,7 @@ class Amplifier(Dialogue):
         values = {"ramp": self.wire_ramp(ramp)}
         members = len(self.line.members)
         # On a line that others share each has three exchanges: a stop and two statuses.
-        timeout += ATTEMPTS * members * self.line.wire.round_trip("GetStatus", PART_BYTES // 4)
+        timeout += ATTEMPTS * members * self.exchange_time("GetStatus")
         waiting = timeout * (members + 1)  # on a line that others keep busy
         try:
             async with asyncio.timeout(waiting) as limit:
@@ -320,7 +319,7 @@ class Amplifier(Dialogue):
                             self, Priority.STOP, "Stop", values, make=make
                         )
                         while is_stopping(status, before):
-                            if self._is_silent(status):
+                            if self.is_silent(status):
                                 return Stopped(True, clock.now())
                             await asyncio.sleep(_INTERVAL)
                             status = await self.read_status(Priority.STOP)
@@ -344,7 +343,7 @@ class Amplifier(Dialogue):
         """Send a request and return the values of its reply."""
         return await self.line.submit(self, priority, name, values, timeout=timeout)
 
-    def _is_silent(self, status: Values) -> bool:
+    def is_silent(self, status: Values) -> bool:
         """Whether a status has the levels of all channels, and all are zero."""
         known = self.capabilities.get("channels")
         return known == len(status["levels"]) and not any(status["levels"])

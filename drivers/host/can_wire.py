@@ -10,7 +10,6 @@ from drivers.codec.can_bus.canopen import BLOCK, CANOPEN, CanFrame, cob_id, fram
 from drivers.codec.can_bus.segments import (
     NODE_MAX,
     NUMBER_MAX,
-    PACKED,
     REPLY,
     REQUEST,
     Assembler,
@@ -49,6 +48,7 @@ class CanWire:
 
     def __init__(self, bitrate: int, *, sequence: int, delay: float = 0.0) -> None:
         self.counters = WireCounters()
+        self.busy = 0.0
         self.delay = delay
         self._frame_time = frame_time(bitrate)
         self._sequence = sequence
@@ -95,9 +95,9 @@ class CanWire:
         """Return how long a request of so many words takes to arrive [s]."""
         return frames_of(words) * self._frame_time
 
-    def round_trip(self, name: str, length: int) -> float:
-        """Return how long a request of this many bytes and its longest reply take [s]."""
-        return (length // PACKED + frames_of(MAX_WORDS)) * self._frame_time
+    def exchange_time(self, words: int, reply: int) -> float:
+        """Return how long a request and a reply of so many words take [s]."""
+        return self.transit(words) + self.transit(reply)
 
     def _arrival(self, frame: CanFrame) -> Arrival | None:
         node = frame.id & NODE_MAX

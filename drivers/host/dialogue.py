@@ -11,6 +11,8 @@ from drivers.host.feeding import Feeding
 from drivers.host.jobs import RequestCounts
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
+from drivers.host.timing import SET_WORDS, TAKEN_WORDS, overtime
+from drivers.host.wire import WIDEST, reply_words, request_words
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import FAULTS, MESSAGES, QUANTITIES, STATES
@@ -64,6 +66,7 @@ class Dialogue:
         self.listeners: list[Callable[[Values], None]] = []
         self.silences = 0
         """Stops and disarms that were sent to it."""
+        self._overtimes: dict[str, float] = {}
         self._time = line.time
         self._ledger: Ledger | None = None
         self._admitted: Staged | None = None
@@ -81,6 +84,21 @@ class Dialogue:
         if self._ledger is None:
             raise CommandError(f"amplifier {self.name} must be opened first")
         return self._ledger
+
+    def exchange_time(self, name: str) -> float:
+        """Return how long the longest request of a name and its reply take on the wire [s]."""
+        can = self.capabilities
+        size = (can["channels"], can["layers"]) if can else WIDEST
+        return self.line.wire.exchange_time(request_words(name), reply_words(name, *size))
+
+    def overtime(self, name: str, values: Values) -> float:
+        """Return how much later than on a fast wire the reply to a request may come [s]."""
+        if name not in self._overtimes:
+            self._overtimes[name] = overtime(self.exchange_time(name))
+        if name == "Set" and self._overtimes[name]:  # much shorter, nearly always
+            words = SET_WORDS + len(values["stream"])
+            return overtime(self.line.wire.exchange_time(words, TAKEN_WORDS))
+        return self._overtimes[name]
 
     @property
     def statistics(self) -> LinkStatistics:

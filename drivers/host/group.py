@@ -23,7 +23,7 @@ from drivers.host.arming import Arming, Silences
 from drivers.host.heartbeats import Heartbeats
 from drivers.host.jobs import Priority
 from drivers.host.joint_sets import JointSets, Played
-from drivers.host.members import Members, is_lost, retried, round_trip_of, to_completion
+from drivers.host.members import Members, is_lost, retried, to_completion
 from drivers.host.stopping import Stopping
 from drivers.host.timing import check_watchdog
 from drivers.protocol.records import Values
@@ -91,6 +91,11 @@ class Group:
         return self._members.lost_by
 
     @property
+    def lost_from(self) -> float:
+        """When [s] the next beat stops all, since one that does not reply must be silent."""
+        return self._members.lost_from
+
+    @property
     def last_sent_at(self) -> float:
         """When [s] a set or silence was last sent to any amplifier."""
         return self._members.last_sent_at
@@ -108,7 +113,7 @@ class Group:
         stops = self._stops  # each amplifier says itself what it has latched before
         await self._members.all([each.open() for each in self.amplifiers.values()])
         for amplifier in self.amplifiers.values():
-            check_watchdog(self._watchdog, round_trip_of(amplifier))
+            check_watchdog(self._watchdog, amplifier.exchange_time("Set"))
         self.state = GroupState.DISARMED
         self._may_be_armed = False
         self._cleared = stops

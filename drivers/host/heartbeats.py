@@ -11,7 +11,7 @@ from drivers import clock
 from drivers.errors import LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.jobs import Priority
-from drivers.host.members import Members, is_lost, round_trip_of, seen
+from drivers.host.members import Members, is_lost, seen
 from drivers.protocol.records import Values
 
 _MAX_STATUS_LOAD = 0.05  # of the line's time, for statuses that show whether the watchdog runs down
@@ -33,11 +33,13 @@ class Heartbeats:
         the requests raise.
         """
         amplifiers = self._members.amplifiers.values()
+        for amplifier in amplifiers:  # before the others are waited for: they are stopped then
+            if is_lost(amplifier):
+                self._members.lost()
+                raise LinkTimeout(amplifier.line.loss or amplifier.silence_cause)
         await self._members.all([self._beat(each) for each in amplifiers])
 
     async def _beat(self, amplifier: Amplifier) -> None:
-        if is_lost(amplifier):
-            raise LinkTimeout(amplifier.line.loss or amplifier.silence_cause)
         if amplifier.silence_cause is None:
             await self._read_running(amplifier)
             if not self._is_armed():
@@ -46,13 +48,13 @@ class Heartbeats:
             return
         reading = self._readings.get(amplifier.name)
         if reading is None or reading.done():
-            reading = asyncio.ensure_future(amplifier.read_status(Priority.HEARTBEAT))
+            reading = asyncio.ensure_future(amplifier.read_status(Priority.READING))
             reading.add_done_callback(seen)
             self._readings[amplifier.name] = reading
 
     async def _read_running(self, amplifier: Amplifier) -> None:
         """Read a status just before the watchdog is fed, unless the wire is too slow for that."""
-        pause = round_trip_of(amplifier) / _MAX_STATUS_LOAD
+        pause = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
         last, now = self._running_read_at.get(amplifier.name), clock.now()
         if last is None or now - last >= pause:
             self._running_read_at[amplifier.name] = now

@@ -60,6 +60,9 @@ class Member(Protocol):
     def counts(self) -> RequestCounts:
         """Counts of its requests."""
 
+    def overtime(self, name: str, values: Values) -> float:
+        """Return how much later than on a fast wire the reply to a request may come [s]."""
+
     def note_sent(self, name: str, values: Values, now: float) -> None:
         """Note a request that may have reached it."""
 

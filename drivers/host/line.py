@@ -14,13 +14,11 @@ from drivers import trace
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
 from drivers.host.jobs import Job, JobQueue, Member, Priority
 from drivers.host.joint_start import JointStart
+from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT
 from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 from drivers.protocol.records import Values
-from drivers.protocol.table import REACTION
 from drivers.trace import Direction
 
-REPLY_TIMEOUT = 0.030  # s; a heartbeat and three of these are less than three heartbeats of 50 ms
-ATTEMPTS = 3
 GRACE = 0.008  # s; how long a stop waits for the reply to another request
 BUSY_PAUSE = 0.005  # s; before a request goes again to a busy amplifier
 _LATE = 0.005  # s; a timer later than this means that this process was delayed
@@ -60,6 +58,7 @@ class Line:
         self.time = self._loop.time
         """The clock of the line [s]."""
         self._is_pumping = False
+        self._free_at = 0.0  # s; before, a reply may still take the line
 
     def submit(
         self,
@@ -114,22 +113,28 @@ class Line:
             if job is None:
                 continue
             if isinstance(arrival, More):
+                if self._must_yield(job):
+                    self._current = None
+                    self.wire.withdraw()
+                    self._not_answered(job)
+                    continue
                 try:
                     self._send(arrival.data, f"{job.name}, read")
                 except LinkError as error:
                     self.lose(str(error))
                     return
-                self._go_on(job)
+                job.due, job.looks = max(job.due, self._loop.time() + job.timeout), 0
                 continue
             self._current = None
             self._end(job, arrival)
         if self._queue.jobs:
             self.pump()
 
-    def _go_on(self, job: Job) -> None:
-        """Give a request that was answered in part its time anew, unless a stop waits."""
-        if not any(each.priority.is_stop_class for each in self._queue.jobs):
-            job.due, job.looks = max(job.due, self._loop.time() + job.timeout), 0
+    def _must_yield(self, job: Job) -> bool:
+        """Whether a request gives way to one that silences."""
+        if job.priority.is_stop_class:
+            return False
+        return any(other.priority.is_stop_class for other in self._queue.jobs)
 
     def _end(self, job: Job, arrival: Reply | Nak | Broken) -> None:
         """End the request that was on the line by what came back."""
@@ -201,7 +206,8 @@ class Line:
                 job.result.set_result({})
                 return
             job.member.check_request(job.name)
-            longer = self._write(job.member.address, job.name, job.values, now)
+            longer = job.member.overtime(job.name, job.values)
+            self._write(job.member.address, job.name, job.values, now)
             if self.loss is not None:  # by what the port did
                 raise LinkError(self.loss)
             job.due = now + longer + job.timeout
@@ -213,21 +219,18 @@ class Line:
         except Exception as error:  # no caller may wait for ever
             self._fail(job, error)
 
-    def _write(self, address: int, name: str, values: Values, now: float) -> float:
-        """Send a request, the only way out, and note it for all that it reaches.
-
-        Returns how much longer than a local one it takes [s].
-        """
+    def _write(self, address: int, name: str, values: Values, now: float) -> None:
+        """Send a request, the only way out, and note it for all that it reaches."""
         data = self.wire.request(address, name, values)
         for member in self.members.values():
             if address in (0, member.address):
                 member.note_sent(name, values, now)
         self._send(data, name if address == 0 else f"{name} to {address}")
-        return max(self.wire.round_trip(name, len(data)) + REACTION - REPLY_TIMEOUT, 0.0)
 
     def _send(self, data: bytes, what: str) -> None:
         if trace.is_active():
             trace.frame(Direction.OUT, data, self.name, lambda: what)
+        self._free_at = self._loop.time() + self.wire.busy
         self._port.write(data)
 
     def _refused(self, job: Job, member: Member, nak: Nak) -> None:
@@ -272,10 +275,11 @@ class Line:
         if current is None or current.priority.is_stop_class:
             return
         waiting = [job.priority for job in self._queue.jobs if job.priority < current.priority]
+        free_at = max(self._loop.time(), self._free_at)
         if current.priority is Priority.READING and min(waiting, default=8) <= Priority.SET:
-            current.due = self._loop.time()
+            current.due = min(current.due, free_at)
         elif min(waiting, default=8) <= Priority.SILENCE:
-            current.due = min(current.due, self._loop.time() + GRACE)
+            current.due = min(current.due, free_at + GRACE)
 
     def _schedule(self) -> None:
         """Have the timer look again by the next time that matters; it is never cancelled."""
@@ -311,8 +315,7 @@ class Line:
         self.pump()
 
     def _not_answered(self, job: Job) -> None:
-        preempting = any(other.priority.is_stop_class for other in self._queue.jobs)
-        if preempting and not job.priority.is_stop_class:
+        if self._must_yield(job):
             job.attempts += 1
             self._repeat(job)
             return

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from drivers import clock
 from drivers.errors import LinkError, LinkTimeout
-from drivers.host.amplifier import PART_BYTES, Amplifier
+from drivers.host.amplifier import Amplifier
 from drivers.protocol.records import Values
 
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
@@ -38,6 +38,12 @@ class Members:
             for name, each in self.amplifiers.items()
             if is_lost(each)
         }
+
+    @property
+    def lost_from(self) -> float:
+        """When [s] the first of those that do not reply is lost; infinite while all reply."""
+        mute = [each for each in self.amplifiers.values() if each.silence_cause is not None]
+        return min((each.feeding.may_play_until for each in mute), default=math.inf)
 
     @property
     def replying(self) -> list[str]:
@@ -92,11 +98,6 @@ def is_lost(amplifier: Amplifier) -> bool:
     """Whether it cannot be reached: its line is gone, or it is mute beyond its watchdog."""
     is_over = clock.now() >= amplifier.feeding.may_play_until
     return amplifier.line.loss is not None or (amplifier.silence_cause is not None and is_over)
-
-
-def round_trip_of(amplifier: Amplifier) -> float:
-    """Return how long the longest exchange with an amplifier takes on its wire [s]."""
-    return amplifier.line.wire.round_trip("Set", PART_BYTES)
 
 
 async def retried(amplifier: Amplifier, request: Callable[[], Awaitable[_T]]) -> _T:

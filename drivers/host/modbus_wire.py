@@ -17,11 +17,20 @@ from drivers.codec.modbus.adu import (
     Write,
     build_adu,
 )
-from drivers.host.wire import Arrival, Broken, More, Nak, Reply, Several, read_nak
-from drivers.protocol.quantity import WireQuantity
-from drivers.protocol.records import Number, Numbers, Real, Record, Refusal, Rest, Rows, Values
+from drivers.host.wire import (
+    WIDEST,
+    Arrival,
+    Broken,
+    More,
+    Nak,
+    Reply,
+    Several,
+    read_nak,
+    reply_words,
+)
+from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import BROADCAST
-from drivers.protocol.table import MAX_WORDS, MESSAGES, QUANTITIES
+from drivers.protocol.table import MESSAGES
 from drivers.statistics import WireCounters
 
 _BOX = 256  # registers of a message
@@ -31,6 +40,7 @@ _TEXTS = ("vendor", "product", "serial_number", "firmware")
 _TEXT_SIZE = 32  # bytes
 _IDENTITY = Read(1065, 2 + len(_TEXTS) * _TEXT_SIZE // 2)
 _WRITE_SIZE = 9  # bytes on RTU of a write, without its registers
+_FRAME_SIZE = 3  # bytes on RTU of a frame beside its PDU
 _ANSWERS_SIZE = 21  # bytes on RTU of the response to a write, of a read and its response
 _BITS = 11  # of a byte, with start, parity and stop
 _GAP = 3.5  # characters of silence before a frame
@@ -43,7 +53,6 @@ _EXCEPTIONS: Mapping[int, str] = {
     5: "BUSY",
     6: "BUSY",
 }
-_WIDEST = QUANTITIES["channel_count"].maximum, QUANTITIES["layer_count"].maximum
 
 
 @dataclass(slots=True)
@@ -66,6 +75,7 @@ class ModbusWire:
         self.counters = WireCounters()
         self.silence = max(_GAP * _BITS / baud, _SHORTEST_GAP) if baud else 0.0
         self.delay = delay
+        self.busy = 0.0
         self._baud = baud
         self._is_rtu = is_rtu
         self._number = number
@@ -86,7 +96,7 @@ class ModbusWire:
             adus = [self._written(unit, name, values).adu for unit in self._sizes]
             self._reader.unawaited = {adu.transaction for adu in adus}
             return b"".join(adu.frame for adu in adus)
-        self._sizes.setdefault(address, _WIDEST)
+        self._sizes.setdefault(address, WIDEST)
         if name == "Hello":
             self._request = _Request(name, address, 0, self._adu(address, _IDENTITY))
         else:
@@ -117,25 +127,28 @@ class ModbusWire:
 
     def transit(self, words: int) -> float:
         """Return how long a request of so many words takes to arrive [s]: its write."""
-        characters = _WRITE_SIZE + 2 * (1 + words)
-        return _BITS * characters / self._baud + self.silence if self._baud else 0.0
+        return self._time(_WRITE_SIZE + 2 * (1 + words)) + self.silence
 
-    def round_trip(self, name: str, length: int) -> float:
-        """Return how long a request of this many bytes and its longest reply take [s].
+    def exchange_time(self, words: int, reply: int) -> float:
+        """Return how long a request and a reply of so many words take [s]; 0 over a network.
 
         Two transactions, with the silences before all four frames.
         """
-        if not self._baud:
-            return 0.0
-        replies = (_reply_registers(name, *size) for size in self._sizes.values() or (_WIDEST,))
-        characters = length + _ANSWERS_SIZE + 2 * max(replies)
-        return _BITS * characters / self._baud + 4 * self.silence
+        rest = self._time(_ANSWERS_SIZE + 2 * (_REPLY_HEAD + reply))
+        return self.transit(words) + rest + 3 * self.silence
+
+    def _time(self, characters: int) -> float:
+        return _BITS * characters / self._baud if self._baud else 0.0
 
     def _adu(self, unit: int, transfer: Read | Write) -> RequestAdu:
         self._number = self._number % 0xFFFF + 1
         self.counters.frames_out += 1
         transaction = 0 if self._is_rtu else self._number
-        return build_adu(transfer, unit=unit, transaction=transaction, is_rtu=self._is_rtu)
+        adu = build_adu(transfer, unit=unit, transaction=transaction, is_rtu=self._is_rtu)
+        if self._is_rtu:
+            response = adu.size + _FRAME_SIZE
+            self.busy = self._time(len(adu.frame) + response) + 2 * self.silence
+        return adu
 
     def _written(self, unit: int, name: str, values: Values) -> _Request:
         """Return a request whose write goes first."""
@@ -155,7 +168,8 @@ class ModbusWire:
             return Broken(f"Modbus exception {response.exception}")
         if isinstance(request.adu.transfer, Write):
             first = MESSAGES[request.name].number * _BOX + _REPLY
-            read = Read(first, _reply_registers(request.name, *self._sizes[request.unit]))
+            count = _REPLY_HEAD + reply_words(request.name, *self._sizes[request.unit])
+            read = Read(first, count)
             request.adu = self._adu(request.unit, read)
             return More(request.adu.frame)
         tag, result, *words = response.registers
@@ -174,36 +188,6 @@ class ModbusWire:
         if request.name == "GetCaps":
             self._sizes[request.unit] = values["channels"], values["layers"]
         return Reply(values)
-
-
-def _reply_registers(name: str, channels: int, layers: int) -> int:
-    """Return how many registers the reply of an amplifier with these can have."""
-    if name == "Hello":
-        return _IDENTITY.count
-    if name == "GetCaps":
-        channels, _ = _WIDEST
-    rows = {"channels": channels, "layers": layers}
-    if name in ("GetAchieved", "GetMeasured"):
-        rows["count"] = channels
-    return _REPLY_HEAD + min(_width(MESSAGES[name].reply, rows), MAX_WORDS)
-
-
-def _width(record: Record, rows: Mapping[str, int]) -> int:
-    """Return the most words of a record; rows: how many there are, by the name of their count."""
-    width = 0
-    for field in record.fields:
-        match field:
-            case Rows(count=str(counted), record=row):
-                width += rows.get(counted, MAX_WORDS) * _width(row, rows)
-            case Numbers(count=counted):
-                width += rows.get(counted, MAX_WORDS)
-            case Rest():
-                width += MAX_WORDS
-            case Number(quantity=WireQuantity(wire="u32")) | Real():
-                width += 2
-            case _:
-                width += 1
-    return width
 
 
 def _identity(registers: tuple[int, ...]) -> Values:

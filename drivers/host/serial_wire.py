@@ -21,7 +21,6 @@ from drivers.protocol.table import (
     BY_NUMBER,
     EVENT,
     EVENT_RECORD,
-    MAX_WORDS,
     MESSAGES,
     NAK,
     VERSION,
@@ -29,8 +28,6 @@ from drivers.protocol.table import (
 from drivers.statistics import WireCounters
 
 _BITS = 10  # of a byte, with start and stop
-_REPLY_MAX = frame_length(2 * MAX_WORDS)  # bytes
-_IDENTITY = frame_length(140)
 
 
 class SerialWire:
@@ -38,6 +35,7 @@ class SerialWire:
 
     def __init__(self, baud: int, *, sequence: int) -> None:
         self.counters = WireCounters()
+        self.busy = 0.0
         self.delay = 0.0 if baud else NETWORK_DELAY
         self._byte_time = _BITS / baud if baud else 0.0
         self._sequence = sequence
@@ -74,9 +72,9 @@ class SerialWire:
         """Return how long a request of so many words takes to arrive [s]."""
         return self._byte_time * frame_length(2 * words)
 
-    def round_trip(self, name: str, length: int) -> float:
-        """Return how long a request of this many bytes and its longest reply take [s]."""
-        return self._byte_time * (length + (_IDENTITY if name == "Hello" else _REPLY_MAX))
+    def exchange_time(self, words: int, reply: int) -> float:
+        """Return how long a request and a reply of so many words take [s]; 0 behind a server."""
+        return self.transit(words) + self.transit(reply)
 
     def _arrival(self, frame: Frame) -> Arrival | None:
         self.counters.frames_in += 1

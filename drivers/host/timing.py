@@ -3,23 +3,33 @@
 from collections.abc import Iterable
 
 from drivers.errors import CommandError
-from drivers.host.line import ATTEMPTS, REPLY_TIMEOUT
 from drivers.protocol.table import REACTION
 
+REPLY_TIMEOUT = 0.030
+"""For a reply [s], on a wire that is fast; a heartbeat and three of these are less than 150 ms."""
+ATTEMPTS = 3
+"""Of a request; one less where the wire is slow."""
 HEARTBEAT = 0.05
 """Interval of heartbeats [s]."""
 MAX_LOSS_DETECTION_TIME = 3 * HEARTBEAT
 """Longest time to detect a loss without a warning [s]."""
 _HEARTBEATS = 3  # a watchdog must outlast this many intervals
-_SET_HEAD, _LAYER_HEAD, _COMMAND = 3, 3, 4  # words
+_LAYER_HEAD, _COMMAND = 3, 4  # words
 
+SET_WORDS = 3
+"""Of a part of a set, before its stream."""
 TAKEN_WORDS = 3
 """Of the reply to a set."""
 
 
 def set_words(channels: int) -> int:
     """Return the words of a set of this many channels in one layer, without envelopes."""
-    return _SET_HEAD + _LAYER_HEAD + _COMMAND * channels
+    return SET_WORDS + _LAYER_HEAD + _COMMAND * channels
+
+
+def overtime(exchange: float) -> float:
+    """Return how much longer than on a fast wire a reply may take [s]; exchange: of both [s]."""
+    return max(exchange + REACTION - REPLY_TIMEOUT, 0.0)
 
 
 def shortest_watchdog(round_trip: float) -> float:
@@ -46,6 +56,6 @@ def loss_detection_time(round_trips: Iterable[float]) -> float:
     """
     detected = HEARTBEAT
     for round_trip in round_trips:
-        takes = max(REPLY_TIMEOUT, round_trip + REACTION)
-        detected += (ATTEMPTS - (takes > REPLY_TIMEOUT)) * takes
+        longer = overtime(round_trip)
+        detected += (ATTEMPTS - (longer > 0)) * (REPLY_TIMEOUT + longer)
     return detected

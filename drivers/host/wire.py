@@ -4,12 +4,32 @@ A wire carries one request at a time. What arrives is matched by it: a reply to 
 is counted as unexpected, and damaged bytes as invalid.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Protocol, TypeAlias
 
-from drivers.protocol.records import Values
-from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REFUSALS
+from drivers.protocol.quantity import WireQuantity
+from drivers.protocol.records import (
+    TEXT_MAX,
+    Number,
+    Numbers,
+    Real,
+    Record,
+    Rest,
+    Rows,
+    Text,
+    Values,
+)
+from drivers.protocol.table import (
+    IDENTITY,
+    MAX_WORDS,
+    MESSAGES,
+    NAK_RECORD,
+    NO_CHANNEL,
+    QUANTITIES,
+    REFUSALS,
+)
 from drivers.statistics import WireCounters
 
 NETWORK_DELAY = 1.0
@@ -17,6 +37,8 @@ NETWORK_DELAY = 1.0
 
 What a broken network delivers later than that is not accounted for.
 """
+WIDEST = QUANTITIES["channel_count"].maximum, QUANTITIES["layer_count"].maximum
+"""Channels and layers of the largest amplifier there can be."""
 _CODES = {number: name for name, number in REFUSALS.items()}
 
 
@@ -81,12 +103,53 @@ def read_nak(words: Sequence[int]) -> Nak:
     return Nak(_CODES.get(values["code"], f"code {values['code']}"), channel)
 
 
+@cache
+def request_words(name: str) -> int:
+    """Return the most words of a request."""
+    return 0 if name == "Hello" else _words(MESSAGES[name].request, {})
+
+
+@cache
+def reply_words(name: str, channels: int, layers: int) -> int:
+    """Return the most words of a reply of an amplifier with so many channels and layers."""
+    if name in ("Hello", "GetCaps"):
+        channels, layers = WIDEST
+    rows = {"channels": channels, "layers": layers}
+    if name in ("GetAchieved", "GetMeasured"):
+        rows["count"] = channels
+    return _words(IDENTITY if name == "Hello" else MESSAGES[name].reply, rows)
+
+
+def _words(record: Record, rows: Mapping[str, int]) -> int:
+    """Return the most words of a record; rows: how many there are, by the name of their count."""
+    words = 0
+    for field in record.fields:
+        match field:
+            case Rows(count=str(counted), record=row):
+                words += rows.get(counted, MAX_WORDS) * _words(row, rows)
+            case Numbers(count=counted):
+                words += rows.get(counted, MAX_WORDS)
+            case Rest():
+                words += MAX_WORDS
+            case Text():
+                words += 1 + TEXT_MAX // 2
+            case Number(quantity=WireQuantity(wire="u32")) | Real():
+                words += 2
+            case _:
+                words += 1
+    return min(words, MAX_WORDS)
+
+
 class Wire(Protocol):
     """The host's side of a kind of wire."""
 
     counters: WireCounters
     delay: float
     """By which a frame may arrive later than its bits take [s]: `NETWORK_DELAY` over a network."""
+
+    @property
+    def busy(self) -> float:
+        """For how long what was sent last and its reply take a line in turn [s]; 0 on others."""
 
     def request(self, address: int, name: str, values: Values) -> bytes:
         """Return the bytes of a request, which is on the wire from now on; address 0: of all."""
@@ -100,5 +163,5 @@ class Wire(Protocol):
     def transit(self, words: int) -> float:
         """Return how long a request of so many words takes to arrive [s]."""
 
-    def round_trip(self, name: str, length: int) -> float:
-        """Return how long a request of this many bytes and its longest reply take [s]."""
+    def exchange_time(self, words: int, reply: int) -> float:
+        """Return how long a request and a reply of so many words take [s]; 0 if unknown."""

@@ -17,7 +17,7 @@ from drivers.protocol.quantity import WireQuantity
 WORD = 0x10000
 _CODES = {"channel": "BAD_CHANNEL", "token": "BAD_TOKEN"}
 """Of Naks, by quantity; others are BAD_VALUE."""
-_TEXT_MAX = 32  # bytes
+TEXT_MAX = 32  # bytes
 _REAL_MAX = (2 - 2**-23) * 2.0**127  # of IEEE 754 binary32
 
 Values = dict[str, Any]
@@ -91,12 +91,12 @@ class Text:
     def encoded(self, values: Mapping[str, Any]) -> bytes:
         """Return the bytes of the text, cut at its longest length between two characters."""
         text: str = values[self.name]
-        return text.encode()[:_TEXT_MAX].decode(errors="ignore").encode()
+        return text.encode()[:TEXT_MAX].decode(errors="ignore").encode()
 
     def read(self, raw: bytes, length: int, values: Values) -> None:
         """Read the text from its bytes, of which there must be a number."""
-        if length != len(raw) or length > _TEXT_MAX:
-            raise Refusal(f"{self.name} must have at most {_TEXT_MAX} bytes", "BAD_LENGTH")
+        if length != len(raw) or length > TEXT_MAX:
+            raise Refusal(f"{self.name} must have at most {TEXT_MAX} bytes", "BAD_LENGTH")
         try:
             values[self.name] = raw.decode("utf-8")
         except UnicodeDecodeError:

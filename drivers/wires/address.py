@@ -24,16 +24,12 @@ class WireAddress(ABC):
         """Parse a URL."""
 
     @abstractmethod
-    def exchange_time(self, words: int, reply: int) -> float:
-        """Return how long a request and its reply of so many words take [s]; 0 if unknown."""
+    def make_wire(self) -> Wire:
+        """Make the host's side of the wire, without I/O."""
 
     def set_time(self, channels: int) -> float:
         """Return how long a set of these channels and its reply take [s]; 0 if unknown."""
-        return self.exchange_time(set_words(channels), TAKEN_WORDS)
-
-    @abstractmethod
-    def make_wire(self) -> Wire:
-        """Make the host's side of the wire, without I/O."""
+        return self.make_wire().exchange_time(set_words(channels), TAKEN_WORDS)
 
     @abstractmethod
     async def open_port(

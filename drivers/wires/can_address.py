@@ -5,8 +5,8 @@ How they are packed: `drivers.codec.can_bus.segments`.
 
 from collections.abc import Mapping
 
-from drivers.codec.can_bus.canopen import BITRATE, frame_time
-from drivers.codec.can_bus.segments import NODE_MAX, NUMBER_MAX, frames_of
+from drivers.codec.can_bus.canopen import BITRATE
+from drivers.codec.can_bus.segments import NODE_MAX, NUMBER_MAX
 from drivers.hardware import number_below
 from drivers.host.can_wire import CanWire
 from drivers.urls import ADDRESS, AmplifierUrl
@@ -29,10 +29,6 @@ class CanAddress(WireAddress):
         self.line, self._delay = line, delay
         self.number = url.whole(url.number, "node", NODE_MAX) if url.number else ADDRESS
         self.settings = {"protocol": "CAN", "bitrate": self.bitrate, **settings}
-
-    def exchange_time(self, words: int, reply: int) -> float:
-        """Return how long a request and its reply of so many words take [s]."""
-        return (frames_of(words) + frames_of(reply)) * frame_time(self.bitrate)
 
     def make_wire(self) -> CanWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""

@@ -15,8 +15,6 @@ _TCP_FORM = "modbus+tcp://HOST:PORT/UNIT (behind a gateway: ?baud=19200, that of
 _RTU_FORM = "modbus+rtu:///dev/ttyS1?baud=115200#UNIT or modbus+rtu://HOST:PORT#UNIT"
 _TCP_PORT = 502
 _PARITIES = {"even": "E", "odd": "O", "none": "N"}
-_WRITE = 9 + 8  # bytes of a write of no registers on RTU, and of its response
-_READ = 8 + 5  # of a read, and of its response of no registers
 
 
 class ModbusAddress(WireAddress):
@@ -43,14 +41,6 @@ class ModbusAddress(WireAddress):
             "parity": self.place.parity,
             "stop": self.place.stop,
         }
-
-    def exchange_time(self, words: int, reply: int) -> float:
-        """Return how long a request and its reply of so many words take [s]; 0 if unknown.
-
-        A write and a read, each with its response: with the silences before all four frames.
-        """
-        count = _WRITE + _READ + 2 * (words + 1 + reply + 2)  # tag; tag and result
-        return self.place.byte_time * count + 4 * self.make_wire().silence
 
     def make_wire(self) -> ModbusWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""

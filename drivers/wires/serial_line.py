@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-from drivers.codec.serial_line.frame import frame_length
 from drivers.hardware import Port, number_below
 from drivers.host.serial_wire import SerialWire
 from drivers.ports.opening import open_port
@@ -24,10 +23,6 @@ class SerialAddress(WireAddress):
         self.number = parsed.whole_option("address", ADDRESS, ADDRESS_MAX)
         self.line = self.place.name
         self.settings = {"protocol": "serial", "baud": self.place.baud}
-
-    def exchange_time(self, words: int, reply: int) -> float:
-        """Return how long a request and its reply of so many words take [s]; 0 if unknown."""
-        return self.place.byte_time * (frame_length(2 * words) + frame_length(2 * reply))
 
     def make_wire(self) -> SerialWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""

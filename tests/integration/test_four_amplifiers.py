@@ -56,9 +56,8 @@ ARRANGED = {
 }
 MAX_SKEW = 1e-3  # s; of several links, docs/reference/several-amplifiers.md
 OWN = 0.250 + 0.010  # s; an amplifier's watchdog and its ramp
-ALL = (
-    OWN + 2 * 0.050 + 3 * 0.030 + 0.010
-)  # s; and two heartbeats, a request sent three times, and its stop
+FED = 0.050 + 2 * 0.035  # s; a heartbeat later it may be fed, by a request that is sent three times
+ALL = OWN + FED + 0.010 + 0.015  # s; and its reaction, and the stop of the others
 LEVEL = 0.2
 
 

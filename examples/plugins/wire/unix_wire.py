@@ -27,10 +27,6 @@ class UnixAddress(WireAddress):
         self.line, self.number = unquote(parts.path), int(number)
         self.settings = {"protocol": "serial"}
 
-    def exchange_time(self, words: int, reply: int) -> float:
-        """Return 0: the speed of the real line is not known here."""
-        return 0.0
-
     def make_wire(self) -> SerialWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""
         return SerialWire(0, sequence=random.getrandbits(16))

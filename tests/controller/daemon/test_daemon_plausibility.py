@@ -86,6 +86,7 @@ def test_dead_weak_channel_ends_in_fault(level: float, names: tuple[str, ...]) -
             assert chain.levels()[names[0]][2] == pytest.approx(level)
             chain.lie(status(levels=lambda levels: [*levels[:2], 0]), names[0])
             await chain.play(3 * HEARTBEAT, interval=TOUCHES, moves=False)
+            await chain.rest(SILENCE)
             assert "level of channel 2" in chain.causes[0]
 
     run_virtual(main(), rng=random.Random(1))

@@ -270,8 +270,8 @@ async def test_lift_as_a_set_is_confirmed_precedes_a_due_heartbeat(later: int) -
                 bench.touch()
 
         def answer(name: str, values: Values) -> None:
-            if name == "Commit" and not before:
-                lift(later)
+            if name == "Commit" and not before:  # until its reply arrives
+                asyncio.get_running_loop().call_later(bench.far_ends[-1].delay, lift, later)
 
         await asyncio.sleep(0.046)
         for far_end in bench.far_ends:

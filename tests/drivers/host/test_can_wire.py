@@ -133,11 +133,10 @@ def test_echo_of_own_frames_is_none(wire: CanWire) -> None:
     assert wire.counters.unexpected_frames == 0
 
 
-def test_round_trip_counts_the_stuffed_bits_of_the_longest_reply() -> None:
-    """A frame has 47 + 64 bits and at most 24 stuffed ones; one and 41 of them at 125 kbit/s."""
+def test_exchange_time_counts_the_stuffed_bits() -> None:
+    """A frame has 47 + 64 bits and at most 24 stuffed ones; one, and 41 of the longest reply."""
     wire = CanWire(125_000, sequence=0)
-    length = len(wire.request(NODE, "GetStatus", {}))
-    assert wire.round_trip("GetStatus", length) == pytest.approx(42 * 135 / 125_000)
+    assert wire.exchange_time(0, 120) == pytest.approx(42 * 135 / 125_000)
 
 
 def test_random_frames_raise_nothing_and_are_no_reply(wire: CanWire) -> None:

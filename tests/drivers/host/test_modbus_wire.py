@@ -254,10 +254,31 @@ def test_each_response_has_its_time(kind: str) -> None:
     run_virtual(run())
 
 
+def test_stop_is_not_sent_over_a_reply() -> None:
+    """On RTU a status of two channels, 8 + 39 characters and two silences, begins 4 ms late."""
+
+    async def run() -> None:
+        end = MemoryLine("rtu", "a")
+        host = end.hosts["a"]
+        await host.open()
+        takes = 47 * 11 / 115_200 + 2 * 0.00175 + 0.004
+        end.outward = lambda name, data: [(takes if len(data) > 8 else 0.0, data)]
+        begin = end.loop.time()
+        reading = asyncio.ensure_future(host.read_status())
+        await asyncio.sleep(0.001)
+        assert (await host.stop()).is_confirmed
+        await reading
+        stopped = min(time for time, request in end.sent if request == "1:8")
+        assert stopped - begin >= takes
+        assert (end.retries, end.line.wire.counters.unexpected_frames) == (0, 0)
+
+    run_virtual(run())
+
+
 def test_times_on_a_line_are_those_of_its_characters() -> None:
     """A set of 22 words: 55 + 8 + 8 + 5 + 2 · 5 characters of 11 bits, four silences."""
     wire = ModbusWire(115_200, is_rtu=True, number=0)
-    assert wire.round_trip("Set", 55) == pytest.approx(86 * 11 / 115_200 + 4 * 0.00175)
+    assert wire.exchange_time(22, 3) == pytest.approx(86 * 11 / 115_200 + 4 * 0.00175)
     slow = ModbusWire(9600, is_rtu=True, number=0)
     assert slow.silence == pytest.approx(3.5 * 11 / 9600)
-    assert ModbusWire(0, is_rtu=False, number=0).round_trip("Set", 55) == 0
+    assert ModbusWire(0, is_rtu=False, number=0).exchange_time(22, 3) == 0

@@ -33,67 +33,64 @@ class SocketcandAddress(CanAddress):
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
     ) -> Port:
         """Connect, and open the bus in raw mode; raises LinkError."""
-        greeting = _Greeting()
         port = TextPort(SOCKETCAND, on_data)
+        said: asyncio.Queue[bytes | LinkError] = asyncio.Queue()
+        is_raw = False
 
         def received(data: bytes) -> None:
-            (port.received if greeting.is_over else greeting.received)(data)
+            if is_raw:
+                port.received(data)
+            else:
+                said.put_nowait(data)
 
         def lost(cause: str) -> None:
-            (on_loss if greeting.is_over else greeting.lost)(cause)
+            if is_raw:
+                on_loss(cause)
+            else:
+                said.put_nowait(LinkError(cause))
 
         port.below = await open_port(self.place, received, lost)
         try:
             async with asyncio.timeout(_GREETING_TIMEOUT):
-                await greeting.expect(b"< hi >")
+                rest = await _expected(b"< hi >", b"", said)
                 port.below.write(f"< open {self.channel} >".encode())
-                await greeting.expect(b"< ok >")
+                rest = await _expected(b"< ok >", rest, said)
                 port.below.write(b"< rawmode >")
-                await greeting.expect(b"< ok >")
-        except asyncio.CancelledError:
+                rest = await _expected(b"< ok >", rest, said)
+        except BaseException as error:
             port.below.close()
-            raise
-        except (TimeoutError, LinkError) as error:
-            port.below.close()
-            said = str(error) or f"no reply within {_GREETING_TIMEOUT:g} s"
+            if not isinstance(error, TimeoutError | LinkError):
+                raise
+            cause = str(error) or f"no reply within {_GREETING_TIMEOUT:g} s"
             raise LinkError(
-                f"CAN bus {self.line} cannot be opened: {said}; check address and port, and that "
+                f"CAN bus {self.line} cannot be opened: {cause}; check address and port, and that "
                 "socketcand serves this bus there"
             ) from None
-        greeting.is_over = True
-        port.received(greeting.rest)
+        is_raw = True
+        port.received(rest)
+        while not said.empty():
+            data = said.get_nowait()
+            if isinstance(data, LinkError):
+                lost(str(data))
+            else:
+                received(data)
         return port
 
 
-class _Greeting:
-    """The elements of a server before it is in raw mode; frames may be among them."""
+async def _expected(element: bytes, rest: bytes, said: "asyncio.Queue[bytes | LinkError]") -> bytes:
+    """Wait for an element of the server, and return what follows; LinkError for another one.
 
-    def __init__(self) -> None:
-        self.is_over = False
-        self.rest = b""
-        self._cause: str | None = None
-        self._changed = asyncio.Event()
-
-    def received(self, data: bytes) -> None:
-        """Take text of the server."""
-        self.rest += data
-        self._changed.set()
-
-    def lost(self, cause: str) -> None:
-        """Note that the connection was lost."""
-        self._cause = cause
-        self._changed.set()
-
-    async def expect(self, expected: bytes) -> None:
-        """Wait for an element; LinkError for another one."""
-        while True:
-            while b">" not in self.rest:
-                if self._cause is not None:
-                    raise LinkError(self._cause)
-                self._changed.clear()
-                await self._changed.wait()
-            element, _, self.rest = self.rest.partition(b">")
-            if not _IS_FRAME.match(element):
-                break
-        if (element + b">").strip() != expected:
-            raise LinkError(f"reply must be {expected!r}, got {element + b'>'!r}")
+    rest: what was said and not looked at yet. Frames may come before it.
+    """
+    while True:
+        while b">" not in rest:
+            data = await said.get()
+            if isinstance(data, LinkError):
+                raise data
+            rest += data
+        found, _, rest = rest.partition(b">")
+        if not _IS_FRAME.match(found):
+            break
+    if (found + b">").strip() != element:
+        raise LinkError(f"reply must be {element!r}, got {found + b'>'!r}")
+    return rest

@@ -18,7 +18,7 @@ from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
 from model.structure.fingertip import Fingertip, FingertipLoad
 from model.structure.point_load import footprints_of
-from model.transients.base_motion import Fade
+from model.transients.base_motion import raised_cosine
 from sim.bench.bench import Bench
 from sim.plant.plant import SAMPLE_RATE, Plant
 
@@ -135,7 +135,7 @@ def _resting(places: Sequence[tuple[float, float]]) -> dict[str, FingertipLoad]:
 def _new_tones(plant: Plant, eras: int) -> None:
     for number in range(eras):
         omega = 2 * np.pi * FREQUENCIES[number % 4]
-        plant.set_input(number, [Fade(plant.time, 0.02, omega, 1e-4, 0.0, 1.0)])
+        plant.set_input(number, raised_cosine(plant.time, 0.02, omega, 0j, 1e-4))
 
 
 def contact_times(rigs: Rigs) -> Iterator[tuple[str, float]]:

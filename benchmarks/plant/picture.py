@@ -21,7 +21,7 @@ from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.structure.fingertip import Fingertip, FingertipLoad
 from model.structure.point_load import footprints_of
-from model.transients.base_motion import Fade
+from model.transients.base_motion import raised_cosine
 from sim.plant.plant import Plant
 
 FREQUENCY = 110.0  # Hz
@@ -60,7 +60,7 @@ def vibrate(
     plant = Plant(reduced, rig.eras)
     omega = 2 * np.pi * FREQUENCY
     stroke = 0.2 * rig.eras[1].stroke
-    plant.set_input(1, [Fade(0.0, 0.02, omega, stroke, 0.0, 1.0)])
+    plant.set_input(1, raised_cosine(0.0, 0.02, omega, 0j, stroke))
     times, felt = [], []
     for until, then in ((LANDS, contacts), (GOES, {}), (ENDS, {})):
         shapes = plant.reduced.at(points)

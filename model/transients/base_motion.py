@@ -4,12 +4,13 @@ import cmath
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray
 
 
 class Term(NamedTuple):
@@ -25,41 +26,51 @@ class Term(NamedTuple):
     c1: complex = 0j
 
 
-class Fade(NamedTuple):
-    """y(t) = Im[gain(t) amplitude exp(i omega (t - start))] [m] from start [s] on.
+Motion: TypeAlias = Sequence[Term]
+"""The motion of a base, the sum of its terms."""
 
-    omega [rad/s]; amplitude [m], complex. The gain goes from gain_from to gain_to within ramp [s]
-    along a raised cosine and stays there; a ramp of 0 is a jump.
+
+def raised_cosine(
+    start: float, ramp: float, omega: float, first: complex, last: complex
+) -> tuple[Term, ...]:
+    """Terms of Im[a(t) exp(i omega (t - start))] from start [s] on, omega [rad/s].
+
+    a goes from first to last [m] within ramp [s] along a raised cosine, which is three terms, at
+    omega and omega +- pi / ramp, and stays there; a ramp of 0 is a jump.
     """
-
-    start: float
-    ramp: float
-    omega: float
-    amplitude: complex
-    gain_from: float
-    gain_to: float
-
-    def terms(self) -> tuple[Term, ...]:
-        """The same motion in terms: the raised cosine is three, at omega and omega +- pi / ramp."""
-        settled = self.start + self.ramp
-        fading: tuple[Term, ...] = ()
-        if self.ramp > 0:
-            mean = (self.gain_from + self.gain_to) / 2
-            half_swing = (self.gain_from - self.gain_to) / 4 * self.amplitude
-            side = math.pi / self.ramp
-            fading = (
-                Term(self.start, settled, self.omega, mean * self.amplitude),
-                Term(self.start, settled, self.omega + side, half_swing),
-                Term(self.start, settled, self.omega - side, half_swing),
-            )
-        if not self.gain_to > 0:
-            return fading
-        lasting = self.gain_to * self.amplitude * cmath.exp(1j * self.omega * self.ramp)
-        return (*fading, Term(settled, math.inf, self.omega, lasting))
+    settled = start + ramp
+    fading: tuple[Term, ...] = ()
+    if ramp > 0:
+        side, half_swing = math.pi / ramp, (first - last) / 4
+        fading = (
+            Term(start, settled, omega, (first + last) / 2),
+            Term(start, settled, omega + side, half_swing),
+            Term(start, settled, omega - side, half_swing),
+        )
+    if last == 0:
+        return fading
+    return (*fading, Term(settled, math.inf, omega, last * cmath.exp(1j * omega * ramp)))
 
 
-Motion: TypeAlias = Sequence[Term | Fade]
-"""The motion of a base, the sum of its parts."""
+def along_lines(
+    start: float, step: float, omega: float, values: Sequence[complex]
+) -> tuple[Term, ...]:
+    """Terms of Im[a(t) exp(i omega (t - start))] from start [s] on, omega [rad/s].
+
+    a goes through values [m], one every step [s], along straight lines, and stays at the last.
+    """
+    # Computed once: between a sum and a product, samples would belong to both terms or none.
+    moments = [start + number * step for number in range(len(values))]
+    factors = [cmath.exp(1j * omega * number * step) for number in range(len(values))]
+    terms = [
+        Term(since, until, omega, factor * here, factor * (there - here) / step)
+        for (since, until), (here, there), factor in zip(
+            pairwise(moments), pairwise(values), factors[:-1], strict=True
+        )
+    ]
+    if values[-1] != 0:
+        terms.append(Term(moments[-1], math.inf, omega, factors[-1] * values[-1]))
+    return tuple(terms)
 
 
 class BaseMotions:
@@ -71,32 +82,21 @@ class BaseMotions:
     """
 
     def __init__(self, *sets: Sequence[Motion], since: float = -math.inf) -> None:
-        terms: list[tuple[complex, ...]] = []
-        fades: list[tuple[complex, ...]] = []
-        for number, motions in enumerate(sets):
-            for era, motion in enumerate(motions):
-                for part in motion:
-                    if isinstance(part, Term):
-                        terms.append((number, era, *part))
-                    elif part.gain_to or part.start + part.ramp > since:
-                        fades.append((number, era, *part))
+        terms = [
+            (number, era, *term)
+            for number, motions in enumerate(sets)
+            for era, motion in enumerate(motions)
+            for term in motion
+            if term.end > since
+        ]
         *reals, c0, c1 = zip(*terms, strict=True) if terms else ((),) * 7
-        columns, amplitude = np.array(reals, dtype=float), np.array(c0, dtype=complex)
-        if fades:
-            added, faded = _terms_of_fades(fades)
-            columns = np.concatenate([columns, added], axis=1)
-            amplitude = np.concatenate([amplitude, faded])
-        self._moments: dict[int, list[float]] = {}
+        columns = np.array(reals, dtype=float)
         order = np.argsort(columns[4], kind="stable")
-        order = order[columns[3][order] > since]
+        self._moments: dict[int, list[float]] = {}
         number, era, self.start, self.end, self.omega = columns[:, order]
         self.number, self.era = number.astype(np.intp), era.astype(np.intp)
-        self.c0: ComplexArray = amplitude[order]
-        self.c1: ComplexArray | None = None
-        if any(c1):
-            growth = np.zeros(len(amplitude), dtype=complex)
-            growth[: len(c1)] = c1
-            self.c1 = growth[order]
+        self.c0: ComplexArray = np.array(c0, dtype=complex)[order]
+        self.c1: ComplexArray | None = np.array(c1, dtype=complex)[order] if any(c1) else None
 
     def moments(self, number: int, since: float, until: float) -> list[float]:
         """When terms of a set start or end, after a time [s] and up to another, ascending."""
@@ -112,27 +112,3 @@ class BaseMotions:
         now = np.asarray(times)[:, None]
         is_of_set = self.number == np.asarray(numbers)[:, None]
         return np.asarray(is_of_set & (self.start <= now) & (now < self.end))
-
-
-def _terms_of_fades(fades: Sequence[tuple[complex, ...]]) -> tuple[FloatArray, ComplexArray]:
-    """Number of the set, ERA, start, end and omega (5, n) of the terms of fades, and c0 (n,)."""
-    number, era, start, ramp, omega, amplitude, gain_from, gain_to = zip(*fades, strict=True)
-    reals = np.array([number, era, start, ramp, omega, gain_from, gain_to], dtype=float)
-    amplitudes = np.array(amplitude, dtype=complex)
-    is_ramped, is_lasting = reals[3] > 0, reals[6] > 0
-    ramped, lasting = reals[:, is_ramped], reals[:, is_lasting]
-    count = ramped.shape[1]
-    columns = np.empty((5, 3 * count + lasting.shape[1]))
-    c0 = np.empty(columns.shape[1], dtype=complex)
-    start, ramp, omega, gain_from, gain_to = ramped[2:]
-    side = math.pi / ramp
-    fading, swings = columns[:, : 3 * count].reshape(5, 3, count), c0[: 3 * count].reshape(3, count)
-    fading[:3], fading[3] = ramped[:3, None], start + ramp
-    fading[4] = omega, omega + side, omega - side
-    swings[0] = (gain_from + gain_to) / 2 * amplitudes[is_ramped]
-    swings[1:] = (gain_from - gain_to) / 4 * amplitudes[is_ramped]
-    start, ramp, omega, _, gain_to = lasting[2:]
-    settled = columns[:, 3 * count :]
-    settled[:2], settled[2], settled[3], settled[4] = lasting[:2], start + ramp, math.inf, omega
-    c0[3 * count :] = gain_to * amplitudes[is_lasting] * np.exp(1j * omega * ramp)
-    return columns, c0

@@ -8,7 +8,6 @@ import cmath
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.structure.actuator import Era
-from model.transients.base_motion import Fade, Term
+from model.transients.base_motion import Term, along_lines, raised_cosine
 from model.vibration.excitation import Excitation
 
 KNOT_STEP = 0.005
@@ -71,17 +70,7 @@ class BaseEnvelope:
     def terms(self) -> tuple[Term, ...]:
         """Motion of the base from time 0 on."""
         omega = 2 * math.pi * self.frequency
-        values = (self.start, *self.knots)
-        pieces = []
-        for number, (here, there) in enumerate(pairwise(values)):
-            since, until = number * self.step, (number + 1) * self.step
-            phase_factor = cmath.exp(1j * omega * since)
-            slope = (there - here) / self.step
-            pieces.append(Term(since, until, omega, here * phase_factor, slope * phase_factor))
-        if self.knots[-1] != 0:
-            last = self.knots[-1] * cmath.exp(1j * omega * self.duration)
-            pieces.append(Term(self.duration, math.inf, omega, last))
-        return tuple(pieces)
+        return along_lines(0.0, self.step, omega, (self.start, *self.knots))
 
 
 Envelopes: TypeAlias = Mapping[str, BaseEnvelope]
@@ -119,7 +108,7 @@ def ramped_pulse(
         # What rises from the end on is the tone itself, in opposite phase.
         omega = 2 * math.pi * tone.frequency
         opposite = -tone.phasor * cmath.exp(1j * omega * duration)
-        release.append(Fade(duration, ramp, omega, opposite, 0.0, 1.0).terms())
+        release.append(raised_cosine(duration, ramp, omega, 0j, opposite))
     return tuple((*rise, *fall) for rise, fall in zip(onset, release, strict=True))
 
 
@@ -132,7 +121,9 @@ def _faded(
     excitation: Excitation, eras: Sequence[Era], *, ramp: float, gains: tuple[float, float]
 ) -> Bases:
     return tuple(
-        Fade(0.0, ramp, 2 * math.pi * tone.frequency, tone.phasor, *gains).terms()
+        raised_cosine(
+            0.0, ramp, 2 * math.pi * tone.frequency, *(gain * tone.phasor for gain in gains)
+        )
         if (tone := excitation.get(era.name))
         else ()
         for era in eras

@@ -26,12 +26,10 @@ from drivers.protocol.table import (
     STATUS_FLAGS,
 )
 from drivers.protocol.tokens import token_after
-from sim.amplifier.outputs import output_of
 from sim.amplifier.set_intake import SetIntake, derated
 from sim.amplifier.state_table import TRANSITIONS
 from sim.amplifier.summary import AmplifierSummary
 from sim.amplifier.thermal_model import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD_BELOW, ThermalState
-from sim.waveform import Output
 
 SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
 LAYERS = 8
@@ -159,8 +157,6 @@ class Amplifier:
         """Reset all but the temperature and the fault history."""
         can = self.capabilities
         self.playback = playback_of(can)
-        self._voices: list[tuple[Voice, ...]] = [()] * can["channels"]  # of these outputs
-        self._outputs: list[Output] = [()] * can["channels"]
         self._intake = SetIntake(can)
         self._watchdog = 0.0
         self._last_fed = 0.0
@@ -171,16 +167,12 @@ class Amplifier:
         self.is_derated = False
 
     @property
-    def outputs(self) -> tuple[Output, ...]:
-        """The output of each channel from now on, without further events.
+    def outputs(self) -> tuple[tuple[Voice, ...], ...]:
+        """The voices of each channel from now on, without further events.
 
-        That of a channel is the same object until it changes.
+        Those of a channel are the same object until they change.
         """
-        for channel, voices in enumerate(self.playback.all_voices):
-            if self._voices[channel] is not voices:
-                self._voices[channel] = voices
-                self._outputs[channel] = output_of(voices)
-        return tuple(self._outputs)
+        return tuple(self.playback.all_voices)
 
     @property
     def next_event(self) -> float:

@@ -11,11 +11,12 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from types import MappingProxyType
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
 from drivers import clock
+from drivers.playback import Voice
 from drivers.protocol.records import Values
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
@@ -32,15 +33,19 @@ from sim.bench.reading import ToneReader
 from sim.bench.sensing import PlateSensor, Sensing
 from sim.plant.felt import Felt, measure_vibration
 from sim.plant.fingers import KEPT, Fingers, Position, Record
-from sim.plant.imperfections import Imperfections, PlateErrors, delayed, draw_noise, realised
+from sim.plant.imperfections import Imperfections, PlateErrors, draw_noise, realised
 from sim.plant.loaded_plates import LoadedPlate
 from sim.plant.plant import SAMPLE_RATE, Plant
-from sim.waveform import Output
+from sim.plant.voiced_base import delayed, motion_of
 
 _TICK = 0.01  # s; of `keep_time`
 _MAX_BEHIND = 0.1  # s; of the plate behind the amplifiers, once time goes on
 _MAX_STEP = 1.0  # s; sampled at once
 _MAX_SHAPES = 16  # sets of points
+
+
+Voices: TypeAlias = tuple[Voice, ...]
+"""What a channel plays."""
 
 
 class Probe(Protocol):
@@ -105,20 +110,20 @@ class Bench:
         for index, era in enumerate(rig.eras):
             channel = rig.wiring[era.name]
             self._wired[channel.amplifier].append((index, channel.number))
-        self._commanded: dict[str, tuple[Output, ...]] = {
+        self._commanded: dict[str, tuple[Voices, ...]] = {
             name: amplifier.outputs for name, amplifier in self.amplifiers.items()
         }
-        self._delayed: dict[str, deque[tuple[float, int, Output]]] = {
+        self._delayed: dict[str, deque[tuple[float, int, Voices]]] = {
             name: deque() for name in rig.amplifiers
         }
-        self._applied_outputs: list[Output] = [()] * len(rig.eras)  # by ERA
+        self._applied_outputs: list[Voices] = [()] * len(rig.eras)  # by ERA
         self._errors = [imperfections.errors_of(era.name, rig) for era in rig.eras]
         self._noise = [draw_noise(seed=imperfections.seed, number=n) for n in range(len(rig.eras))]
         self._shapes_at = lru_cache(_MAX_SHAPES)(
             lambda points: self._plant.reduced.at(np.frombuffer(points).reshape(-1, 2))
         )
-        # Outputs that moved a base, with the time of their end [s].
-        self._played: deque[tuple[Output, float]] = deque()
+        # Voicess that moved a base, with the time of their end [s].
+        self._played: deque[tuple[Voices, float]] = deque()
 
     @property
     def time(self) -> float:
@@ -361,7 +366,8 @@ class Bench:
                 delay = self.imperfections.delay(name)
                 for index, number in self._wired[name]:
                     if outputs[number] is not commanded[number]:
-                        playing = delayed(outputs[number], delay)
+                        playing = outputs[number]
+                        playing = delayed(playing, delay) if delay else playing
                         waiting.append((self._time + delay, index, playing))
             while waiting and waiting[0][0] <= self._time:
                 _, index, playing = waiting.popleft()
@@ -369,17 +375,16 @@ class Bench:
         while self._played and self._played[0][1] < self._time - KEPT:
             self._played.popleft()
 
-    def _apply(self, index: int, playing: Output) -> None:
+    def _apply(self, index: int, playing: Voices) -> None:
         """Let an output move the base of an ERA from now on."""
         self._plant.set_input(index, self._motion(index, playing), since=self._time)
         self._played.append((self._applied_outputs[index], self._time))
         self._applied_outputs[index] = playing
 
-    def _motion(self, index: int, playing: Output) -> Motion:
+    def _motion(self, index: int, playing: Voices) -> Motion:
         """The base motion of an ERA by the output of its channel, imperfections included."""
         era, errors = self.rig.eras[index], self._errors[index]
-        motion: Motion = [part for tone in playing for part in tone.motion(stroke=era.stroke)]
-        motion = realised(motion, errors)
+        motion = realised(motion_of(playing, stroke=era.stroke), errors)
         if errors.noise and playing:
             end = max(tone.silent_from for tone in playing)
             rms = errors.noise * era.stroke
@@ -394,7 +399,7 @@ class Bench:
                 tone.frequency
                 for output, end in [*self._played, *present]
                 for tone in output
-                if tone.start < until and min(end, tone.silent_from) > since
+                if tone.transition.start < until and min(end, tone.silent_from) > since
             }
         )
 

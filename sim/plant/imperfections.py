@@ -20,9 +20,8 @@ from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
 from model.structure.fingertip import Fingertip
 from model.structure.point_load import PointLoad
-from model.transients.base_motion import Fade, Motion, Term
+from model.transients.base_motion import Motion, Term
 from model.vibration.discretisation import finer_mesh
-from sim.waveform import Output
 
 _MAX_LOSS_FACTOR = 0.99
 _MIN_FACTOR = 0.05  # of a normal draw about 1, which may be negative
@@ -191,26 +190,10 @@ def _other_mesh(rig: Rig) -> PlateMesh:
     return mesh if mesh != rig.mesh else finer_mesh(rig.plate, mesh, frequency_max=highest)
 
 
-def delayed(output: Output, delay: float) -> Output:
-    """The output of a channel, delayed [s]."""
-    if delay == 0:
-        return output
-    return tuple(
-        tone._replace(start=tone.start + delay, origin=tone.origin + delay) for tone in output
-    )
-
-
-def realised(motion: Motion, errors: ChannelErrors) -> list[Term | Fade]:
+def realised(motion: Motion, errors: ChannelErrors) -> list[Term]:
     """Base motion with the gain and phase errors of its channel."""
-    if (errors.gain, errors.phase) == (1.0, 0.0):
-        return list(motion)
     factor = errors.factor
-    return [
-        part._replace(amplitude=factor * part.amplitude)
-        if isinstance(part, Fade)
-        else part._replace(c0=factor * part.c0, c1=factor * part.c1)
-        for part in motion
-    ]
+    return [term._replace(c0=factor * term.c0, c1=factor * term.c1) for term in motion]
 
 
 @dataclass(frozen=True)

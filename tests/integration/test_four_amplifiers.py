@@ -89,7 +89,10 @@ class FourAmplifiers:
         self.levels()
         return {
             name: {
-                segment.start for output in each.outputs for segment in output if segment.is_lasting
+                voice.transition.start
+                for voices in each.outputs
+                for voice in voices
+                if voice.transition.last
             }
             for name, each in self.bench.amplifiers.items()
         }

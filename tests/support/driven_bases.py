@@ -4,13 +4,11 @@ import cmath
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 
 from model.arrays import FloatArray
-from model.transients.base_motion import Fade, Motion, Term
-from sim.waveform import ShapedTone
+from model.transients.base_motion import Motion, Term, along_lines, raised_cosine
 
 
 @dataclass(frozen=True)
@@ -24,8 +22,7 @@ class Base:
 def motion_of(motion: Motion, times: FloatArray) -> FloatArray:
     """Displacement [m] at times (n,) [s] by the definition of a term."""
     y = np.zeros(len(times))
-    parts = [part.terms() if isinstance(part, Fade) else (part,) for part in motion]
-    for term in chain.from_iterable(parts):
+    for term in motion:
         tau = times - term.start
         value = (term.c0 + term.c1 * tau) * np.exp(1j * term.omega * tau)
         y += np.where((times >= term.start) & (times < term.end), value.imag, 0.0)
@@ -72,9 +69,9 @@ def faded_base(
     def at(time: float) -> complex:
         return cmath.rect(amplitude, omega * time + phase)
 
-    up = Fade(rise[0], rise[1] - rise[0], omega, at(rise[0]), 0, 1).terms()
+    up = raised_cosine(rise[0], rise[1] - rise[0], omega, 0j, at(rise[0]))
     up = (*up[:-1], up[-1]._replace(end=fall[0]))
-    down = Fade(fall[0], fall[1] - fall[0], omega, at(fall[0]), 1, 0).terms()
+    down = raised_cosine(fall[0], fall[1] - fall[0], omega, at(fall[0]), 0j)
     return Base(motion, (*up, *down))
 
 
@@ -97,8 +94,8 @@ def shaped_base(
         turn = amplitude * cmath.exp(1j * omega * time)
         return (value * turn).imag, ((slope + 1j * omega * value) * turn).imag
 
-    tone = ShapedTone(frequency, 0.0, start, step, knots)
-    return Base(motion, tone.motion(stroke=amplitude))
+    factor = amplitude * cmath.exp(1j * omega * start)
+    return Base(motion, along_lines(start, step, omega, [factor * knot for knot in knots]))
 
 
 STROKE = 1e-4  # m

@@ -149,7 +149,7 @@ class Pressed:
         def handle(name: str, values: Values, now: float) -> Values:
             reply = obey(name, values, now)
             outputs = bench.amplifiers["main"].outputs
-            origins = {tone.origin for each in outputs for tone in each if tone.is_lasting}
+            origins = {tone.origin for each in outputs for tone in each if tone.transition.last}
             self._starts += sorted(origins - {*self._starts})
             return reply
 

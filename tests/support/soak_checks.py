@@ -13,7 +13,6 @@ from drivers.protocol.records import Values
 from drivers.protocol.table import MESSAGES, STATES
 from sim.amplifier.contract import Amplifier
 from sim.bench.bench import Bench
-from sim.waveform import level_of
 from soak_contacts import SourceContacts
 from soak_plan import Plan
 
@@ -86,8 +85,8 @@ class Checks:
         self._bench.advance(now)
         loud = {}
         for name, amplifier in self._bench.amplifiers.items():
-            levels = [min(level_of(output, now), 1.0) for output in amplifier.outputs]
-            level = max(levels, default=0.0)
+            playback = amplifier.playback
+            level = max(min(playback.level(each, now), 1.0) for each in range(playback.channels))
             if not level <= AUDIBLE:
                 loud[name] = level
                 self._check_loud(name, level, now)

@@ -36,6 +36,6 @@ def sense(witness: Witness, now: float, name: str, amplifier: Amplifier) -> None
         channel: tone.frequency
         for channel, output in enumerate(amplifier.outputs)
         for tone in output
-        if tone.is_lasting
+        if tone.transition.last
     }
     witness.levels(now, name, levels, frequencies=frequencies)

@@ -2,18 +2,32 @@
 
 import cmath
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from model.transients.base_motion import BaseMotions, Fade, Motion, Term
+from model.transients.base_motion import BaseMotions, Motion, Term, raised_cosine
 
 OMEGA = 2 * math.pi * 110.0
+
+
+class Fade(NamedTuple):
+    """From one complex amplitude [m] to another; start and ramp [s]."""
+
+    start: float
+    ramp: float
+    omega: float
+    first: complex
+    last: complex
+
+
 FADES = [
-    Fade(1.0, 0.02, OMEGA, 1e-4 * cmath.exp(0.7j), 0.0, 1.0),
-    Fade(1.005, 0.01, 2 * OMEGA, 2e-4j, 0.8, 0.3),
-    Fade(1.01, 0.03, OMEGA, 5e-5 + 0j, 1.0, 0.0),
-    Fade(1.015, 0.0, OMEGA / 2, 1e-4 + 0j, 0.0, 0.6),
+    Fade(1.0, 0.02, OMEGA, 0j, 1e-4 * cmath.exp(0.7j)),
+    Fade(1.005, 0.01, 2 * OMEGA, 1.6e-4j, 6e-5 - 2e-5j),
+    Fade(1.01, 0.03, OMEGA, 5e-5 + 0j, 0j),
+    Fade(1.015, 0.0, OMEGA / 2, 0j, 6e-5 + 0j),
 ]
 
 
@@ -32,15 +46,20 @@ def faded(fade: Fade, time: float) -> float:
     if tau < 0:
         return 0.0
     share = 1.0 if tau >= fade.ramp else (1 - math.cos(math.pi * tau / fade.ramp)) / 2
-    gain = fade.gain_from + (fade.gain_to - fade.gain_from) * share
-    return gain * (fade.amplitude * cmath.exp(1j * fade.omega * tau)).imag
+    amplitude = fade.first + (fade.last - fade.first) * share
+    return (amplitude * cmath.exp(1j * fade.omega * tau)).imag
+
+
+def terms(fades: Sequence[Fade]) -> Motion:
+    """The motion of a base by some fades."""
+    return [term for fade in fades for term in raised_cosine(*fade)]
 
 
 @pytest.mark.parametrize("time", [0.99, 1.0, 1.0031, 1.0142, 1.015, 1.0199, 1.03, 1.2])
 def test_terms_of_fades_add_up_to_raised_cosines(time: float) -> None:
     """Of two sets of motions each base has its own, at every moment of a fade and after it."""
     rest: Motion = ()
-    motions = BaseMotions([FADES[:1], FADES[1:3]], [rest, FADES[3:]])
+    motions = BaseMotions([terms(FADES[:1]), terms(FADES[1:3])], [rest, terms(FADES[3:])])
     for number, era, fades in (
         (0, 0, FADES[:1]),
         (0, 1, FADES[1:3]),
@@ -54,7 +73,7 @@ def test_terms_of_fades_add_up_to_raised_cosines(time: float) -> None:
 def test_terms_stand_beside_fades() -> None:
     """A base that moves by both moves as their sum, a linear term with its slope."""
     term = Term(1.0, 1.1, OMEGA, 1e-4 + 0j, 3e-3j)
-    motions = BaseMotions([[FADES[0], term]])
+    motions = BaseMotions([[*terms(FADES[:1]), term]])
     for time in (1.004, 1.05, 1.2):
         tau = time - 1.0
         linear = ((1e-4 + 3e-3j * tau) * cmath.exp(1j * OMEGA * tau)).imag if tau < 0.1 else 0.0
@@ -64,13 +83,13 @@ def test_terms_stand_beside_fades() -> None:
 
 def test_moments_are_those_of_one_set() -> None:
     """Starts and ends of its terms within a window, whose begin is left out."""
-    motions = BaseMotions([FADES[:1]], [FADES[1:2]])
+    motions = BaseMotions([terms(FADES[:1])], [terms(FADES[1:2])])
     assert motions.moments(0, 0.0, 2.0) == [1.0, 1.02]
     assert motions.moments(1, 1.005, 2.0) == [pytest.approx(1.015)]
 
 
 def test_terms_that_have_ended_are_left_out() -> None:
     """A fade to silence is forgotten once it is silent, a lasting tone is not."""
-    motions = BaseMotions([[FADES[0], FADES[2]]], since=1.05)
+    motions = BaseMotions([terms([FADES[0], FADES[2]])], since=1.05)
     assert motions.omega.tolist() == [OMEGA]
     assert motions.end.tolist() == [math.inf]

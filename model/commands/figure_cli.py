@@ -27,46 +27,28 @@ def figure(
     Write a CSV file of its numbers beside it.
     """
     from model.figures import save_figure
+    from model.figures.paper import paper_figures
     from model.files.csv_file import write_columns
-    from model.paper.catalogue import paper_figures
     from model.rig.file import load_rig
 
     rig = load_rig(rig_file, mesh=mesh)
     output.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
-    files: list[str] = []
-    findings = {}
+    names, files = [], []
     for made in paper_figures(rig, number):
         picture = output / f"{made.name}.png"
         save_figure(made.figure, picture)
-        files.append(str(picture))
-        for suffix, columns in made.tables.items():
-            table = output / f"{made.name}{suffix}.csv"
+        tables = [output / f"{made.name}{suffix}.csv" for suffix in made.tables]
+        for table, columns in zip(tables, made.tables.values(), strict=True):
             write_columns(table, columns)
-            files.append(str(table))
-        findings[made.name] = dict(made.findings)
-        if not as_json:
-            print(made.name)
-            for key, value in made.findings.items():
-                print(f"  {key:40s} {_shown(value)}")
+        names.append(made.name)
+        files += [str(path) for path in (picture, *tables)]
     elapsed = time.perf_counter() - started
     if as_json:
-        answer = {"figures": findings, "mesh": [rig.mesh.nx, rig.mesh.ny]}
+        answer = {"figures": names, "mesh": [rig.mesh.nx, rig.mesh.ny]}
         print(json.dumps(answer | {"time_s": elapsed, "files": files}))
         return
     print(f"{elapsed:.1f} s, mesh {rig.mesh}; wrote")
     for name in files:
         print(f"  {name}")
-    print(next_line("era", "study", "placement", rig_file, "-o", "study"))
-
-
-def _shown(value: object) -> str:
-    match value:
-        case float():
-            return f"{value:.5g}"
-        case list():
-            return ", ".join(_shown(one) for one in value)
-        case dict():
-            return ", ".join(f"{key} {_shown(one)}" for key, one in value.items())
-        case _:
-            return str(value)
+    print(next_line("era", "design", rig_file, "-o", "design"))

@@ -1,4 +1,4 @@
-"""Layouts of ERAs by name, and the raster of places for studies.
+"""Layouts of ERAs by name.
 
 The drawings of the paper's layouts (its Figures 8 and 9) are not available, so these are our own.
 Places are fractions of the plate's length and width, so that a layout fits every plate.
@@ -67,24 +67,6 @@ def alike(era: Era, positions: FloatArray) -> tuple[Era, ...]:
         replace(era, name=f"E{number}", x=float(x), y=float(y))
         for number, (x, y) in enumerate(positions, start=1)
     )
-
-
-def place_eras(eras: Sequence[Era], positions: FloatArray) -> tuple[Era, ...]:
-    """The same ERAs at other positions [m] (eras, 2)."""
-    return tuple(
-        replace(era, x=float(x), y=float(y)) for era, (x, y) in zip(eras, positions, strict=True)
-    )
-
-
-def candidate_places(nx: int, ny: int) -> FloatArray:
-    """Raster of places as fractions, edges included, x first: (nx * ny, 2).
-
-    13x13, every twelfth of a side, holds all named layouts.
-    """
-    if not (2 <= nx <= 100 and 2 <= ny <= 100):
-        raise InputError(f"candidates must be 2x2 to 100x100 places, got {nx}x{ny}")
-    x, y = np.meshgrid(np.linspace(0, 1, nx), np.linspace(0, 1, ny))
-    return np.column_stack([x.ravel(), y.ravel()])
 
 
 def edge_pair(eras: Sequence[Era]) -> tuple[int, int]:

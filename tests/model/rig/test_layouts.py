@@ -7,7 +7,6 @@ from model.errors import InputError
 from model.rig.layouts import (
     FOUR_ERA_LAYOUTS,
     alike,
-    candidate_places,
     diagonal_pair,
     edge_pair,
 )
@@ -21,13 +20,6 @@ def test_corners_layout_is_that_of_the_paper():
     corners = next(layout for layout in FOUR_ERA_LAYOUTS if layout.name == "corners")
     expected = [(era.x, era.y) for era in rig.eras]
     np.testing.assert_allclose(corners.positions(rig.plate), expected)
-
-
-@pytest.mark.parametrize("nx", [0, 1, 101])
-def test_candidate_places_refuse_rasters_out_of_range(nx):
-    """Fewer than two places along a side, or more than memory takes, is bad input."""
-    with pytest.raises(InputError, match="2x2 to 100x100"):
-        candidate_places(nx, 5)
 
 
 def test_edge_and_diagonal_pairs_of_the_paper():

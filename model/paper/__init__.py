@@ -1,1 +1,0 @@
-"""The founding paper: its printed numbers, and its figures reproduced."""

@@ -12,7 +12,7 @@ typedef struct {
 typedef struct {
     int steps, limited;   /* weights; whether each is brought to the level within full stroke */
     float variance, gain; /* of each ERA beyond that of the form; up to full stroke, 0 for none */
-    float reserve, growth;
+    float reserve, growth, most;
 } method;
 
 static const float LEAST = 1e-30f, TINY = 1e-7f, LEAST_FIELD = 1e-20f;
@@ -102,7 +102,7 @@ void phased_search(const forms *from, const method *by, const int *indices, int 
         for (size_t i = 0; i < n; i++) c[i] = (value){target[i].re, -target[i].im};
         for (size_t i = 0; i < q; i++) share[i] = filled(1 / (float)q);
         for (size_t i = 0; i < n; i++) multiplier[i] = best[i].re = best[i].im = ZERO.re;
-        lanes score = {0}, miss = {0}, bound = filled(INFINITY);
+        lanes score = {0}, miss = {0}, bound = filled(INFINITY), limit = {0};
 
         for (int step = 0; step < by->steps; step++) {
             memset(R, 0, n * n * sizeof(value));
@@ -157,9 +157,10 @@ void phased_search(const forms *from, const method *by, const int *indices, int 
                     quiet_power(own, &on, w);
                     lanes start = loudest_of(own, q) / larger(total, filled(LEAST));
                     for (size_t u = 0; u < n; u++) multiplier[u] = start;
+                    limit = start * by->most;
                 }
                 for (size_t u = 0; u < n; u++)
-                    multiplier[u] *= smaller(power(w[u]), filled(by->growth));
+                    multiplier[u] = smaller(multiplier[u] * smaller(power(w[u]), filled(by->growth)), limit);
             }
             if (q > 1) {
                 lanes total = {0};

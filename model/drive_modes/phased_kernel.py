@@ -17,6 +17,7 @@ from model.drive_modes.coherent import (
     LEVEL_RESERVE,
     LIMITED_STEPS,
     MAX_GROWTH,
+    MAX_MULTIPLIER,
     CoherentResult,
 )
 from model.drive_modes.forms import Forms
@@ -37,13 +38,20 @@ class _Method(ctypes.Structure):
 
     _fields_ = (
         *((name, c_int) for name in ("steps", "limited")),
-        *((name, c_float) for name in ("variance", "gain", "reserve", "growth")),
+        *((name, c_float) for name in ("variance", "gain", "reserve", "growth", "most")),
     )
 
 
 _ONE_FINGER, _SEVERAL = _Method(steps=1), _Method(steps=1 + LAWSON_STEPS)
 _WITHIN_STROKE = (
-    _Method(steps=LIMITED_STEPS, limited=1, gain=1, reserve=LEVEL_RESERVE, growth=MAX_GROWTH),
+    _Method(
+        steps=LIMITED_STEPS,
+        limited=1,
+        gain=1,
+        reserve=LEVEL_RESERVE,
+        growth=MAX_GROWTH,
+        most=MAX_MULTIPLIER,
+    ),
     *(_Method(steps=1, variance=sigma**2, gain=gain) for sigma, gain in LEVEL_RELAXATION),
 )
 

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, IntArray
+from model.arrays import Complex64Array, Float32Array
 from model.compiled.kernels import kernels
 from model.ensemble.attached_plate import AttachedPlate, Attachments
 from model.ensemble.contact_forms_kernel import FoundForms, contact_forms
@@ -56,23 +56,6 @@ class LoadedContacts:
     moved: Complex64Array
     error_power: Float32Array
     gain_variance: float
-
-    def point_power(self, frequencies: IntArray, *, first: int) -> Complex64Array:
-        """Expected power at each point of the fingers from the first on, (n, points, eras, eras).
-
-        frequencies (n,): by index.
-        """
-        start = first * self.fields.shape[2]
-        rows = self.rows.take(frequencies, axis=0)[:, :, start:].swapaxes(1, 2)
-        f, p, _, n = rows.shape
-        reach = self.reach.take(frequencies, axis=0)[:, start:]
-        moved = self.moved.take(frequencies, axis=0)
-        outer = _outer(moved).reshape(*moved.shape[:2], -1).view(np.float32)
-        power = gram(rows)
-        power += (reach @ outer).view(np.complex64).reshape(f, p, n, n)
-        error = self.error_power.take(frequencies, axis=0)[:, None]
-        _add_diagonal(power, self.gain_variance * power_of(rows[:, :, 0]) + error)
-        return power
 
 
 def load_contacts(

@@ -23,6 +23,9 @@ from model.transients.onset import RINGING_TIMES, RampedRinging
 MAX_FINGERS_BY_POINT = 4
 """Quiet fingers up to which the points of each are looked at one by one in a search."""
 
+CENTRE_AND_RIM, CENTRE_AND_FOUR = np.array([0, *range(9, 21)]), np.array([0, 9, 12, 15, 18])
+"""Of the fine points of a fingertip, those between which no null hides, and a few of them."""
+
 MAX_VARIANCE_FINE = 0.005
 """Variance of an ERA's gain up to which nulls are so deep that few points do not show them."""
 
@@ -61,7 +64,10 @@ class FingersOnPlate:
         contacts, gains = self._contacts, self._gains
         mean = (self._tips.few_weights[:t, None] @ contacts.fields[:, :t])[:, :, 0]
         by_target = np.asarray(mean.swapaxes(0, 1) * gains[:, None, None])
-        power = contacts.power[:, :t].swapaxes(0, 1) * (gains**2)[:, None, None, None]
+        # What the field differs over a target is no uncertainty of its level.
+        few = contacts.fields[:, :t] * np.sqrt(self._tips.few_weights[:t, :, None])
+        expected = contacts.power[:, :t] - gram(few) + gram(mean[:, :, None])
+        power = expected.swapaxes(0, 1) * (gains**2)[:, None, None, None]
         quiet = contacts.power[:, t:] if background is None else self._expected(background)[:, None]
         wanted = 10 ** (self._question.level_db_sl / 20)
         found = Forms(by_target, power, np.ascontiguousarray(quiet), self._threshold, wanted)
@@ -128,10 +134,18 @@ class FingersOnPlate:
             fine=None,
         )
 
-    def by_point(self, forms: Forms, frequencies: IntArray) -> Forms:
-        """Forms, at rows (n,) of the plate's frequencies, with every quiet point as a fingertip."""
-        quiet = self._contacts.point_power(frequencies, first=len(self._question.targets))
-        return replace(forms, quiet=quiet, few=None, fine=None)
+    def by_point(self, forms: Forms, rows: IntArray, points: IntArray = CENTRE_AND_RIM) -> Forms:
+        """Forms, at rows (n,) of the plate's frequencies, by point of every quiet fingertip.
+
+        points (p,): by index, of the fine ones. What is uncertain counts by the fingertip's mean.
+        """
+        t, n = len(self._question.targets), forms.era_count
+        fields = self._contacts.fields.take(rows, axis=0)[:, t:]
+        few = fields * np.sqrt(self._tips.few_weights[t:, :, None])
+        at_points = self._fine_fields(t).take(rows, axis=0)[:, :, points]
+        uncertain = self._contacts.power.take(rows, axis=0)[:, t:] - gram(few)
+        quiet = uncertain[:, :, None] + gram(at_points[:, :, :, None])
+        return replace(forms, quiet=quiet.reshape(len(rows), -1, n, n), few=None, fine=None)
 
     def respond(self, drives: Sequence[Weights]) -> "DriveResponses":
         """Responses of the fingertips to drives."""

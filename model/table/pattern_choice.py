@@ -13,9 +13,9 @@ from typing import TypeAlias
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
-from model.choice import best_of
+from model.choice import best_first, best_of
 from model.counting import counted
-from model.drive_modes import DRIVE_MODES, find_drives, max_sensation
+from model.drive_modes import ALTERNATIVES, DRIVE_MODES, find_drives, max_sensation
 from model.drive_modes.coherent import CoherentResult
 from model.drive_modes.exact_search import search_exactly, sensation_found
 from model.drive_modes.forms import Forms, Weights
@@ -24,7 +24,12 @@ from model.ensemble.measures import Felt, percentile, percentile_of_sorted
 from model.errors import InputError
 from model.finger.perception import decibels
 from model.structure.actuator import Era
-from model.table.fingers_on_plate import MAX_FINGERS_BY_POINT, DriveResponses, FingersOnPlate
+from model.table.fingers_on_plate import (
+    CENTRE_AND_FOUR,
+    MAX_FINGERS_BY_POINT,
+    DriveResponses,
+    FingersOnPlate,
+)
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.pulse_gains import OverEffect, contrast_over_effect
 from model.table.question import Question
@@ -136,6 +141,9 @@ def _search(
     question: Question, drive_mode: str, candidates: Candidates, forms: Forms
 ) -> list[tuple[float, Weights]]:
     """The drives of the best scores, and further ones at their frequencies."""
+    is_steady = candidates.over_effect is None
+    if drive_mode == "switched" and is_steady and 1 <= len(question.quiet) <= MAX_FINGERS_BY_POINT:
+        forms = candidates.fingers.by_point(forms, candidates.playable, CENTRE_AND_FOUR)
     found = find_drives(forms, drive_mode)
     if not found:
         return []
@@ -170,20 +178,24 @@ def _by_point(
     forms: Forms,
     drives: Sequence[tuple[float, Weights]],
 ) -> list[tuple[float, Weights]]:
-    """Drives at the same frequencies that minimise over the points of the quiet fingers.
+    """Drives that minimise over the points of the quiet fingers.
 
-    Where nulls are narrow, with few fingers and small errors, these do better.
+    Where nulls are narrow, with few fingers and small errors, these do better. For several targets
+    at the frequencies of the drives found, since their search takes long.
     """
     coherent = DRIVE_MODES[drive_mode].coherent
     if coherent is None or coherent.bound is not None:  # restricted weights gain next to nothing
         return []
     if not 1 <= len(question.quiet) <= MAX_FINGERS_BY_POINT:
         return []
-    at = _rows_of([drive for _, drive in drives if len(drive.tones()) == 1])
+    at = np.arange(forms.frequency_count)
+    if len(question.targets) > 1:
+        at = _rows_of([drive for _, drive in drives if len(drive.tones()) == 1])
     if len(at) == 0:
         return []
     by_point = candidates.fingers.by_point(forms.at(at), candidates.playable[at])
-    return _drives_of(coherent.search_all(by_point), at)
+    found = _drives_of(coherent.search(by_point, 0.0), at)
+    return [found[each] for each in best_first([score for score, _ in found])[:ALTERNATIVES]]
 
 
 def _during_effect(

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from era_haptics.pictures import draw_pattern as draw_pattern
     from era_haptics.pictures import draw_playback as draw_playback
     from era_haptics.solved_plate import SolvedPlate as SolvedPlate
+    from era_haptics.tables import answer as answer
     from era_haptics.tables import query as query
     from era_haptics.tables import table as table
     from model.calibration.calibration_result import Calibration as Calibration
@@ -49,6 +50,9 @@ if TYPE_CHECKING:
     from model.table.file import load_table as load_table
     from model.table.file import save_table as save_table
     from model.table.pattern import Pattern as Pattern
+    from model.table.request import Answer as Answer
+    from model.table.request import Finger as Finger
+    from model.table.request import Request as Request
     from model.table.table import LocalizationTable as LocalizationTable
     from model.vibration.excitation import Tone as Tone
     from model.vibration.maps import PlateMap as PlateMap
@@ -68,7 +72,7 @@ _NAMES = {
     "era_haptics.pictures": "draw_map draw_pattern draw_playback",
     "era_haptics.solved_plate": "SolvedPlate",
     "era_haptics.designs": "RankedLayout design",
-    "era_haptics.tables": "query table",
+    "era_haptics.tables": "answer query table",
     "model.calibration.calibration_result": "Calibration",
     "model.errors": "InputError",
     "model.finger.grid": "Grid",
@@ -79,6 +83,7 @@ _NAMES = {
     "model.structure.fingertip": "Fingertip",
     "model.table.file": "load_table save_table",
     "model.table.pattern": "Pattern",
+    "model.table.request": "Answer Finger Request",
     "model.table.table": "LocalizationTable",
     "model.vibration.excitation": "Tone",
     "model.vibration.maps": "PlateMap",

@@ -11,9 +11,11 @@ from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL
 from model.rig.rig import Rig
+from model.table.answer import answer as _answer
 from model.table.pattern import Pattern
 from model.table.query import query_table
 from model.table.question import Question
+from model.table.request import APART_HZ, Answer, Finger, Request
 from model.table.table import PAPER_GRID, LocalizationTable
 from model.table.table_cache import cached_table
 from model.table.timing import Timing
@@ -76,6 +78,33 @@ def query(
     )
     pattern, _ = query_table(table, question, _timing(table), measures=measures)
     return pattern
+
+
+def answer(
+    table: LocalizationTable,
+    requests: Sequence[Request],
+    fingers: Sequence[Finger] = (),
+    *,
+    apart_hz: float = APART_HZ,
+    bands_may_swap: bool = False,
+) -> Answer:
+    """Answer the requests of several fingers at once, each with a vibration of its own.
+
+    fingers: the others, which are to feel nothing; apart_hz: distance of the frequencies;
+    bands_may_swap: whether a finger may have another one's band. Where the worst finger would have
+    less than 6 dB, contents are shared or held back as the requests allow (`Answer.applied`).
+    Raises InputError for fingers off the plate or at one place, and for a band without
+    frequencies. The same as `era table query --own`.
+    """
+    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect(requests, Sequence, what="requests", made_by="[era.Request((0.08, 0.06))]")
+    for request in requests:
+        expect(request, Request, what="a request", made_by="era.Request((0.08, 0.06))")
+    expect(fingers, Sequence, what="fingers", made_by="[era.Finger((0.22, 0.16))]")
+    for finger in fingers:
+        expect(finger, Finger, what="a finger", made_by="era.Finger((0.22, 0.16))")
+    expect_number(apart_hz, what="apart_hz", unit="hertz")
+    return _answer(table, requests, fingers, apart_hz=apart_hz, bands_may_swap=bands_may_swap)
 
 
 def _expect_mode(given: object) -> None:

@@ -1,4 +1,4 @@
-"""`era table query`: the pattern for a set of contacts."""
+"""`era table query`: the pattern for a set of contacts, or a content for each finger."""
 
 import json
 from pathlib import Path
@@ -25,6 +25,18 @@ def query(
             help="Position of a finger that must not feel it, in metres; repeatable.",
         ),
     ] = None,
+    own: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="X,Y[@LOW-HIGH]",
+            help="Position of a finger in metres that is to feel a vibration of its own, and the "
+            "lowest and highest frequency of it in Hz; repeatable.",
+        ),
+    ] = None,
+    swap_bands: Annotated[
+        bool,
+        typer.Option("--swap-bands", help="With --own: let fingers have each other's bands."),
+    ] = False,
     drive_mode: Annotated[
         str | None,
         typer.Option("--mode", help="switched, graded, signed or phased; default: the table's."),
@@ -58,7 +70,8 @@ def query(
 ) -> None:
     """Find the pattern for target and quiet fingers.
 
-    Print frequency, level and phase of each ERA, and predicted levels and contrast.
+    Or with --own a vibration for each of several fingers. Print frequency, level and phase of each
+    ERA, and predicted levels and contrast.
     """
     from model.config.points import parse_point
     from model.errors import InputError
@@ -67,8 +80,8 @@ def query(
     from model.table.question import Question
 
     if batch is not None:
-        if target or quiet:
-            raise InputError("--target and --quiet must be left out with --batch")
+        if target or quiet or own:
+            raise InputError("--target, --own and --quiet must be left out with --batch")
         defaults = {
             "level_db_sl": level,
             "mode": drive_mode,
@@ -77,9 +90,17 @@ def query(
         }
         _query_batch(table_file, batch, defaults, thorough=thorough)
         return
+    if own:
+        if target or drive_mode or eras != 2 or envelopes or thorough:
+            raise InputError(
+                "--own must be given without --target, --mode, --eras, --envelopes and --thorough"
+            )
+        _answer(table_file, own, quiet or [], level=level, swap_bands=swap_bands, as_json=as_json)
+        return
     if not target:
         raise InputError(
-            "targets must be at least one, got none; give --target X,Y, metres, or --batch FILE"
+            "targets must be at least one, got none; give --target X,Y or --own X,Y, metres, or "
+            "--batch FILE"
         )
     question = Question(
         targets=tuple(parse_point(text, what="--target") for text in target),
@@ -136,6 +157,75 @@ def _print_answer(answer: dict[str, Any], uncertainty: Uncertainty) -> None:
         print(f"{name:30s} {value:6.1f} {unit}")
     print(f"'or more', 'or less': nine of ten plates within the rig's uncertainty ({uncertainty})")
     print(f"solved in {1000 * answer['solve_time_s']:.1f} ms")
+
+
+def _answer(
+    table_file: Path,
+    own: list[str],
+    quiet: list[str],
+    *,
+    level: float,
+    swap_bands: bool,
+    as_json: bool,
+) -> None:
+    """Answer several contents at once."""
+    from model.config.points import parse_point
+    from model.table.file import load_table
+    from model.table.query import answer_as_json
+    from model.table.request import ANY_BAND, Finger, Request
+
+    requests = []
+    for text in own:
+        place, _, band = text.partition("@")
+        at = parse_point(place, what="--own")
+        requests.append(Request(at, _band(band) if band else ANY_BAND, level))
+    fingers = [Finger(parse_point(text, what="--quiet")) for text in quiet]
+    table = load_table(table_file)
+    table.prepare("phased", with_ringing=False)
+    found = answer_as_json(table, requests, fingers, bands_may_swap=swap_bands)
+    if as_json:
+        print(json.dumps(found))
+        return
+    print("finger [m]         frequency   level  contrast  foreign level")
+    for layer in found["layers"]:
+        print(
+            f"{_place(layer):18s} {_cell(layer['frequency_hz'], 'Hz'):>9s} "
+            f"{_cell(layer['promised_level_db_sl']):>7s} "
+            f"{_cell(layer['robust_felt_contrast_db'], 'dB'):>9s} "
+            f"{_cell(layer['foreign_level_db_sl'], 'dB SL'):>14s}  {layer['verdict']}"
+        )
+    for finger in found["quiet"]:
+        print(
+            f"{_place(finger):18s} {'':9s} {'':7s} "
+            f"{_cell(finger['robust_felt_contrast_db'], 'dB'):>9s} "
+            f"{_cell(finger['foreign_level_db_sl'], 'dB SL'):>14s}  quiet"
+        )
+    if found["robust_worst_db"] is not None:
+        print(f"worst finger: {found['robust_worst_db']:.1f} dB or more")
+    for line in found["applied"]:
+        print(f"changed: {line}")
+    print(f"promised to nine of ten plates within the rig's uncertainty ({table.uncertainty})")
+    print(f"solved in {1000 * found['solve_time_s']:.1f} ms")
+
+
+def _band(text: str) -> tuple[float, float]:
+    """Lowest and highest frequency [Hz] of LOW-HIGH, or of one frequency."""
+    from model.errors import InputError
+
+    low, _, high = text.partition("-")
+    try:
+        return float(low), float(high or low)
+    except ValueError:
+        raise InputError(f"band of --own must be LOW-HIGH in Hz, got {text!r}") from None
+
+
+def _place(finger: dict[str, Any]) -> str:
+    x, y = finger["at_m"]
+    return f"({x:g}, {y:g})"
+
+
+def _cell(value: float | None, unit: str = "") -> str:
+    return "-" if value is None else f"{value:.1f} {unit}".rstrip()
 
 
 def _usable(answer: dict[str, Any]) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, IntArray
 from model.ensemble.measures import Felt, Fingertips, felt
 from model.rig.uncertainty import Uncertainty
 from model.structure.dynamic_stiffness import attached_stiffness, dynamic_stiffness
@@ -73,6 +73,19 @@ def felt_on(
     table: LocalizationTable, question: Question, excitation: Excitation, plates: Plates
 ) -> Felt:
     """Measures of an excitation on plates, (1, d)."""
+    rows, power = powers_on(table, question, excitation, plates)
+    weights = table.read_fingertips(question.contacts).fine_weights
+    fingertips = Fingertips(weights, np.array(question.gains))
+    return felt(power, table.threshold_at(rows), np.zeros(1, dtype=int), fingertips)
+
+
+def powers_on(
+    table: LocalizationTable, question: Question, excitation: Excitation, plates: Plates
+) -> tuple[IntArray, FloatArray]:
+    """Rows of an excitation's frequencies (m,), and squared amplitudes on plates (m, points, d).
+
+    At the fine points of `read_fingertips` of a question, finger by finger.
+    """
     tips = table.read_fingertips(question.contacts)
     frequencies, bases = base_amplitudes(excitation, table.eras)
     rows = np.searchsorted(table.frequencies, frequencies)
@@ -83,12 +96,7 @@ def felt_on(
             for row, base in zip(rows, bases, strict=True)
         ]
     )
-    return felt(
-        np.abs(responses) ** 2,
-        table.threshold_at(rows),
-        np.zeros(1, dtype=int),
-        Fingertips(tips.fine_weights, np.array(question.gains)),
-    )
+    return rows, np.abs(responses) ** 2
 
 
 def fields_on(

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import accumulate
 
 import numpy as np
@@ -30,56 +31,100 @@ MAX_VARIANCE_FINE = 0.005
 """Variance of an ERA's gain up to which nulls are so deep that few points do not show them."""
 
 
+@dataclass(frozen=True, eq=False)
 class FingersOnPlate:
-    """Fields, expected powers and drawn plates at the fingers of a question, targets first.
+    """Fields, expected powers and drawn plates at fingers, some of which are targets, some quiet.
 
-    threshold (f,) [m/s²]; error_power (f, eras): mean square of the discretisation error of each
-    ERA's field.
+    tips: of k fingers; threshold (f,) [m/s²]; error_power (f, eras): mean square of the
+    discretisation error of each ERA's field; loads (k,): of the fingers, as of a question; targets,
+    quiet: indices of fingers; gains: factors on the fields of the targets that make all levels the
+    same; wanted: their amplitude to threshold.
     """
 
-    def __init__(
-        self,
+    plate: AttachedPlate
+    tips: FingertipShapes
+    threshold: Float32Array
+    error_power: Float32Array
+    loads: tuple[float, ...]
+    contacts: LoadedContacts
+    targets: IntArray
+    quiet: IntArray
+    gains: Float32Array
+    wanted: float
+
+    @classmethod
+    def of(
+        cls,
         plate: AttachedPlate,
         tips: FingertipShapes,
         question: Question,
         *,
         threshold: Float32Array,
         error_power: Float32Array,
-    ) -> None:
-        self._plate, self._tips = plate, tips
-        self._question = question
-        self._threshold = threshold
-        self._error_power = error_power
-        self._contacts: LoadedContacts = load_contacts(
-            plate, tips.few, tips.few_weights, error_power, question.loads
+    ) -> "FingersOnPlate":
+        """Put the fingers of a question on a plate, targets first."""
+        t, loads = len(question.targets), question.loads
+        fingers = np.arange(len(tips.few))
+        contacts = load_contacts(plate, tips.few, tips.few_weights, error_power, loads)
+        return cls(
+            plate,
+            tips,
+            threshold,
+            error_power,
+            loads,
+            contacts,
+            fingers[:t],
+            fingers[t:],
+            np.array(question.gains, dtype=np.float32),
+            10 ** (question.level_db_sl / 20),
         )
-        self._gains = np.array(question.gains, dtype=np.float32)
+
+    def for_targets(
+        self, targets: Sequence[int], quiet: Sequence[int], *, level_db_sl: float
+    ) -> "FingersOnPlate":
+        """The same fingers on the plate with other targets, all at one level."""
+        return replace(
+            self,
+            targets=np.array(targets),
+            quiet=np.array(quiet, dtype=int),
+            gains=np.ones(len(targets), dtype=np.float32),
+            wanted=10 ** (level_db_sl / 20),
+        )
 
     def forms(self, background: Complex64Array | None) -> Forms:
         """Forms to search, by quiet fingertip.
 
         background (f, eras, eras): mean power of the rest of the plate, for no quiet finger.
         """
-        t = len(self._question.targets)
-        contacts, gains = self._contacts, self._gains
-        mean = (self._tips.few_weights[:t, None] @ contacts.fields[:, :t])[:, :, 0]
+        contacts, gains, targets = self.contacts, self.gains, self.targets
+        fields, weights = contacts.fields.take(targets, axis=1), self.tips.few_weights[targets]
+        mean = (weights[:, None] @ fields)[:, :, 0]
         by_target = np.asarray(mean.swapaxes(0, 1) * gains[:, None, None])
         # What the field differs over a target is no uncertainty of its level.
-        few = contacts.fields[:, :t] * np.sqrt(self._tips.few_weights[:t, :, None])
-        expected = contacts.power[:, :t] - gram(few) + gram(mean[:, :, None])
+        few = gram(fields * np.sqrt(weights[:, :, None]))
+        expected = contacts.power.take(targets, axis=1) - few + gram(mean[:, :, None])
         power = expected.swapaxes(0, 1) * (gains**2)[:, None, None, None]
-        quiet = contacts.power[:, t:] if background is None else self._expected(background)[:, None]
-        wanted = 10 ** (self._question.level_db_sl / 20)
-        found = Forms(by_target, power, np.ascontiguousarray(quiet), self._threshold, wanted)
-        is_deep = self._plate.gain_variance < MAX_VARIANCE_FINE
-        if background is not None or not is_deep or len(self._tips.few) - t > MAX_FINGERS_BY_POINT:
+        quiet = (
+            contacts.power.take(self.quiet, axis=1)
+            if background is None
+            else self._expected(background)[:, None]
+        )
+        found = Forms(by_target, power, quiet, self.threshold, self.wanted)
+        is_deep = self.plate.gain_variance < MAX_VARIANCE_FINE
+        if background is not None or not is_deep or len(self.quiet) > MAX_FINGERS_BY_POINT:
             return found
-        few = contacts.fields[:, t:] * np.sqrt(self._tips.few_weights[t:, :, None])
-        return replace(found, few=few, fine=self._fine_fields(t))
+        return replace(found, few=self._few_fields, fine=self._fine_fields)
 
-    def _fine_fields(self, first: int) -> Complex64Array:
-        """Fields of each ERA at the fine points of the fingers from the first on, (f, q, p, n)."""
-        contacts, plate, fine = self._contacts, self._plate, self._tips.fine[first:]
+    @cached_property
+    def _few_fields(self) -> Complex64Array:
+        """Fields at the few points of the quiet fingers, each times the root of its weight."""
+        weights = self.tips.few_weights[self.quiet]
+        return self.contacts.fields.take(self.quiet, axis=1) * np.sqrt(weights[:, :, None])
+
+    @cached_property
+    def _fine_fields(self) -> Complex64Array:
+        """Fields of each ERA at the fine points of the quiet fingers, (f, q, p, n)."""
+        contacts, plate, fine = self.contacts, self.plate, self.tips.fine[self.quiet]
         f, a, n = contacts.forces.shape
         by_attachment = np.ascontiguousarray(contacts.forces.transpose(1, 0, 2)).reshape(a, -1)
         modal = (contacts.shapes.T @ by_attachment.view(np.float32)).view(np.complex64)
@@ -97,7 +142,7 @@ class FingersOnPlate:
         fingertip by its power, that after the end included. Ringing is that of the plate without
         fingers.
         """
-        contacts, points = self._contacts, self._tips.few.reshape(-1, self._tips.few.shape[2])
+        contacts, points = self.contacts, self.tips.few.reshape(-1, self.tips.few.shape[2])
         f, k, p, n = contacts.fields.shape
         real, imaginary = ringing.parts.reshape(2, -1, points.shape[1]) @ points.T
         parts = (real + 1j * imaginary).reshape(f, n, -1, k, p).transpose(0, 3, 2, 4, 1)
@@ -107,7 +152,7 @@ class FingersOnPlate:
     def forms_during(self, responses: PulseResponses) -> Forms:
         """Forms as `forms_over` at the rows of responses, of the plate with the fingers on it."""
         over = responses.values[:, :, :-1].transpose(0, 3, 2, 4, 1).astype(np.complex64)
-        fields = self._contacts.fields.take(responses.rows, axis=0)
+        fields = self.contacts.fields.take(responses.rows, axis=0)
         return self._over(self.forms(None).at(responses.rows), fields, over, responses.count)
 
     def _over(
@@ -117,17 +162,17 @@ class FingersOnPlate:
 
         count: times until its end.
         """
-        t, (f, k, _, _, n) = len(self._question.targets), over.shape
-        weights = self._tips.few_weights
-        mean = (over[:, :t, :count].mean(axis=2) * weights[:t, :, None]).sum(axis=2)
-        scale = np.sqrt(weights[t:])[:, None, :, None]
+        targets, quiet, (f, _, _, _, n) = self.targets, self.quiet, over.shape
+        weights = self.tips.few_weights
+        mean = (over[:, targets, :count].mean(axis=2) * weights[targets, :, None]).sum(axis=2)
+        scale = np.sqrt(weights[quiet])[:, None, :, None]
         lasting, during = (
-            (each[:, t:] * scale / np.float32(math.sqrt(length))).reshape(f, k - t, -1, n)
+            (each[:, quiet] * scale / np.float32(math.sqrt(length))).reshape(f, len(quiet), -1, n)
             for each, length in ((fields[:, :, None], 1), (over, count))
         )
         return replace(
             steady,
-            targets=np.asarray(mean.swapaxes(0, 1) * self._gains[:, None, None]),
+            targets=np.asarray(mean.swapaxes(0, 1) * self.gains[:, None, None]),
             quiet=np.ascontiguousarray(steady.quiet + gram(during) - gram(lasting)),
             level_margin=0.0,
             few=None,
@@ -139,17 +184,16 @@ class FingersOnPlate:
 
         points (p,): by index, of the fine ones. What is uncertain counts by the fingertip's mean.
         """
-        t, n = len(self._question.targets), forms.era_count
-        fields = self._contacts.fields.take(rows, axis=0)[:, t:]
-        few = fields * np.sqrt(self._tips.few_weights[t:, :, None])
-        at_points = self._fine_fields(t).take(rows, axis=0)[:, :, points]
-        uncertain = self._contacts.power.take(rows, axis=0)[:, t:] - gram(few)
+        n = forms.era_count
+        at_points = self._fine_fields[np.ix_(rows, np.arange(len(self.quiet)), points)]
+        power = self.contacts.power[np.ix_(rows, self.quiet)]
+        uncertain = power - gram(self._few_fields.take(rows, axis=0))
         quiet = uncertain[:, :, None] + gram(at_points[:, :, :, None])
         return replace(forms, quiet=quiet.reshape(len(rows), -1, n, n), few=None, fine=None)
 
     def respond(self, drives: Sequence[Weights]) -> "DriveResponses":
         """Responses of the fingertips to drives."""
-        plate, tips = self._plate, self._tips
+        plate, tips = self.plate, self.tips
         each = [drive.tones() for drive in drives]
         ends = list(accumulate(len(tones) for tones in each))
         tones = Tones(
@@ -157,26 +201,26 @@ class FingersOnPlate:
             np.array([weights for tones in each for _, weights in tones]),
         )
         points = tips.fine.reshape(-1, tips.fine.shape[-1])
-        error = self._error_power.take(tones.frequencies, axis=0) * np.abs(tones.weights) ** 2
+        error = self.error_power.take(tones.frequencies, axis=0) * np.abs(tones.weights) ** 2
         return DriveResponses(
-            tone_responses(plate, self._contacts, tones, points),
+            tone_responses(plate, self.contacts, tones, points),
             np.sqrt(np.add.reduce(error, axis=1)),
-            self._threshold.take(tones.frequencies),
+            self.threshold.take(tones.frequencies),
             np.array([0, *ends[:-1]]),
             np.array(ends),
-            Fingertips(tips.fine_weights, self._gains),
+            Fingertips(tips.fine_weights, self.gains),
             plate,
-            self._contacts,
+            self.contacts,
             tones,
             points,
-            self._question.loads,
+            self.loads,
         )
 
     def _expected(self, background: Complex64Array) -> Complex64Array:
         """The mean power under errors of the gains, (f, eras, eras)."""
         expected = background.copy()
         diagonal = expected.reshape(len(expected), -1)[:, :: expected.shape[1] + 1]
-        diagonal *= 1 + np.float32(self._plate.gain_variance)
+        diagonal *= 1 + np.float32(self.plate.gain_variance)
         return expected
 
 
@@ -214,16 +258,16 @@ class DriveResponses:
             tones=Tones(self.tones.frequencies[start:end], self.tones.weights[start:end]),
         )
 
-    def drawn(self, *, count: int, seed: int, thicknesses: int) -> Felt:
-        """Measures on the plate as modelled, and on drawn ones, (c, 1 + count).
+    def drawn(self, *, count: int, seed: int, thicknesses: int) -> Float32Array:
+        """Squared amplitudes on the plate as modelled, and on drawn ones, (m, k p, 1 + count).
 
         thicknesses: how many the drawn plates have. All else that is uncertain changes their
         responses as on the plate as modelled, in proportion.
         """
         draws, nodes = self._draws(count, seed, thicknesses)
-        return self._felt(draws, draws.accelerations(self.values, self._at_nodes(nodes)))
+        return draws.power(draws.accelerations(self.values, self._at_nodes(nodes)), self.error)
 
-    def promised(self, *, count: int, seed: int, thicknesses: int, bases: int) -> Felt:
+    def promised(self, *, count: int, seed: int, thicknesses: int, bases: int) -> Float32Array:
         """As `drawn`, but all else that is uncertain acts on a thickness as it does there.
 
         bases: thicknesses at which its changes are computed, each for as many drawn plates.
@@ -252,7 +296,11 @@ class DriveResponses:
         nominal = self._at_nodes(nodes).repeat(count // len(nodes), axis=2)
         plates_drawn = nominal + changes.swapaxes(0, 1)
         found = np.concatenate([self.values[:, :, NOMINAL, None], plates_drawn], axis=2)
-        return self._felt(draws, found)
+        return draws.power(found, self.error)
+
+    def felt(self, power: Float32Array) -> Felt:
+        """Measures of the drives where the fingers' targets come first, (c, plates)."""
+        return felt(power, self.threshold, self.starts, self.fingertips)
 
     def _draws(self, count: int, seed: int, thicknesses: int) -> tuple[Draws, FloatArray]:
         """Drawn plates, and the deviations of their thickness, none where it is certain."""
@@ -272,7 +320,3 @@ class DriveResponses:
     def _at_nodes(self, nodes: FloatArray) -> Complex64Array:
         """Nominal responses at thicknesses, (m, k p, thicknesses)."""
         return responses_of_thicknesses(self.plate, self.contacts, self.tones, self.points, nodes)
-
-    def _felt(self, draws: Draws, accelerations: Complex64Array) -> Felt:
-        power = draws.power(accelerations, self.error)
-        return felt(power, self.threshold, self.starts, self.fingertips)

@@ -5,7 +5,7 @@ nine of ten goes first, then felt contrast. The promise is of other draws.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeAlias
@@ -35,11 +35,12 @@ from model.table.pulse_gains import OverEffect, contrast_over_effect
 from model.table.question import Question
 from model.transients.onset import RampedRinging
 
-JUDGING_DRAWS, JUDGING_SEED, JUDGING_THICKNESSES = 64, 1, 5
+JUDGING_DRAWS: Mapping[str, int] = {"count": 64, "seed": 1, "thicknesses": 5}
+PROMISED_DRAWS: Mapping[str, int] = {"count": 200, "seed": 8, "thicknesses": 40, "bases": 5}
+"""Drawn plates that judge candidates, and those of the promise."""
+
 MAX_DURING_EFFECT = 3
 """Drives that are rated by what is felt over a short effect, and as many at their frequencies."""
-
-PROMISED_DRAWS, PROMISED_SEED, PROMISED_THICKNESSES, PROMISED_BASES = 200, 8, 40, 5
 
 PROMISED_PERCENTILE = 9
 """Percentile of the draws that is promised.
@@ -271,9 +272,7 @@ def _judged(
     """
     if len(drives) == 1:
         return 0
-    judged = responses.drawn(
-        count=JUDGING_DRAWS, seed=JUDGING_SEED, thicknesses=JUDGING_THICKNESSES
-    )
+    judged = responses.felt(responses.drawn(**JUDGING_DRAWS))
     if candidates.over_effect is not None:
         return _judged_over_effect(question, drives, scores, judged, candidates.over_effect)
     least = percentile(judged.level[:, 1:])
@@ -346,12 +345,7 @@ def _pattern(
     gap_db: float | None,
 ) -> Pattern:
     """The pattern of a drive, turned down to the wanted level at nine of ten plates."""
-    drawn = responses.promised(
-        count=PROMISED_DRAWS,
-        seed=PROMISED_SEED,
-        thicknesses=PROMISED_THICKNESSES,
-        bases=PROMISED_BASES,
-    )
+    drawn = responses.felt(responses.promised(**PROMISED_DRAWS))
     measures = [drawn.level]
     if drawn.contrast is not None:
         measures += [drawn.contrast.loudest, drawn.contrast.acceleration, drawn.contrast.felt]

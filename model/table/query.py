@@ -3,7 +3,7 @@
 import cmath
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, Any
 
@@ -11,15 +11,31 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from model.errors import InputError, first_problem
 from model.finger.perception import STRONG_DB_SL
+from model.table.answer import answer
 from model.table.concentration import with_concentration
 from model.table.pattern import Pattern
 from model.table.question import Question
+from model.table.request import APART_HZ, Finger, Request
 from model.table.table import LocalizationTable
 from model.table.thorough_query import query_thoroughly
 from model.table.timing import Timing
 from model.transients.envelope import Envelopes
 
 _Place = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class _Own(BaseModel):
+    """Schema of a finger with a content of its own."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    at: _Place
+    band_hz: _Place | None = None
+    level_db_sl: float | None = None
+    priority: int = 0
+    may_share: bool = False
+    is_protected: bool = True
+    load: float = 1.0
 
 
 class _Line(BaseModel):
@@ -29,7 +45,10 @@ class _Line(BaseModel):
 
     target: _Place | None = None
     targets: list[_Place] = []
+    own: list[_Own] = []
     quiet: list[_Place] = []
+    bands_may_swap: bool = False
+    apart_hz: float = APART_HZ
     mode: str | None = None
     level_db_sl: float = STRONG_DB_SL
     eras_at_most: int = 2
@@ -44,9 +63,13 @@ def question_from_json(line: str, defaults: Mapping[str, Any] = MappingProxyType
     `"envelopes"`, and `"loads"`, of each contact relative to the rig's fingertip, targets first.
     defaults: of keys that the line leaves out. Raises InputError.
     """
+    return _question(_parsed(line, defaults))
+
+
+def _parsed(line: str, defaults: Mapping[str, Any]) -> _Line:
     try:
         asked = _Line.model_validate_json(line)
-        asked = asked.model_copy(
+        return asked.model_copy(
             update={k: v for k, v in defaults.items() if k not in asked.model_fields_set}
         )
     except ValidationError as error:
@@ -57,6 +80,9 @@ def question_from_json(line: str, defaults: Mapping[str, Any] = MappingProxyType
             else 'line must be a JSON object such as {"target": [0.08, 0.06], "quiet": '
             f"[[0.22, 0.16]]}}; {rule}"
         ) from None
+
+
+def _question(asked: _Line) -> Question:
     targets = [*([] if asked.target is None else [asked.target]), *asked.targets]
     return Question(
         targets=tuple((x, y) for x, y in targets),
@@ -128,6 +154,80 @@ def query_as_json(
     }
 
 
+def _answer_of_line(table: LocalizationTable, asked: _Line) -> dict[str, Any]:
+    """Answer the requests of a line; its loads are those of the quiet fingers."""
+    if asked.target or asked.targets:
+        raise InputError("own must be given without target and targets")
+    requests = []
+    for each in asked.own:
+        given = each.model_dump(exclude_none=True)
+        given["at"] = tuple(each.at)
+        if each.band_hz:
+            given["band_hz"] = tuple(each.band_hz)
+        requests.append(Request(**{"level_db_sl": asked.level_db_sl} | given))
+    loads = asked.loads or [1.0] * len(asked.quiet)
+    if len(loads) != len(asked.quiet):
+        raise InputError(
+            f"loads must have one value per quiet finger ({len(asked.quiet)}), got {len(loads)}"
+        )
+    fingers = [Finger((x, y), load) for (x, y), load in zip(asked.quiet, loads, strict=True)]
+    return answer_as_json(
+        table,
+        requests,
+        fingers,
+        apart_hz=asked.apart_hz,
+        bands_may_swap=asked.bands_may_swap,
+    )
+
+
+def answer_as_json(
+    table: LocalizationTable,
+    requests: Sequence[Request],
+    fingers: Sequence[Finger] = (),
+    *,
+    apart_hz: float = APART_HZ,
+    bands_may_swap: bool = False,
+) -> dict[str, Any]:
+    """Answer requests as `model.table.answer` and return the JSON object of `--own`."""
+    started = time.perf_counter()
+    found = answer(table, requests, fingers, apart_hz=apart_hz, bands_may_swap=bands_may_swap)
+    elapsed = time.perf_counter() - started
+    layers = []
+    for layer in found.layers:
+        tones = layer.excitation
+        layers.append(
+            {
+                "at_m": list(layer.request.at),
+                "frequency_hz": next(iter(tones.values())).frequency if tones else None,
+                "drive": table.drive_of(tones),
+                "level_db_sl": layer.level_db_sl if tones else None,
+                "promised_level_db_sl": layer.promised_level_db_sl if tones else None,
+                "felt_contrast_db": layer.felt_contrast_db,
+                "median_felt_contrast_db": layer.median_felt_contrast_db,
+                "robust_felt_contrast_db": layer.promised_contrast_db,
+                "foreign_level_db_sl": layer.foreign_level_db_sl,
+                "verdict": layer.verdict,
+            }
+        )
+    quiet = [
+        {
+            "at_m": list(each.at),
+            "felt_contrast_db": each.felt_contrast_db,
+            "robust_felt_contrast_db": each.promised_contrast_db,
+            "foreign_level_db_sl": each.level_db_sl,
+        }
+        for each in found.quiet
+    ]
+    return {
+        "layers": layers,
+        "quiet": quiet,
+        "robust_worst_db": found.promised_worst_db,
+        "stroke_factor": found.stroke_factor,
+        "applied": list(found.applied),
+        "solve_time_s": elapsed,
+    }
+
+
 def prepared_timing(table: LocalizationTable) -> Timing:
     """Solve what the timing of patterns needs at every frequency of a table."""
     timing = Timing(table)
@@ -174,7 +274,10 @@ def query_batch(
         if not line.strip():
             continue
         try:
-            question = question_from_json(line, defaults)
-            yield query_as_json(table, question, timing, thorough=thorough)
+            asked = _parsed(line, defaults)
+            if asked.own:
+                yield _answer_of_line(table, asked)
+            else:
+                yield query_as_json(table, _question(asked), timing, thorough=thorough)
         except InputError as error:
             yield {"error": str(error), "line": number}

@@ -383,7 +383,7 @@ class LocalizationTable:
         return np.asarray(rest.conj() @ rest.swapaxes(1, 2) / np.float32(rest.shape[2]))
 
     def _fingers(self, question: Question, tips: FingertipShapes) -> FingersOnPlate:
-        return FingersOnPlate(
+        return FingersOnPlate.of(
             self.attached,
             tips,
             question,
@@ -406,7 +406,7 @@ class LocalizationTable:
             eras=self.eras,
             frequencies=self.frequencies.take(rows),
             playable=np.arange(len(rows)),
-            fingers=FingersOnPlate(
+            fingers=FingersOnPlate.of(
                 self.attached.at(rows),
                 tips,
                 question,

@@ -23,6 +23,10 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "table": None, "target": TARGET, "quiet": (), "level_db_sl": 20.0, "drive_mode": "signed",
         "loads": (1.5,),
     },
+    era.answer: {
+        "table": None, "requests": [era.Request(TARGET)], "fingers": [era.Finger((0.2, 0.1))],
+        "apart_hz": 30.0,
+    },
     era.calibrate: {"rig": RIG, "measured": "measured.csv"},
     era.study: {
         "rig": RIG, "what": "count", "layouts": 9, "active": "1", "frequencies": [60],
@@ -44,7 +48,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
 }  # fmt: skip
 """Valid arguments by function; None: a small table."""
 
-TAKES_ANYTHING = {"title", "envelopes", "measures", "all_scales"}
+TAKES_ANYTHING = {"bands_may_swap", "title", "envelopes", "measures", "all_scales"}
 
 
 STRAYS = (object(), "here", 3.5, [object()])

@@ -92,12 +92,12 @@ def test_hmi_engineer_example_feels_what_was_predicted() -> None:
 def test_page_example_feels_what_was_predicted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ten lines, executed as printed; played contrast is the predicted one."""
+    """Twelve lines, executed as printed; played contrast is the predicted one."""
     (tmp_path / "examples").mkdir()
     shutil.copy(EXAMPLES / "paper_plate.yaml", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
     lines = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)[0]
-    assert len(lines.split("\n\n")[1].splitlines()) == 10
+    assert len(lines.split("\n\n")[1].splitlines()) == 12
     (tmp_path / "page.py").write_text(lines, "utf-8")
     ran = runpy.run_path("page.py")
     assert ran["felt"].contrast_db == pytest.approx(ran["pattern"].contrast_db, abs=0.2)

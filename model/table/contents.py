@@ -1,0 +1,311 @@
+"""Several contents at once: one tone each, the other fingers protected from it.
+
+Content j for its fingers is the question "these are targets, all others quiet", and K contents are
+K searches over one load of the plate: weights that share the prices of the fingers gain 0.3 dB at
+most. Tones of different frequencies add in power. The combination of a few candidates each is
+chosen by the worst finger on drawn plates; the promise is of other draws, the same for all tones.
+
+    C_k = g_k own_k / sqrt(max_p sum_j g_j^2 power_j(p)),  j other contents, p points of finger k
+
+and for a quiet finger the weakest content counts, over all contents.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+
+from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from model.choice import best_first
+from model.drive_modes.forms import Weights
+from model.drive_modes.phased import PHASED
+from model.ensemble.measures import percentile
+from model.table.fingers_on_plate import MAX_FINGERS_BY_POINT, DriveResponses, FingersOnPlate
+from model.table.pattern_choice import JUDGING_DRAWS, PROMISED_DRAWS, PROMISED_PERCENTILE
+
+MIN_CANDIDATES, ROWS_BY_POINT = 4, 16
+"""Candidates of a content by the mean over fingertips and as many by their points; frequencies that
+are searched by point."""
+
+MAX_COMBINATIONS = 200
+"""Combinations of candidates that are continued with those of the next content."""
+
+_TINY = 1e-30
+_NEARLY_HIGHEST = 0.99
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """A content for fingers, by index, at a level.
+
+    rows: of the frequencies that it may have, for each band (one unless bands may be exchanged).
+    """
+
+    targets: tuple[int, ...]
+    level_db_sl: float
+    rows: tuple[IntArray, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """The tones of K contents.
+
+    rows (K,): of their frequencies; weights (K, n): up to full stroke; power (K, k, p, 1 + d):
+    squared amplitudes to threshold at the points of all fingers, on the plate as modelled and on
+    drawn ones; is_apart: whether the frequencies are.
+    """
+
+    rows: IntArray
+    weights: Complex64Array
+    power: Float32Array
+    is_apart: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """Candidates (m,) of all contents: of which stream and band, row, weights (m, n)."""
+
+    streams: IntArray
+    bands: IntArray
+    rows: IntArray
+    weights: Complex64Array
+
+
+def choose_contents(
+    fingers: FingersOnPlate,
+    streams: Sequence[Stream],
+    quiet: Sequence[int],
+    frequencies: FloatArray,
+    *,
+    apart_hz: float,
+) -> Chosen:
+    """Choose a tone for each content.
+
+    fingers: all on the plate, at rows (f,) of frequencies [Hz]; quiet: those that feel nothing.
+    """
+    candidates = _candidates(fingers, streams, quiet, frequencies, apart_hz)
+    weights = fingers.tips.fine_weights
+    responses = _respond(fingers, candidates.rows, candidates.weights)
+    power = _to_threshold(responses.drawn(**JUDGING_DRAWS), responses, weights)
+    loudest = power.max(axis=2)[:, :, 1:]
+    own = np.empty((len(power), loudest.shape[2]), dtype=np.float32)
+    for number, stream in enumerate(streams):
+        of = candidates.streams == number
+        own[of] = own_amplitudes(power[of], weights, stream.targets)[:, 1:]
+        gain = 10 ** (stream.level_db_sl / 20) / np.maximum(percentile(own[of]), _TINY)
+        own[of] *= gain[:, None]
+        loudest[of] *= gain[:, None, None] ** 2
+    best, is_apart = _best_combination(
+        candidates, streams, quiet, own, loudest, frequencies, apart_hz
+    )
+    return tones_chosen(fingers, candidates.rows[best], candidates.weights[best], is_apart=is_apart)
+
+
+def tones_chosen(
+    fingers: FingersOnPlate, rows: IntArray, weights: Complex64Array, *, is_apart: bool = True
+) -> Chosen:
+    """Tones at rows (K,) of the frequencies with weights (K, n), and what they promise."""
+    responses = _respond(fingers, rows, weights)
+    power = _to_threshold(
+        responses.promised(**PROMISED_DRAWS), responses, fingers.tips.fine_weights
+    )
+    return Chosen(rows, weights, power, is_apart)
+
+
+def own_amplitudes(
+    power: Float32Array, weights: Float32Array, targets: Sequence[int]
+) -> Float32Array:
+    """Mean amplitude over the weakest target fingertip, (..., d), of powers (..., k, p, d).
+
+    weights (k, p): of the points in the mean.
+    """
+    means = [weights[t] @ np.sqrt(power[..., t, :, :]) for t in targets]
+    return np.asarray(np.minimum.reduce(means))
+
+
+def loudest_power(power: Float32Array, rows: IntArray, finger: int) -> Float32Array:
+    """Power (d,) of contents at the loudest point of a finger, of power (j, k, p, d).
+
+    Of contents of one frequency, by rows (j,), the amplitudes add.
+    """
+    at = power[:, finger]
+    total = np.zeros(at.shape[1:], dtype=at.dtype)
+    order = np.argsort(rows, kind="stable").tolist()
+    for _, same in groupby(order, key=rows.__getitem__):
+        total += np.sqrt(at[list(same)]).sum(axis=0) ** 2
+    return np.asarray(total.max(axis=0))
+
+
+def contrasts(
+    power: Float32Array,
+    weights: Float32Array,
+    rows: IntArray,
+    streams: Sequence[Stream],
+    quiet: Sequence[int],
+) -> dict[int, Float32Array]:
+    """Ratio of own amplitude to that of others on each plate (d,), by finger; none of one alone.
+
+    That of an only content is the one at the loudest quiet finger.
+
+    power (K, k, p, d): of the contents at their gains; rows (K,): of their frequencies.
+    """
+    own = [own_amplitudes(power[j], weights, each.targets) for j, each in enumerate(streams)]
+    every = np.arange(len(streams))
+    found: dict[int, Float32Array] = {}
+    for j, stream in enumerate(streams):
+        others = every != j
+        if others.any():
+            for finger in stream.targets:
+                level = own_amplitudes(power[j], weights, (finger,))
+                others_power = loudest_power(power[others], rows[others], finger)
+                found[finger] = _ratio(level, others_power)
+    for finger in quiet:
+        others_power = loudest_power(power, rows, finger)
+        found[finger] = _ratio(np.min(own, axis=0), others_power)
+    if found and len(streams) == 1:
+        loudest = np.min([*found.values()], axis=0)
+        found.update(dict.fromkeys(streams[0].targets, loudest))
+    return found
+
+
+def _ratio(level: Float32Array, others_power: Float32Array) -> Float32Array:
+    return np.asarray(level / np.sqrt(np.maximum(others_power, _TINY)), dtype=np.float32)
+
+
+def promise(values: Float32Array, percent: float = PROMISED_PERCENTILE) -> float:
+    """Percentile of the drawn plates, without the first, that as modelled."""
+    return float(percentile(values[1:].astype(float), percent))
+
+
+def _respond(fingers: FingersOnPlate, rows: IntArray, weights: Complex64Array) -> DriveResponses:
+    return fingers.respond(
+        [Weights.at(row, each) for row, each in zip(rows.tolist(), weights, strict=True)]
+    )
+
+
+def _to_threshold(
+    power: Float32Array, responses: DriveResponses, weights: Float32Array
+) -> Float32Array:
+    """Squared amplitudes to threshold, (m, k, p, d), of squared ones (m, k p, d)."""
+    power /= (responses.threshold**2)[:, None, None]
+    return power.reshape(len(power), *weights.shape, -1)
+
+
+def _candidates(
+    fingers: FingersOnPlate,
+    streams: Sequence[Stream],
+    quiet: Sequence[int],
+    frequencies: FloatArray,
+    apart_hz: float,
+) -> _Candidates:
+    """The best drives of each content in each band, apart from each other."""
+    every = {*quiet}.union(*(stream.targets for stream in streams))
+    count = MIN_CANDIDATES + len(streams) // 2
+    found: list[tuple[int, int, int, Complex64Array]] = []
+    for number, stream in enumerate(streams):
+        others = sorted(every - {*stream.targets})
+        for band, rows in enumerate(stream.rows):
+            for score, weights in _search(fingers, stream, others, rows, len(streams)):
+                for at in _apart(score, frequencies[rows], count, apart_hz):
+                    found.append((number, band, int(rows[at]), weights[at]))
+    streams_of, bands, at_rows, chosen = zip(*found, strict=True)
+    return _Candidates(np.array(streams_of), np.array(bands), np.array(at_rows), np.array(chosen))
+
+
+def _search(
+    fingers: FingersOnPlate, stream: Stream, others: Sequence[int], rows: IntArray, contents: int
+) -> list[tuple[Float32Array, Complex64Array]]:
+    """Scores (n,) and weights (n, eras) at rows (n,), by the fingertips' mean and by their points.
+
+    Weights reach a level that the other contents leave room for, else the highest there is.
+    """
+    level = stream.level_db_sl + 20 * math.log10(contents)
+    view = fingers.for_targets(stream.targets, others, level_db_sl=level)
+    forms = view.forms(None).at(rows)
+    found = PHASED.search(forms, 0.0)
+    if not found.score.any():
+        highest = np.float32(_NEARLY_HIGHEST * PHASED.max_sensation(forms))
+        forms = replace(forms, wanted=float(highest), level_margin=0.0)
+        found = PHASED.search(forms, 0.0)
+    drives = [(found.score, found.weights)]
+    if len(others) <= MAX_FINGERS_BY_POINT and len(stream.targets) == 1:
+        top = np.sort(best_first(found.score)[:ROWS_BY_POINT])
+        by_point = PHASED.search(view.by_point(forms.at(top), rows[top]), 0.0)
+        score, weights = np.zeros_like(found.score), np.zeros_like(found.weights)
+        score[top], weights[top] = by_point.score, by_point.weights
+        drives.append((score, weights))
+    return drives
+
+
+def _apart(score: Float32Array, frequencies: FloatArray, count: int, apart_hz: float) -> list[int]:
+    """Indices of the two best scores, and of the best ones that are apart from all of these."""
+    found: list[int] = []
+    for at in best_first(score).tolist():
+        if score[at] <= 0 or len(found) == count:
+            break
+        near = np.abs(frequencies[found] - frequencies[at]) < apart_hz
+        if len(found) < 2 or not near.any():
+            found.append(at)
+    return found
+
+
+def _best_combination(
+    candidates: _Candidates,
+    streams: Sequence[Stream],
+    quiet: Sequence[int],
+    own: Float32Array,
+    loudest: Float32Array,
+    frequencies: FloatArray,
+    apart_hz: float,
+) -> tuple[IntArray, bool]:
+    """A candidate of each content (K,), and whether their frequencies are apart.
+
+    own (m, d), loudest (m, k, d): amplitude and power of the candidates, at the contents' levels.
+    Of all that exchange bands and are apart, else of all that exchange bands.
+    """
+    hertz, may_exchange = frequencies[candidates.rows], len(streams[0].rows) > 1
+    for gap in (apart_hz, 0.0):
+        combinations = np.flatnonzero(candidates.streams == 0)[:, None]
+        for number in range(1, len(streams)):
+            own_candidates = np.flatnonzero(candidates.streams == number)
+            combinations = np.concatenate(
+                [
+                    np.repeat(combinations, len(own_candidates), axis=0),
+                    np.tile(own_candidates, len(combinations))[:, None],
+                ],
+                axis=1,
+            )
+            last, before = combinations[:, -1:], combinations[:, :-1]
+            allowed = (np.abs(hertz[last] - hertz[before]) >= gap).all(axis=1)
+            if may_exchange:
+                allowed &= (candidates.bands[last] != candidates.bands[before]).all(axis=1)
+            combinations = combinations[allowed]
+            if len(combinations) > MAX_COMBINATIONS and number + 1 < len(streams):
+                worst = _worst(combinations, streams, quiet, own, loudest)
+                combinations = combinations[best_first(worst)[:MAX_COMBINATIONS]]
+        if len(combinations):
+            worst = _worst(combinations, streams, quiet, own, loudest)
+            return combinations[best_first(worst)[0]], gap == apart_hz
+    raise AssertionError("contents with as many bands must have a combination")
+
+
+def _worst(
+    combinations: IntArray,
+    streams: Sequence[Stream],
+    quiet: Sequence[int],
+    own: Float32Array,
+    loudest: Float32Array,
+) -> FloatArray:
+    """Power ratio at the worst finger on nine of ten plates, of combinations (c, j): (c,)."""
+    levels, total = own[combinations] ** 2, loudest[combinations].sum(axis=1)
+    worst = np.full((len(combinations), own.shape[1]), np.inf, dtype=np.float32)
+    for j, at in enumerate(combinations.T):
+        if combinations.shape[1] > 1:
+            for finger in streams[j].targets:
+                others_power = np.maximum(total[:, finger] - loudest[at, finger], _TINY)
+                worst = np.minimum(worst, levels[:, j] / others_power)
+    for finger in quiet:
+        worst = np.minimum(worst, levels.min(axis=1) / np.maximum(total[:, finger], _TINY))
+    return percentile(worst.astype(float))

@@ -1,0 +1,145 @@
+"""Requests: what each finger is to feel, and the answer to all of them together."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from model.config.points import in_metres
+from model.errors import InputError
+from model.finger import MAX_CONTACTS
+from model.finger.fingertip import FINGERTIP_RADIUS
+from model.finger.perception import STRONG_DB_SL
+from model.structure.fingertip import check_loads
+from model.structure.plate import Plate
+from model.table.question import MAX_LEVEL_DB_SL, MIN_LEVEL_DB_SL, Point
+from model.vibration.excitation import Excitation
+
+APART_HZ = 30.0
+"""Distance of the frequencies of two contents: nearer ones would be felt to beat."""
+
+MIN_CONTRAST_DB, OWN_CONTRAST_DB = 6.0, 12.0
+"""Promised contrast from which a content is served, and from which it is a finger's own."""
+
+ANY_BAND = (0.0, math.inf)
+
+
+@dataclass(frozen=True)
+class Request:
+    """A finger at a place [m], and the content that it is to feel.
+
+    band_hz: lowest and highest frequency of the content; level_db_sl: its level; priority: lower
+    ones give way first; may_share: whether the content may be that of the nearest finger that may
+    share, too; is_protected: whether the finger keeps the others' contents away where its own is
+    given up; load: of the finger relative to the rig's fingertip.
+    """
+
+    at: Point
+    band_hz: tuple[float, float] = ANY_BAND
+    level_db_sl: float = STRONG_DB_SL
+    priority: int = 0
+    may_share: bool = False
+    is_protected: bool = True
+    load: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check everything that does not depend on the table."""
+        low, high = self.band_hz
+        if not 0 <= low <= high:  # False for NaN
+            raise InputError(
+                f"band of ({self.at[0]:g}, {self.at[1]:g}) m must be from a lowest to a highest "
+                f"frequency in Hz, got {low:g} to {high:g}"
+            )
+        if not MIN_LEVEL_DB_SL <= self.level_db_sl <= MAX_LEVEL_DB_SL:
+            raise InputError(
+                f"level must be between {MIN_LEVEL_DB_SL:g} and {MAX_LEVEL_DB_SL:g} dB SL, got "
+                f"{self.level_db_sl:g}"
+            )
+        if isinstance(self.priority, bool) or not isinstance(self.priority, int):
+            raise InputError(f"priority must be a whole number, got {self.priority!r}")
+
+
+@dataclass(frozen=True)
+class Finger:
+    """A finger at a place [m] that is to feel nothing; load: relative to the rig's fingertip."""
+
+    at: Point
+    load: float = 1.0
+
+
+@dataclass(frozen=True)
+class Layer:
+    """What is played for one request, with what its finger feels.
+
+    excitation: of all ERAs, empty where it is held back; level_db_sl, promised_level_db_sl: as
+    modelled, and what nine of ten plates give; felt_contrast_db, median_felt_contrast_db,
+    promised_contrast_db: level of the content above that of all others at this finger, or above
+    its own at the loudest quiet finger where it is the only content: as modelled, and that of half
+    and of nine of ten plates, None where there is nothing to compare with; foreign_level_db_sl: of
+    all other contents at this finger, which nine of ten plates do not exceed; verdict: `own`,
+    `mixed` (below OWN_CONTRAST_DB), `shared` (the content of another finger) or `held back`, which
+    has the contrast that it would have had.
+    """
+
+    request: Request
+    excitation: Excitation
+    verdict: str
+    level_db_sl: float = -math.inf
+    promised_level_db_sl: float = -math.inf
+    felt_contrast_db: float | None = None
+    median_felt_contrast_db: float | None = None
+    promised_contrast_db: float | None = None
+    foreign_level_db_sl: float | None = None
+
+
+@dataclass(frozen=True)
+class QuietFinger:
+    """What a finger at a place [m] that is to feel nothing feels.
+
+    felt_contrast_db, promised_contrast_db: level of the weakest content at its own finger above
+    that of all contents here; level_db_sl: of these, which nine of ten plates do not exceed.
+    """
+
+    at: Point
+    felt_contrast_db: float
+    promised_contrast_db: float
+    level_db_sl: float
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Layers of all requests, in their order, and what is promised of all together.
+
+    quiet: what quiet fingers feel; promised_worst_db: the least contrast of all fingers, on nine of
+    ten plates, None for one finger alone; stroke_factor: of the requested levels that the ERAs'
+    stroke allows, 1 for all; applied: what was changed in the requests, in words.
+    """
+
+    layers: tuple[Layer, ...]
+    quiet: tuple[QuietFinger, ...]
+    promised_worst_db: float | None
+    stroke_factor: float
+    applied: tuple[str, ...] = field(default=())
+
+
+def check_requests(requests: Sequence[Request], fingers: Sequence[Finger], plate: Plate) -> None:
+    """Raise InputError for requests that contradict each other or are not on the plate."""
+    if not requests:
+        raise InputError("an answer must have at least one request, got none")
+    every: list[Request | Finger] = [*requests, *fingers]
+    if len(every) > MAX_CONTACTS:
+        raise InputError(f"an answer must have up to {MAX_CONTACTS} fingers, got {len(every)}")
+    check_loads(each.load for each in every)
+    for number, finger in enumerate(every):
+        x, y = finger.at
+        if not plate.contains(x, y):  # False for NaN
+            raise InputError(
+                f"finger ({x:g}, {y:g}) m must be on the plate, from (0, 0) to "
+                f"({plate.length:g}, {plate.width:g}) m"
+                f"{in_metres(x, y, length=plate.length, width=plate.width)}"
+            )
+        for other in every[:number]:
+            if math.dist(other.at, finger.at) < FINGERTIP_RADIUS:
+                raise InputError(
+                    f"finger ({x:g}, {y:g}) m must be at least {1000 * FINGERTIP_RADIUS:g} mm "
+                    f"from the one at ({other.at[0]:g}, {other.at[1]:g}) m"
+                )

@@ -9,7 +9,7 @@ loops and few calls: every set is played by host and far end.
 import cmath
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
@@ -58,6 +58,14 @@ class Playback:
     def __post_init__(self) -> None:
         """Start silent."""
         self.all_voices = [()] * self.channels
+
+    def copied(self) -> "Playback":
+        """Return it as it is, to look ahead while the original stays."""
+        copied = replace(self)
+        copied.all_voices = [*self.all_voices]
+        copied._layers = {number: replace(layer) for number, layer in self._layers.items()}
+        copied._note_changes()
+        return copied
 
     def commit(self, layers: Sequence[LayerSet], token: int, time: float) -> None:
         """Play a set from a time on; what has a new tone counts its phase from there."""

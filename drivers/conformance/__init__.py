@@ -13,48 +13,45 @@ from drivers.conformance import (
     modbus_frames,
     parts,
     reading,
+    sensors,
     serial_frames,
     sets,
     shapes,
     silencing,
     telling,
     tokens,
-    voices,
     watchdog,
 )
-from drivers.conformance.check import Check, CheckResult, Report, Result, run_checks
+from drivers.conformance.check import run_checks
 from drivers.conformance.opening import opened
+from drivers.conformance.report import Check, CheckResult, Report, Result
 from drivers.conformance.subject import LEVEL
 
 __all__ = ["CHECKS", "LEVEL", "Check", "CheckResult", "Report", "Result", "judge", "of_kind"]
 
 CHECKS: tuple[Check, ...] = (
     *(reading.identity, reading.capabilities, reading.starts_disarmed, reading.replies_in_time),
-    *(reading.unknown_types, reading.reading_changes_nothing, reading.ages_and_temperature),
-    *(reading.hello_for_ever, telling.sensors, modbus_frames.areas, modbus_frames.pieces),
-    *(can_frames.objects, reading.lengths),
-    *(silencing.stop, silencing.stop_ramps, silencing.silence_never_later),
+    *(reading.unknown_types, reading.reading_changes_nothing, reading.hello_for_ever),
+    *(sensors.sensors, modbus_frames.areas, modbus_frames.pieces, can_frames.objects),
+    *(reading.lengths, silencing.stop, silencing.stop_ramps, silencing.silence_never_later),
     *(silencing.stop_ends_all, silencing.stops_are_numbered, silencing.clear_too_early),
-    *(silencing.disarm, silencing.silence),
-    *(arming.plays_nothing_disarmed, arming.arming, arming.watchdog_ranges, arming.arms_again),
-    *(arming.sessions, arming.arming_ends_fades),
-    *(watchdog.watchdog, watchdog.watchdog_unread, watchdog.watchdog_left, watchdog.what_feeds),
+    *(silencing.silence, arming.plays_nothing_disarmed, arming.arming, arming.watchdog_ranges),
+    *(arming.arms_again, arming.sessions, arming.arming_ends_fades),
+    *(watchdog.watchdog, watchdog.watchdog_unread, watchdog.what_feeds),
     *(watchdog.what_does_not_feed, watchdog.trips_amid_other_requests),
     *(watchdog.trips_amid_fades, watchdog.fault_list),
     *(sets.every_channel, sets.levels_of_every_frequency, sets.achieved, sets.steps_as_stated),
     *(sets.all_or_nothing, sets.accepts_its_ranges, parts.parts_of_sets, parts.max_set),
-    parts.sets_expire,
-    *(tokens.stage_and_commit, tokens.repeats_change_nothing, tokens.tokens_wrap),
-    *(tokens.newer_sets_replace, tokens.committed_together),
-    *(layers.layers_add, layers.layers_play_on, layers.limited, layers.valid_for, layers.renew),
-    layers.after,
-    *(shapes.ramps, shapes.cross_fades, shapes.interrupted_ramps, shapes.kept_phase),
-    *(shapes.onsets, shapes.endings, shapes.endings_amid, shapes.extreme_envelopes),
-    *(shapes.phases, shapes.frequency, voices.voices, voices.voices_of_layers),
+    *(parts.sets_expire, tokens.stage_and_commit, tokens.repeats_change_nothing),
+    *(tokens.tokens_wrap, tokens.newer_sets_replace, tokens.committed_together),
+    *(layers.layers_add, layers.layers_play_on, layers.valid_for, layers.renew, layers.after),
+    *(shapes.ramps, shapes.cross_fades, shapes.kept_phase, shapes.onsets, shapes.endings),
+    *(shapes.endings_amid, shapes.extreme_envelopes, shapes.phases, shapes.voices),
+    *(shapes.voices_of_layers, shapes.limited),
     *(serial_frames.damaged_frames, serial_frames.doubled_frames, serial_frames.tolerated_frames),
     *(modbus_frames.present_areas, modbus_frames.exceptions),
     *(can_frames.numbers, can_frames.network_management, can_frames.heartbeats),
-    *(telling.events, telling.broadcasts, telling.measured, telling.readings, telling.addresses),
+    *(telling.events, telling.broadcasts, telling.addresses, sensors.measured, sensors.readings),
 )
 """All checks, in their order of execution."""
 

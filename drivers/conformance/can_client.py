@@ -15,7 +15,7 @@ from drivers.codec.can_bus.segments import (
     segments,
     unpack_frames,
 )
-from drivers.conformance.client import Answer, Client, Heard, Port, expect_reply
+from drivers.conformance.client import Answer, Client, Heard, Port, When, altered, expect_reply
 from drivers.conformance.findings import Violation, expect_equal
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import HELLO
@@ -27,7 +27,7 @@ _SETTLING = 0.005  # s; after a command of network management
 
 
 class CanClient(Client):
-    """A bus; number: of the last request. frames: all of the node, with their times [s]."""
+    """A bus; number: of the last request. frames: all of the node."""
 
     kind = "can"
     addresses = NODE_MAX
@@ -35,7 +35,7 @@ class CanClient(Client):
     def __init__(self, port: Port, address: int, *, number: int = 0) -> None:
         super().__init__(port, address)
         self.number = number
-        self.frames: list[tuple[float, CanFrame]] = []
+        self.frames: list[CanFrame] = []
         self._counters = WireCounters()
         self._replies = Assembler(self._counters)
         self._events = Assembler(self._counters, is_numbered=False)
@@ -46,7 +46,7 @@ class CanClient(Client):
         for frame in unpack_frames(data):
             if frame.id & NODE_MAX != self.address:
                 continue
-            self.frames.append((now, frame))
+            self.frames.append(frame)
             if frame.id != REPLY + self.address:
                 continue
             is_event = frame.data[:1] == b"\0"
@@ -89,7 +89,7 @@ class CanClient(Client):
         if heard.type == NAK:
             return self.refusal(sent, heard.at, number, heard.words)
         expect_equal(heard.type, number, "type of a reply")
-        return self.answer(sent, heard.at, number, heard.words)
+        return Answer("", None, heard.words, When(sent, heard.at))
 
     def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
         """Return the frames of a request."""
@@ -119,12 +119,9 @@ class CanClient(Client):
             yield "its last frame missing", self.packed(frames()[:-1])
             yield "its first frame missing", self.packed(frames()[1:])
             first, *rest = frames()
-            other = rest[-1][:2] + bytes(byte ^ 1 for byte in rest[-1][2:])
-            yield "two frames of one place", self.packed([other, *rest, first])
+            yield "two frames of one place", self.packed([altered(rest[-1], 2), *rest, first])
 
-    @property
-    def emergencies(self) -> list[bytes]:
-        """Data of the emergencies heard."""
-        return [
-            frame.data for _, frame in self.frames if frame.id == cob_id("emergency", self.address)
-        ]
+    def data_of(self, name: str) -> list[bytes]:
+        """Return the data of the frames heard of a kind, by the name of its identifier."""
+        can_id = cob_id(name, self.address)
+        return [frame.data for frame in self.frames if frame.id == can_id]

@@ -1,150 +1,46 @@
-"""Checks and their results: one attempt after the other until this machine was in time."""
+"""Checks and their execution: one attempt after the other until this machine was in time."""
 
-from collections.abc import Awaitable, Callable, Iterable, Sequence
-from dataclasses import dataclass
-from enum import StrEnum
-from typing import Any, TypeAlias
+from collections.abc import Callable, Iterable, Sequence
 
 from drivers import clock
 from drivers.conformance.client import Client
 from drivers.conformance.findings import Late, Optional, Violation
+from drivers.conformance.report import Check, CheckResult, Result, Steps
 from drivers.conformance.subject import MAX_ATTEMPTS, Subject
 from drivers.errors import LinkError
-
-Steps: TypeAlias = Callable[[Subject], Awaitable[None]]
-
-
-class Result(StrEnum):
-    """What a check found; skipped: there is nothing to check, as the contract allows."""
-
-    PASSED = "passed"
-    FAILED = "failed"
-    SKIPPED = "skipped"
+from drivers.protocol.records import Refusal
+from drivers.protocol.table import MESSAGES
 
 
-@dataclass(frozen=True, slots=True)
-class Check:
-    """A rule of the contract: its name, what it requires, and the place that says so.
-
-    drives: whether it arms the amplifier. kinds: of wires on which it can be tried, empty for all.
-    """
-
-    name: str
-    requirement: str
-    place: str
-    drives: bool
-    kinds: tuple[str, ...]
-    run: Steps
-
-
-@dataclass(frozen=True, slots=True)
-class CheckResult:
-    """Result of a check; reason, seen, expected: of a violation, or why it was skipped."""
-
-    check: Check
-    number: int
-    result: Result
-    reason: str = ""
-    seen: str = ""
-    expected: str = ""
-    seconds: float = 0.0
-    attempts: int = 1
-
-    def to_json(self) -> dict[str, Any]:
-        """Make a row with stable keys."""
-        return {
-            "number": self.number,
-            "name": self.check.name,
-            "requirement": self.check.requirement,
-            "place": self.check.place,
-            "result": self.result.value,
-            "reason": self.reason,
-            "seen": self.seen,
-            "expected": self.expected,
-            "seconds": round(self.seconds, 3),
-            "attempts": self.attempts,
-        }
-
-
-@dataclass(frozen=True, slots=True)
-class Report:
-    """Results of checks on one amplifier; level: the highest at which channels were driven.
-
-    not_run: number of checks that were not tried.
-    """
-
-    url: str
-    level: float
-    results: tuple[CheckResult, ...]
-    not_run: int
-
-    @property
-    def overall(self) -> str:
-        """The worst result: failed, incomplete or passed."""
-        if any(each.result is Result.FAILED for each in self.results):
-            return "failed"
-        return "incomplete" if self.not_run else "passed"
-
-    @property
-    def summary(self) -> str:
-        """The number of checks with each result."""
-        counted = [f"{count} {name}" for name, count in self._counts().items()]
-        driven = f", driven at up to {self.level:.0%} of full level" if self.level else ""
-        left = f", {self.not_run} not run" if self.not_run else ""
-        return f"{', '.join(counted)}{left}{driven}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Make an object with stable keys."""
-        return {
-            "url": self.url,
-            "overall": self.overall,
-            "level": self.level,
-            **self._counts(),
-            "not_run": self.not_run,
-            "seconds": round(sum(each.seconds for each in self.results), 3),
-            "checks": [each.to_json() for each in self.results],
-        }
-
-    def _counts(self) -> dict[str, int]:
-        results = [each.result for each in self.results]
-        return {result.value: results.count(result) for result in Result}
-
-
-def reading(place: str, *kinds: str) -> Callable[[Steps], Check]:
+def reading(place: str, *kinds: str, drives: bool = False) -> Callable[[Steps], Check]:
     """Make a check that only reads of its steps, whose docstring begins with 'It'."""
-    return lambda steps: _check(steps, place, kinds, drives=False)
+
+    def make(steps: Steps) -> Check:
+        text = " ".join((steps.__doc__ or "").split())
+        requirement = text.removeprefix("It ").removesuffix(".")
+        return Check(getattr(steps, "__name__", ""), requirement, place, drives, kinds, steps)
+
+    return make
 
 
 def driving(place: str, *kinds: str) -> Callable[[Steps], Check]:
     """Make a check that arms the amplifier and drives its channels."""
-    return lambda steps: _check(steps, place, kinds, drives=True)
-
-
-def _check(steps: Steps, place: str, kinds: tuple[str, ...], *, drives: bool) -> Check:
-    requirement = " ".join((steps.__doc__ or "").split("\n\n")[0].split())
-    requirement = requirement.removeprefix("It ").removesuffix(".")
-    return Check(getattr(steps, "__name__", ""), requirement, place, drives, kinds, steps)
+    return reading(place, *kinds, drives=True)
 
 
 async def identified(client: Client, level: float) -> Subject:
     """Identify the amplifier at the far end of a client; raises Violation."""
     identity = await client.hello()
     client.reply_words = {}
-    answer = await client.exchange(2, ())
+    message = MESSAGES["GetCaps"]
+    answer = await client.exchange(message.number, ())
     if answer.code:
         raise Violation("GetCaps", expected="carried out", seen=answer.code)
-    can = Subject.read(_UNIDENTIFIED, "GetCaps", answer).values
+    try:
+        can = message.reply.unpack(answer.words, is_strict=False)
+    except Refusal as error:
+        raise Violation("reply to GetCaps", expected="as in the table", seen=error) from None
     return Subject(client, identity, can, level)
-
-
-class _Unidentified(Subject):
-    """An amplifier of which nothing is known yet."""
-
-    def __init__(self) -> None:
-        self.channels = self.layers = range(0)
-
-
-_UNIDENTIFIED = _Unidentified()
 
 
 async def run_checks(
@@ -170,27 +66,27 @@ async def run_checks(
 
 
 async def _run(number: int, check: Check, client: Client, level: float) -> tuple[CheckResult, bool]:
-    began = clock.now()
-    for attempt in range(1, MAX_ATTEMPTS + 1):
-        finding, is_at_rest = await _attempt(check, client, level)
-        if isinstance(finding, Late):
-            continue
-        took = clock.now() - began
-        if finding is None:
-            result = CheckResult(check, number, Result.PASSED, seconds=took, attempts=attempt)
-        elif isinstance(finding, Optional):
-            result = CheckResult(
-                *(check, number, Result.SKIPPED, str(finding)), seconds=took, attempts=attempt
+    began, attempts = clock.now(), 0
+    finding: Exception | None = Late("it was not tried")
+    while isinstance(finding, Late):
+        if attempts == MAX_ATTEMPTS:
+            raise LinkError(
+                f"check {check.name}: this machine was late {attempts} times ({finding}); "
+                "run it on one that is less busy"
             )
-        else:
-            assert isinstance(finding, Violation)  # noqa: S101
-            texts = str(finding), finding.seen, finding.expected
-            result = CheckResult(check, number, Result.FAILED, *texts, took, attempt)
-        return result, is_at_rest
-    raise LinkError(
-        f"check {check.name}: this machine was late {MAX_ATTEMPTS} times ({finding}); "
-        "run it on one that is less busy"
-    )
+        attempts += 1
+        finding, is_at_rest = await _attempt(check, client, level)
+    result = Result.SKIPPED if isinstance(finding, Optional) else Result.FAILED
+    return CheckResult(
+        check=check,
+        number=number,
+        result=Result.PASSED if finding is None else result,
+        reason="" if finding is None else str(finding),
+        seen=getattr(finding, "seen", ""),
+        expected=getattr(finding, "expected", ""),
+        seconds=clock.now() - began,
+        attempts=attempts,
+    ), is_at_rest
 
 
 async def _attempt(check: Check, client: Client, level: float) -> tuple[Exception | None, bool]:

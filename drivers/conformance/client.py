@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol
 
 from drivers import clock
-from drivers.conformance.findings import Violation
+from drivers.conformance.findings import Violation, expect, expect_equal
 from drivers.errors import LinkError
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REFUSALS
@@ -62,10 +62,9 @@ class Client(ABC):
     """One amplifier at an address of a line.
 
     heard: messages that no request was waiting for; events: those of type Event; order: types of
-    all, as they came. reply_words: the
-    longest reply to each message by its number, where it is known. transit: time on the wire [s] of
-    a request and the longest reply. session: that was begun last. loss: why the line was
-    lost.
+    all, as they came. reply_words: the longest reply to each message by its number, where it is
+    known. transit: time on the wire [s] of a request and the longest reply. session: that was begun
+    last. loss: why the line was lost.
     """
 
     kind: ClassVar[str]
@@ -109,6 +108,11 @@ class Client(ABC):
     def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
         """Yield what is wrong, and frames that must have no effect and no reply, made in turn."""
 
+    async def expect_silence(self, data: bytes, what: str) -> None:
+        """Send bytes, to which nothing must be heard."""
+        heard = await self.send(data)
+        expect(not heard, f"replies to {what}", expected="none", seen=len(heard))
+
     async def send(self, data: bytes, quiet: float = QUIET) -> list[Heard]:
         """Send bytes; return what is heard until a time [s] has passed."""
         self.heard.clear()
@@ -144,21 +148,23 @@ class Client(ABC):
         finally:
             timer.cancel()
 
-    def answer(self, sent: float, came: float, number: int, words: Sequence[int]) -> Answer:
-        """Make the answer of a reply that was carried out."""
-        return Answer("", None, tuple(words), When(sent, came))
-
     def refusal(self, sent: float, came: float, number: int, words: Sequence[int]) -> Answer:
         """Make the answer of a Nak; Violation where it names another request."""
         try:
             values = NAK_RECORD.unpack(words, is_strict=True)
         except Refusal as error:
             raise Violation("Nak", expected="three words", seen=str(error)) from None
-        if values["request"] != number:
-            raise Violation("request that a Nak names", expected=number, seen=values["request"])
+        expect_equal(values["request"], number, "request that a Nak names")
         channel = None if values["channel"] == NO_CHANNEL else values["channel"]
         code = _CODES.get(values["code"], f"code {values['code']}")
         return Answer(code, channel, (), When(sent, came))
+
+
+def altered(data: bytes, at: int) -> bytes:
+    """Return bytes with one bit of one of them wrong."""
+    changed = bytearray(data)
+    changed[at] ^= 0x10
+    return bytes(changed)
 
 
 def expect_reply(found: Heard | None, number: int) -> Heard:

@@ -1,110 +1,264 @@
-"""What a channel must show, as formulas of the decision: raised cosines and straight lines.
+"""What an amplifier must show after what it was sent: states, latches, tokens, levels, watchdog.
 
-Written from the rules alone, without the playback that the product plays and bounds by. Amplitudes
-are complex, in shares of full level; times [s] count from the commit.
+What a channel plays is asked of `drivers.playback`. When a request was carried out is known as an
+interval, so there are a few playbacks, whose sets were committed sooner or later within theirs.
 """
 
-import cmath
 import math
-from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from collections.abc import Mapping, Sequence
 
-Curve: TypeAlias = Callable[[float], complex]
-Bounds: TypeAlias = Callable[[float], tuple[float, float]]
-"""Least and largest level at a time."""
-_POINTS, _POINT = (24, 600), 2e-5  # of an interval at which a curve is looked at; s apart
-_PARTS = 4  # of an interval that has passed
-_LATE_START = 0.002  # s; by which a transition may begin later
-_DRIFT = 1e-3  # of a time, by the amplifier's clock
+from drivers.conformance.client import When
+from drivers.conformance.findings import expect, expect_equal
+from drivers.playback import Playback, playback_of
+from drivers.protocol.records import Values
+from drivers.protocol.sets import LayerSet
+from drivers.protocol.table import FAULTS, QUANTITIES, STATES, STATUS_FLAGS
+from drivers.protocol.tokens import token_after
 
-
-def polar(level: float, degrees: float) -> complex:
-    """Return the amplitude of a level and a phase [degrees]."""
-    return cmath.rect(level, math.radians(degrees))
-
-
-def steady(amplitude: complex) -> Curve:
-    """Return a tone that does not change."""
-    return lambda time: amplitude
-
-
-def cosine(ramp: float, first: complex, last: complex) -> Curve:
-    """Return a raised cosine between two amplitudes along a ramp [s]."""
-
-    def at(time: float) -> complex:
-        if time >= ramp:
-            return last
-        part = (1 - math.cos(math.pi * max(time, 0.0) / ramp)) / 2
-        return first + (last - first) * part
-
-    return at
+SLACK = 0.002  # s; of times in milliseconds
+DRIFT = 1e-3  # of a time; of the amplifier's clock
+NAMES = {number: name for name, number in STATES.items()}
+OFF, ENABLED, STOPPED = "SWITCH_ON_DISABLED", "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
+_FALLING = {"SWITCHED_ON": OFF, "FAULT_REACTION_ACTIVE": "FAULT"}
+"""States that last until all is silent, with those that follow."""
+_TRIP, FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until a trip, of a fault, until a state shows
+_LATE = 0.002  # s; by which a set may begin later
+_SHARES = ((0, 0), (0, 1), (1, 0), (0.5, 0.5))
+"""Of the interval of a commit, for the sets of even and odd number of each playback."""
+_POINTS, _POINT = 600, 2e-5  # at which an interval is looked at; s apart
+_PER_LINE, _PER_COSINE = 400, 100  # points of a step of an envelope, of a ramp
+_TOLERANCE = 0.002  # of full level
+_FULL = QUANTITIES["level"].per_unit
 
 
-def lines(step: float, *points: complex) -> Curve:
-    """Return straight lines through points a step [s] apart, the first at 0."""
+class Expected:
+    """An amplifier since a status at rest; times [s] are intervals of this machine's clock.
 
-    def at(time: float) -> complex:
-        steps = max(time, 0.0) / step
-        if steps >= len(points) - 1:
-            return points[-1]
-        index = int(steps)
-        return points[index] + (points[index + 1] - points[index]) * (steps - index)
+    fed: when the watchdog was fed last. staged: token of the set that waits for its commit.
+    is_exact: whether its levels show how tones of one frequency interfere. sets: by their tokens.
+    """
 
-    return at
+    def __init__(self, can: Values, rest: Values, when: When) -> None:
+        self.can, self.latch, self.token = can, rest["latch"], rest["token"]
+        self.state, self.fault = OFF, FAULTS["NONE"]
+        self.session = self.staged = 0
+        self.sets: dict[int, tuple[LayerSet, ...]] = {}
+        self.is_exact = False
+        self.watchdog = 0.0
+        self.fed = self.began = self.silent = when
+        self.cause = "rest"
+        self.tolerance = max(2 * can["level_step"] / _FULL, _TOLERANCE)
+        self._has_floor = True  # or levels may be lower: of a fault, whose fade may be shorter
+        self._playbacks = [playback_of(can) for _ in _SHARES]
+        self._moments = [when.earliest] * len(_SHARES)
+        self._count = self._incoming = 0
+        self._received: set[int] = set()
+
+    # What it was sent
+
+    def carried_out(self, name: str, values: Values, when: When) -> None:
+        """Note a request that was carried out within an interval."""
+        ramp = min(values.get("ramp", 0), self.can["ramp_max"]) / 1000
+        if name in ("Arm", "Set", "Commit", "Silence", "Ping") and self.state == ENABLED:
+            self.fed = when
+        if name == "Arm":
+            self.watchdog, self.fed = values["watchdog"] / 1000, when
+            if self.state != ENABLED or values["session"] != self.session:
+                self.session, self.token, self.sets = values["session"], 0, {}
+                self._fall_silent(ENABLED, when, FADE, has_floor=False)
+        elif name == "Commit":
+            self._commit(values["token"], when)
+        elif name == "Silence":
+            self._fall_silent(ENABLED, when, ramp)
+        elif name == "Stop":
+            self.latch = token_after(self.latch)
+            self._fall_silent("FAULT" if self.fault else STOPPED, when, ramp)
+        elif name == "Disarm":
+            state = "SWITCHED_ON" if self.state == ENABLED else self.state
+            self._fall_silent(state, when, ramp)
+        elif name == "Clear" and when.latest >= self.silent.earliest and self.state != ENABLED:
+            self.state, self.fault = OFF, FAULTS["NONE"]
+        if name not in ("Set", "Ping", "GetStatus"):
+            self.cause = f"{name} {values}"
+
+    def taken(self, values: Values, shown: Values, when: When) -> None:
+        """Note a part of a set, and require what its reply must say."""
+        token, is_now = values["token"], bool(values["now"])
+        if token == self.token:
+            expect_equal((shown["token"], shown["played"]), (token, 1), "token, played of a repeat")
+            return
+        if token != self._incoming:
+            self._incoming, self._received, self.staged = token, set(), 0
+        self._received.add(values["index"])
+        missing = [each for each in range(values["parts"]) if each not in self._received]
+        seen = tuple(shown[each] for each in ("token", "staged", "played", "missing"))
+        required = token, not missing and not is_now, not missing and is_now, (*missing, 0)[0]
+        what = f"token, staged, played, missing after part {values['index']} of a set"
+        expect_equal(seen, required, what)
+        if not missing:
+            self.staged = token
+            if is_now:
+                self._commit(token, when)
+
+    def forget_parts(self) -> None:
+        """Note that what was staged, or not complete, has been discarded."""
+        self.staged = self._incoming = 0
+
+    def _commit(self, token: int, when: When) -> None:
+        if token == self.token:
+            return
+        layers = self.sets[token]
+        self.token, self.cause = token, f"set {token} of layers {[one.layer for one in layers]}"
+        self.forget_parts()
+        self._has_floor = True
+        self._start(when)
+        for playback, moment in zip(self._playbacks, self._moments, strict=True):
+            playback.commit(layers, token, moment)
+
+    def _fall_silent(self, state: str, when: When, ramp: float, *, has_floor: bool = True) -> None:
+        self.state, self._has_floor = state, has_floor
+        self.forget_parts()
+        self._start(when)
+        ends = []
+        for playback, moment in zip(self._playbacks, self._moments, strict=True):
+            playback.silence(moment, ramp)
+            ends.append(max(playback.ends_by, moment))
+        self.silent = When(min(ends) if has_floor else when.earliest, max(ends))
+
+    def _start(self, when: When) -> None:
+        """Let something begin within an interval, in each playback at a moment of its own."""
+        self.began, self._count = when, self._count + 1
+        width = when.latest + _LATE - when.earliest
+        shares = [both[self._count % 2] for both in _SHARES]
+        moments = [when.earliest + share * width for share in shares]
+        self._moments = [max(pair) for pair in zip(moments, self._moments, strict=True)]
+
+    # What it must show
+
+    def check(self, shown: Values, when: When) -> None:
+        """Require what a status must show that was read within an interval; raises Violation."""
+        self._expect_state(NAMES.get(shown["state"], ""), shown, when)
+        required = self.fault, self.latch, self.token
+        seen = tuple(shown[name] for name in ("fault", "latch", "token"))
+        expect_equal(seen, required, f"fault, latch, token after {self.cause}")
+        left, low, high = shown["watchdog_left"] / 1000, 0.0, 0.0
+        if self.state == ENABLED:
+            low = self.watchdog - (when.latest - self.fed.earliest) - SLACK
+            high = max(self.watchdog - (when.earliest - self.fed.latest) + SLACK, 0.0)
+        limits = f"{low:.3f} to {high:.3f} s"
+        what = f"watchdog_left after {self.cause}"
+        expect(low <= left <= high, what, expected=limits, seen=left)
+        self._expect_played(shown, when)
+
+    def _expect_state(self, state: str, shown: Values, when: When) -> None:
+        if self.state == ENABLED:
+            self._expect_watchdog(state, when)
+        falling = {after: before for before, after in _FALLING.items()}
+        known = {_FALLING.get(self.state, self.state)}
+        is_silent = when.earliest > self.silent.latest + _SETTLING + SLACK
+        if (before := falling.get(max(known))) and self.state != OFF and not is_silent:
+            known = {before, *known} if when.latest > self.silent.earliest - SLACK else {before}
+        what = f"state {when.earliest - self.began.latest:.3f} s after {self.cause}"
+        expect(state in known, what, expected=" or ".join(sorted(known)), seen=state)
+        if self.state == "SWITCHED_ON":
+            self.state = state
+        is_on = flag(shown, "high_voltage")
+        must_be = self.state in (ENABLED, "SWITCHED_ON")
+        what = f"high_voltage in {state} after {self.cause}"
+        expect(is_on == must_be or not (must_be or is_silent), what, expected=must_be, seen=is_on)
+
+    def _expect_watchdog(self, state: str, when: When) -> None:
+        """Require that the watchdog trips at its time, not before."""
+        earliest = self.fed.earliest + self.watchdog * (1 - DRIFT) - SLACK
+        latest = self.fed.latest + (self.watchdog + _TRIP) * (1 + DRIFT)
+        seen = f"{state} after {when.earliest - self.fed.latest:.4f} s"
+        limits = f"FAULT from {self.watchdog:.3f} to {self.watchdog + _TRIP:.3f} s after it was fed"
+        has_tripped = state in ("FAULT", "FAULT_REACTION_ACTIVE")
+        is_met = when.latest >= earliest if has_tripped else when.earliest <= latest + SLACK
+        expect(is_met, f"state by the watchdog ({self.cause})", expected=limits, seen=seen)
+        if has_tripped:
+            self.cause = f"the watchdog tripped ({self.cause})"
+            self.fault, self.latch = FAULTS["WATCHDOG"], token_after(self.latch)
+            since = When(earliest, max(min(latest, when.latest), earliest))
+            self._fall_silent("FAULT", since, FADE, has_floor=False)
+
+    def _expect_played(self, shown: Values, when: When) -> None:
+        bounds, tokens = self._played(when)
+        after = 1e3 * (when.earliest - self.began.latest), 1e3 * (when.latest - self.began.earliest)
+        where = f"{after[0]:.1f} to {after[1]:.1f} ms after {self.cause}"
+        for channel, (low, high) in enumerate(bounds):
+            level, low = shown["levels"][channel] / _FULL, low * self._has_floor
+            is_met = low - self.tolerance <= level <= high + self.tolerance
+            limits = f"{low:.4f} to {high:.4f}"
+            expect(is_met, f"level of channel {channel}, {where}", expected=limits, seen=level)
+        for number, known in enumerate(tokens):
+            seen = shown["tokens"][number]
+            expect(seen in known, f"token of layer {number}, {where}", expected=known, seen=seen)
+
+    def _played(self, when: When) -> tuple[list[tuple[float, float]], list[set[int]]]:
+        """Return least and largest level of each channel, and possible tokens of each layer."""
+        levels: list[list[float]] = [[] for _ in range(self.can["channels"])]
+        tokens: list[set[int]] = [set() for _ in range(self.can["layers"])]
+        for original, moment in zip(self._playbacks, self._moments, strict=True):
+            playback = original.copied()
+            passed = when.latest - self.began.earliest
+            first = moment + when.earliest - self.began.latest - _LATE - DRIFT * passed
+            last = moment + passed * (1 + DRIFT)
+            moments = _moments_of(playback, max(first, moment), last)
+            for time in moments:
+                playback.advance(time)
+                for channel, seen in enumerate(levels):
+                    if playback.voices_of(channel):
+                        seen += _levels(playback, channel, time, is_exact=self.is_exact)
+                    else:
+                        seen.append(0.0)
+                if time in (moments[0], moments[-1]):
+                    playing = playback.tokens
+                    for number, known in enumerate(tokens):
+                        known.add(playing.get(number, 0))
+        return [(min(1.0, *each), min(1.0, max(each))) for each in levels], tokens
+
+    def settled_at(self, now: float) -> float:
+        """Return when all that plays lasts or is silent [s], as far as is known."""
+        playback = self._playbacks[0].copied()
+        while (due := playback.next_due) < math.inf:
+            playback.advance(due)
+            now = due
+        ends = [voice.transition.end for voices in playback.all_voices for voice in voices]
+        return max([now, *ends])
 
 
-def later(delay: float, before: Curve, after: Curve) -> Curve:
-    """Return one curve until a delay [s], from then on another, whose time counts from there."""
-    return lambda time: before(time) if time < delay else after(time - delay)
+def _moments_of(playback: Playback, first: float, last: float) -> Sequence[float]:
+    """Return moments at which an interval is looked at: one where nothing changes."""
+    if playback.is_settled(first) and playback.next_due > last:
+        return (first,)
+    apart = [
+        each.transition.step / (_PER_LINE if each.transition.knots else _PER_COSINE)
+        for voices in playback.all_voices
+        for each in voices
+        if each.transition.end > first
+    ]
+    width = max(min(apart, default=math.inf), _POINT)
+    count = min(math.ceil((last - first) / width) + 3, _POINTS)
+    return [first + (last - first) * at / (count - 1) for at in range(count)]
 
 
-def alone(curve: Curve) -> Bounds:
-    """Return the level of one voice."""
-    return lambda time: (abs(curve(time)), abs(curve(time)))
+def _levels(
+    playback: Playback, channel: int, time: float, *, is_exact: bool
+) -> tuple[float, float]:
+    """Return the least and largest level that a channel may show."""
+    voices = playback.voices_of(channel)
+    parts = [abs(voice.transition.at(time)) for voice in voices]
+    highest = sum(parts)
+    if is_exact:
+        return (playback.level(channel, time),) * 2
+    if len({voice.frequency for voice in voices}) == len(voices):
+        return highest, highest
+    if len({voice.origin for voice in voices}) == 1:
+        return playback.level(channel, time), highest
+    return max(2 * max(parts) - highest, 0.0), highest
 
 
-def together(*curves: Curve) -> Bounds:
-    """Return the level of voices of frequencies that differ: their magnitudes, added."""
-
-    def at(time: float) -> tuple[float, float]:
-        level = min(sum(abs(curve(time)) for curve in curves), 1.0)
-        return level, level
-
-    return at
-
-
-def alike(*curves: Curve) -> Bounds:
-    """Return the level of voices of one frequency, which may be shown as they interfere."""
-
-    def at(time: float) -> tuple[float, float]:
-        amplitudes = [curve(time) for curve in curves]
-        return min(abs(sum(amplitudes)), 1.0), min(sum(map(abs, amplitudes)), 1.0)
-
-    return at
-
-
-def unsure(make: Callable[[float], Bounds], passed: tuple[float, float]) -> Bounds:
-    """Return the levels of what began when another had passed for a time within an interval [s]."""
-    low, high = max(passed[0] - _LATE_START, 0.0), passed[1]
-    cases = [make(low + (high - low) * part / _PARTS) for part in range(_PARTS + 1)]
-
-    def at(time: float) -> tuple[float, float]:
-        levels = [case(time) for case in cases]
-        return min(low for low, _ in levels), max(high for _, high in levels)
-
-    return at
-
-
-def within(bounds: Bounds, earliest: float, latest: float) -> tuple[float, float]:
-    """Return the least and largest level of an interval [s], with what clocks may be off."""
-    low = earliest * (1 - _DRIFT) - _LATE_START
-    high = max(latest * (1 + _DRIFT), low)
-    count = min(max(round((high - low) / _POINT), _POINTS[0]), _POINTS[1])
-    width = (high - low) / (count - 1)
-    levels = [bounds(low + width * point) for point in range(count)]
-    return min(low for low, _ in levels), max(high for _, high in levels)
-
-
-def interference(levels: Sequence[float], phases: Sequence[float]) -> float:
-    """Return the level of tones of one frequency; phases in radians."""
-    return abs(sum(cmath.rect(*each) for each in zip(levels, phases, strict=True)))
+def flag(status: Mapping[str, int], name: str) -> bool:
+    """Whether a flag of a status is set."""
+    return bool(status["flags"] >> STATUS_FLAGS[name] & 1)

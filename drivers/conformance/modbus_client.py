@@ -6,7 +6,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from drivers import clock
-from drivers.conformance.client import QUIET, Answer, Client, Heard, Port, expect_reply
+from drivers.codec.modbus.crc import crc16
+from drivers.conformance.client import (
+    QUIET,
+    Answer,
+    Client,
+    Heard,
+    Port,
+    When,
+    altered,
+    expect_reply,
+)
 from drivers.conformance.findings import Violation, expect, expect_equal
 from drivers.protocol.records import Values
 from drivers.protocol.table import MAX_WORDS, MESSAGES
@@ -75,8 +85,10 @@ class ModbusClient(Client):
         if len(self._buffer) < size:
             return None
         frame, self._buffer = self._buffer[:size], self._buffer[size:]
-        is_good = crc(frame[:-2]) == frame[-2:]
-        expect(is_good, "CRC of a response", expected=crc(frame[:-2]).hex(), seen=frame[-2:].hex())
+        is_good = crc16(frame[:-2]) == frame[-2:]
+        expect(
+            is_good, "CRC of a response", expected=crc16(frame[:-2]).hex(), seen=frame[-2:].hex()
+        )
         return 0, unit, frame[1:-2]
 
     def adu(self, pdu: bytes, *, unit: int | None = None) -> bytes:
@@ -86,7 +98,7 @@ class ModbusClient(Client):
         if not self.is_rtu:
             return _HEADER.pack(self.number, 0, len(pdu) + 1, unit) + pdu
         body = bytes([unit]) + pdu
-        return body + crc(body)
+        return body + crc16(body)
 
     async def transact(self, pdu: bytes) -> tuple[Response, float]:
         """Send a PDU and await its response; returns it and when it was sent [s]."""
@@ -110,15 +122,14 @@ class ModbusClient(Client):
 
     async def hello(self) -> Values:
         """Read the identity."""
-        registers = await self.read(IDENTITY, 2 + 4 * TEXT)
-        expect_equal(registers[0], 0, "tag of the identity")
-        identity: Values = {"versions": registers[1]}
-        raw = struct.pack(f">{4 * TEXT}H", *registers[2:])
+        tag, versions, *texts = await self.read(IDENTITY, 2 + 4 * TEXT)
+        expect_equal(tag, 0, "tag of the identity")
+        identity: Values = {"versions": versions}
         for at, name in enumerate(("vendor", "product", "serial_number", "firmware")):
-            text = raw[2 * TEXT * at : 2 * TEXT * (at + 1)].rstrip(b"\0")
-            identity[name] = text.decode("utf-8", errors="replace")
-            is_good = "\ufffd" not in identity[name] and identity[name].isprintable()
-            expect(is_good, name, expected="UTF-8 without control characters", seen=text)
+            raw = struct.pack(f">{TEXT}H", *texts[TEXT * at : TEXT * (at + 1)]).rstrip(b"\0")
+            text = identity[name] = raw.decode("utf-8", errors="replace")
+            is_good = "\ufffd" not in text and text.isprintable()
+            expect(is_good, name, expected="UTF-8 without control characters", seen=raw)
         return identity
 
     async def exchange(self, number: int, words: Sequence[int]) -> Answer:
@@ -131,7 +142,7 @@ class ModbusClient(Client):
             when = sent, response.at
             if response.pdu[0] & EXCEPTION:
                 code = _EXCEPTIONS.get(response.pdu[1], f"exception {response.pdu[1]}")
-                return Answer(code, None, (), self.answer(*when, number, ()).when)
+                return Answer(code, None, (), When(*when))
         sent = clock.now()
         count = HEAD + min(self.reply_words.get(number, MAX_WORDS), MAX_WORDS)
         shown, result, *reply = await self.read(BOX * number + REPLY, count)
@@ -140,14 +151,12 @@ class ModbusClient(Client):
         when = when or (sent, clock.now())
         if result:
             return self.refusal(*when, number, (number, *divmod(result, 256)))
-        return self.answer(*when, number, reply)
+        return Answer("", None, tuple(reply), When(*when))
 
     def write_of(self, number: int, words: Sequence[int], *, tag: int | None = None) -> bytes:
         """Return the PDU that writes a message, tagged with the number of its frame."""
         tag = self.number % 0xFFFF + 1 if tag is None else tag
-        row = (tag, *words)
-        head = struct.pack(">BHHB", WRITE, BOX * number % 0x10000, len(row), 2 * len(row) % 256)
-        return head + struct.pack(f">{len(row)}H", *row)
+        return write_pdu(BOX * number % 0x10000, (tag, *words))
 
     def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
         """Return the frame that writes a message."""
@@ -159,9 +168,8 @@ class ModbusClient(Client):
         yield "another unit", self.adu(pdu, unit=self.address % self.addresses + 1)
         if self.is_rtu:
             frame = self.adu(pdu)
-            for at in (1, 2):
-                yield f"byte {at} of the CRC wrong", _altered(frame, at - 3)
-            yield "a wrong byte", _altered(frame, len(frame) - 4)
+            for at in (-2, -1, -4):
+                yield f"a wrong byte {at}", altered(frame, at)
 
     async def send(self, data: bytes, quiet: float = QUIET) -> list[Heard]:
         """Send bytes; return what is heard until a time [s] has passed."""
@@ -172,6 +180,13 @@ class ModbusClient(Client):
         return heard
 
 
+def write_pdu(first: int, registers: Sequence[int]) -> bytes:
+    """Return the PDU that writes registers, also more than there can be."""
+    count = len(registers)
+    head = struct.pack(">BHHB", WRITE, first, count, 2 * count % 256)
+    return head + struct.pack(f">{count}H", *registers)
+
+
 def registers_of(pdu: bytes, count: int, first: int) -> tuple[int, ...]:
     """Return the registers in a response; Violation for an exception or another length."""
     if pdu[0] & EXCEPTION:
@@ -179,19 +194,3 @@ def registers_of(pdu: bytes, count: int, first: int) -> tuple[int, ...]:
         raise Violation(what, expected="the registers", seen=f"exception {pdu[1]}")
     expect_equal((len(pdu), pdu[1]), (2 + 2 * count, 2 * count), "length of a response")
     return struct.unpack(f">{count}H", pdu[2:])
-
-
-def crc(data: bytes) -> bytes:
-    """CRC-16 of Modbus, low byte first."""
-    remainder = 0xFFFF
-    for byte in data:
-        remainder ^= byte
-        for _ in range(8):
-            remainder = remainder >> 1 ^ (0xA001 if remainder & 1 else 0)
-    return remainder.to_bytes(2, "little")
-
-
-def _altered(frame: bytes, at: int) -> bytes:
-    changed = bytearray(frame)
-    changed[at] ^= 0x10
-    return bytes(changed)

@@ -7,7 +7,7 @@ from cobs import cobs
 
 from drivers import clock
 from drivers.codec.serial_line.frame import NEUTRAL, REPLY, Frame, FrameReader, encode_frame
-from drivers.conformance.client import Answer, Client, Heard, Port, expect_reply
+from drivers.conformance.client import Answer, Client, Heard, Port, When, altered, expect_reply
 from drivers.conformance.findings import Violation, expect_equal
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import HELLO, pack_words, unpack_identity, unpack_words
@@ -76,7 +76,7 @@ class SerialClient(Client):
             return answer
         expect_equal(frame.kind, number | REPLY, f"type of the reply to message {number}")
         expect_equal(frame.version, VERSION, f"version of the reply to message {number}")
-        return self.answer(sent, heard.at, number, heard.words)
+        return Answer("", None, heard.words, When(sent, heard.at))
 
     async def _replied(self, request: Frame) -> tuple[Heard, Frame]:
         self.port.write(encode_frame(request))
@@ -105,30 +105,18 @@ class SerialClient(Client):
         """Yield frames with damage of all kinds."""
         good = self.request(number, words)
         content = cobs.decode(good[1:-1])
-        wrong = {
-            f"byte {at} of the CRC wrong": self._altered(content, at - 1 - _CRC_SIZE)
-            for at in range(1, 1 + _CRC_SIZE)
-        }
         long = content[:-_CRC_SIZE] + bytes(2 * MAX_WORDS + 2 - 2 * len(words))
         reply = bytes([content[0] | REPLY]) + content[1:-_CRC_SIZE]
-        flawed = {
-            **wrong,
-            "a wrong byte": self._altered(content, _SEQUENCE_AT),
-            "its last byte missing": good[:-2] + b"\0",
-            "its first byte missing": b"\0" + good[2:],
-            "a broken stuffing": b"\0\xff" + good[2:],
-            "no CRC": _framed(content[:-_CRC_SIZE]),
-            "more than 240 bytes of payload": _framed(_checked(long)),
-            "the bit of a reply": _framed(_checked(reply)),
-            "another address": self.request(number, words, to=self.address % self.addresses + 1),
-        }
-        yield from flawed.items()
-
-    @staticmethod
-    def _altered(content: bytes, at: int) -> bytes:
-        changed = bytearray(content)
-        changed[at] ^= 0x10
-        return _framed(bytes(changed))
+        for at in (-4, -3, -2, -1, _SEQUENCE_AT):
+            yield f"a wrong byte {at}", _framed(altered(content, at))
+        yield "its last byte missing", good[:-2] + b"\0"
+        yield "its first byte missing", b"\0" + good[2:]
+        yield "a broken stuffing", b"\0\xff" + good[2:]
+        yield "no CRC", _framed(content[:-_CRC_SIZE])
+        yield "more than 240 bytes of payload", _framed(_checked(long))
+        yield "the bit of a reply", _framed(_checked(reply))
+        other = self.address % self.addresses + 1
+        yield "another address", self.request(number, words, to=other)
 
     def _count(self, piece: bytes) -> None:
         self.invalid += 1

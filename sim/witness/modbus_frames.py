@@ -4,6 +4,7 @@ import struct
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
+from drivers.codec.modbus.crc import crc16
 from sim.witness.capture import Direction
 
 _MIN_LENGTH, _MAX_LENGTH = 4, 256
@@ -123,13 +124,3 @@ class RtuSplitter(Splitter):
         at, around = _COUNTS[self._direction][function]
         size = around + data[at] if len(data) > at else around
         return size if size <= _MAX_LENGTH else 0
-
-
-def crc16(data: bytes) -> bytes:
-    """CRC-16 of Modbus (polynomial 8005 reflected, initial FFFF), low byte first."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
-    return crc.to_bytes(2, "little")

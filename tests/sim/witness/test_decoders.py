@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from drivers.codec.modbus.crc import crc16
 from sim.witness.can_decoder import CanDecoder
 from sim.witness.capture import Direction
 from sim.witness.decoded import (
@@ -21,7 +22,6 @@ from sim.witness.decoded import (
     Request,
 )
 from sim.witness.modbus_decoder import ModbusDecoder
-from sim.witness.modbus_frames import crc16
 from sim.witness.serial_decoder import SerialDecoder
 from sim.witness.watched_wire import Decoder
 

@@ -1,0 +1,79 @@
+"""Sets for an amplifier that is judged, within its capabilities and at its test level."""
+
+import math
+
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, Envelope, LayerSet
+from drivers.protocol.table import QUANTITIES, has_feature
+
+FULL = QUANTITIES["level"].per_unit
+
+
+class Material:
+    """What an amplifier can play; level: of driven channels, at most.
+
+    lowest, highest, frequency, other: frequencies of every channel, in steps.
+    """
+
+    def __init__(self, can: Values, level: float) -> None:
+        self.can = can
+        self.channels, self.layers = range(can["channels"]), range(can["layers"])
+        limits = [can, *can["limits"]]
+        self.lowest = max(one["frequency_min"] for one in limits)
+        self.highest = min(one["frequency_max"] for one in limits)
+        self.level = min(level, *(one["level_max"] / FULL for one in limits))
+        ordinary = QUANTITIES["frequency"].to_wire(110.0)
+        self.frequency = min(max(ordinary, self.lowest), self.highest)
+        both = self.frequency + 800, self.lowest, self.highest
+        self.other = next(each for each in both if each <= self.highest)
+
+    def has(self, feature: str) -> bool:
+        """Whether it states a feature."""
+        return has_feature(self.can, feature)
+
+    def tone(
+        self,
+        channel: int = 0,
+        fraction: float = 1.0,
+        phase: float = 0.0,
+        *,
+        frequency: int = 0,
+        keep: bool = False,
+        skip: bool = False,
+        onset: Envelope | None = None,
+        ending: Envelope | None = None,
+    ) -> Command:
+        """Make a command at a fraction of the test level; frequency in steps, 0 for the usual."""
+        numbers = round(fraction * self.level * FULL), QUANTITIES["phase"].to_wire(phase)
+        return Command(channel, frequency or self.frequency, *numbers, keep, skip, onset, ending)
+
+    def one(self, *commands: Command, ramp: int = 0, valid_for: int = 0) -> LayerSet:
+        """Make what layer 0 is to play, by default the usual tone on channel 0."""
+        return layer(0, *(commands or [self.tone()]), ramp=ramp, valid_for=valid_for)
+
+    def envelope(self, step: float, *amplitudes: complex) -> Envelope:
+        """Make an envelope of knots in fractions of the test level, or the nearest step [s]."""
+        low, high = self.can["envelope_step_min"], self.can["envelope_step_max"]
+        steps = min(max(QUANTITIES["envelope_step"].to_wire(step), low), high)
+        phases = [math.degrees(math.atan2(each.imag, each.real)) for each in amplitudes]
+        knots = [
+            (round(abs(each) * self.level * FULL), QUANTITIES["phase"].to_wire(phase))
+            for each, phase in zip(amplitudes, phases, strict=True)
+        ]
+        return Envelope(steps, tuple(knots))
+
+    def apart(self, number: int) -> int:
+        """Return a frequency of a layer of its own, so that layers do not interfere."""
+        return int(min(self.frequency + 40 * number, self.highest - len(self.layers) + number))
+
+
+def layer(
+    number: int,
+    *commands: Command,
+    ramp: int = 0,
+    valid_for: int = 0,
+    after: bool = False,
+    renew: bool = False,
+) -> LayerSet:
+    """Make what one layer is to play; ramp, valid_for in ms."""
+    return LayerSet(number, ramp, valid_for, commands, after, renew)

@@ -1,0 +1,78 @@
+"""One conformance check of an amplifier on one wire, in virtual time.
+
+Run by the judge of planted faults only: the suite has all checks in turn in
+`tests/drivers/conformance`. Faults of a simulated amplifier are found on it; those of
+`drivers.playback`, which conformance asks what must be played, on the firmware, which does not.
+"""
+
+from pathlib import Path
+
+import pytest
+
+from drivers.conformance import CHECKS, LEVEL, CheckResult, Result, of_kind
+from drivers.conformance.check import run_checks
+from firmware_line import FirmwarePort
+from firmware_programs import build_firmware
+from judged_line import CLIENTS, KINDS, judged, plain
+from virtual_loop import run_virtual
+
+_CASES = [(kind, check.name) for kind in KINDS for _, check in of_kind(kind)]
+_OF_ANY_WIRE = [check.name for check in CHECKS if not check.kinds]
+
+
+def _violation(kind: str, name: str, level: float = 0.3, **options: bool) -> str:
+    far = plain() if options.get("is_plain") else None
+    (result,) = judged(kind, [name], level=level, far=far)
+    return result.reason * (result.result is Result.FAILED)
+
+
+@pytest.mark.parametrize(("kind", "name"), _CASES, ids=[f"{k}-{name}" for k, name in _CASES])
+def test_check(kind: str, name: str) -> None:
+    """The check finds no violation."""
+    violation = _violation(kind, name)
+    assert not violation, violation
+
+
+@pytest.mark.parametrize("name", _OF_ANY_WIRE)
+def test_loud(name: str) -> None:
+    """It finds none where it drives at nearly full level."""
+    violation = _violation("serial", name, 0.9)
+    assert not violation, violation
+
+
+@pytest.mark.parametrize("name", _OF_ANY_WIRE)
+def test_plain(name: str) -> None:
+    """It finds none on an amplifier with all that the table allows."""
+    violation = _violation("serial", name, is_plain=True)
+    assert not violation, violation
+
+
+@pytest.fixture(scope="module")
+def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the firmware on a moved clock."""
+    return build_firmware(tmp_path_factory.mktemp("firmware"), "era-moved.so")
+
+
+@pytest.mark.parametrize("name", _OF_ANY_WIRE)
+def test_firmware(name: str, firmware: Path) -> None:
+    """It finds none on the firmware, whose playback is its own."""
+
+    async def result() -> CheckResult:
+        port = FirmwarePort("serial", firmware)
+        client = CLIENTS["serial"](port, 1)
+        port.take = client.received
+        chosen = [each for each in of_kind("serial") if each[1].name == name]
+        (found,) = await run_checks(chosen, client, level=LEVEL)
+        return found
+
+    found = run_virtual(result())
+    violation = found.reason * (found.result is Result.FAILED)
+    assert not violation, violation
+
+
+def test_run_ends_soon() -> None:
+    """The whole run passes, within a minute of the amplifier's time."""
+    results = judged("serial")
+    failed = [f"{each.check.name}: {each.reason}" for each in results if each.result == "failed"]
+    assert not failed, failed[0]
+    assert sum(each.seconds for each in results) < 60

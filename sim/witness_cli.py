@@ -3,7 +3,8 @@
 import json
 import math
 import sys
-from contextlib import ExitStack, closing
+from dataclasses import asdict
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
@@ -15,7 +16,6 @@ from model.files.regular_file import regular_file
 
 if TYPE_CHECKING:
     from sim.witness.endpoint import WireEndpoint
-    from sim.witness.violation import Violation
     from sim.witness.witness import Witness
 
 
@@ -64,33 +64,34 @@ def witness(
         raise InputError("--record and --replay exclude each other: give one of them")
     endpoints = [parse_endpoint(url) for url in urls]
     _check_apart(endpoints)
-    wires = {
-        location: f"wire{n}"
-        for n, location in enumerate(dict.fromkeys(each.location for each in endpoints), 1)
-    }
+    locations = dict.fromkeys(each.location for each in endpoints)
+    wires = {location: f"wire{number}" for number, location in enumerate(locations, 1)}
     config = {
-        "wires": {wires[endpoint.location]: endpoint.kind for endpoint in endpoints},
+        "wires": {wires[each.location]: each.kind for each in endpoints},
         "amplifiers": {
-            endpoint.url: {
-                "wire": wires[endpoint.location],
-                "address": endpoint.address,
+            each.url: {
+                "wire": wires[each.location],
+                "address": each.address,
                 "channels": dict.fromkeys(range(channels), limits),
             }
-            for endpoint in endpoints
+            for each in endpoints
         },
         "times_s": {"slack": slack * 1e-3},
     }
-    with ExitStack() as stack:
-        capture = None if record is None else stack.enter_context(closing(_Capture(record)))
-        checker = Witness(config, record=None if capture is None else capture.write)
+    with _Capture(record) as capture:
+        checker = Witness(config, record=capture.write)
         if replay is not None:
-            found = _replay(replay, checker)
+            end = _replay(replay, checker)
         else:
-            names = [wires[endpoint.location] for endpoint in endpoints]
-            found = _relay(endpoints, names, checker, to=sys.stderr if as_json else sys.stdout)
-    _print(found, checker, as_json=as_json)
-    if capture is not None:
-        capture.check()
+            to = sys.stderr if as_json else sys.stdout
+            end = _relay(endpoints, [wires[each.location] for each in endpoints], checker, to=to)
+        found = checker.finish(end)
+        if as_json:
+            listed = {"frames": checker.frames, "violations": [asdict(each) for each in found]}
+            print(json.dumps(listed))
+        else:
+            counts = f"{counted(checker.frames, 'frame')}, {counted(len(found), 'violation')}"
+            print(*found, counts, sep="\n")
     if found:
         raise typer.Exit(1)
 
@@ -114,55 +115,54 @@ def _in_range(option: str, given: float, *, maximum: float = math.inf, unit: str
 
 def _check_apart(endpoints: list["WireEndpoint"]) -> None:
     """Refuse two URLs for one amplifier, or for one wire in two ways."""
-    for number, endpoint in enumerate(endpoints):
-        for other in endpoints[:number]:
-            if endpoint.location != other.location:
-                continue
-            if endpoint.kind != other.kind:
-                raise InputError(
-                    f"{other.url} and {endpoint.url}: one wire cannot be {other.kind} and "
-                    f"{endpoint.kind}; give the URL of its actual protocol"
-                )
-            if endpoint.address == other.address:
-                raise InputError(
-                    f"{other.url} and {endpoint.url}: both are amplifier {endpoint.address} of one "
-                    "wire; give each amplifier once, by its address"
-                )
+    for other, endpoint in combinations(endpoints, 2):
+        is_same_wire = endpoint.location == other.location
+        if is_same_wire and endpoint.kind != other.kind:
+            raise InputError(
+                f"{other.url} and {endpoint.url}: one wire cannot be {other.kind} and "
+                f"{endpoint.kind}; give the URL of its actual protocol"
+            )
+        if is_same_wire and endpoint.address == other.address:
+            raise InputError(
+                f"{other.url} and {endpoint.url}: both are amplifier {endpoint.address} of one "
+                "wire; give each amplifier once, by its address"
+            )
 
 
 class _Capture:
-    """A capture file; write errors are kept until `check`, so that relaying goes on.
+    """A capture file, if there is one; its end tells what could not be written.
 
-    Raises InputError where it cannot be opened.
+    Relaying goes on where writing fails. Raises InputError where it cannot be opened.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path | None) -> None:
         self._path = path
         self._problem: OSError | None = None
+        self._file = None
         try:
-            self._file = open(  # noqa: SIM115  closed in close
-                path, "w", encoding="utf-8", opener=regular_file
-            )
+            if path is not None:
+                self._file = open(path, "w", encoding="utf-8", opener=regular_file)  # noqa: SIM115
         except OSError as problem:
             raise InputError(f"--record {path}: cannot be written: {problem.strerror}") from problem
 
     def write(self, line: str) -> None:
         """Append a line, unless an earlier one failed."""
-        if self._problem is None:
+        if self._file is not None and self._problem is None:
             try:
                 print(line, file=self._file)
             except OSError as problem:
                 self._problem = problem
 
-    def close(self) -> None:
-        """Flush and close."""
+    def __enter__(self) -> "_Capture":
+        return self
+
+    def __exit__(self, *of_error: object) -> None:
+        """Close it; raise InputError if it is incomplete."""
         try:
-            self._file.close()
+            if self._file is not None:
+                self._file.close()
         except OSError as problem:
             self._problem = self._problem or problem
-
-    def check(self) -> None:
-        """Raise InputError if the capture is incomplete."""
         if self._problem is not None:
             raise InputError(
                 f"--record {self._path}: capture incomplete: {self._problem.strerror}; free disk "
@@ -170,28 +170,25 @@ class _Capture:
             ) from self._problem
 
 
-def _replay(path: Path, checker: "Witness") -> list["Violation"]:
+def _replay(path: Path, checker: "Witness") -> float:
+    """Check a capture; returns its end [s]."""
     from sim.witness.capture import read_capture
 
     end = None
-    for piece in read_capture(path, wires=checker.wires):
-        checker.record_bytes(piece.wire, piece.direction, piece.time, piece.data)
-        end = piece.time
-    if end is None:
+    for end, wire, direction, data in read_capture(path, wires=checker.wires):
+        checker.record_bytes(wire, direction, end, data)
+    if end is None or not checker.frames:
         raise InputError(
-            f"{path}: must hold lines TIME WIRE > HEX, as --record writes them, got none"
+            f"{path}: no frame decoded, nothing was checked; write lines TIME WIRE > HEX, and give "
+            "URLs of the captured kind of wire"
         )
-    found = checker.finish(end)
-    if not checker.frames:
-        raise InputError(
-            f"{path}: no frame decoded, nothing was checked; give URLs of the captured kind of wire"
-        )
-    return found
+    return end
 
 
 def _relay(
     endpoints: list["WireEndpoint"], names: list[str], checker: "Witness", *, to: TextIO
-) -> list["Violation"]:
+) -> float:
+    """Relay until a signal comes; returns when that was [s]."""
     import asyncio
     import signal
     import time
@@ -208,28 +205,8 @@ def _relay(
             await ended.wait()
 
     asyncio.run(run())
-    found = checker.finish(time.monotonic())
     if not checker.frames:
         raise InputError(
             "no frame passed, nothing was checked; use the relay URLs in place of the amplifiers'"
         )
-    return found
-
-
-def _print(found: list["Violation"], checker: "Witness", *, as_json: bool) -> None:
-    if as_json:
-        listed = [
-            {
-                "invariant": violation.invariant,
-                "wire": violation.wire,
-                "time_s": violation.time,
-                "sentence": violation.sentence,
-                "frames": list(violation.frames),
-            }
-            for violation in found
-        ]
-        print(json.dumps({"frames": checker.frames, "violations": listed}))
-        return
-    for violation in found:
-        print(violation)
-    print(f"{counted(checker.frames, 'frame')}, {counted(len(found), 'violation')}")
+    return time.monotonic()

@@ -8,9 +8,9 @@ import contextlib
 import logging
 import os
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from asyncio import StreamReader, StreamWriter
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
-from typing import cast
 
 import serial
 
@@ -109,13 +109,13 @@ async def _serial_relay(
             return
         except OSError:
             data = b""
-        if not data:
-            loop.remove_reader(port.fileno())
-            observer.witness.closed(name, time.monotonic())
-            return
         at = time.monotonic()
-        terminal.write(data)
-        observer.record(name, "host", at, data)
+        if data:
+            terminal.write(data)
+            observer.record(name, "host", at, data)
+        else:
+            loop.remove_reader(port.fileno())
+            observer.witness.closed(name, at)
 
     with contextlib.closing(port), contextlib.closing(terminal):
         loop.add_reader(port.fileno(), to_host)
@@ -129,109 +129,55 @@ async def _serial_relay(
 @asynccontextmanager
 async def _tcp_relay(endpoint: WireEndpoint, name: str, observer: _Observer) -> AsyncIterator[str]:
     """Relay a server through a port of the loopback interface."""
-    loop = asyncio.get_running_loop()
-    host, _, number = endpoint.location.rpartition(":")
-    open_now: set[_RelayedConnection] = set()
-    opening: set[asyncio.Task[None]] = set()
+    host, _, port = endpoint.location.rpartition(":")
+    running: set[asyncio.Task[None]] = set()
 
-    def opened(connection: "_RelayedConnection") -> None:
-        open_now.add(connection)
+    async def forward(source: StreamReader, sink: StreamWriter, direction: Direction) -> None:
+        with contextlib.suppress(OSError):
+            while data := await source.read(_READ_MAX):
+                before = time.monotonic()
+                sink.write(data)
+                observer.record(name, direction, before, data)
+
+    async def relay(from_host: StreamReader, to_host: StreamWriter) -> None:
+        with contextlib.closing(to_host):
+            try:
+                from_amplifier, to_amplifier = await asyncio.open_connection(host, int(port))
+            except OSError as problem:
+                _logger.warning(
+                    "%s: connection refused (%s), closing the relayed one; check power and URL",
+                    endpoint.location,
+                    problem.strerror or problem,
+                )
+                return
+            with contextlib.closing(to_amplifier):
+                ways = [
+                    asyncio.ensure_future(forward(from_host, to_amplifier, "amplifier")),
+                    asyncio.ensure_future(forward(from_amplifier, to_host, "host")),
+                ]
+                try:
+                    await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+                finally:
+                    for way in ways:
+                        way.cancel()
+
+    def opened(from_host: StreamReader, to_host: StreamWriter) -> None:
         observer.witness.opened(name, time.monotonic())
+        task = asyncio.ensure_future(relay(from_host, to_host))
+        running.add(task)
+        task.add_done_callback(closed)
 
-    def closed(connection: "_RelayedConnection") -> None:
-        open_now.discard(connection)
-        if not open_now:
+    def closed(task: asyncio.Task[None]) -> None:
+        running.discard(task)
+        if not running:
             observer.witness.closed(name, time.monotonic())
 
-    def on_data(direction: Direction, at: float, data: bytes) -> None:
-        observer.record(name, direction, at, data)
-
-    async def open_back(front: "_RelayedConnection") -> None:
-        try:
-            _, back = await loop.create_connection(
-                lambda: _RelayedConnection("host", on_data, lambda _: None, lambda _: None),
-                host,
-                int(number),
-            )
-        except OSError as problem:
-            _logger.warning(
-                "%s: connection refused (%s), closing the relayed one; check power and URL",
-                endpoint.location,
-                problem.strerror or problem,
-            )
-            front.close()
-            return
-        back.connect(front)
-        front.connect(back)
-
-    def make() -> "_RelayedConnection":
-        connection = _RelayedConnection("amplifier", on_data, opened, closed)
-        task = loop.create_task(open_back(connection))
-        opening.add(task)
-        task.add_done_callback(opening.discard)
-        return connection
-
-    server = await loop.create_server(make, "127.0.0.1", 0)
+    server = await asyncio.start_server(opened, "127.0.0.1", 0)
     try:
         yield f"127.0.0.1:{server.sockets[0].getsockname()[1]}"
     finally:
         server.close()
-        for connection in tuple(open_now):
-            connection.close()
-        await asyncio.gather(*opening, return_exceptions=True)
+        for task in tuple(running):
+            task.cancel()
+        await asyncio.gather(*running, return_exceptions=True)
         await server.wait_closed()
-
-
-class _RelayedConnection(asyncio.Protocol):
-    """One of the two connections of a relay, which forwards to the other."""
-
-    def __init__(
-        self,
-        direction: Direction,
-        on_data: Callable[[Direction, float, bytes], None],
-        opened: Callable[["_RelayedConnection"], None],
-        closed: Callable[["_RelayedConnection"], None],
-    ) -> None:
-        self._direction: Direction = direction
-        self._on_data = on_data
-        self._opened = opened
-        self._closed = closed
-        self._other: _RelayedConnection | None = None
-        self._early = b""
-        self._transport: asyncio.Transport | None = None
-        self._is_closed = False
-
-    def connect(self, other: "_RelayedConnection") -> None:
-        """Connect the other one, and forward the bytes received meanwhile."""
-        self._other = other
-        early, self._early = self._early, b""
-        if early:
-            self.data_received(early)
-        if self._is_closed:
-            other.close()
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Note the transport."""
-        self._transport = cast(asyncio.Transport, transport)
-        self._opened(self)
-
-    def data_received(self, data: bytes) -> None:
-        """Forward, then pass to the witness."""
-        if self._other is None or self._other._transport is None:
-            self._early += data
-            return
-        before = time.monotonic()
-        self._other._transport.write(data)
-        self._on_data(self._direction, before, data)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Close the other one, too."""
-        self._is_closed = True
-        self._closed(self)
-        if self._other is not None:
-            self._other.close()
-
-    def close(self) -> None:
-        """Close the connection."""
-        if self._transport is not None:
-            self._transport.close()

@@ -5,11 +5,12 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from drivers.playback import Playback
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, LayerSet
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.sets import LayerSet
 from sim.witness.config import AmplifierConfig
 from sim.witness.expected_amplifier import ExpectedAmplifier
+from sim.witness.expected_outputs import silent
 from sim.witness.violation import ReportViolation
 
 _TOKENS_KEPT = 16  # of commits
@@ -19,19 +20,21 @@ _TOKENS_KEPT = 16  # of commits
 class AmplifierSession:
     """Requests to one amplifier by name, and the model of it; times [s].
 
-    last_set: sent since Arm, token and layers; staged: the same, unless it was silenced since;
-    layers: what each was sent to play, and until when; is_disturbed: whether faults were injected
-    into the wire at or shortly before a time.
+    report_always: for violations that no fault of the wire excuses; report: for all others.
+    is_disturbed: whether faults were injected into the wire at or shortly before a time. played:
+    what it was sent to play; last_set: sent since Arm, token and layers; staged: the same, unless
+    it was silenced since.
     """
 
     name: str
     config: AmplifierConfig
     amplifier: ExpectedAmplifier
+    report_always: ReportViolation
     report: ReportViolation
     is_disturbed: Callable[[float], bool]
-    last_set: tuple[int, tuple[LayerSet, ...]] | None = None
-    staged: tuple[int, tuple[LayerSet, ...]] | None = None
-    layers: dict[int, tuple[LayerSet, float]] = field(default_factory=dict)
+    played: Playback = field(default_factory=silent)
+    last_set: tuple[int, Sequence[LayerSet]] | None = None
+    staged: tuple[int, Sequence[LayerSet]] | None = None
     session: int | None = None  # with which the host has armed it
     last_vibration: float = -math.inf  # when a vibrating set was accepted
     last_silenced: float = -math.inf  # when a silencing request was sent
@@ -45,32 +48,29 @@ class AmplifierSession:
     last_stop: float = -math.inf  # or status read
     last_feed: float | None = None
     heard_other_host: float = -math.inf
+    overdue_at: float = -math.inf  # when a reply was last overdue
+    is_mute: bool = False  # it has restarted, and replies to nothing until it is identified
     constants: dict[str, Values] = field(default_factory=dict)
 
     def vibrates(self, time: float) -> bool:
-        """Whether it vibrates by what was sent."""
-        return any(until > time for _, until in self.layers.values())
-
-    def set_sent(self, token: int, layers: Sequence[LayerSet], time: float) -> None:
-        """Note a set that plays from a time on."""
-        self.committed_tokens.append(token)
-        for one in layers:
-            before, until = self.layers.get(one.layer, (one, time))
-            if one.renew and until > time:
-                self.layers[one.layer] = before, _end_of(one, time)
-            elif not one.renew:
-                lasts = max((_lasts(each) for each in one.commands), default=0.0)
-                self.layers[one.layer] = one, min(time + lasts, _end_of(one, time))
+        """Whether it vibrates at a time by what was sent until now."""
+        self.played.advance(time)
+        return any(self.played.end_of(layer) > time for layer in self.played.tokens)
 
     def silence_sent(self, time: float) -> None:
         """Note a request that silences all layers and drops what is staged."""
-        self.layers.clear()
+        self.played = silent()
         self.last_silenced, self.staged = time, None
+
+    def forget_amplifier(self) -> None:
+        """Take it for another one from now on, or for one that has started."""
+        self.amplifier.forget_state()
+        self.constants.clear()
+        self.played = silent()
 
     def check_constant(self, what: str, reported: Values, time: float) -> None:
         """Compare what must be the same for ever with what was reported before."""
-        before = self.constants.setdefault(what, reported)
-        if reported != before and not self.is_disturbed(time):
+        if reported != self.constants.setdefault(what, reported):
             self.report("constant", time, f"{self.name}: reply to {what} has changed")
         self.constants[what] = reported
 
@@ -78,16 +78,3 @@ class AmplifierSession:
 def is_vibrating(layers: Sequence[LayerSet]) -> bool:
     """Whether a set makes anything vibrate, or go on to."""
     return any(one.renew or any(each.is_driven for each in one.commands) for one in layers)
-
-
-def _end_of(one: LayerSet, time: float) -> float:
-    valid_for = QUANTITIES["valid_for"].from_wire(one.valid_for)
-    return time + valid_for if valid_for else math.inf
-
-
-def _lasts(command: Command) -> float:
-    """Return how long a command lasts [s]: an onset may lead to level 0."""
-    if command.level or command.onset is None:
-        return math.inf if command.level else 0.0
-    step = QUANTITIES["envelope_step"].from_wire(command.onset.step)
-    return step * (len(command.onset.knots) + 1)

@@ -2,15 +2,18 @@
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
-from drivers.protocol.records import Refusal, Values
+from drivers.protocol.records import Record, Refusal, Values
+from drivers.protocol.serial_payload import HELLO as HELLO_NUMBER
 from drivers.protocol.table import (
     BY_NUMBER,
+    EVENT,
     EVENT_RECORD,
     FAULTS,
     IDENTITY,
     MESSAGES,
+    NAK,
     NAK_RECORD,
     STATES,
     read_request,
@@ -20,12 +23,15 @@ HELLO = "Hello"
 A_READ = "a read"
 """Name of a read that is no message, and changes nothing."""
 STATUS_RECORD = MESSAGES["GetStatus"].reply
-CHANGING = frozenset({"Arm", "Disarm", "Set", "Commit", "Silence", "Stop", "Clear"})
-"""Requests that change what the amplifier does."""
+REPLIES = {HELLO: IDENTITY, **{name: message.reply for name, message in MESSAGES.items()}}
+"""Records of replies by the name of the request."""
+NAMES = {HELLO_NUMBER: HELLO, **{number: message.name for number, message in BY_NUMBER.items()}}
+"""Names of requests by number."""
 BROADCAST = frozenset(name for name, message in MESSAGES.items() if message.is_broadcast)
 """Requests that may be for all amplifiers of a line."""
 FEEDING = frozenset(name for name, message in MESSAGES.items() if message.feeds)
 """Requests that feed the watchdog unless they are refused."""
+_WITH_STATE = (STATUS_RECORD, EVENT_RECORD)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,14 +51,6 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
-    """Part of an exchange: the amplifier has carried the request out, or the host goes on."""
-
-    key: Hashable
-    is_from_host: bool
-
-
-@dataclass(frozen=True, slots=True)
 class Reply:
     """A reply. key: of its request, None where it matches none; values: None where it has none.
 
@@ -67,84 +65,73 @@ class Reply:
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
-    """An unsolicited change of state: values of its record."""
+class Notice:
+    """What is neither: part of an exchange, a change, or what cannot be read.
 
-    address: int
-    values: Values
+    carried out: the amplifier has carried the request of a key out; read on: the host goes on with
+    it. event: unasked, with the values of its record. boot: an amplifier has started, or a master
+    has reset it. other host: its request, by name. damaged: a frame that is none, and why.
+    """
 
-
-@dataclass(frozen=True, slots=True)
-class BootUp:
-    """An amplifier has started, or a master has reset it."""
-
-    address: int
-
-
-@dataclass(frozen=True, slots=True)
-class OtherHost:
-    """A request of another host to an amplifier, by its name."""
-
-    address: int
-    name: str
+    what: Literal["carried out", "read on", "event", "boot", "other host", "damaged"]
+    address: int = 0
+    key: Hashable = None
+    values: Values = field(default_factory=dict)
+    text: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Damaged:
-    """Bytes that form no frame, or a frame that decodes to no message."""
-
-    reason: str
-
-
-Message: TypeAlias = Request | Progress | Reply | Event | BootUp | OtherHost | Damaged
+Message: TypeAlias = Request | Reply | Notice
 DecodedFrame: TypeAlias = tuple[bytes, Message | None]
 """A frame and its message; None for part of a message, or none that concerns the rules."""
 
 
-def request_of(number: int, words: Sequence[int], address: int, key: Hashable) -> Request:
+def damaged(why: str) -> Notice:
+    """Return what is said of bytes that form no message."""
+    return Notice("damaged", text=why)
+
+
+def request_of(
+    number: int,
+    words: Sequence[int],
+    address: int,
+    key: Hashable,
+    begun: float | None = None,
+) -> Request:
     """Read a request by the number of its message."""
-    name = BY_NUMBER[number].name if number in BY_NUMBER else f"type {number}"
-    try:
-        _, values = read_request(number, words)
-    except Refusal as refusal:
-        return Request(name, address, key, problem=str(refusal))
+    name, values = NAMES.get(number, f"type {number}"), Values()
     problem = "" if address or name in BROADCAST else "must not be a broadcast"
-    return Request(name, address, key, values, problem)
+    try:
+        if number != HELLO_NUMBER:
+            _, values = read_request(number, words)
+    except Refusal as refusal:
+        problem = str(refusal)
+    return Request(name, address, key, values, problem, begun)
 
 
-def reply_of(name: str, words: Sequence[int], address: int, key: Hashable) -> Reply:
-    """Read the reply to a request of this name."""
-    record = IDENTITY if name == HELLO else MESSAGES[name].reply
+def reply_of(record: Record, words: Sequence[int], address: int, key: Hashable) -> Reply:
+    """Read what an amplifier sends: the record of a reply, a refusal or an Event."""
     try:
         values = record.unpack(words, is_strict=False)
     except Refusal as refusal:
         return Reply(address, key, problem=str(refusal))
-    problem = state_problem(values) if record is STATUS_RECORD else ""
-    return Reply(address, key, values, problem=problem)
-
-
-def nak_of(words: Sequence[int], address: int, key: Hashable) -> Reply:
-    """Read a refusal."""
-    try:
-        values = NAK_RECORD.unpack(words, is_strict=False)
-    except Refusal as refusal:
-        return Reply(address, key, problem=str(refusal))
-    return Reply(address, key, refusal=values["code"])
-
-
-def event_of(words: Sequence[int], address: int) -> Event | Damaged:
-    """Read an Event."""
-    try:
-        values = EVENT_RECORD.unpack(words, is_strict=False)
-    except Refusal as refusal:
-        return Damaged(f"an invalid Event: {refusal}")
-    problem = state_problem(values)
-    return Damaged(f"an invalid Event: {problem}") if problem else Event(address, values)
-
-
-def state_problem(values: Values) -> str:
-    """Describe a state or fault that is none; "" if both are known."""
-    for name, known in (("state", STATES), ("fault", FAULTS)):
+    problem = ""
+    for name, known in (("state", STATES), ("fault", FAULTS)) if record in _WITH_STATE else ():
         if values[name] not in known.values():
-            return f"{name} must be 0 to {max(known.values())}, got {values[name]}"
-    return ""
+            problem = f"{name} must be 0 to {max(known.values())}, got {values[name]}"
+    return Reply(address, key, values, values["code"] if record is NAK_RECORD else 0, problem)
+
+
+def sent_by_amplifier(
+    number: int, words: Sequence[int], address: int, sequence: int
+) -> Reply | Notice:
+    """Read a message that an amplifier sends by its number; sequence: 0 for an Event on CAN."""
+    if number == EVENT:
+        event = reply_of(EVENT_RECORD, words, address, None)
+        if event.problem or event.values is None:
+            return damaged(f"an invalid Event: {event.problem}")
+        return Notice("event", address, values=event.values)
+    if number == NAK:
+        return reply_of(NAK_RECORD, words, address, (address, sequence, *words[:1]))
+    if number not in NAMES:
+        return damaged(f"a reply of unknown type {number}")
+    return reply_of(REPLIES[NAMES[number]], words, address, (address, sequence, number))

@@ -6,6 +6,7 @@ every transition has a radius beside, by which its amplitude may differ meanwhil
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 from drivers.playback import Playback, Voice
 from drivers.protocol.sets import LayerSet
@@ -15,26 +16,31 @@ from sim.witness.violation import ReportViolation
 
 LEVEL = 0.002
 """Tolerance of levels, in full levels: rounding, and the last step of a fade."""
-CHANNELS, LAYERS = QUANTITIES["channel_count"].maximum, QUANTITIES["layer_count"].maximum
-_RAMP, _STEP = QUANTITIES["ramp"], QUANTITIES["envelope_step"]
+_RAMP, _VOICES = QUANTITIES["ramp"], QUANTITIES["voices"]
 _FINE = 0.026  # Hz; half a step of the wire
 _MAX_ENDING = 3.3  # s; 32 knots, 0.1 s apart
 _FRACTIONS = 16  # of a transition at which sums are looked at
 Interval = tuple[float, float]
 
 
+def silent() -> Playback:
+    """Return a silent playback with all the channels and voices that there can be.
+
+    No fade is cut short in it, so that its levels are upper bounds.
+    """
+    return Playback(QUANTITIES["channel_count"].maximum, _VOICES.maximum)
+
+
 class ExpectedOutputs:
-    """The channels of one amplifier by name; times [s].
+    """The channels of one amplifier; times [s].
 
     voices: of a channel, as the amplifier states them; cause: of what plays, for messages; is_warm:
-    it may derate.
+    it may derate. report: takes what it does, without its name.
     """
 
-    def __init__(self, name: str, *, slack: float, report: ReportViolation) -> None:
-        self.voices = QUANTITIES["voices"].minimum
-        self.cause = "nothing"
+    def __init__(self, *, slack: float, report: ReportViolation) -> None:
+        self.voices = _VOICES.minimum
         self.is_warm = False
-        self._name = name
         self._slack = slack
         self._report = report
         # Silence where there must be none, which an unreported fault would explain.
@@ -43,32 +49,32 @@ class ExpectedOutputs:
 
     def settle(self, cause: str) -> None:
         """Treat all channels as silent, their fades over."""
-        # No fade is cut short in it, so that its levels are upper bounds.
-        self.playback = Playback(CHANNELS, QUANTITIES["voices"].maximum)
+        self.playback = silent()
         self.cause = cause
         self.is_exact = True
-        self._half = [0.0] * LAYERS  # s; by which what a layer plays may be earlier or later
+        layers = QUANTITIES["layer_count"].maximum
+        self._half = [0.0] * layers  # s; by which what a layer plays may be earlier or later
         self._marks: dict[int, tuple[Transition, float, float]] = {}  # half a time, radius at first
-        self._unknown = [-math.inf] * LAYERS  # until when what a layer plays is not known [s]
-        self._before: Mapping[int, float] = {}  # levels of channels before the last commit
+        self._unknown = [-math.inf] * layers  # until when what a layer plays is not known [s]
+        self._before: Sequence[float] = ()  # levels of channels before the last commit
         self._ghosts: list[tuple[int, Transition, float]] = []  # of voices that may still fade
         self._last_due = -math.inf
         self._uncertain_until = -math.inf  # fades may have been cut short
+        self._highest = 0.0  # of the sums of a channel since the last status, at most
 
     def forget(self) -> None:
         """Treat what plays as unknown."""
         self.settle("what was not heard")
-        self._unknown = [math.inf] * LAYERS
+        self._unknown = [math.inf] * len(self._unknown)
 
     # what happens
 
-    def advance(self, time: float) -> None:
+    def _advance(self, time: float) -> None:
         """End layers whose `valid_for` has passed, and start what waits."""
         while self.playback.next_due <= time:
             due = self._last_due = self.playback.next_due
-            before = self._voices()
+            before, half = [*self.playback.all_voices], max(self._half)
             self.playback.advance(due)
-            half = max(self._half)
             self._mark(before, (due - half, due + half), half)
         self.playback.advance(time)
 
@@ -76,10 +82,8 @@ class ExpectedOutputs:
         """Play a set from some time between two on."""
         begin, end = when
         middle, half = (begin + end) / 2, (end - begin) / 2
-        self.advance(begin - self.lag)
-        self._before = {
-            channel: self.playback.settled(channel) for channel in range(self.playback.channels)
-        }
+        self._advance(begin - self._lag)
+        self._before = [*map(self.playback.settled, range(self.playback.channels))]
         for one in layers:
             number, ends = one.layer, self.playback.end_of(one.layer)
             is_ending = begin - self._half[number] <= ends <= end + self._half[number]
@@ -89,51 +93,39 @@ class ExpectedOutputs:
                 fade = middle + half + _MAX_ENDING + _RAMP.from_wire(one.ramp)
                 self._unknown[number] = min(self._unknown[number], fade)
             self._half[number] = max(half, self._half[number] if one.after else 0.0)
-        voices = self._voices()
+        voices = [*self.playback.all_voices]
         self.playback.commit(layers, token, middle)
         self._mark(voices, when, half)
         self.cause, self.is_exact = "a set", exact and self.is_exact
-        for each in self.playback.all_voices:
+        for channel, each in enumerate(self.playback.all_voices):
+            self._highest = max(self._highest, self.playback.peak(channel, begin))
             fades = [voice.silent_from for voice in each if voice.has_ended]
             if len(each) > self.voices and fades:
                 self._uncertain_until = max(self._uncertain_until, *fades)
 
-    def note_silent(self, tokens: Sequence[int], time: float) -> None:
-        """Note the layers that play nothing by a status at a time; they may still fade."""
-        for layer, until in enumerate(self._unknown):
-            if until == math.inf and (layer >= len(tokens) or not tokens[layer]):
-                self._unknown[layer] = time + _MAX_ENDING + _RAMP.high
-
     def silence(self, when: Interval, ramp: float, cause: str) -> None:
         """Silence all channels along a ramp [s], from some time between two on."""
         begin, end = when
-        self.advance(begin - self.lag)
-        voices = self._voices()
+        self._advance(begin - self._lag)
+        voices = [*self.playback.all_voices]
         self.playback.silence((begin + end) / 2, ramp)
         self._mark(voices, when, (end - begin) / 2)
         self._unknown = [min(until, end + ramp) for until in self._unknown]
         self.cause = cause
-
-    def _voices(self) -> list[tuple[Voice, ...]]:
-        return [*self.playback.all_voices]
 
     def _mark(self, before: Sequence[Sequence[Voice]], when: Interval, half: float) -> None:
         """Note the radius of every transition that is new."""
         marks: dict[int, tuple[Transition, float, float]] = {}
         self._ghosts = [each for each in self._ghosts if each[1].end + each[2] > when[0]]
         for channel, were in enumerate(before):
-            voices = self.playback.voices_of(channel)
-            known = {(each.layer, each.frequency, each.origin): each.transition for each in were}
-            for voice in voices:
-                way = voice.transition
-                last = known.get((voice.layer, voice.frequency, voice.origin))
-                if id(way) in self._marks:
-                    marks[id(way)] = self._marks[id(way)]
-                else:
-                    radius = 0.0 if last is None else self._radius(last, *when)
-                    marks[id(way)] = (way, half, radius)
-            left = known.keys() - {(each.layer, each.frequency, each.origin) for each in voices}
-            for way in (known[each] for each in left):
+            left = {(each.layer, each.frequency, each.origin): each.transition for each in were}
+            known = dict(left)
+            for voice in self.playback.voices_of(channel):
+                name, way = (voice.layer, voice.frequency, voice.origin), voice.transition
+                left.pop(name, None)
+                radius = self._radius(known[name], *when) if name in known else 0.0
+                marks[id(way)] = self._marks.get(id(way), (way, half, radius))
+            for way in left.values():
                 late = self._marks.get(id(way), (way, 0.0, 0.0))[1]
                 if way.end + late > when[0]:
                     self._ghosts.append((channel, way, late))
@@ -150,7 +142,7 @@ class ExpectedOutputs:
         return reach + (radius if since < way.end else 0.0)
 
     @property
-    def lag(self) -> float:
+    def _lag(self) -> float:
         """Longest time by which a transition under way may be earlier or later [s]."""
         halves = [half for _, half, _ in self._marks.values()]
         return max(*self._half, *halves, 0.0) + self._slack
@@ -158,8 +150,12 @@ class ExpectedOutputs:
     # what is reported
 
     def is_quiet(self, begin: float, end: float) -> bool:
-        """Whether no layer ends or starts by itself near two times, and all of them are known."""
-        half = self.lag
+        """Go on to a time, and return whether all layers are known from it to another one.
+
+        None ends or starts by itself near these.
+        """
+        half = self._lag
+        self._advance(begin - half)
         is_known = all(until < begin for until in self._unknown)
         is_due = self.playback.next_due <= end + half or self._last_due >= begin - half
         vanish = any(  # onsets that lead to silence
@@ -169,30 +165,26 @@ class ExpectedOutputs:
         )
         return is_known and not is_due and not vanish
 
-    def bounds(self, channel: int, begin: float, end: float) -> Interval:
-        """Return the least and the largest level of a channel between two times."""
+    def _bounds(self, channel: int, begin: float, end: float) -> Interval:
+        """Return the least and the largest sum of a channel between two times."""
         low = high = 0.0
         by_frequency: dict[float, dict[float, tuple[complex, float]]] = {}
         for voice in self.playback.voices_of(channel):
             group = by_frequency.setdefault(voice.frequency, {})
             center, radius = group.get(voice.origin, (0j, 0.0))
-            way = voice.transition
-            center += way.at((begin + end) / 2)
-            group[voice.origin] = center, radius + self._radius(way, begin, end)
+            center += voice.transition.at((begin + end) / 2)
+            group[voice.origin] = center, radius + self._radius(voice.transition, begin, end)
         for group in by_frequency.values():
             highs = [abs(center) + radius for center, radius in group.values()]
-            lows = [abs(center) - radius for center, radius in group.values()]
             # Tones of one frequency that began at different times may cancel.
-            low += max(
-                0.0, *(one - (sum(highs) - own) for one, own in zip(lows, highs, strict=True))
-            )
+            others = [sum(highs) - own for own in highs]
+            lows = [abs(center) - radius for center, radius in group.values()]
+            low += max(0.0, *(one - other for one, other in zip(lows, others, strict=True)))
             high += sum(highs)
         for at, way, late in self._ghosts:
             if at == channel and way.end + late > begin:
                 low, high = 0.0, high + abs(way.at(begin - late))
-        if begin <= self._uncertain_until:
-            low = 0.0
-        return min(low, 1.0), min(high, 1.0)
+        return 0.0 if begin <= self._uncertain_until else low, high
 
     def check_levels(
         self, levels: Sequence[float], begin: float, end: float, *, may_be_off: bool,
@@ -203,29 +195,22 @@ class ExpectedOutputs:
         may_be_off: whether the watchdog may have expired; of_sensor: levels that are too low wait
         for `resolve_suspicions`.
         """
-        self.advance(begin - self.lag)
         if not self.is_quiet(begin, end):
             return
-        begin, end = begin - self._slack, end + self._slack
+        is_settled = self.playback.is_settled(begin - self._lag)
+        can_be_low = self.is_warm or may_be_off or not self.is_exact
         for channel, level in enumerate(levels):
-            low, high = self.bounds(channel, begin, end)
-            is_low = level < low - LEVEL
-            if not (level > high + LEVEL or is_low):
-                continue
-            if is_low and (self.is_warm or may_be_off or not self.is_exact):
-                continue
-            wrong = f"at least {low:.4f}" if is_low else f"at most {high:.4f}"
-            is_settled = self.playback.is_settled(begin - self.lag)
-            found = (
-                self._rule_of_level(channel, level, is_settled=is_settled),
-                end,
-                f"channel {channel} of {self._name}: level must be {wrong}, got {level:.4f} "
-                f"{'' if is_settled else 'fading '}after {self.cause}",
-            )
-            if is_low and of_sensor:
-                self.suspect(*found)
-            else:
-                self._report(*found)
+            low, high = self._bounds(channel, begin - self._slack, end + self._slack)
+            is_low = level < min(low, 1.0) - LEVEL
+            if level > min(high, 1.0) + LEVEL or (is_low and not can_be_low):
+                wrong = f"at least {low:.4f}" if is_low else f"at most {high:.4f}"
+                report = self.suspect if is_low and of_sensor else self._report
+                report(
+                    self._rule_of_level(channel, level, is_settled=is_settled),
+                    end,
+                    f"has level {level:.4f} on channel {channel}, must be {wrong} after "
+                    f"{self.cause}",
+                )
 
     def _rule_of_level(self, channel: int, level: float, *, is_settled: bool) -> str:
         if self.cause == "the watchdog":
@@ -234,11 +219,24 @@ class ExpectedOutputs:
             return "ramp"
         if self.cause != "a set":
             return "silent"
-        return "commit" if abs(level - self._before.get(channel, 0.0)) < LEVEL else "plays"
+        before = self._before[channel] if channel < len(self._before) else 0.0
+        return "commit" if abs(level - before) < LEVEL else "plays"
 
-    def suspect(self, rule: str, time: float, sentence: str) -> None:
+    def check_limited(self, begin: float, end: float, *, is_limited: bool) -> None:
+        """Compare whether a sum was limited since the last status, and begin anew."""
+        channels = range(self.playback.channels)
+        since, until = begin - self._slack, end + self._slack
+        if self.is_quiet(begin, end):
+            low = max(self._bounds(channel, since, until)[0] for channel in channels)
+            if is_limited and self._highest < 1:
+                self._report("plays", end, "reports a sum as limited, none exceeds full level")
+            elif low > 1 + LEVEL and self.is_exact and not (self.is_warm or is_limited):
+                self._report("plays", end, "does not report that a sum is limited")
+        self._highest = max(self.playback.peak(channel, since) for channel in channels)
+
+    def suspect(self, rule: str, time: float, what: str) -> None:
         """Note a violation that is none if the amplifier has a fault, as its next status says."""
-        self._suspicions.append((rule, time, sentence))
+        self._suspicions.append((rule, time, what))
 
     def resolve_suspicions(self, *, is_enabled: bool) -> None:
         """Report suspicions, unless a fault explains them."""
@@ -248,59 +246,49 @@ class ExpectedOutputs:
 
     def check_frequencies(self, measured: Mapping[int, float], time: float) -> None:
         """Compare the frequency [Hz] that a channel vibrates with, where it must have settled."""
-        self.advance(time - self.lag)
         if not self.is_quiet(time, time):
             return
         for channel, frequency in measured.items():
             voices = self.playback.voices_of(channel)
             lasting = sorted({each.frequency for each in voices if not each.has_ended})
-            is_settled = all(each.transition.end < time - self.lag for each in voices)
+            is_settled = all(each.transition.end < time - self._lag for each in voices)
             if lasting and is_settled and all(abs(each - frequency) > _FINE for each in lasting):
-                expected = " or ".join(f"{each:g}" for each in lasting)
-                what = f"channel {channel} of {self._name} vibrates at {frequency:g} Hz, commanded "
-                self._report("plays", time, f"{what}{expected} Hz")
+                what = f"vibrates at {frequency:g} Hz on channel {channel}, commanded {lasting} Hz"
+                self._report("plays", time, what)
 
     def check_tokens(self, tokens: Sequence[int], begin: float, end: float) -> None:
-        """Compare the token of each layer."""
-        self.advance(begin - self.lag)
-        if not self.is_quiet(begin, end):
-            return
+        """Compare the token of each layer, where all are known."""
         expected = self.playback.tokens
-        for layer, token in enumerate(tokens):
+        for layer, token in enumerate(tokens) if self.is_quiet(begin, end) else ():
             if token != expected.get(layer, 0):
-                what = f"{self._name} reports token {token} of layer {layer}, expected "
-                self._report("token", end, f"{what}{expected.get(layer, 0)}")
+                what = f"reports token {token} of layer {layer}, expected {expected.get(layer, 0)}"
+                self._report("token", end, what)
+
+    def note_silent(self, tokens: Sequence[int], time: float) -> None:
+        """Note the layers that play nothing by a status at a time; they may still fade."""
+        for layer, until in enumerate(self._unknown):
+            if until == math.inf and (layer >= len(tokens) or not tokens[layer]):
+                self._unknown[layer] = time + _MAX_ENDING + _RAMP.high
 
     def sums(self, time: float) -> tuple[Mapping[int, float], float, Mapping[int, float]]:
-        """Return what follows from a time on: largest levels and steepest rises, and power.
+        """Return what follows from a time on: largest levels, power, and steepest rises.
 
-        By channel, in full levels and full levels/s; looked at along the transitions under way.
+        Levels and rises by channel, in full levels and full levels/s; looked at along the
+        transitions under way.
         """
         times = {time}
-        for voices in self.playback.all_voices:
-            for voice in voices:
-                way = voice.transition
-                count = max(_FRACTIONS, len(way.knots) + 1)
-                times.update(
-                    way.start + (way.end - way.start) * part / count for part in range(count + 1)
-                )
+        playing = {each: one for each, one in enumerate(self.playback.all_voices) if one}
+        for way in [voice.transition for voices in playing.values() for voice in voices]:
+            count = max(_FRACTIONS, len(way.knots) + 1)
+            steps = range(count + 1)
+            times.update(way.start + (way.end - way.start) * part / count for part in steps)
         moments = sorted({round(at, 6) for at in times if at >= time})  # no sums of floats
-        levels: dict[int, list[float]] = {
-            channel: [sum(abs(each.transition.at(at)) for each in voices) for at in moments]
-            for channel, voices in enumerate(self.playback.all_voices)
-            if voices
-        }
-        power = max(
-            (sum(v * v for v in row) for row in zip(*levels.values(), strict=True)), default=0.0
-        )
-        rises = {
-            channel: max(
-                (
-                    (row[i + 1] - row[i]) / (moments[i + 1] - moments[i])
-                    for i in range(len(moments) - 1)
-                ),
-                default=0.0,
-            )
-            for channel, row in levels.items()
-        }
+        levels, rises = dict[int, list[float]](), dict[int, float]()
+        for channel, voices in playing.items():
+            row = [sum(abs(each.transition.at(at)) for each in voices) for at in moments]
+            steeps = zip(pairwise(row), pairwise(moments), strict=True)
+            levels[channel] = row
+            rises[channel] = max(((b - a) / (t - s) for (a, b), (s, t) in steeps), default=0.0)
+        moment_by_moment = zip(*levels.values(), strict=True)
+        power = max((sum(v * v for v in each) for each in moment_by_moment), default=0.0)
         return {channel: max(row) for channel, row in levels.items()}, power, rises

@@ -3,12 +3,11 @@
 import math
 
 from drivers.protocol.records import Values
-from drivers.protocol.table import FAULTS, LATCHED, QUANTITIES, STATES
+from drivers.protocol.table import FAULTS, LATCHED, QUANTITIES, STATES, STATUS_FLAGS
 from drivers.protocol.tokens import is_newer_token
 from sim.witness.expected_outputs import ExpectedOutputs, Interval
-from sim.witness.reports import fault_list_problem
+from sim.witness.sent import ENABLED, Sent
 from sim.witness.set_replies import SetReplies
-from sim.witness.unanswered import ENABLED, Unanswered
 from sim.witness.violation import ReportViolation
 from sim.witness.watchdog import Watchdog
 
@@ -23,32 +22,35 @@ _SPONTANEOUS = {
     **dict.fromkeys(OFF, OFF),
 }
 """States that an amplifier may enter from a state without a request."""
-NAMES = {number: name for name, number in STATES.items()}
+_NAMES = {number: name for name, number in STATES.items()}
+_CLOCK = 0.01  # share of an age by which the clock of an amplifier may be wrong
+_ROUNDING = 0.002  # s; of an age
 
 
 class ExpectedState:
     """The expected state of one amplifier by name, None while it is unknown; times [s].
 
     is_answered: it has said its state in a reply; last_fault: when it was seen to enter a fault;
-    reported_at: when it reported a state other than before.
+    reported_at: when it reported a state other than before. unanswered: requests that have no
+    reply, and may have been carried out.
     """
 
     def __init__(self, name: str, *, slack: float, report: ReportViolation) -> None:
         self.state: int | None = None
         self.is_answered = True
         self.last_fault = self.reported_at = -math.inf
-        self.watchdog = Watchdog(name, slack=slack, report=report)
-        self.outputs = ExpectedOutputs(name, slack=slack, report=report)
-        self.sets = SetReplies(name, report=report)
+        self.watchdog = Watchdog(slack)
+        self.outputs = ExpectedOutputs(slack=slack, report=self._report)
+        self.sets = SetReplies()
+        self.unanswered: list[Sent] = []
         self._name = name
-        self._report = report
+        self._report_sentence = report
         self._slack = slack
         self._fault = 0
         self._is_reported = True  # it has reported this state
         self._fault_since: Interval | None = None  # when the present one came, if known
         self._last_status = -math.inf
         self._latch: int | None = None
-        self._unanswered = Unanswered()
 
     @property
     def is_enabled(self) -> bool:
@@ -62,11 +64,15 @@ class ExpectedState:
 
     def advance(self, time: float) -> None:
         """Apply what must have happened without a request until now."""
-        if self.state == ENABLED and self.watchdog.has_expired(time) and not self._unanswered:
+        if self.is_enabled and self.watchdog.has_expired(time) and not self.unanswered:
             self._silence(self.watchdog.expiry, SILENCING_RAMP, "the watchdog")
             self.state, self._fault, self._is_reported = REACTING, FAULTS["WATCHDOG"], False
             self.is_answered = False
             self.last_fault, self._fault_since = time, self.watchdog.expiry
+
+    def _report(self, rule: str, time: float, what: str) -> None:
+        """Report what it does, or is."""
+        self._report_sentence(rule, time, f"{self._name} {what}")
 
     def _note_state(self, now: int, fault: int, end: float) -> None:
         """Compare a state and a fault with those expected, and go on with them."""
@@ -78,33 +84,47 @@ class ExpectedState:
             self.last_fault = end
             self._check_trip(now, fault, end)
         elif now not in _SPONTANEOUS.get(here, (here,)):
-            self._report(self._rule_against(now), end, self._state_problem(now))
+            self._report(
+                self._rule_against(now), end, self._in(now, f", must be in {_NAMES[here]}")
+            )
         elif self._is_reported and self._fault and fault != self._fault and now in LATCHED:
-            what = f"{self._name} reports fault {fault} instead of {self._fault}"
-            self._report("latched", end, what)
+            self._report("latched", end, f"reports fault {fault} instead of {self._fault}")
         self._fault = fault if now in (REACTING, FAULT) else 0
         self.outputs.resolve_suspicions(is_enabled=now not in (REACTING, FAULT))
         if now != here or not self._is_reported:
             self.reported_at = end
         self.state, self._is_reported = now, True
 
+    def _in(self, state: int | None, what: str) -> str:
+        name = "an unknown state" if state is None else _NAMES[state]
+        return f"is in {name}{what}; {self.watchdog}"
+
+    def _rule_against(self, now: int) -> str:
+        """Which rule a state breaks."""
+        if not self._is_reported:
+            return "watchdog" if now == ENABLED else "latched"
+        if now == ENABLED:
+            return "armed"
+        return "latched" if self.state in LATCHED else "state"
+
     def _adopt(self, state: int, fault: int, time: float) -> None:
         """Adopt a reported state where it is unknown."""
         self.state, self._fault, self._is_reported = state, fault, True
         self._fault_since = None
         if state in (*OFF, FAULT):
-            self.outputs.settle(NAMES[state])
+            self.outputs.settle(_NAMES[state])
         elif state == ENABLED:
-            self.watchdog.feed((-math.inf, time))
+            self.watchdog.fed = (-math.inf, time)
 
     def _check_trip(self, state: int, fault: int, end: float) -> None:
         """Check a transition into a fault: the watchdog not before its time."""
         since = (min(self._last_status, end), end)
         if fault == FAULTS["WATCHDOG"]:
-            self.watchdog.check_trip(end)
+            if not self.watchdog.may_have_expired(end):
+                self._report("watchdog", end, f"expired at {end:.4f} s: {self.watchdog}")
             since = (min(max(self.watchdog.expiry[0], self._last_status), end), end)
         elif fault == FAULTS["NONE"]:
-            self._report("state", end, f"{self._name} is in {NAMES[state]} without a fault")
+            self._report("state", end, self._in(state, " without a fault"))
         self._fault_since = since if since[0] > -math.inf else None
         self._silence((max(since[0], end - 2.0), end), SILENCING_RAMP, "a fault")
 
@@ -115,46 +135,50 @@ class ExpectedState:
             return
         is_newer = latch > 0 and is_newer_token(latch, before)
         if after == "Stop" and not is_newer:
-            what = f"{self._name} reports latch {latch} after Stop, must be newer than {before}"
+            what = f"reports latch {latch} after Stop, must be newer than {before}"
             self._report("latched", end, what)
         elif latch != before and not (is_newer and state in LATCHED):
-            what = f"{self._name} reports latch {latch} in {NAMES[state]}, must be {before}"
+            what = f"reports latch {latch} in {_NAMES[state]}, must be {before}"
             self._report("latched", end, what)
 
-    def _rule_against(self, now: int) -> str:
-        if not self._is_reported:
-            return "watchdog" if now == ENABLED else "latched"
-        if now == ENABLED:
-            return "armed"
-        return "latched" if self.state in LATCHED else "state"
-
-    def _state_problem(self, now: int) -> str:
-        if not self._is_reported and now == ENABLED:
-            return f"{self._name} is still enabled: {self.watchdog}"
-        return f"{self._name} must be in {self._state_name()}, got {NAMES[now]}"
-
     def _check_left(self, left: int, state: int, begin: float, end: float) -> None:
+        """Check the time left of the watchdog."""
+        seconds = QUANTITIES["watchdog_left"].from_wire(left)
+        problem = ""
         if state == ENABLED:
-            seconds = QUANTITIES["watchdog_left"].from_wire(left)
-            self.watchdog.check_left(seconds, begin, end)
+            problem = self.watchdog.left_problem(seconds, begin, end)
         elif state in OFF and left:
-            self._report("watchdog", end, f"{self._name}: watchdog runs while disarmed")
+            problem = "watchdog runs while disarmed"
+        if problem:
+            self._report("watchdog", end, problem)
+
+    def _check_flags(self, flags: int, state: int, begin: float, end: float) -> None:
+        """Check whether high voltage is on, and whether a sum was limited."""
+        is_limited = bool(flags >> STATUS_FLAGS["limited"] & 1)
+        self.outputs.check_limited(begin, end, is_limited=is_limited)
+        is_on = bool(flags >> STATUS_FLAGS["high_voltage"] & 1)
+        must = {ENABLED: True, FAULT: False}.get(state, False if state in OFF else None)
+        if must is not None and must != is_on:
+            what = f"reports high voltage {'on' if is_on else 'off'} in {_NAMES[state]}"
+            self._report("high_voltage", end, what)
 
     def _check_faults(self, values: Values, begin: float, end: float) -> None:
+        """Check a list of faults: newest first, with the present one, of the age that it has."""
         faults = [(each["fault"], each["age"] / 1000) for each in values["faults"]]
-        is_known = self.is_in_fault and self._is_reported and not self._unanswered
-        problem = fault_list_problem(
-            tuple(faults),
-            (begin - self._slack, end + self._slack),
-            present=self._fault if is_known else 0,
-            since=self._fault_since,
-        )
-        if problem is not None:
-            self._report("faults", end, f"{self._name} {problem}")
+        ages = [age for fault, age in faults if fault == self._fault]
+        if faults != sorted(faults, key=lambda each: each[1]):
+            self._report("faults", end, f"lists faults {faults}, must be newest first")
+        elif not self.is_in_fault or not self._is_reported or self.unanswered:
+            return
+        elif not ages:
+            self._report("faults", end, f"is in fault {self._fault}, which it does not list")
+        elif self._fault_since is not None:
+            low = begin - self._slack - self._fault_since[1] - _ROUNDING
+            high = end + self._slack - self._fault_since[0] + _ROUNDING
+            if not any(low <= age * (1 + _CLOCK) and age * (1 - _CLOCK) <= high for age in ages):
+                what = f"lists fault {self._fault} of {ages} s ago, must be {low:.3f} to {high:.3f}"
+                self._report("faults", end, what)
 
     def _silence(self, when: Interval, ramp: float, cause: str) -> None:
         self.sets.drop()
         self.outputs.silence((max(when[0], -1e9), when[1]), ramp, cause)
-
-    def _state_name(self) -> str:
-        return NAMES[self.state] if self.state is not None else "an unknown state"

@@ -5,25 +5,25 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 from drivers.protocol.records import Refusal
-from drivers.protocol.table import BY_NUMBER, IDENTITY, MAX_WORDS, REFUSALS
+from drivers.protocol.serial_payload import unpack_identity
+from drivers.protocol.table import BY_NUMBER, MAX_WORDS, REFUSALS
 from sim.witness.capture import Direction
 from sim.witness.decoded import (
     A_READ,
     HELLO,
-    Damaged,
     DecodedFrame,
     Message,
-    Progress,
+    Notice,
     Reply,
     Request,
+    damaged,
     reply_of,
     request_of,
 )
-from sim.witness.modbus_frames import Adu, RtuSplitter, Splitter, TcpSplitter
+from sim.witness.modbus_frames import READS, WRITE, Adu, AduReader
 
 _BOX, _REPLY, _HEAD = 256, 128, 2  # registers: of a message, before its reply, of tag and result
-_IDENTITY, _IDENTITY_SIZE, _TEXT_SIZE = 1065, 66, 16  # registers
-_WRITE, _READS = 16, (3, 4)
+_IDENTITY, _IDENTITY_SIZE, _TEXT_SIZE = 1065, 66, 32  # registers, and bytes of a text
 _PRESENT = ("GetCaps", "GetStatus", "GetFaults")
 """Replies that are read as they are at that moment, written before or not."""
 _EXCEPTIONS = {
@@ -43,26 +43,47 @@ class _Written:
 
 
 @dataclass(frozen=True, slots=True)
-class _Open:
-    """A transaction whose response is missing; address, count: of registers read or written."""
+class _Transaction:
+    """One whose response is missing; address, count: of registers read or written."""
 
-    unit: int
+    adu: Adu
     key: Hashable
-    function: int
-    address: int
-    count: int
+    address: int = 0
+    count: int = 0
+
+    @property
+    def transfer(self) -> tuple[int, int, int, int]:
+        """What is read or written: a repeated one takes the place of the one before."""
+        return self.adu.unit, self.adu.function, self.address, self.count
+
+    def problem_of(self, response: Adu) -> str:
+        """Describe why something is no response to it; "" if it is one."""
+        function, body = self.adu.function, response.body
+        if response.function == function | 0x80 and len(body) == 1:
+            return ""
+        if response.function != function:
+            return f"function must be {function}, got {response.function}"
+        if function == WRITE:
+            is_echo = body == struct.pack(">HH", self.address, self.count)
+            return "" if is_echo else "address and count must be those that were written"
+        is_whole = len(body) == 1 + 2 * self.count and body[0] == 2 * self.count
+        return "" if is_whole else f"registers must be {self.count}"
 
 
 class ModbusDecoder:
-    """Decodes both directions, over TCP or RTU."""
+    """Decodes both directions, over TCP or RTU.
+
+    Over RTU a request that silences may pass before the reply to another one, which still comes:
+    the first transaction that a response fits has it.
+    """
 
     def __init__(self, *, over_tcp: bool) -> None:
         self._over_tcp = over_tcp
-        self._split: dict[Direction, Splitter] = {
-            "amplifier": TcpSplitter() if over_tcp else RtuSplitter("amplifier"),
-            "host": TcpSplitter() if over_tcp else RtuSplitter("host"),
+        self._readers: dict[Direction, AduReader] = {
+            "amplifier": AduReader("amplifier", over_tcp=over_tcp),
+            "host": AduReader("host", over_tcp=over_tcp),
         }
-        self._open: dict[int, _Open] = {}  # by transaction; over RTU at most one
+        self._open: list[_Transaction] = []
         self._written: dict[tuple[int, int], _Written] = {}  # by unit and number of the message
         self._requests = 0
 
@@ -70,39 +91,34 @@ class ModbusDecoder:
         """Decode bytes; returns the complete frames."""
         take = self._request if direction == "amplifier" else self._response
         seen: list[DecodedFrame] = []
-        for adu in self._split[direction].feed(time, data):
-            if adu.pdu is None:
-                seen.append((adu.raw, Damaged("a malformed ADU, or a wrong CRC")))
-                if direction == "amplifier" and not self._over_tcp:
-                    self._open.clear()
-            else:
-                seen.append((adu.raw, take(adu, adu.pdu)))
+        for adu in self._readers[direction].feed(time, data):
+            seen.append((adu.raw, take(adu) if adu.is_good else damaged("a malformed ADU")))
+            if not adu.is_good and direction == "amplifier" and not self._over_tcp:
+                self._open.clear()
         return seen
 
     def has_partial_frame(self, direction: Direction) -> bool:
         """Whether the last bytes in this direction begin a frame."""
-        return self._split[direction].has_partial_frame
+        return self._readers[direction].has_partial_frame
 
-    def _request(self, adu: Adu, pdu: bytes) -> Message:
+    def _request(self, adu: Adu) -> Message:
         self._requests += 1
         key = (adu.unit, self._requests) if adu.unit or self._over_tcp else None
-        function, body = pdu[0], pdu[1:]
         try:
-            if function in _READS:
-                address, count = struct.unpack(">HH", body)
-                return self._read(adu, key, function, address, count)
-            if function == _WRITE:
-                address, count, size = struct.unpack_from(">HHB", body)
-                words = struct.unpack(f">{count}H", body[5:])
-                if size == 2 * count and count:
-                    return self._write(adu, key, address, words)
-        except struct.error:
+            address, count = struct.unpack_from(">HH", adu.body)
+            if adu.function in READS and len(adu.body) == 4:
+                return self._read(adu, key, address, count)
+            if adu.function == WRITE and adu.body[4:5] == bytes([2 * count]) != b"\0":
+                words = struct.unpack(f">{count}H", adu.body[5:])
+                return self._write(adu, key, address, words)
+        except (struct.error, ValueError):
             pass
-        self._remember(adu, key, function, 0, 0)
-        return Request(A_READ, adu.unit, key, problem=f"function {function} is malformed or none")
+        self._remember(_Transaction(adu, key))
+        problem = f"function {adu.function} is malformed or none"
+        return Request(A_READ, adu.unit, key, problem=problem)
 
     def _write(self, adu: Adu, key: Hashable, address: int, words: Sequence[int]) -> Request:
-        self._remember(adu, key, _WRITE, address, len(words))
+        self._remember(_Transaction(adu, key, address, len(words)))
         number, offset = divmod(address, _BOX)
         if offset or number not in BY_NUMBER or len(words) > MAX_WORDS + 1 or not words[0]:
             problem = f"write of {len(words)} registers to {address}, tag {words[0]}"
@@ -111,80 +127,75 @@ class ModbusDecoder:
             self._written[adu.unit, number] = _Written(words[0], key)
         return request_of(number, words[1:], adu.unit, key)
 
-    def _read(
-        self, adu: Adu, key: Hashable, function: int, address: int, count: int
-    ) -> Request | Progress:
+    def _read(self, adu: Adu, key: Hashable, address: int, count: int) -> Request | Notice:
         number, offset = divmod(address, _BOX)
         written = self._written.get((adu.unit, number))
         is_reply = number in BY_NUMBER and offset == _REPLY
         if is_reply and written is not None and not written.is_read:
-            self._remember(adu, written.key, function, address, count)
-            return Progress(written.key, is_from_host=True)
-        self._remember(adu, key, function, address, count)
+            self._remember(_Transaction(adu, written.key, address, count))
+            return Notice("read on", key=written.key)
+        self._remember(_Transaction(adu, key, address, count))
         if address == _IDENTITY:
             return Request(HELLO, adu.unit, key)
         is_present = is_reply and BY_NUMBER[number].name in _PRESENT
         return Request(BY_NUMBER[number].name if is_present else A_READ, adu.unit, key)
 
-    def _remember(self, adu: Adu, key: Hashable, function: int, address: int, count: int) -> None:
-        if key is None:
+    def _remember(self, transaction: _Transaction) -> None:
+        if transaction.key is None:
             return
         if not self._over_tcp:
-            self._open.clear()
-        self._open[adu.number] = _Open(adu.unit, key, function, address, count)
+            last = self._open[-1:]
+            self._open = [each for each in last if each.transfer != transaction.transfer]
+        self._open.append(transaction)
 
-    def _response(self, adu: Adu, pdu: bytes) -> Message | None:
-        request = self._open.get(adu.number)
-        if request is None or request.unit != adu.unit:
+    def _response(self, adu: Adu) -> Message | None:
+        awaited = [
+            each
+            for each in self._open
+            if (each.adu.unit, each.adu.number) == (adu.unit, adu.number)
+        ]
+        if not awaited:
             return Reply(adu.unit)
-        del self._open[adu.number]
-        if pdu[0] == request.function | 0x80 and len(pdu) == 2:
-            return self._refused(request, pdu[1])
-        if pdu[0] != request.function:
-            return Reply(adu.unit, problem=f"function must be {request.function}, got {pdu[0]}")
-        if request.function == _WRITE:
-            if pdu[1:] != struct.pack(">HH", request.address, request.count):
-                return Reply(adu.unit, problem="address and count must be those that were written")
-            return Progress(request.key, is_from_host=False)
-        if len(pdu) != 2 + 2 * request.count or pdu[1] != 2 * request.count:
-            return Reply(adu.unit, problem=f"registers must be {request.count}")
-        return self._reply(request, struct.unpack(f">{request.count}H", pdu[2:]))
+        fitting = [each for each in awaited if not each.problem_of(adu)]
+        request = (fitting or awaited)[0]
+        at = self._open.index(request)
+        # On a line the ones before it have no response any more.
+        del self._open[at if self._over_tcp else 0 : at + 1]
+        if not fitting:
+            return Reply(adu.unit, problem=request.problem_of(adu))
+        if adu.function != request.adu.function:  # what gateways refuse is no response
+            refusal = _EXCEPTIONS.get(adu.body[0])
+            return None if refusal is None else Reply(adu.unit, request.key, refusal=refusal)
+        if adu.function == WRITE:
+            return Notice("carried out", key=request.key)
+        return self._reply(request, struct.unpack_from(f">{request.count}H", adu.body, 1))
 
-    def _refused(self, request: _Open, code: int) -> Message | None:
-        """Return what an exception means; those of gateways are no response."""
-        if code not in _EXCEPTIONS:
-            return None
-        return Reply(request.unit, request.key, refusal=_EXCEPTIONS[code])
-
-    def _reply(self, request: _Open, words: Sequence[int]) -> Reply:
+    def _reply(self, request: _Transaction, words: Sequence[int]) -> Reply:
         number, offset = divmod(request.address, _BOX)
+        unit, key = request.adu.unit, request.key
         if request.address == _IDENTITY and request.count == _IDENTITY_SIZE:
-            return _identity(request, words)
+            return _identity(unit, key, words)
         if offset != _REPLY or number not in BY_NUMBER or len(words) < _HEAD:
-            return Reply(request.unit, request.key)
-        written = self._written.get((request.unit, number))
+            return Reply(unit, key)
+        written = self._written.get((unit, number))
         tag = 0 if written is None else written.tag
         if words[0] != tag:
-            problem = f"tag must be {tag}, got {words[0]}"
-            return Reply(request.unit, problem=problem)
-        if written is not None and written.key == request.key:
+            return Reply(unit, problem=f"tag must be {tag}, got {words[0]}")
+        if written is not None and written.key == key:
             written.is_read = True
         if words[1]:
-            return Reply(request.unit, request.key, refusal=words[1] >> 8)
-        reply = reply_of(BY_NUMBER[number].name, words[_HEAD:], request.unit, request.key)
+            return Reply(unit, key, refusal=words[1] >> 8)
+        reply = reply_of(BY_NUMBER[number].reply, words[_HEAD:], unit, key)
         is_part = len(words) < _HEAD + MAX_WORDS and reply.values is None
-        return Reply(request.unit, request.key) if is_part else reply
+        return Reply(unit, key) if is_part else reply
 
 
-def _identity(request: _Open, words: Sequence[int]) -> Reply:
+def _identity(unit: int, key: Hashable, words: Sequence[int]) -> Reply:
     """Read the identity: tag 0, versions, texts padded with zeros."""
-    row = [words[1]]
-    for at in range(2, len(words), _TEXT_SIZE):
-        text = struct.pack(f">{_TEXT_SIZE}H", *words[at : at + _TEXT_SIZE]).rstrip(b"\0")
-        padded = text + b"\0" * (len(text) % 2)
-        row += [len(text), *struct.unpack(f">{len(padded) // 2}H", padded)]
+    raw = struct.pack(f">{len(words) - 2}H", *words[2:])
+    texts = [raw[at : at + _TEXT_SIZE].rstrip(b"\0") for at in range(0, len(raw), _TEXT_SIZE)]
+    payload = struct.pack("<H", words[1]) + b"".join(bytes([len(each)]) + each for each in texts)
     try:
-        values = IDENTITY.unpack(row, is_strict=True)
+        return Reply(unit, key, unpack_identity(payload))
     except Refusal as refusal:
-        return Reply(request.unit, request.key, problem=str(refusal))
-    return Reply(request.unit, request.key, values)
+        return Reply(unit, key, problem=str(refusal))

@@ -1,126 +1,103 @@
 """Modbus ADUs in a stream of bytes, TCP and RTU, from docs/reference/modbus.md."""
 
 import struct
-from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 from drivers.codec.modbus.crc import crc16
 from sim.witness.capture import Direction
 
-_MIN_LENGTH, _MAX_LENGTH = 4, 256
-_PAUSE = 0.04  # s; a longer pause ends a partial frame
-_SIZES: dict[Direction, dict[int, int]] = {
-    "amplifier": {3: 8, 4: 8, 6: 8},
-    "host": {6: 8, 16: 8},
-}
-# Of the others: offset of the byte count, and bytes around the data, CRC included.
-_COUNTS: dict[Direction, dict[int, tuple[int, int]]] = {
-    "amplifier": {16: (6, 9), 23: (10, 13)},
-    "host": {3: (2, 5), 4: (2, 5), 23: (2, 5)},
+READS, WRITE = (3, 4), 16
+_HEADER, _RTU_MIN, _RTU_MAX = 7, 4, 256  # bytes
+_PAUSE = 0.04  # s; a longer pause ends a partial frame on RTU
+# Of RTU, by function: where a count of bytes stands, if one does, and bytes around those counted.
+_SIZES: dict[Direction, dict[int, tuple[int | None, int]]] = {
+    "amplifier": {**dict.fromkeys(READS, (None, 8)), WRITE: (6, 9)},
+    "host": {
+        **dict.fromkeys(READS, (2, 5)),
+        WRITE: (None, 8),
+        **dict.fromkeys(range(0x80, 0x100), (None, 5)),
+    },
 }
 
 
 class Adu(NamedTuple):
-    """An ADU; number: the TCP transaction, 0 over RTU; pdu: None where it is damaged."""
+    """An ADU; number: the TCP transaction, 0 over RTU; function 0: it is damaged."""
 
     raw: bytes
-    unit: int
-    number: int
-    pdu: bytes | None
+    unit: int = 0
+    number: int = 0
+    function: int = 0
+    body: bytes = b""
+
+    @property
+    def is_good(self) -> bool:
+        """Whether it has length and checksum of an ADU."""
+        return self.function != 0
 
 
-class Splitter(ABC):
-    """Splits the stream of one direction into ADUs."""
+class AduReader:
+    """Splits the stream of one direction into ADUs.
 
-    def __init__(self) -> None:
+    TCP has a header: transaction, 0, length, unit. On RTU the function determines the length, and
+    a CRC-16 confirms it.
+    """
+
+    def __init__(self, direction: Direction, *, over_tcp: bool) -> None:
+        self._sizes = _SIZES[direction]
+        self._next = self._next_tcp if over_tcp else self._next_rtu
+        self._pause = float("inf") if over_tcp else _PAUSE
         self._buffer = b""
+        self._last = 0.0
 
     @property
     def has_partial_frame(self) -> bool:
         """Whether the last bytes begin a frame."""
         return bool(self._buffer)
 
-    @abstractmethod
     def feed(self, time: float, data: bytes) -> list[Adu]:
-        """Decode bytes; returns the complete frames."""
-
-
-class TcpSplitter(Splitter):
-    """Splits TCP ADUs by their header: transaction, 0, length, unit."""
-
-    def feed(self, time: float, data: bytes) -> list[Adu]:
-        """Decode bytes; returns the complete frames."""
-        self._buffer += data
-        found = []
-        while len(self._buffer) >= 7:
-            number, protocol, length, unit = struct.unpack_from(">HHHB", self._buffer)
-            if protocol or not 2 <= length <= 254:
-                found.append(Adu(self._buffer, unit, number, None))
-                self._buffer = b""
-                break
-            if len(self._buffer) < 6 + length:
-                break
-            raw, self._buffer = self._buffer[: 6 + length], self._buffer[6 + length :]
-            found.append(Adu(raw, unit, number, raw[7:]))
-        return found
-
-
-class RtuSplitter(Splitter):
-    """Splits RTU ADUs, whose function determines the length; CRC-16, low byte first."""
-
-    def __init__(self, direction: Direction) -> None:
-        super().__init__()
-        self._direction: Direction = direction
-        self._last = 0.0
-
-    def feed(self, time: float, data: bytes) -> list[Adu]:
-        """Decode bytes; returns the complete frames."""
-        found = []
-        if self._buffer and time - self._last > _PAUSE:
-            found.append(Adu(self._buffer, self._buffer[0], 0, None))
-            self._buffer = b""
+        """Decode bytes; returns the complete frames, and damaged ones."""
+        found: list[Adu] = []
+        if self._buffer and time - self._last > self._pause:
+            found.append(Adu(self._taken(len(self._buffer))))
         self._last = time
         self._buffer += data
-        while len(self._buffer) >= _MIN_LENGTH:
-            begin, size = self._first_valid()
-            if not size:
-                break
-            if begin:
-                found.append(self._damaged(begin))
-            raw, self._buffer = self._buffer[:size], self._buffer[size:]
-            found.append(Adu(raw, raw[0], 0, raw[1:-2]))
-        if len(self._buffer) >= _MIN_LENGTH and not self._may_be_partial():
-            found.append(self._damaged(len(self._buffer)))
+        while (adu := self._next()) is not None:
+            found.append(adu)
         return found
 
-    def _first_valid(self) -> tuple[int, int]:
-        """Offset and size of the first valid ADU; size 0 for none."""
-        for begin in range(len(self._buffer) - _MIN_LENGTH + 1):
-            size = self._size(self._buffer[begin:])
-            end = begin + size
-            if size and end <= len(self._buffer):
-                raw = self._buffer[begin:end]
-                if crc16(raw[:-2]) == raw[-2:]:
-                    return begin, size
-        return 0, 0
-
-    def _may_be_partial(self) -> bool:
-        """Whether the buffer may begin an ADU."""
-        return len(self._buffer) < self._size(self._buffer)
-
-    def _damaged(self, size: int) -> Adu:
+    def _taken(self, size: int) -> bytes:
         raw, self._buffer = self._buffer[:size], self._buffer[size:]
-        return Adu(raw, raw[0], 0, None)
+        return raw
 
-    def _size(self, data: bytes) -> int:
-        """Size of the ADU that begins with these bytes; 0 where it is invalid."""
-        function = data[1]
-        if self._direction == "host" and function & 0x80:
-            return 5
-        if function in _SIZES[self._direction]:
-            return _SIZES[self._direction][function]
-        if function not in _COUNTS[self._direction]:
+    def _next_tcp(self) -> Adu | None:
+        if len(self._buffer) < _HEADER:
+            return None
+        number, protocol, length, unit = struct.unpack_from(">HHHB", self._buffer)
+        if protocol or not 2 <= length <= 254:
+            return Adu(self._taken(len(self._buffer)))
+        if len(self._buffer) < 6 + length:
+            return None
+        raw = self._taken(6 + length)
+        return Adu(raw, unit, number, raw[7], raw[8:])
+
+    def _next_rtu(self) -> Adu | None:
+        """Return the first valid ADU, or the damaged bytes before it."""
+        for begin in range(len(self._buffer) - _RTU_MIN + 1):
+            size = self._size(begin)
+            raw = self._buffer[begin : begin + size]
+            if size and len(raw) == size and crc16(raw[:-2]) == raw[-2:]:
+                if begin:
+                    return Adu(self._taken(begin))
+                return Adu(self._taken(size), raw[0], 0, raw[1], raw[2:-2])
+        # What cannot become an ADU is damaged.
+        is_whole = len(self._buffer) >= max(_RTU_MIN, self._size(0))
+        return Adu(self._taken(len(self._buffer))) if is_whole else None
+
+    def _size(self, begin: int) -> int:
+        """Size of the ADU that begins here; 0 where it is invalid."""
+        if len(self._buffer) < begin + 2:
             return 0
-        at, around = _COUNTS[self._direction][function]
-        size = around + data[at] if len(data) > at else around
-        return size if size <= _MAX_LENGTH else 0
+        at, around = self._sizes.get(self._buffer[begin + 1], (None, 0))
+        counted = 0 if at is None else sum(self._buffer[begin + at : begin + at + 1])
+        size = around + counted
+        return size if size <= _RTU_MAX else 0

@@ -1,22 +1,19 @@
 """Messages of a serial line."""
 
-from drivers.codec.serial_line.frame import NEUTRAL, Frame, FrameReader
+from drivers.codec.serial_line.frame import NEUTRAL, FrameReader
 from drivers.protocol.records import Refusal
 from drivers.protocol.serial_payload import HELLO as HELLO_NUMBER
 from drivers.protocol.serial_payload import unpack_identity, unpack_words
-from drivers.protocol.table import BY_NUMBER, EVENT, NAK, REFUSALS, VERSION
+from drivers.protocol.table import EVENT, REFUSALS, VERSION
 from sim.witness.capture import Direction
 from sim.witness.decoded import (
-    HELLO,
-    Damaged,
     DecodedFrame,
     Message,
     Reply,
     Request,
-    event_of,
-    nak_of,
-    reply_of,
+    damaged,
     request_of,
+    sent_by_amplifier,
 )
 
 _MAX_REST = 512  # bytes kept of a frame that does not end
@@ -42,43 +39,26 @@ class SerialDecoder:
 def _decode(direction: Direction, piece: bytes) -> Message:
     frames = FrameReader().feed(piece + b"\0")
     if not frames:
-        return Damaged("a frame of invalid length or checksum")
+        return damaged("a frame of invalid length or checksum")
     (frame,) = frames
     if frame.is_reply != (direction == "host") and frame.type != EVENT:
-        return Damaged("a frame of the wrong direction")
+        return damaged("a frame of the wrong direction")
+    key = (frame.address, frame.sequence, frame.type) if frame.address else None
+    is_hello = frame.type == HELLO_NUMBER
+    message: Message
     try:
-        return _request(frame) if direction == "amplifier" else _from_amplifier(frame)
+        words = () if is_hello else unpack_words(frame.payload)
+        if direction == "amplifier":
+            message = request_of(frame.type, words, frame.address, key)
+        elif is_hello:
+            message = Reply(frame.address, key, unpack_identity(frame.payload))
+        else:
+            message = sent_by_amplifier(frame.type, words, frame.address, frame.sequence)
     except Refusal as refusal:
         if direction == "amplifier":
-            return Request(f"type {frame.type}", frame.address, _key(frame), problem=str(refusal))
-        return Reply(frame.address, _key(frame), problem=str(refusal))
-
-
-def _key(frame: Frame) -> tuple[int, int, int] | None:
-    return (frame.address, frame.sequence, frame.type) if frame.address else None
-
-
-def _request(frame: Frame) -> Message:
-    if frame.type == HELLO_NUMBER:
-        return Request(HELLO, frame.address, _key(frame))
-    if frame.version != VERSION:
-        return Damaged(f"protocol version {frame.version}")
-    return request_of(frame.type, unpack_words(frame.payload), frame.address, _key(frame))
-
-
-def _from_amplifier(frame: Frame) -> Message:
-    words = () if frame.type == HELLO_NUMBER else unpack_words(frame.payload)
-    version = NEUTRAL if frame.type == HELLO_NUMBER else VERSION
-    if frame.type == NAK:
-        nak = nak_of(words, frame.address, (frame.address, frame.sequence, *words[:1]))
-        if frame.version == VERSION or nak.refusal == REFUSALS["UNSUPPORTED_VERSION"]:
-            return nak
-    if frame.version != version:
-        return Damaged(f"protocol version {frame.version}")
-    if frame.type == EVENT:
-        return event_of(words, frame.address)
-    if frame.type == HELLO_NUMBER:
-        return Reply(frame.address, _key(frame), unpack_identity(frame.payload))
-    if frame.type not in BY_NUMBER:
-        return Damaged(f"a reply of unknown type {frame.type}")
-    return reply_of(BY_NUMBER[frame.type].name, words, frame.address, _key(frame))
+            return Request(f"type {frame.type}", frame.address, key, problem=str(refusal))
+        return Reply(frame.address, key, problem=str(refusal))
+    is_other = frame.version != (NEUTRAL if is_hello else VERSION)
+    if is_other and getattr(message, "refusal", 0) != REFUSALS["UNSUPPORTED_VERSION"]:
+        return damaged(f"protocol version {frame.version}")
+    return message

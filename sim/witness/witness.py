@@ -5,11 +5,9 @@ from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from typing import Any, Literal
 
 from sim.witness.amplifier_session import AmplifierSession
-from sim.witness.capture import Direction
+from sim.witness.capture import Direction, capture_line
 from sim.witness.config import WitnessConfig, parse_config
-from sim.witness.decoded import CHANGING, Damaged
-from sim.witness.delays import Delays
-from sim.witness.exchanges import Exchanges
+from sim.witness.deadlines import Delays
 from sim.witness.expected_amplifier import ExpectedAmplifier
 from sim.witness.host_rules import HostRules
 from sim.witness.set_rules import ExpectedSets
@@ -30,48 +28,50 @@ class Witness:
         self,
         config: Mapping[str, Any] | WitnessConfig,
         *,
-        record: Callable[[str], None] | None = None,
+        record: Callable[[str], None] = lambda line: None,
     ) -> None:
         self._config = config if isinstance(config, WitnessConfig) else parse_config(config)
         self._report = Report()
         self._record = record
         self._now = -math.inf
         self.frames = 0
-        self._sessions: dict[str, AmplifierSession] = {}
-        self._wires: dict[str, WatchedWire] = {}
-        for wire, kind in self._config.wires.items():
-            sessions = {}
-            for name, one in self._config.amplifiers.items():
-                if one.wire == wire:
-                    sessions[one.address] = self._sessions[name] = self._session(name)
-            self._wires[wire] = WatchedWire(wire, kind, sessions)
-        times = self._config.times_s
         self._delays = Delays()
+        self._sessions = {name: self._session(name) for name in self._config.amplifiers}
+        times = self._config.times_s
         self._host = HostRules(self._sessions, times=times, delays=self._delays)
-        self._exchanges = Exchanges(
-            self._host, times=times, delays=self._delays, report=self._report
-        )
+        self._wires = {
+            wire: WatchedWire(
+                wire,
+                kind,
+                {
+                    one.config.address: one
+                    for one in self._sessions.values()
+                    if one.config.wire == wire
+                },
+                host=self._host,
+                times=times,
+                delays=self._delays,
+                report=self._report,
+            )
+            for wire, kind in self._config.wires.items()
+        }
 
     def _session(self, name: str) -> AmplifierSession:
         config = self._config.amplifiers[name]
 
-        def report(invariant: str, time: float, sentence: str) -> None:
+        def report_always(invariant: str, time: float, sentence: str) -> None:
             self._report.add(invariant, config.wire, time, sentence)
 
         def is_disturbed(time: float) -> bool:
             return self._wires[config.wire].is_disturbed(time)
 
-        def report_unless_disturbed(invariant: str, time: float, sentence: str) -> None:
-            if not is_disturbed(self._now):
-                report(invariant, time, sentence)
+        def report(invariant: str, time: float, sentence: str) -> None:
+            if not is_disturbed(time):
+                report_always(invariant, time, sentence)
 
-        amplifier = ExpectedAmplifier(
-            name,
-            times=self._config.times_s,
-            report=report_unless_disturbed,
-            report_always=report,
-        )
-        return AmplifierSession(name, config, amplifier, report, is_disturbed)
+        slack = self._config.times_s.slack
+        amplifier = ExpectedAmplifier(name, slack=slack, report=report, report_always=report_always)
+        return AmplifierSession(name, config, amplifier, report_always, report, is_disturbed)
 
     @property
     def wires(self) -> tuple[str, ...]:
@@ -81,21 +81,8 @@ class Witness:
     def record_bytes(self, link: str, direction: Direction, time: float, data: bytes) -> None:
         """Process bytes on a wire, toward the amplifier or the host."""
         self._advance(time)
-        wire = self._wires[link]
-        if self._record is not None:
-            arrow = ">" if direction == "amplifier" else "<"
-            self._record(f"{time:.6f} {link} {arrow} {data.hex()}")
-        for begun, (raw, message) in wire.feed(direction, time, data):
-            self.frames += 1
-            self._report.frame(link, time, direction, raw)
-            if message is None:
-                continue
-            if isinstance(message, Damaged):
-                self._exchanges.damaged(wire, time, direction, message, begun)
-            if direction == "amplifier":
-                self._exchanges.sent(wire, time, raw, message, begun)
-            else:
-                self._exchanges.received(wire, time, message)
+        self._record(capture_line(time, link, direction, data))
+        self.frames += self._wires[link].feed(direction, time, data)
 
     def delayed(self, until: float, duration: float) -> None:
         """Note that this program did not run for a duration [s] until a time [s].
@@ -107,28 +94,12 @@ class Witness:
     def opened(self, link: str, time: float) -> None:
         """Note that a host has opened a wire: its amplifiers are not identified yet."""
         self._advance(time)
-        wire = self._wires[link]
-        wire.reset()
-        wire.forget_pending()
-        for session in wire.sessions.values():
-            session.is_open, session.is_identified, session.session = True, False, None
-            session.layers.clear()
-            session.constants.clear()  # it may be another one
-            session.amplifier.forget_state()
+        self._wires[link].opened()
 
     def closed(self, link: str, time: float) -> None:
         """Note that the host has closed or lost a wire."""
         self._advance(time)
-        wire = self._wires[link]
-        if wire.pending:
-            wire.disturb(time)  # the next host may receive their replies
-        for pending in wire.pending.values():
-            if pending.sent.request.name in CHANGING:
-                pending.session.amplifier.forget_state()  # it may execute a request unheard
-        wire.forget_pending()
-        for session in wire.sessions.values():
-            session.is_open = False
-            session.stop_requested_at = session.last_feed = session.first_stop = None
+        self._wires[link].closed(time)
 
     def contacts(
         self, time: float, contacts: Collection[Hashable], *, is_answerable: bool = True
@@ -142,7 +113,7 @@ class Witness:
 
     def expect(self, expected: ExpectedSets | None) -> None:
         """Set what every pattern must be, by amplifier and channel; None for any."""
-        self._host.expect(expected)
+        self._host.expected = expected
 
     def operator_command(self, time: float, command: OperatorCommand) -> None:
         """Note an operator's command to the controller."""
@@ -158,9 +129,6 @@ class Witness:
         """Note the start or the end of injected faults on a wire or its amplifiers."""
         self._advance(time)
         self._wires[link].set_disturbed(time, is_on=are_on)
-        if not are_on:  # what amplifiers did meanwhile may be unseen
-            for session in self._wires[link].sessions.values():
-                session.amplifier.forget_state()
 
     def levels(
         self,
@@ -176,12 +144,11 @@ class Witness:
         for channel, level in enumerate(levels):
             limits = session.config.channels.get(channel)
             if level > (limits.level if limits is not None else 0.0) + 0.002:
-                session.report(
+                session.report_always(
                     "limits", time, f"channel {channel} of {amplifier} has level {level:.4f}"
                 )
-        wire = self._wires[session.config.wire]
         # A reply that is on its way is of an earlier time, which must not be passed before.
-        is_pending = any(pending.session is session for pending in wire.pending.values())
+        is_pending = self._wires[session.config.wire].is_pending(session)
         if not (is_pending or session.is_disturbed(time)):
             session.amplifier.check_sensors(levels, frequencies or {}, time)
 
@@ -189,12 +156,12 @@ class Witness:
         """The violations in order; time [s]: end of the observation."""
         if time is not None:
             self._advance(time)
-        return self._report.found
+        return list(self._report.found)
 
     def _advance(self, time: float) -> None:
         self._now = max(self._now, time)
         self._host.advance(self._now)
+        for session in self._sessions.values():
+            session.amplifier.advance(self._now)
         for wire in self._wires.values():
-            for session in wire.sessions.values():
-                session.amplifier.advance(self._now)
-            self._exchanges.check_overdue(wire, self._now)
+            wire.advance(self._now)

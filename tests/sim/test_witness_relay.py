@@ -79,7 +79,7 @@ def test_parse_endpoint_splits_a_url(url: str, place: str, address: int) -> None
         *("sim://rig.yaml", "serial://", "modbus+tcp://host/1", "nonsense"),
         *("serial:///dev/ttyUSB0?address=300", "serial:///dev/ttyUSB0?baud=fast"),
         *("modbus+tcp://127.0.0.1:502/0", "modbus+tcp://127.0.0.1:99999/1"),
-        *("can+slcan:///dev/ttyACM0#64", "modbus+rtu:///dev/ttyS1#two"),
+        *("can+slcan:///dev/ttyACM0#128", "modbus+rtu:///dev/ttyS1#two"),
     ],
 )
 def test_parse_endpoint_refuses_an_invalid_url(url: str) -> None:

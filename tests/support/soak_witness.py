@@ -98,7 +98,7 @@ class SoakWitness:
     def found(self) -> Sequence[str]:
         """What it has found until now, with the frames around it."""
         return [
-            f"{one.time - START:.6f} {one.wire} {one.invariant}: {one.sentence}"
+            f"{one.time_s - START:.6f} {one.wire} {one.invariant}: {one.sentence}"
             + "".join(f"\n        {frame}" for frame in one.frames)
             for one in self._witness.finish(self._loop.time())
         ]

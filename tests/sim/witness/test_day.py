@@ -15,6 +15,7 @@ from virtual_loop import run_virtual
 from words_line import KINDS
 
 SWELL = Shape(0.01, (0.1 + 0j, 0.3 + 0j, 0.1 + 0j))
+SLOW = Shape(0.04, (0.05 + 0j,))
 
 
 class Day:
@@ -40,13 +41,17 @@ class Day:
                 each.cancel()
 
     async def plays(self) -> None:
-        """A tone is renewed, read back and ends by itself; another swells and fades beside it."""
+        """A tone is renewed, read back and ends by itself; another swells, anew and
+        before what waits for its onset, and fades beside it."""
         tones = (Tone(0, 100.0, 0.5), Tone(1, 100.0, 0.3, 90.0))
         await self.apply(Layer(0, tones, 0.01, 0.3), rest=0.2)
         await self.apply(Layer(0, (), 0.01, 0.3, renew=True), rest=0.15)
         await self.host._request("GetAchieved", {"layer": 0}, Priority.OTHER)
         swelling = Tone(0, 150.0, 0.2, onset=SWELL, ending=SWELL)
         await self.apply(Layer(1, (swelling,), 0.005), rest=0.1)
+        await self.apply(Layer(1, (Tone(0, 150.0, 0.2, onset=SLOW),), 0.005), rest=0.02)
+        waiting = (Tone(0, 150.0, 0.2), Tone(1, 100.0, 0.3))
+        await self.apply(Layer(1, waiting, 0.005, after=True), rest=0.2)
         await self.apply(Layer(1, (), 0.005), rest=0.2)
 
     async def stops(self) -> None:

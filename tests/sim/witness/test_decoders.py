@@ -9,21 +9,9 @@ from typing import Any
 import pytest
 
 from drivers.codec.modbus.crc import crc16
-from sim.witness.can_decoder import CanDecoder
 from sim.witness.capture import Direction
-from sim.witness.decoded import (
-    BootUp,
-    Damaged,
-    Event,
-    Message,
-    OtherHost,
-    Progress,
-    Reply,
-    Request,
-)
-from sim.witness.modbus_decoder import ModbusDecoder
-from sim.witness.serial_decoder import SerialDecoder
-from sim.witness.watched_wire import Decoder
+from sim.witness.decoded import Message, Reply, Request
+from sim.witness.watched_wire import decoder_of
 
 DOCS = Path(__file__).parents[3] / "docs" / "reference"
 STATUS = {"state": 4, "fault": 0, "flags": 1, "watchdog_left": 250, "temperature": 250}
@@ -43,8 +31,8 @@ MEANINGS: dict[str, list[tuple[str, dict[str, Any]]]] = {
     "Stop along 5 ms, to all": [("Stop", {"ramp": 5})],
 }
 EVENTS = {
-    "Arm": ("Event", {"state": 4, "fault": 0, "channel": 255, "latch": 0}),
-    "Stop along 5 ms, to all": ("Event", {"state": 5, "fault": 0, "channel": 255, "latch": 1}),
+    "Arm": ("event", {"state": 4, "fault": 0, "channel": 255, "latch": 0}),
+    "Stop along 5 ms, to all": ("event", {"state": 5, "fault": 0, "channel": 255, "latch": 1}),
 }
 
 
@@ -62,18 +50,14 @@ def shown(page: str) -> Iterator[tuple[str, Direction, str]]:
 
 
 def summary(message: Message) -> tuple[str, dict[str, Any]]:
-    """Return what a message is, and its values."""
-    match message:
-        case Request(problem=""):
-            return message.name, message.values
-        case Reply(problem="", values=None) if message.refusal:
-            return "refusal", {"code": message.refusal}
-        case Reply(problem="", values=dict() as values):
-            return "reply", values
-        case Event():
-            return "Event", message.values
-        case _:
-            return type(message).__name__, {}
+    """Return what a message is, and its values; of one that is wrong what is said of it."""
+    if isinstance(message, Request):
+        return message.name, {"problem": True} if message.problem else message.values
+    if isinstance(message, Reply):
+        if message.refusal or message.problem:
+            return "refusal", {"code": message.refusal or message.problem}
+        return "reply", message.values or {}
+    return message.what, {"text": message.text} if message.text else message.values
 
 
 def slcan(direction: Direction, frame: str) -> bytes:
@@ -92,17 +76,11 @@ def socketcand(direction: Direction, frame: str) -> bytes:
 
 def decoded(kind: str) -> Iterator[tuple[str, Message]]:
     """Yield the messages of a page with their titles."""
-    decoder: Decoder
-    match kind:
-        case "serial":
-            decoder, page = SerialDecoder(), "serial"
-        case "tcp" | "rtu":
-            decoder, page = ModbusDecoder(over_tcp=kind == "tcp"), "modbus"
-        case _:
-            decoder, page = CanDecoder(kind), "can"
+    page = {"serial": "serial", "slcan": "can", "socketcand": "can"}.get(kind, "modbus")
+    decoder = decoder_of(kind)
     titles = [*dict.fromkeys(title for title, _, _ in shown(page))]  # a second apart
     for number, (title, direction, text) in enumerate(shown(page)):
-        if page == "modbus" and ("RTU" in title) != (kind == "rtu"):
+        if page == "modbus" and ("RTU" in title) != (kind == "modbus-rtu"):
             continue
         if page == "can":
             as_text = slcan if kind == "slcan" else socketcand
@@ -111,11 +89,11 @@ def decoded(kind: str) -> Iterator[tuple[str, Message]]:
             data = bytes.fromhex(text)
         for raw, message in decoder.feed(direction, titles.index(title) + 0.001 * number, data):
             assert raw
-            if message is not None and not isinstance(message, Progress):
+            if message is not None and getattr(message, "what", "event") == "event":
                 yield title, message
 
 
-@pytest.mark.parametrize("kind", ["serial", "tcp", "rtu", "slcan", "socketcand"])
+@pytest.mark.parametrize("kind", ["serial", "modbus-tcp", "modbus-rtu", "slcan", "socketcand"])
 def test_bytes_of_the_pages_mean_what_stands_beside_them(kind: str) -> None:
     """Each request, reply, refusal and Event, on every wire; none is damaged."""
     found: dict[str, list[tuple[str, dict[str, Any]]]] = {}
@@ -126,7 +104,7 @@ def test_bytes_of_the_pages_mean_what_stands_beside_them(kind: str) -> None:
         named = title.replace("The commit on RTU", "Commit")
         (begins,) = [each for each in MEANINGS if named.startswith(each)]
         expected = MEANINGS[begins]
-        if any(name == "Event" for name, _ in messages):
+        if any(name == "event" for name, _ in messages):
             expected = [*expected[:1], EVENTS[begins], *expected[1:]]
         assert [name for name, _ in messages] == [name for name, _ in expected], title
         for (_, values), (_, must) in zip(messages, expected, strict=True):
@@ -139,129 +117,129 @@ def test_set_of_the_pages_has_the_words_of_the_first_page() -> None:
     shown_words = text.partition("The amplifier replies")[0]
     rows = re.findall(r"(?m)^ {4,6}((?:[0-9A-F]{4}[ ·]+)*[0-9A-F]{4})", shown_words)
     words = [int(word, 16) for row in rows for word in re.findall(r"[0-9A-F]{4}", row)]
-    for kind in ("serial", "tcp", "slcan"):
+    for kind in ("serial", "modbus-tcp", "slcan"):
         (message,) = [
             each for _, each in decoded(kind) if isinstance(each, Request) and each.name == "Set"
         ]
         assert message.values["stream"] == words[3:]
 
 
-def tcp(unit: int, number: int, pdu: str) -> bytes:
-    """Return an ADU of Modbus TCP: transaction, 0, length, unit, PDU."""
+def tcp(number: int, pdu: str) -> bytes:
+    """Return an ADU of Modbus TCP for unit 1: transaction, 0, length, unit, PDU."""
     data = bytes.fromhex(pdu)
-    return struct.pack(">HHHB", number, 0, len(data) + 1, unit) + data
+    return struct.pack(">HHHB", number, 0, len(data) + 1, 1) + data
 
 
-def one(decoder: Decoder, direction: Direction, data: bytes) -> Message | None:
-    """Return the one message of bytes."""
-    ((_, message),) = decoder.feed(direction, 0.0, data)
-    return message
+def rtu(adu: str) -> bytes:
+    """Return an ADU of RTU with its checksum."""
+    return bytes.fromhex(adu) + crc16(bytes.fromhex(adu))
 
 
-@pytest.mark.parametrize(
-    ("response", "refusal", "problem"),
-    [
-        ("84 02", 1, ""),  # UNKNOWN_TYPE
-        ("84 06", 7, ""),  # BUSY
-        ("04 04 0008 0500", 5, ""),  # WRONG_STATE
-        ("04 04 0009 0000", 0, "tag must be 8, got 9"),
-        ("03 04 0008 0000", 0, "function must be 4, got 3"),
-    ],
+def can(frame: str) -> bytes:
+    """Return a frame as a line of a serial adapter."""
+    return slcan("amplifier", frame)
+
+
+Heard = tuple[str, bytes, str, dict[str, Any]]
+"""A direction, bytes, and the message that they complete: "" for none."""
+PING: tuple[Heard, ...] = (
+    (">", tcp(5, "10 0C00 0002 04 0008 0007"), "Ping", {"session": 7}),
+    ("<", tcp(5, "10 0C00 0002"), "carried out", {}),
+    (">", tcp(6, "04 0C80 0002"), "read on", {}),
 )
-def test_modbus_replies_that_refuse_or_are_another(
-    response: str, refusal: int, problem: str
-) -> None:
-    """After a Ping with tag 8 was written; numbers of refusals are by the page on messages."""
-    decoder = ModbusDecoder(over_tcp=True)
-    ping = one(decoder, "amplifier", tcp(1, 5, "10 0C00 0002 04 0008 0007"))
-    assert isinstance(ping, Request)
-    assert (ping.name, ping.values) == ("Ping", {"session": 7})
-    assert one(decoder, "host", tcp(1, 5, "10 0C00 0002")) == Progress(ping.key, is_from_host=False)
-    read = one(decoder, "amplifier", tcp(1, 6, "04 0C80 0002"))
-    assert read == Progress(ping.key, is_from_host=True)
-    reply = one(decoder, "host", tcp(1, 6, response))
-    assert isinstance(reply, Reply)
-    assert (reply.refusal, reply.problem) == (refusal, problem)
-    assert reply.key == (None if problem else ping.key)
+"""With tag 8 and session 7."""
+OFF = "0000 0000 0001 0000 0000 0000 0000 00FA 0708 0000 0101 0000 0000 0000 0000"
+"""Registers of a status without a tag: state 1, one channel and one layer."""
+TONES = ("201 04 00 11 05 01 00 64 00", "201 04 01 02 00 D0 07 E8 03")
+"""Measure, two tones."""
+MEASURE = {"reading": 1, "window": 100, "tones": 2, "frequencies": [2000, 1000]}
+TALKS: dict[str, tuple[str, tuple[Heard, ...]]] = {
+    "unknown type": ("modbus-tcp", (*PING, ("<", tcp(6, "84 02"), "refusal", {"code": 1}))),
+    "busy": ("modbus-tcp", (*PING, ("<", tcp(6, "84 06"), "refusal", {"code": 7}))),
+    "wrong state": (
+        "modbus-tcp",
+        (*PING, ("<", tcp(6, "04 04 0008 0500"), "refusal", {"code": 5})),
+    ),
+    "reply with another tag": (
+        "modbus-tcp",
+        (*PING, ("<", tcp(6, "04 04 0009 0000"), "refusal", {"code": "tag must be 8, got 9"})),
+    ),
+    "response of another function": (
+        "modbus-tcp",
+        (
+            *PING,
+            ("<", tcp(6, "03 04 0008 0000"), "refusal", {"code": "function must be 4, got 3"}),
+        ),
+    ),
+    "gateway that finds no amplifier": ("modbus-tcp", (PING[0], ("<", tcp(5, "90 0B"), "", {}))),
+    "status without a write": (
+        "modbus-tcp",
+        (
+            (">", tcp(1, "04 0980 000F"), "GetStatus", {}),
+            ("<", tcp(1, f"04 1E {OFF}"), "reply", {"state": 1}),
+        ),
+    ),
+    "function 23": (
+        "modbus-tcp",
+        ((">", tcp(1, "17 0980 0002 0C00 0002 04 0008 0007"), "a read", {"problem": True}),),
+    ),
+    "function 6": ("modbus-tcp", ((">", tcp(1, "06 0C00 0008"), "a read", {"problem": True}),)),
+    "write amid a message": (
+        "modbus-tcp",
+        ((">", tcp(1, "10 0C01 0001 02 0008"), "a read", {"problem": True}),),
+    ),
+    "broadcast on RTU": (
+        "modbus-rtu",
+        ((">", rtu("00 10 0800 0002 04 0003 0005"), "Stop", {"ramp": 5}),),
+    ),
+    "reply to what a silence came before": (
+        "modbus-rtu",
+        (
+            (">", rtu("01 04 0980 000F"), "GetStatus", {}),
+            (">", rtu("01 10 0700 0003 06 0008 0007 0005"), "Silence", {"session": 7, "ramp": 5}),
+            ("<", rtu(f"01 04 1E {OFF}"), "reply", {"state": 1}),
+            ("<", rtu("01 10 0700 0003"), "carried out", {}),
+        ),
+    ),
+    "frames in any order, and a copy": (
+        "slcan",
+        (
+            (">", can(TONES[1]), "", {}),
+            (">", can(TONES[0]), "Measure", MEASURE),
+            (">", can(TONES[0]), "", {}),
+        ),
+    ),
+    "frame that does not come": (
+        "slcan",
+        (
+            (">", can(TONES[0]), "", {}),
+            (
+                *(">", can("201 05 00 0C 01 07 00 00 00"), "damaged"),
+                {"text": "message 4 without all frames"},
+            ),
+        ),
+    ),
+    "echo, and another host": (
+        "slcan",
+        (
+            (">", can("201 01 00 0C 01 07 00 00 00"), "Ping", {"session": 7}),
+            ("<", can("201 01 00 0C 01 07 00 00 00"), "", {}),
+            ("<", can("201 02 00 03 02 17 2A FA 00"), "other host", {"text": "Arm"}),
+        ),
+    ),
+    "boot-up": ("slcan", (("<", b"t701100\r", "boot", {}),)),
+    "reset by NMT": ("slcan", ((">", b"t00028101\r", "boot", {}),)),
+}
 
 
-def test_modbus_gateway_that_finds_no_amplifier_is_no_reply() -> None:
-    """Exceptions 10 and 11 are not the amplifier's."""
-    decoder = ModbusDecoder(over_tcp=True)
-    decoder.feed("amplifier", 0.0, tcp(1, 5, "10 0C00 0002 04 0008 0007"))
-    assert one(decoder, "host", tcp(1, 5, "90 0B")) is None
-
-
-def test_modbus_status_is_read_without_a_write() -> None:
-    """Any master can look at GetCaps, GetStatus and GetFaults; the tag is 0 then."""
-    decoder = ModbusDecoder(over_tcp=True)
-    request = one(decoder, "amplifier", tcp(3, 1, "04 0980 000F"))
-    assert isinstance(request, Request)
-    assert (request.name, request.address) == ("GetStatus", 3)
-    words = "0000 0000 0001 0000 0000 0000 0000 00FA 0708 0000 0101 0000 0000 0000 0000"
-    reply = one(decoder, "host", tcp(3, 1, f"04 1E {words}"))
-    assert isinstance(reply, Reply)
-    assert reply.values is not None
-    assert (reply.key, reply.values["state"]) == (request.key, 1)
-
-
-@pytest.mark.parametrize(
-    "pdu", ["17 0980 0002 0C00 0002 04 0008 0007", "06 0C00 0008", "10 0C01 0001 02 0008"]
-)
-def test_modbus_writes_that_are_no_message_are_named(pdu: str) -> None:
-    """Other functions, and writes that do not begin where a message does."""
-    request = one(ModbusDecoder(over_tcp=True), "amplifier", tcp(1, 1, pdu))
-    assert isinstance(request, Request)
-    assert request.problem
-
-
-def test_modbus_broadcast_has_no_reply_on_rtu() -> None:
-    """Stop for unit 0; over TCP unit 0 is a unit."""
-    body = bytes.fromhex("00 10 0800 0002 04 0003 0005")
-    stop = one(ModbusDecoder(over_tcp=False), "amplifier", body + crc16(body))
-    assert isinstance(stop, Request)
-    assert (stop.name, stop.address, stop.key) == ("Stop", 0, None)
-
-
-PING = ("201 01 00 0C 01 07 00 00 00",)
-ARM = ("201 02 00 03 02 17 2A FA 00",)
-SILENCE = ("201 03 00 07 02 09 00 05 00",)
-READING = ("201 04 00 11 05 01 00 64 00", "201 04 01 02 00 D0 07 E8 03")  # Measure, two tones
-
-
-def heard(direction: Direction, *frames: str, decoder: CanDecoder | None = None) -> list[Message]:
-    """Return the messages of frames."""
-    decoder = decoder or CanDecoder("slcan")
-    found = [decoder.feed(direction, 0.001, slcan(direction, each)) for each in frames]
-    return [message for each in found for _, message in each if message is not None]
-
-
-def test_can_message_has_its_frames_in_any_order() -> None:
-    """It is whole with the last of them, and a copy of a frame has no effect."""
-    (message,) = heard("amplifier", *reversed(READING), READING[0])
-    assert isinstance(message, Request)
-    assert message.values == {"reading": 1, "window": 100, "tones": 2, "frequencies": [2000, 1000]}
-
-
-def test_can_message_without_a_frame_is_damaged() -> None:
-    """The next number says so; the next message is whole."""
-    damaged, ping = heard("amplifier", READING[0], "201 05 00 0C 01 07 00 00 00")
-    assert damaged == Damaged("message 4 without all frames")
-    assert isinstance(ping, Request)
-
-
-def test_can_requests_of_another_host_are_no_echo() -> None:
-    """What the bus brings is the host's own request, or another host's."""
-    decoder = CanDecoder("slcan")
-    heard("amplifier", *PING, decoder=decoder)
-    assert heard("host", *PING, decoder=decoder) == []
-    assert heard("host", *ARM, decoder=decoder) == [OtherHost(1, "Arm")]
-    assert heard("host", *SILENCE, decoder=decoder) == [OtherHost(1, "Silence")]
-
-
-@pytest.mark.parametrize(
-    ("direction", "frame"), [("host", "t701100\r"), ("amplifier", "t00028101\r")]
-)
-def test_can_node_that_starts_anew_is_noted(direction: Direction, frame: str) -> None:
-    """It sends its boot-up, or a master resets it (NMT 129)."""
-    assert one(CanDecoder("slcan"), direction, frame.encode()) == BootUp(1)
+@pytest.mark.parametrize("talk", TALKS)
+def test_decoders_read_what_no_page_shows(talk: str) -> None:
+    """Refusals, late and damaged frames, other hosts; numbers are by the page on messages."""
+    kind, pieces = TALKS[talk]
+    decoder = decoder_of(kind)
+    for arrow, data, what, values in pieces:
+        direction: Direction = "amplifier" if arrow == ">" else "host"
+        heard = [message for _, message in decoder.feed(direction, 0.001, data)]
+        name, found = summary(heard[0]) if heard and heard[0] is not None else ("", {})
+        assert name == what
+        assert {each: found[each] for each in values} == values

@@ -41,7 +41,7 @@ async def relays(
     async with contextlib.AsyncExitStack() as stack:
         for endpoint, name in zip(endpoints, names, strict=True):
             if endpoint.location not in relayed:
-                relay = _serial_relay if endpoint.is_device else _tcp_relay
+                relay = _serial_relay if endpoint.baud else _tcp_relay
                 relayed[endpoint.location] = await stack.enter_async_context(
                     relay(endpoint, name, observer)
                 )

@@ -2,30 +2,36 @@
 
 from dataclasses import dataclass
 
-from drivers.urls.can_bus import CanUrl
-from drivers.urls.modbus import ModbusUrl
-from drivers.urls.serial_line import SerialUrl
-
+from drivers.codec.can_bus.segments import NODE_MAX
 from drivers.errors import CommandError
+from drivers.urls import ADDRESS, ADDRESS_MAX, BAUD, RTU_BAUD, AmplifierUrl
 from model.errors import InputError
 
-_FORMS = "serial://, modbus+tcp://, modbus+rtu://, can+socketcand:// or can+slcan://"
+_KINDS = {
+    "serial": ("serial", BAUD, ADDRESS_MAX),
+    "serial+tcp": ("serial", 0, ADDRESS_MAX),
+    "modbus+tcp": ("modbus-tcp", 0, 255),  # where there is only one unit it may be 255
+    "modbus+rtu": ("modbus-rtu", RTU_BAUD, ADDRESS_MAX),
+    "can+socketcand": ("socketcand", 0, NODE_MAX),
+    "can+slcan": ("slcan", 115_200, NODE_MAX),
+}
+"""By scheme: kind of wire, speed of a device [baud], highest address."""
+_FORM = f"one of {', '.join(_KINDS)} with a device or HOST:PORT, as era sim prints it"
+_OPTIONS = ("address", "baud", "bitrate", "parity", "stop")
 
 
 @dataclass(frozen=True)
 class WireEndpoint:
-    """A parsed URL. kind: of wire; location: device or HOST:PORT; address: on the wire."""
+    """A parsed URL. kind: of wire; location: device or HOST:PORT; address: on the wire.
+
+    baud: of a serial device, 0 for a port of the network.
+    """
 
     url: str
     kind: str
     location: str
     address: int
     baud: int
-
-    @property
-    def is_device(self) -> bool:
-        """Whether it is a serial port."""
-        return self.location.startswith("/")
 
     def url_via(self, other: str) -> str:
         """The URL with another location."""
@@ -35,28 +41,15 @@ class WireEndpoint:
 def parse_endpoint(url: str) -> WireEndpoint:
     """Parse a URL; raises InputError where no relay is possible."""
     try:
-        endpoint = _endpoint(url)
+        parsed = AmplifierUrl(url, _FORM, known=_OPTIONS)
+        if parsed.scheme not in _KINDS:
+            raise parsed.refused("scheme must be of a wire that can be relayed")
+        kind, baud, highest = _KINDS[parsed.scheme]
+        place = parsed.server(has_path=True) if parsed.place else parsed.device(baud)
+        text = parsed.options.get("address", parsed.number)
+        if kind == "modbus-tcp":
+            text = parsed.path.strip("/")
+        number = parsed.whole(text, "address", highest) if text else ADDRESS
     except CommandError as problem:
         raise InputError(str(problem)) from problem
-    if endpoint is None or endpoint.location not in url:
-        raise InputError(
-            f"{url}: must be {_FORMS} with a device, or with HOST:PORT; write it as era sim prints "
-            "it"
-        )
-    return endpoint
-
-
-def _endpoint(url: str) -> WireEndpoint | None:
-    scheme = url.partition("://")[0]
-    if scheme == "serial":
-        serial = SerialUrl.parse(url)
-        return WireEndpoint(url, "serial", serial.port, serial.address, serial.baud)
-    if scheme in ("modbus+tcp", "modbus+rtu"):
-        modbus = ModbusUrl.parse(url)
-        kind = scheme.replace("+", "-")
-        return WireEndpoint(url, kind, modbus.endpoint, modbus.unit, modbus.baud)
-    if scheme in ("can+socketcand", "can+slcan"):
-        can = CanUrl.parse(url)
-        place = f"{can.bus.host}:{can.bus.port}" if can.bus.host else can.bus.channel
-        return WireEndpoint(url, scheme.removeprefix("can+"), place, can.node, can.bus.baud)
-    return None
+    return WireEndpoint(url, kind, place.name, number, place.baud if place.device else 0)

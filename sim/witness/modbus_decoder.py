@@ -51,11 +51,6 @@ class _Transaction:
     address: int = 0
     count: int = 0
 
-    @property
-    def transfer(self) -> tuple[int, int, int, int]:
-        """What is read or written: a repeated one takes the place of the one before."""
-        return self.adu.unit, self.adu.function, self.address, self.count
-
     def problem_of(self, response: Adu) -> str:
         """Describe why something is no response to it; "" if it is one."""
         function, body = self.adu.function, response.body
@@ -71,11 +66,7 @@ class _Transaction:
 
 
 class ModbusDecoder:
-    """Decodes both directions, over TCP or RTU.
-
-    Over RTU a request that silences may pass before the reply to another one, which still comes:
-    the first transaction that a response fits has it.
-    """
+    """Decodes both directions, over TCP or RTU."""
 
     def __init__(self, *, over_tcp: bool) -> None:
         self._over_tcp = over_tcp
@@ -83,7 +74,7 @@ class ModbusDecoder:
             "amplifier": AduReader("amplifier", over_tcp=over_tcp),
             "host": AduReader("host", over_tcp=over_tcp),
         }
-        self._open: list[_Transaction] = []
+        self._open: dict[int, _Transaction] = {}  # by number; over RTU at most one
         self._written: dict[tuple[int, int], _Written] = {}  # by unit and number of the message
         self._requests = 0
 
@@ -141,28 +132,16 @@ class ModbusDecoder:
         return Request(BY_NUMBER[number].name if is_present else A_READ, adu.unit, key)
 
     def _remember(self, transaction: _Transaction) -> None:
-        if transaction.key is None:
-            return
-        if not self._over_tcp:
-            last = self._open[-1:]
-            self._open = [each for each in last if each.transfer != transaction.transfer]
-        self._open.append(transaction)
+        if transaction.key is not None:
+            self._open[transaction.adu.number] = transaction
 
     def _response(self, adu: Adu) -> Message | None:
-        awaited = [
-            each
-            for each in self._open
-            if (each.adu.unit, each.adu.number) == (adu.unit, adu.number)
-        ]
-        if not awaited:
+        request = self._open.get(adu.number)
+        if request is None or request.adu.unit != adu.unit:
             return Reply(adu.unit)
-        fitting = [each for each in awaited if not each.problem_of(adu)]
-        request = (fitting or awaited)[0]
-        at = self._open.index(request)
-        # On a line the ones before it have no response any more.
-        del self._open[at if self._over_tcp else 0 : at + 1]
-        if not fitting:
-            return Reply(adu.unit, problem=request.problem_of(adu))
+        del self._open[adu.number]
+        if problem := request.problem_of(adu):
+            return Reply(adu.unit, problem=problem)
         if adu.function != request.adu.function:  # what gateways refuse is no response
             refusal = _EXCEPTIONS.get(adu.body[0])
             return None if refusal is None else Reply(adu.unit, request.key, refusal=refusal)

@@ -192,15 +192,6 @@ TALKS: dict[str, tuple[str, tuple[Heard, ...]]] = {
         "modbus-rtu",
         ((">", rtu("00 10 0800 0002 04 0003 0005"), "Stop", {"ramp": 5}),),
     ),
-    "reply to what a silence came before": (
-        "modbus-rtu",
-        (
-            (">", rtu("01 04 0980 000F"), "GetStatus", {}),
-            (">", rtu("01 10 0700 0003 06 0008 0007 0005"), "Silence", {"session": 7, "ramp": 5}),
-            ("<", rtu(f"01 04 1E {OFF}"), "reply", {"state": 1}),
-            ("<", rtu("01 10 0700 0003"), "carried out", {}),
-        ),
-    ),
     "frames in any order, and a copy": (
         "slcan",
         (

@@ -25,7 +25,7 @@ SCENARIOS: dict[str, Callable[[Chain], Awaitable[None]]] = {
 SERIAL_ONLY = {"noise", "late_copy", "damaged_answer", "foreign_answer"}
 # Over RTU an answer begins within 10 ms, and nothing may be sent before it: 25 ms are a fault, and
 # the stop that follows a fault is still under way when the operator clears.
-NOT_OVER_RTU = {"slow_stop", "slow_lift", "slow_touch", "asked"}
+NOT_OVER_RTU = {"slow_stop", "slow_lift", "slow_touch", "asked", "hung"}
 
 
 def _played() -> list[tuple[str, str, int]]:

@@ -4,25 +4,8 @@ from collections.abc import Iterator
 
 FIRST_PAUSE = 0.1  # s; a loose contact recovers within it
 MAX_PAUSE = 5.0  # s; the longest wait after an adapter was plugged in again
-
-
 GOOD_TIME = 60.0
 """Time [s] of working after which pauses start anew."""
-
-
-class Backoff:
-    """Pauses [s] before restarts: each twice the previous one, the first again after a good run."""
-
-    def __init__(self, first: float = FIRST_PAUSE, maximum: float = MAX_PAUSE) -> None:
-        self._first, self._maximum = first, maximum
-        self._next = first
-
-    def pause(self, *, ran_for: float) -> float:
-        """Return the pause before a restart of what ran for a time [s]."""
-        if ran_for >= GOOD_TIME:
-            self._next = self._first
-        pause, self._next = self._next, min(2 * self._next, self._maximum)
-        return pause
 
 
 def pauses(first: float = FIRST_PAUSE, maximum: float = MAX_PAUSE) -> Iterator[float]:
@@ -31,3 +14,17 @@ def pauses(first: float = FIRST_PAUSE, maximum: float = MAX_PAUSE) -> Iterator[f
     while True:
         yield pause
         pause = min(2 * pause, maximum)
+
+
+class Backoff:
+    """Pauses [s] before restarts: each twice the previous one, the first again after a good run."""
+
+    def __init__(self, first: float, maximum: float) -> None:
+        self._bounds = first, maximum
+        self._pauses = pauses(*self._bounds)
+
+    def pause(self, *, ran_for: float) -> float:
+        """Return the pause before a restart of what ran for a time [s]."""
+        if ran_for >= GOOD_TIME:
+            self._pauses = pauses(*self._bounds)
+        return next(self._pauses)

@@ -6,20 +6,19 @@ listen-only mode, so nothing is sent on the bus.
 
 import re
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 
 import serial
 
-from drivers.codec.can_bus.adapter_text import SLCAN, TextReader
+from drivers.codec.can_bus.adapter_text import SLCAN, SLCAN_RATES, TextReader
 from drivers.codec.can_bus.canopen import BITRATE, cob_id
 from drivers.codec.can_bus.segments import NODE_MAX
 
 _BAUD = 115_200  # ignored by USB devices, which most adapters are
 _REPLY_TIMEOUT = 0.1  # s; USB adapters and their drivers delay bytes by 16 ms at most
 _LISTENING_TIME = 0.2  # s; four heartbeats of 50 ms
-_SPEEDS = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 750_000, 1_000_000)
+_NODES = set(range(1, NODE_MAX + 1))
 _VERSION = re.compile(rb"V([0-9A-Fa-f]{4})\r")
 _END = re.compile(rb"[\r\x07]")  # done, or refused
 _DONE = b"\r"
@@ -52,23 +51,17 @@ def detect_slcan(port: str) -> SlcanAdapter | None:
         if found is None:
             return None
         version = found.group(1).decode()
-        with _listening(line) as is_listening:
-            if not is_listening:
+        line.write(b"C\r")  # in case it was left open
+        _text_until(line, _END)
+        try:
+            speed = b"S%d\r" % SLCAN_RATES.index(BITRATE)
+            if not (_is_done(line, speed) and _is_done(line, b"L\r")):
                 return SlcanAdapter(version, problem="no listen-only mode, so it was not opened")
-            return SlcanAdapter(version, nodes=tuple(sorted(set(_heard(line)))))
-
-
-@contextmanager
-def _listening(line: serial.Serial) -> Iterator[bool]:
-    """Open the adapter in listen-only mode if it has one, and close it afterwards."""
-    line.write(b"C\r")  # in case it was left open
-    _text_until(line, _END)
-    try:
-        yield _is_done(line, b"S%d\r" % _SPEEDS.index(BITRATE)) and _is_done(line, b"L\r")
-    finally:
-        with suppress(serial.SerialException):
-            line.write(b"C\r")
-            line.flush()
+            return SlcanAdapter(version, nodes=tuple(sorted(_heard(line))))
+        finally:
+            with suppress(serial.SerialException):
+                line.write(b"C\r")
+                line.flush()
 
 
 def _is_done(line: serial.Serial, command: bytes) -> bool:
@@ -84,11 +77,11 @@ def _text_until(line: serial.Serial, end: re.Pattern[bytes]) -> bytes:
     return text
 
 
-def _heard(line: serial.Serial) -> Iterator[int]:
-    """Yield the nodes whose heartbeats are received."""
+def _heard(line: serial.Serial) -> set[int]:
+    """Return the nodes whose heartbeats are received."""
     reader, deadline = TextReader(SLCAN), time.monotonic() + _LISTENING_TIME
-    nodes = {cob_id("heartbeat", node): node for node in range(1, NODE_MAX + 1)}
+    heard: set[int] = set()
     while time.monotonic() < deadline:
         for frame in reader.feed(line.read(max(1, line.in_waiting))):
-            if frame.id in nodes:
-                yield nodes[frame.id]
+            heard.add(frame.id - cob_id("heartbeat"))
+    return heard & _NODES

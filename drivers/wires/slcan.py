@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from drivers.codec.can_bus.adapter_text import SLCAN
+from drivers.codec.can_bus.adapter_text import SLCAN, SLCAN_RATES
 from drivers.hardware import Port
 from drivers.host.wire import NETWORK_DELAY
 from drivers.ports.opening import open_port
@@ -11,7 +11,6 @@ from drivers.wires.can_address import CanAddress
 from drivers.wires.text_port import TextPort
 
 _FORM = "can+slcan:///dev/ttyACM0?bitrate=500000#NODE or can+slcan://HOST:PORT#NODE"
-_RATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
 _BAUD = 115_200  # of the adapter's serial port
 _CLOSE = b"\rC\r"
 
@@ -28,8 +27,8 @@ class SlcanAddress(CanAddress):
             delay=NETWORK_DELAY if self.place.host else 0.0,
             settings={"baud": self.place.baud},
         )
-        if self.bitrate not in _RATES:
-            raise parsed.refused(f"bitrate must be one of {', '.join(map(str, _RATES))}")
+        if self.bitrate not in SLCAN_RATES:
+            raise parsed.refused(f"bitrate must be one of {', '.join(map(str, SLCAN_RATES))}")
 
     async def open_port(
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
@@ -38,5 +37,5 @@ class SlcanAddress(CanAddress):
         port = TextPort(SLCAN, on_data, cut_off=b"\r", goodbye=_CLOSE)
         port.below = await open_port(self.place, port.received, on_loss)
         # Closed first, where an earlier host has left it open.
-        port.below.write(_CLOSE + b"S%d\rO\r" % _RATES.index(self.bitrate))
+        port.below.write(_CLOSE + b"S%d\rO\r" % SLCAN_RATES.index(self.bitrate))
         return port

@@ -9,6 +9,8 @@ from drivers.codec.can_bus.canopen import CanFrame
 _MAX_LENGTH = 512  # characters without a terminator; ten times the longest frame
 _ID_MAX = 0x7FF
 _LINE = re.compile(rb"t([0-9A-Fa-f]{3})([0-8])((?:[0-9A-Fa-f]{2})*)")
+SLCAN_RATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
+"""Bit rates [bit/s] by the number of the command S of LAWICEL."""
 _STAMP = 4  # digits of a timestamp, if the adapter is configured to send it
 _ELEMENT = re.compile(
     rb"< frame ([0-9A-Fa-f]{3}) (?:[0-9A-Fa-f]{2} )?[0-9]+\.[0-9]+ "

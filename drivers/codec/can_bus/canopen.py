@@ -50,7 +50,6 @@ class CanFrame(NamedTuple):
 
     id: int
     data: bytes
-    fd: bool = False
 
 
 def cob_id(kind: str, node: int = 0) -> int:

@@ -61,18 +61,6 @@ def test_frame_equals_its_specification(frame: Frame) -> None:
     assert FrameReader().feed(wire) == [frame]
 
 
-@given(st.lists(FRAMES, min_size=1, max_size=5), st.data())
-def test_any_split_gives_the_same_frames(frames: list[Frame], data: st.DataObject) -> None:
-    """However the stream is cut."""
-    stream = b"".join(encode_frame(frame) for frame in frames)
-    cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=8).map(sorted))
-    reader = FrameReader()
-    got = []
-    for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
-        got += reader.feed(stream[start:end])
-    assert got == frames
-
-
 @given(FRAMES, st.integers(0, 10**6))
 def test_flipped_bit_never_gives_another_message(frame: Frame, where: int) -> None:
     """At most the frame is lost."""
@@ -84,15 +72,6 @@ def test_flipped_bit_never_gives_another_message(frame: Frame, where: int) -> No
     got = FrameReader().feed(bytes(wire) + encode_frame(after) + encode_frame(after))
     assert [one for one in got if one not in (frame, after)] == []
     assert got[-1] == after
-
-
-@given(st.binary(max_size=2000))
-def test_noise_gives_no_frame(noise: bytes) -> None:
-    """Random bytes give no frame, and the next good frame is understood."""
-    reader = FrameReader()
-    after = Frame(12, address=1, sequence=1, payload=b"x", version=3)
-    assert reader.feed(noise) == []
-    assert reader.feed(b"\0" + encode_frame(after)) == [after]
 
 
 def test_damaged_frames_are_counted() -> None:
@@ -108,16 +87,6 @@ def test_damaged_frames_are_counted() -> None:
         assert reader.feed(data) == []
         assert len(invalid) == count
     assert len(reader.feed(good)) == 1
-
-
-def test_buffer_is_bounded() -> None:
-    """A megabyte without a delimiter is one damaged frame."""
-    invalid: list[bytes] = []
-    reader = FrameReader(on_invalid=invalid.append)
-    for _ in range(256):
-        reader.feed(b"\x55" * 4096)
-    assert [len(each) for each in invalid] == [250]
-    assert len(reader._rest) == 0
 
 
 def test_long_payload_is_refused() -> None:

@@ -21,7 +21,6 @@ from controller.sources.registry import open_source
 from controller.sources.tuio import TuioSource
 from drivers.errors import CommandError
 from drivers.wires.known import address_of
-from drivers.wires.known import known_schemes as known_wires
 from drivers.wires.serial_line import SerialAddress
 from model.errors import InputError
 from model.structure.materials import KNOWN_MATERIALS, known_material, material_names
@@ -114,7 +113,6 @@ KINDS = [
         "a class derived from WireAddress",
         address_of,
         ("serial+tcp", SerialAddress),
-        known_wires,
         fails="from era_haptics.plugins.wires import WireAddress\n"
         "class THING(WireAddress):\n"
         "    def __init__(self, url): self.line, self.number, self.settings = url, 1, {}\n"

@@ -16,7 +16,7 @@ from drivers.by_hand.reaching import (
     round_trip,
     wire_rows,
 )
-from drivers.by_hand.rows import capability_rows, fault_rows, status_rows
+from drivers.by_hand.rows import capability_rows, fault_rows, in_units, status_rows
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import STOP_RAMP, WATCHDOG, Amplifier
@@ -24,7 +24,7 @@ from drivers.host.comparison import name_of
 from drivers.host.jobs import Priority
 from drivers.host.sensors import check_tones, measure_tones, read_measured, read_sensors
 from drivers.host.timing import check_watchdog
-from drivers.protocol.table import FAULTS, LATCHED, QUANTITIES, STATES, has_feature
+from drivers.protocol.table import COMMAND, FAULTS, LATCHED, QUANTITIES, STATES, has_feature
 from drivers.urls import with_address
 
 _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
@@ -211,8 +211,15 @@ async def drive(
         lowest = QUANTITIES["watchdog"].from_wire(amplifier.capabilities["watchdog_min"])
         watchdog = max(WATCHDOG, lowest)
         check_watchdog(watchdog, round_trip(amplifier))
+        before = await amplifier.read_status()
+        if before["state"] in LATCHED:
+            raise CommandRefused(
+                f"the amplifier does not arm: state {name_of(STATES, before['state'])}, fault "
+                f"{name_of(FAULTS, before['fault'])}; once the cause is gone: era amp clear "
+                f"{shlex.quote(url)}"
+            )
         try:
-            await _arm(amplifier, watchdog, url)
+            await amplifier.arm(random_session(), watchdog)
             await amplifier.stage(_TOKEN, [layer], now=True)
             achieved = await request(amplifier, "GetAchieved", {"layer": layer.number})
             await keep_alive(amplifier, duration, watchdog / 5)
@@ -221,28 +228,5 @@ async def drive(
             with contextlib.suppress(DriverError):
                 await amplifier.disarm(_RAMP)
         after = await amplifier.read_status()
-    played = [
-        {
-            "channel": row["channel"],
-            "frequency_hz": QUANTITIES["frequency"].from_wire(row["frequency"]),
-            "level": QUANTITIES["level"].from_wire(row["level"]),
-            "phase_deg": QUANTITIES["phase"].from_wire(row["phase"]),
-        }
-        for row in achieved["commands"]
-    ]
+    played = [{"channel": row["channel"], **in_units(COMMAND, row)} for row in achieved["commands"]]
     return {"url": url, "achieved": played, "duration_s": duration, **status_rows(after)}
-
-
-async def _arm(amplifier: Amplifier, watchdog: float, url: str) -> None:
-    """Arm with a watchdog [s]; a refusal after a stop or fault names the remedy."""
-    try:
-        await amplifier.arm(random_session(), watchdog)
-    except CommandRefused as refused:
-        now = await amplifier.read_status()
-        if now["state"] not in LATCHED:
-            raise
-        raise CommandRefused(
-            f"the amplifier does not arm: state {name_of(STATES, now['state'])}, fault "
-            f"{name_of(FAULTS, now['fault'])}; once the cause is gone: era amp clear "
-            f"{shlex.quote(url)}"
-        ) from refused

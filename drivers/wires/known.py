@@ -35,11 +35,6 @@ _WIRES: PluginRegistry[Callable[[str], WireAddress]] = PluginRegistry(
 )
 
 
-def known_schemes() -> tuple[str, ...]:
-    """Return the URL schemes, our own first."""
-    return _WIRES.names()
-
-
 def address_of(url: str) -> WireAddress:
     """Parse the URL of an amplifier; CommandError for an unknown or invalid one."""
     return _WIRES.make(url)

@@ -22,7 +22,9 @@ from word_wires import WORD_WIRES, FarSide
 
 pytestmark = pytest.mark.real_time
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
-ADDRESSED = [wire for wire in WORD_WIRES if not wire.endswith(("tcp", "server"))]
+OF_CONNECTIONS = ("tcp", "server", "socketcand")
+ADDRESSED = [wire for wire in WORD_WIRES if not wire.endswith(OF_CONNECTIONS)]
+"""Wires whose far end lasts: the others have one for each connection, at the first addresses."""
 
 
 async def leave_playing(far: FarSide, number: int = 1) -> None:

@@ -26,14 +26,13 @@ from drivers.protocol.table import (
     STATUS_FLAGS,
 )
 from drivers.protocol.tokens import token_after
+from sim.amplifier.capabilities import capabilities
 from sim.amplifier.set_intake import SetIntake, derated
 from sim.amplifier.state_table import TRANSITIONS
 from sim.amplifier.summary import AmplifierSummary
 from sim.amplifier.thermal_model import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD_BELOW, ThermalState
 
 SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
-LAYERS = 8
-VOICES = 16
 _FAULTS_KEPT = 16
 _HIGH_VOLTAGE = 1800.0  # V
 _CAPACITANCE = 1e-9  # F; of an actuator
@@ -58,64 +57,6 @@ class SensorPort(Protocol):
 
     def forget(self) -> None:
         """Forget the reading, as without supply."""
-
-
-class AmplifierPort(Protocol):
-    """An amplifier as its far ends serve it: an `Amplifier`, or one with faults of its supply."""
-
-    @property
-    def identity(self) -> Values:
-        """Values of its identity."""
-
-    @property
-    def state(self) -> str:
-        """Name of its state."""
-
-    @property
-    def fault(self) -> str:
-        """Name of its fault."""
-
-    @property
-    def listeners(self) -> list[Callable[[Values, float], None]]:
-        """Called with the values of every Event, and its time [s]."""
-
-    @property
-    def is_answering(self) -> bool:
-        """Whether it replies at all: neither hung nor without supply."""
-
-    @property
-    def next_event(self) -> float:
-        """Time of its next event [s]."""
-
-    def tick(self, now: float) -> None:
-        """Process the events due by now."""
-
-    def handle(self, name: str, values: Values, now: float) -> Values:
-        """Return the values of the reply to a request at a time [s]; raises Refusal."""
-
-    def restart(self, moment: float) -> None:
-        """Power-cycle it."""
-
-
-def capabilities(channels: int, *, is_output: bool = False) -> Values:
-    """Capabilities of a simulated amplifier with this number of channels.
-
-    is_output: full level is a linear amplifier's output, else the stroke of a motion.
-    """
-    features = ("events", "interlock", "electrical", "address", *(("output",) if is_output else ()))
-    low = _Q["frequency"].to_wire(10.0)  # the guard's floor: below it a plate only rocks
-    high, full = _Q["frequency"].maximum, _Q["level"].maximum
-    limits = {"frequency_min": low, "frequency_max": high, "level_max": full}
-    return {
-        **{"channels": channels, "layers": LAYERS, "voices": VOICES, "set_words": 4096},
-        **{"knots": _Q["knots"].maximum, "features": sum(1 << FEATURES[each] for each in features)},
-        **limits,
-        **{"frequency_step": 1, "level_step": 1, "phase_step": 1, "slew": _Q["slew"].maximum},
-        **{"ramp_max": _Q["ramp"].maximum},
-        **{f"watchdog_{end}": getattr(_Q["watchdog"], f"{end}imum") for end in ("min", "max")},
-        **{"envelope_step_min": 10, "envelope_step_max": _Q["envelope_step"].maximum},
-        "limits": [dict(limits) for _ in range(channels)],
-    }
 
 
 class Amplifier:

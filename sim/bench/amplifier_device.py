@@ -14,7 +14,7 @@ from sim.faults.fault_window import Faults, FaultWindow
 
 
 class AmplifierDevice:
-    """An amplifier of a bench by name, as `sim.amplifier.contract.AmplifierPort`, with its faults.
+    """An amplifier of a bench by name, in the place of an `Amplifier`, with its faults.
 
     Requests advance the bench, and what they change moves its plate. In a storm of Naks it refuses
     all of them but Hello. address: on its wire, from 1; plug_listeners: called when the wire is

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
-from sim.amplifier.contract import AmplifierPort
 from sim.far_ends.modbus.frames import RequestAdu, RtuReader, TcpReader, rtu_frame, tcp_frame
 from sim.far_ends.modbus.pdu import (
     ILLEGAL_ADDRESS,
@@ -25,7 +24,7 @@ from sim.far_ends.modbus.pdu import (
     registers_read,
     to_write,
 )
-from sim.transport.far_end import FarEnd, Send
+from sim.transport.far_end import AmplifierPort, FarEnd, Send
 
 _MARGIN = 0.001  # s; behind the end of a pause, which must be exceeded
 _BOX = 256  # registers of a message

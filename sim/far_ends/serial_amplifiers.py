@@ -23,8 +23,7 @@ from drivers.protocol.table import (
     nak_of,
     read_request,
 )
-from sim.amplifier.contract import AmplifierPort
-from sim.transport.far_end import FarEnd, Send
+from sim.transport.far_end import AmplifierPort, FarEnd, Send
 
 
 class SerialAmplifiers(FarEnd):

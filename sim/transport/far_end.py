@@ -5,10 +5,11 @@ import math
 import socket
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Self, cast
+from typing import Self, TypeAlias, cast
 
 from drivers import clock
 from drivers.errors import LinkError
+from sim.amplifier.contract import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.faults.fault_window import Faults
 from sim.transport.line import TwoWayLine
@@ -37,6 +38,9 @@ class FarEnd(ABC):
     def close(self) -> None:  # noqa: B027
         """Send nothing more."""
 
+
+AmplifierPort: TypeAlias = Amplifier | AmplifierDevice
+"""An amplifier as far ends serve it: alone, or on a bench with faults."""
 
 Send = Callable[[bytes], None]
 MakeEnd = Callable[[Send], FarEnd]

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.protocol.table import MESSAGES
-from firmware_script import ARM, GET_STATUS, NAK, STOP, arm, request, stuffed, unstuffed
+from firmware_script import GET_STATUS, NAK, request, stuffed, unstuffed
 from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware
 from sim.far_ends.modbus.frames import rtu_frame
 
@@ -59,23 +58,6 @@ def test_hello_has_version_0_and_the_texts(firmware: MovedFirmware) -> None:
     assert serial(firmware, frame_of_2) == [bytes([NAK, 0, 1, 7, 0]) + words]
 
 
-def test_event_precedes_the_reply(firmware: MovedFirmware) -> None:
-    """Armed, no fault, no channel, latch 0; then the status, whose state says the same."""
-    event, status = serial(firmware, arm())
-    assert event == struct.pack("<BBBH4H", EVENT, 3, 1, 1, 4, 0, 255, 0)
-    assert (status[0], status[5]) == (0x80 | ARM, 4)
-    stopped, _ = serial(firmware, request(STOP, 0))
-    assert stopped == struct.pack("<BBBH4H", EVENT, 3, 1, 2, 5, 0, 255, 1)
-
-
-@pytest.mark.parametrize("name", ["GetMeasured", "GetSensors", "Measure", "GetReading"])
-def test_what_is_not_there_is_unknown(firmware: MovedFirmware, name: str) -> None:
-    """Sensors and electrical measurement, of which the capabilities say nothing."""
-    number = MESSAGES[name].number
-    (reply,) = serial(firmware, request(number))
-    assert reply[5:] == struct.pack("<3H", number, UNKNOWN_TYPE, 255)
-
-
 @pytest.mark.parametrize(
     ("text", "reply"),
     [
@@ -99,17 +81,6 @@ def test_modbus_replies(firmware: MovedFirmware, text: str, reply: str) -> None:
         pdu(firmware, "10 0900 0001 02 0007")
     assert pdu(firmware, text) == reply
     assert pdu(firmware, text, unit=2) == pdu(firmware, text, unit=0) == ""
-
-
-def test_refusal_stays_in_its_area_until_the_next_write(firmware: MovedFirmware) -> None:
-    """Of a Ping while armed by another session; that of a status is read once."""
-    serial(firmware, arm())
-    assert pdu(firmware, "10 0C00 0002 04 0003 0001") == "100c000002"
-    refusal = f"0304{3:04x}{WRONG_SESSION << 8 | 255:04x}"
-    assert pdu(firmware, "03 0C80 0002") == pdu(firmware, "03 0C80 0002") == refusal
-    assert pdu(firmware, "10 0900 0002 04 0005 0001") == "1009000002"
-    assert pdu(firmware, "03 0980 0003") == f"0306{5:04x}{2 << 8 | 255:04x}0000"
-    assert pdu(firmware, "03 0980 0003") == f"0306{5:04x}00000004"
 
 
 def test_modbus_address_holds_once_its_reply_was_read(firmware: MovedFirmware) -> None:
@@ -200,17 +171,6 @@ def test_objects_are_read_and_one_is_written(firmware: MovedFirmware) -> None:
         firmware.move(0.05 + tenth / 10)
         beats += frame(firmware, 0x7FF, "00")
     assert beats == [(0x701, "7f")] * 5
-
-
-def test_node_that_leaves_operation_stops(firmware: MovedFirmware) -> None:
-    """Its host could not stop it any more; a reset boots it."""
-    frame(firmware, 0x000, "0100")
-    frame(firmware, 0x201, "0100 0302 0900 F401")
-    frame(firmware, 0x000, "8000")
-    assert serial(firmware, request(GET_STATUS))[-1][5] == 5
-    assert frame(firmware, 0x000, "8101")[-1] == (0x701, "00")
-    status = serial(firmware, request(GET_STATUS))[-1]
-    assert (status[5], status[11]) == (1, 1)  # disarmed, and the latch goes on
 
 
 def test_can_address_boots_the_node_again(firmware: MovedFirmware) -> None:

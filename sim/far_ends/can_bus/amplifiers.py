@@ -30,10 +30,10 @@ from drivers.protocol.table import (
     read_request,
 )
 from drivers.statistics import WireCounters
-from sim.amplifier.contract import SILENCING_RAMP, AmplifierPort
+from sim.amplifier.contract import SILENCING_RAMP
 from sim.far_ends.can_bus.sdo import SdoServer
 from sim.far_ends.can_bus.word_objects import FAULT_NAMES, WordObjects
-from sim.transport.far_end import FarEnd, Send
+from sim.transport.far_end import AmplifierPort, FarEnd, Send
 
 _NMT: Mapping[str, int] = CANOPEN["nmt"]
 _NMT_STATES: Mapping[str, int] = CANOPEN["nmt_states"]

@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 from drivers.codec.can_bus.canopen import CANOPEN, cob_id
 from drivers.protocol.table import FAULTS, MESSAGES
-from sim.amplifier.contract import AmplifierPort
 from sim.far_ends.can_bus.sdo import BAD_LENGTH, NO_OBJECT, NO_SUBINDEX, READ_ONLY, SdoAbort
+from sim.transport.far_end import AmplifierPort
 
 FAULT_NAMES = {number: name for name, number in FAULTS.items()}
 _INDEX = CANOPEN["objects"]

@@ -20,7 +20,7 @@ from model.structure.material import Material
 from model.structure.plate import Plate
 from model.transients.envelope import BaseEnvelope
 from registry.limits import GuardLimits
-from sim.amplifier.contract import capabilities
+from sim.amplifier.capabilities import capabilities
 
 LIMITS = GuardLimits(40.0, 500.0, 0.8)
 

@@ -8,7 +8,7 @@ from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, DriverError, LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
-from sim.amplifier.contract import capabilities
+from sim.amplifier.capabilities import capabilities
 from virtual_loop import run_virtual
 from words_line import KINDS, LIMITS, MemoryLine, unaltered
 

@@ -127,6 +127,9 @@ async def test_node_that_has_restarted_is_mute_until_it_is_identified(
     ("kind", "fault"),
     [
         ("over_voltage", "OVER_VOLTAGE"),
+        ("arc", "ARC"),
+        ("over_current", "OVER_CURRENT"),
+        ("channel", "CHANNEL"),
         ("over_temperature", "OVER_TEMPERATURE"),
         ("interlock", "INTERLOCK"),
         ("hang", "WATCHDOG"),

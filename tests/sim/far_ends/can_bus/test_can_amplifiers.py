@@ -60,28 +60,6 @@ def bus() -> Bus:
     return bus
 
 
-def test_heartbeats_show_the_state_of_the_node() -> None:
-    """Boot-up, then every 50 ms: pre-operational 7f, operational 05, stopped 04."""
-    bus = Bus("a")
-    assert bus.sent == [(0x701, "00")]
-    beats = []
-    for at, command in ((0.01, "8001"), (0.06, "0100"), (0.11, "0201")):
-        bus.put(at, (0x000, command))
-        bus.end.tick(at + 0.045)
-        beats += bus.sent
-    assert beats == [(0x701, "7f"), (0x701, "05"), (0x701, "04")]
-    assert bus.end.next_event == pytest.approx(0.2)
-
-
-def test_node_replies_only_in_operation() -> None:
-    """Neither before it is started nor after another master has stopped it."""
-    status = (0x201, "0100090000000000")
-    bus = Bus("a")
-    assert bus.put(0.0, status) == []
-    assert len(bus.put(0.3, START, status)) == 7
-    assert bus.put(0.6, (0x000, "8001"), status) == []
-
-
 def test_status_has_the_bytes_of_the_decision(bus: Bus) -> None:
     """18 words: disarmed, 25.0 degrees, one channel, eight layers, silent."""
     assert bus.put(0.0, (0x201, "1100090000000000")) == [
@@ -154,18 +132,6 @@ def test_heartbeat_of_the_host_feeds_nothing(bus: Bus) -> None:
     bus.put(0.2, (0x201, "04000c0134120000"))
     bus.put(0.4, (0x77F, "05"))
     assert [bus.level(at) for at in (0.44, 0.456)] == [0.5, 0.0]
-
-
-def test_broadcast_reaches_every_amplifier() -> None:
-    """Two play by one commit and fall silent by one stop."""
-    bus = Bus("a", "b")
-    bus.put(0.0, START)
-    for node in (1, 2):
-        bus.put(0.0, *((0x200 + node, data) for _, data in (ARM, *SET)))
-    bus.put(0.1, COMMIT)
-    assert [bus.level(0.1, of) for of in (0, 1)] == [0.5, 0.5]
-    bus.put(0.11, (0x200, "0000080105000000"))
-    assert [bus.level(0.12, of) for of in (0, 1)] == [0.0, 0.0]
 
 
 def test_broadcast_of_another_message_is_not_obeyed(bus: Bus) -> None:

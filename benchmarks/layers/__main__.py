@@ -11,7 +11,7 @@ from model.fem.symmetry import CLASSES
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from model.spectral.layered_class import Band, LayeredPlate
+from model.spectral.modes import Band, SpectralPlate
 from model.structure.air_gap import AirGap
 from model.structure.equivalent import bending, equivalent_plate
 from model.structure.laminate import Laminate, Layer
@@ -93,7 +93,7 @@ def _plate(layers: tuple[Layer, ...], *, width: float = 0.225) -> Plate:
 
 def _strip(layers: tuple[Layer, ...]) -> FloatArray:
     """Natural frequencies [Hz] of a strip of infinite width."""
-    solved = LayeredPlate(_plate(layers, width=1.0), (16, 0), AT)
+    solved = SpectralPlate(_plate(layers, width=1.0), (16, 0), AT)
     found = [
         solved.modes(each, shift=1e4, cut=1e10, band=Band(AT, AT)).eigenvalues
         for each in CLASSES

@@ -99,7 +99,7 @@ def design(
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find places of ERAs for the best robust felt contrast, or rank layouts by it.
+    """Find or rank places of ERAs for the best robust felt contrast.
 
     Resume an interrupted design.
     """

@@ -21,7 +21,6 @@ from model.fem.mesh import Mesh
 from model.fem.plate_mesh import PlateMesh, check_frequencies
 from model.reduction.finite_element_modes import finite_element_modes
 from model.reduction.free_modes import RESIDUAL_ORDER, FreeModes, PointSolutions
-from model.reduction.layered_modes import layered_modes
 from model.reduction.spectral_modes import spectral_modes
 from model.reduction.truncation import truncation_weights
 from model.spectral.mesh import SpectralMesh
@@ -187,16 +186,14 @@ def solve_free_plate(plate: Plate, mesh: PlateMesh, *, frequency_max: float = 50
     cutoff_frequency = FREQUENCY_MARGIN * frequency_max
     modes: FreeModes
     match mesh:
-        case SpectralMesh() if plate.is_layered:
-            modes = layered_modes(
+        case SpectralMesh():
+            modes = spectral_modes(
                 plate,
                 mesh,
                 shift=shift,
                 cutoff_frequency=cutoff_frequency,
                 frequency_max=frequency_max,
             )
-        case SpectralMesh():
-            modes = spectral_modes(plate, mesh, shift=shift, cutoff_frequency=cutoff_frequency)
         case Mesh():
             modes = finite_element_modes(
                 plate, mesh, shift=shift, cutoff_frequency=cutoff_frequency

@@ -1,12 +1,11 @@
 """Modes of the free plate in Legendre polynomials, and its truncated ones between any points.
 
-The residual vectors of the points of the first layout are solved for alone. For a second one those
-of all polynomials of the deflection are: the residual vectors of a force at any point are then a
-product with the polynomials there, and so are the sums over truncated modes. With many polynomials,
-where that takes much longer than modes and layouts together, the first few are solved alone.
+All modes of the polynomials of the deflection are known, so that the sums over the truncated ones
+are taken as they stand.
 """
 
 import math
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +13,7 @@ import numpy as np
 from model.arrays import FloatArray
 from model.fem.symmetry import CLASSES
 from model.reduction.free_modes import RESIDUAL_ORDER, CacheKey, PointSolutions, unknowns_of
+from model.spectral.functions import deflections_by_class
 from model.spectral.local_compliance import (
     Unresolved,
     compliance_between,
@@ -21,57 +21,62 @@ from model.spectral.local_compliance import (
     unresolved_at,
 )
 from model.spectral.mesh import SpectralMesh
-from model.spectral.modes import SpectralClass, deflections_by_class, solve_class
+from model.spectral.modes import Band, SpectralClass, SpectralPlate
 from model.structure.dispersion import Dispersion
+from model.structure.equivalent import short_wave_plate
 from model.structure.footprint import check_on_plate
 from model.structure.plate import Plate
 
-_MAX_CACHED = 4  # sets of points whose polynomials are kept
-_PER_POINT = 50  # polynomials of a class for each point that is solved alone
+_MAX_CACHED = 4  # sets of points whose shapes are kept
 
 
 @dataclass(frozen=True, eq=False)
 class _Observed:
-    """At p points: deflections by class, each (p, m), shapes (p, r), unresolved compliance."""
+    """At p points: shapes of the modes (p, r) and truncated ones (p, t), unresolved compliance."""
 
-    deflections: tuple[FloatArray, ...]
     shapes: FloatArray
+    truncated: FloatArray
     unresolved: Unresolved
 
 
 class SpectralModes:
-    """Modes of a free plate in the functions of a spectral mesh; see `FreeModes`."""
+    """Modes of a free plate in the polynomials of a mesh; see `FreeModes`."""
 
     def __init__(
-        self, plate: Plate, mesh: SpectralMesh, classes: tuple[SpectralClass, ...]
+        self,
+        plate: Plate,
+        mesh: SpectralMesh,
+        classes: tuple[SpectralClass, ...],
+        *,
+        shift: float,
+        band: Band,
     ) -> None:
         self._plate = plate
         self._mesh = mesh
-        self._directions = mesh.directions(plate)
         self._classes = classes
+        self._local_plate = local_plate(plate, mesh, band.middle)
         self.eigenvalues = np.concatenate([part.eigenvalues for part in classes])
-        self.losses = np.zeros(len(self.eigenvalues))
-        self.dispersion: Dispersion | None = None
-        self.largest_truncated = max(part.largest_truncated for part in classes)
-        self._first: PointSolutions | None = None
-        self._alone_count = 0
-        self._operators: tuple[FloatArray, ...] | None = None
+        self.losses = np.concatenate([part.losses for part in classes])
+        dispersion = np.hstack([part.dispersion for part in classes])
+        self.dispersion = Dispersion(band.frequencies, dispersion) if dispersion.any() else None
+        u = 1 / (np.concatenate([part.truncated for part in classes]) + shift)
+        self.largest_truncated = float(u.max())
+        # u / u_c of each truncated mode to the powers 1, 2, ...
+        self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
         self._known: dict[CacheKey, _Observed] = {}
+        self._is_softer = False
+
+    def softer(self) -> "SpectralModes":
+        """The plate as soft under every force as its polynomials leave possible."""
+        found = copy(self)
+        found._is_softer = True
+        return found
 
     def solve_at(self, points: FloatArray) -> PointSolutions:
         """Solve for forces at points [m] (n, 2)."""
         at = self._observe(points)
-        if self._first is None:
-            self._first = self._solve_alone(points, at)
-        if np.array_equal(self._first.points, points):
-            return self._first
-        if self._is_solved_alone(len(points)):
-            return self._solve_alone(points, at)
-        residuals = tuple(
-            np.moveaxis(operator[:RESIDUAL_ORDER] @ own.T, 2, 0)
-            for own, operator in zip(at.deflections, self._solved_operators(), strict=True)
-        )
-        return PointSolutions(points, at.shapes, residuals, self.truncated_terms(points, points))
+        residuals = at.truncated[:, None] * self._powers[:RESIDUAL_ORDER]
+        return PointSolutions(points, at.shapes, (residuals,), self.truncated_terms(points, points))
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
@@ -79,75 +84,40 @@ class SpectralModes:
 
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums between points (n, 2) and others (m, 2), as in `PointSolutions`."""
-        if self._is_solved_alone(len(points) + len(others)):
-            both = np.vstack([points, others])
-            solved = self._solve_alone(both, self._observe(both))
-            return solved.truncated_terms[:, : len(points), len(points) :]
         own, other = self._observe(points), self._observe(others)
-        truncated_terms = np.zeros((2 * RESIDUAL_ORDER, len(points), len(others)))
-        pairs = zip(own.deflections, other.deflections, self._solved_operators(), strict=True)
-        for left, right, operator in pairs:
-            truncated_terms += left @ operator @ right.T
-        truncated_terms[0] += self._local(own, other)
-        return truncated_terms
+        terms = (own.truncated * self._powers[:, None]) @ other.truncated.T
+        terms[0] += self._local(own, other)
+        return np.asarray(terms)
 
     def basis(self, attached: PointSolutions, points: FloatArray) -> FloatArray:
         """Deflection at points of modes and residual vectors, (p, r + RESIDUAL_ORDER n)."""
-        at = self._observe(points)
-        count, modes = len(attached.points), len(self.eigenvalues)
-        basis = np.zeros((len(points), modes + RESIDUAL_ORDER * count))
-        basis[:, :modes] = at.shapes
-        extra = basis[:, modes:]
-        for own, residual in zip(at.deflections, attached.residuals, strict=True):
-            extra += own @ residual.transpose(2, 1, 0).reshape(own.shape[1], -1 if count else 0)
-        extra[:, :count] += self._local(at, self._observe(attached.points))
-        return basis
+        at, count = self._observe(points), len(attached.points)
+        (residuals,) = attached.residuals
+        shape = RESIDUAL_ORDER * count, residuals.shape[2]
+        extra = residuals.transpose(1, 0, 2).reshape(shape) @ at.truncated.T
+        extra[:count] += self._local(self._observe(attached.points), at)
+        return np.hstack([at.shapes, extra.T])
 
     def unknowns(self, attached: PointSolutions) -> tuple[FloatArray, ...]:
         """The columns of `basis` by symmetry class, without the local compliance."""
-        modes = [part.vectors[: part.deflections] for part in self._classes]
-        density = self._plate.material.rho * self._plate.thickness
-        return tuple(each / math.sqrt(density) for each in unknowns_of(modes, attached.residuals))
-
-    def uncertain(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """By how much `truncated_terms` of the first power may be too low, (n, m)."""
-        own, other = self._observe(points), self._observe(others)
-        return uncertain_compliance(self._plate, own.unresolved, other.unresolved) / (
-            self.largest_truncated
-        )
-
-    def _is_solved_alone(self, count: int) -> bool:
-        """Whether so many further points take less without the operators."""
-        max_alone = max(part.deflections for part in self._classes) // _PER_POINT
-        return self._operators is None and self._alone_count + count <= max_alone
-
-    def _solve_alone(self, points: FloatArray, at: _Observed) -> PointSolutions:
-        """Solve for these points, without the operators."""
-        self._alone_count += len(points)
-        residuals = []
-        truncated_terms = np.zeros((2 * RESIDUAL_ORDER, len(points), len(points)))
-        for own, part in zip(at.deflections, self._classes, strict=True):
-            solved = part.residuals(own, terms=RESIDUAL_ORDER, scale=self.largest_truncated)
-            deflection = solved[:, :, : own.shape[1]]
-            truncated_terms += _sums(solved, own @ deflection[0].T)
-            residuals.append(deflection.swapaxes(0, 1))
-        truncated_terms[0] += self._local(at, at)
-        return PointSolutions(points, at.shapes, tuple(residuals), truncated_terms)
-
-    def _solved_operators(self) -> tuple[FloatArray, ...]:
-        """Residual operators between the polynomials, by class (2 RESIDUAL_ORDER, m, m)."""
-        if self._operators is None:
-            operators = []
-            for part in self._classes:
-                unit = np.eye(part.deflections)
-                solved = part.residuals(unit, terms=RESIDUAL_ORDER, scale=self.largest_truncated)
-                operators.append(_sums(solved, solved[0, :, : part.deflections]))
-            self._operators = tuple(operators)
-        return self._operators
+        (together,) = attached.residuals
+        ends = np.cumsum([len(part.truncated) for part in self._classes])[:-1]
+        truncated = np.split(together, ends, axis=2)
+        counts = [len(part.eigenvalues) for part in self._classes]
+        pairs = list(zip(self._classes, counts, strict=True))
+        modes = [part.shapes[:, :count] for part, count in pairs]
+        residuals = [
+            own @ part.shapes[:, count:].T
+            for own, (part, count) in zip(truncated, pairs, strict=True)
+        ]
+        return unknowns_of(modes, residuals)
 
     def _local(self, own: _Observed, other: _Observed) -> FloatArray:
         """Compliance in waves that the polynomials do not resolve, in units of u_c."""
-        missing = compliance_between(self._plate, own.unresolved, other.unresolved)
+        places = self._local_plate, own.unresolved, other.unresolved
+        missing = compliance_between(*places)
+        if self._is_softer:
+            missing = missing + uncertain_compliance(*places)
         return missing / self.largest_truncated
 
     def _observe(self, points: FloatArray) -> _Observed:
@@ -158,44 +128,32 @@ class SpectralModes:
             check_on_plate(points, length=self._mesh.length, width=self._mesh.width)
             if len(self._known) >= _MAX_CACHED:
                 self._known.pop(next(iter(self._known)))
-            deflections = deflections_by_class(self._plate, *self._directions, points)
-            pairs = zip(deflections, self._classes, strict=True)
-            self._known[key] = _Observed(
-                deflections,
-                np.hstack([own @ part.vectors[: part.deflections] for own, part in pairs]),
-                unresolved_at(self._plate, (self._mesh.nx, self._mesh.ny), points),
-            )
+            degrees = (self._mesh.nx, self._mesh.ny)
+            bases = deflections_by_class((self._plate.length, self._plate.width), degrees, points)
+            found = [
+                np.split(own @ part.shapes, [len(part.eigenvalues)], axis=1)
+                for own, part in zip(bases, self._classes, strict=True)
+            ]
+            shapes, truncated = (np.hstack(each) for each in zip(*found, strict=True))
+            unresolved = unresolved_at(self._local_plate, degrees, points)
+            self._known[key] = _Observed(shapes, truncated, unresolved)
         return self._known[key]
 
 
-def _sums(solved: FloatArray, first: FloatArray) -> FloatArray:
-    """Sums over the truncated modes between k forces, (2 RESIDUAL_ORDER, k, k).
-
-    solved (RESIDUAL_ORDER, k, n): their residual vectors, of which the sums of powers i + j are
-    inner products; first (k, k): that of power one, a product with the forces.
-    """
-    sums = np.empty((2 * RESIDUAL_ORDER, *first.shape))
-    sums[0] = first
-    for power in range(2, 2 * RESIDUAL_ORDER + 1):
-        sums[power - 1] = solved[power // 2 - 1] @ solved[(power + 1) // 2 - 1].T
-    return sums
+def local_plate(plate: Plate, mesh: SpectralMesh, frequency: float) -> Plate:
+    """The homogeneous plate that yields under a force in waves that a mesh does not resolve."""
+    return short_wave_plate(plate, 2 * math.pi / mesh.shortest_wavelength, frequency)
 
 
 def spectral_modes(
-    plate: Plate, mesh: SpectralMesh, *, shift: float, cutoff_frequency: float
+    plate: Plate, mesh: SpectralMesh, *, shift: float, cutoff_frequency: float, frequency_max: float
 ) -> SpectralModes:
-    """Solve the four symmetry classes of a free plate for all modes below cutoff_frequency [Hz].
+    """Solve the four symmetry classes of a free plate for all modes below a cutoff [Hz].
 
-    shift [rad²/s²]: of the factorisations.
+    shift [rad²/s²]: of the order of the lowest modes; frequency_max [Hz]: of responses.
     """
-    x, y = mesh.directions(plate)
+    band = Band(math.sqrt(shift) / (2 * math.pi), frequency_max)
+    spectral = SpectralPlate(plate, (mesh.nx, mesh.ny), band.middle)
     cut = (2 * math.pi * cutoff_frequency) ** 2
-    count = plate.modes_below(cutoff_frequency) // 4 + 4
-    return SpectralModes(
-        plate,
-        mesh,
-        tuple(
-            solve_class(plate, x, y, parity, shift=shift, cut=cut, count=count)
-            for parity in CLASSES
-        ),
-    )
+    classes = tuple(spectral.modes(each, shift=shift, cut=cut, band=band) for each in CLASSES)
+    return SpectralModes(plate, mesh, classes, shift=shift, band=band)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import FloatArray
-from model.spectral.layered_stiffness import ClassFunctions
+from model.spectral.stiffness import ClassFunctions
 from model.structure.air_gap import AirGap
 
 # Shapes for each degree: at open edges, where the deflection is not zero, they converge slowly.

@@ -1,5 +1,10 @@
-"""Steady-state response solved directly at each frequency: the check of the reduction."""
+"""Response of a plate solved at each frequency with the moduli there: the check of modes.
 
+Nothing is approximated in frequency: adhesives, air and the inertia along the plate are those of
+the frequency at hand.
+"""
+
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -7,12 +12,13 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray
 from model.fem.plate_mesh import check_frequencies
 from model.fem.symmetry import CLASSES
+from model.spectral.functions import deflections_by_class
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
-from model.spectral.modes import deflections_by_class
-from model.spectral.stiffness import class_stiffness
+from model.spectral.modes import SpectralPlate
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
+from model.structure.equivalent import short_wave_plate
 from model.structure.footprint import as_footprints
 from model.structure.low_rank import coupled_forces, on_diagonal
 from model.structure.modal_elasticity import check_of_theory, loss_factors
@@ -31,27 +37,26 @@ def direct_spectral_acceleration(
 ) -> ComplexArray:
     """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and driven ERA: (f, eras, p).
 
-    As `direct_acceleration` on finite elements: ((1 + i eta) K - omega² M) u = F in all unknowns,
-    plus the compliance that the polynomials do not resolve.
+    As `direct_acceleration` on finite elements, plus the compliance that the polynomials do not
+    resolve. Raises InputError as it does.
     """
-    check_of_theory(plate)
     check_frequencies(plate, mesh, frequencies)
+    check_of_theory(plate)
     attached = footprints_of(eras, loads)
-    x, y = mesh.directions(plate)
-    omega = 2 * np.pi * np.asarray(frequencies, dtype=float)
-    loss = (1 + 1j * loss_factors(plate, omega))[:, None, None]
     everywhere = np.concatenate([attached, as_footprints(points)])
-    degrees = (mesh.nx, mesh.ny)
-    receptance = np.empty((len(omega), len(everywhere), len(attached)), dtype=complex)
-    receptance[:] = local_compliance(plate, degrees, everywhere, attached) / loss
-    for parity, shapes in zip(CLASSES, deflections_by_class(plate, x, y, everywhere), strict=True):
-        upper = np.triu(class_stiffness(plate, x, y, parity))
-        K = upper + np.triu(upper, 1).T
-        forces = np.zeros((len(K), len(attached)))
-        forces[: shapes.shape[1]] = shapes[: len(attached)].T
-        for number, each in enumerate(omega):
-            moved = np.linalg.solve(loss[number] * K - each**2 * np.eye(len(K)), forces)
-            receptance[number] += shapes @ moved[: shapes.shape[1]]
+    degrees, count = (mesh.nx, mesh.ny), len(attached)
+    bases = deflections_by_class((plate.length, plate.width), degrees, everywhere)
+    omega = 2 * np.pi * np.asarray(frequencies, dtype=float)
+    receptance = np.empty((len(omega), len(everywhere), count), dtype=complex)
+    for number, frequency in enumerate(frequencies):
+        local = short_wave_plate(plate, 2 * math.pi / mesh.shortest_wavelength, frequency)
+        receptance[number] = local_compliance(local, degrees, everywhere, attached) / (
+            1 + 1j * float(loss_factors(plate, omega[number]))
+        )
+        layered = SpectralPlate(plate, degrees, frequency)
+        for parity, shapes in zip(CLASSES, bases, strict=True):
+            D = layered.dynamic_stiffness(parity, frequency)
+            receptance[number] += shapes @ np.linalg.solve(D, shapes[:count].T)
     return driven_acceleration(receptance, eras, loads, omega)
 
 

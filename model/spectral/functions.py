@@ -1,79 +1,174 @@
-"""Functions of one direction: Legendre polynomials, and the boundary layer of a free edge.
+"""Functions of one direction: Legendre polynomials, and boundary layers of a free edge.
 
-Everything is even or odd about the middle. On a Reissner-Mindlin plate the rotations at a free edge
-have a boundary layer exp(-k x) about as wide as the plate is thick, k² = shear / twisting rigidity
-(k = sqrt(10) / h), which polynomials resolve only at very high degree. The rotations therefore have
-one more function in each direction, exp(-k x) +- exp(-k (L - x)).
-
-All integrals are closed: a polynomial's derivative is a sum of lower polynomials, the integral of
-exp(-k x) with a polynomial is a modified spherical Bessel function, and what is left of the layer
-beside the polynomials is orthogonal to all their derivatives, so that by parts only its value at
-the edge remains.
+Everything is even or odd about the middle. Displacements along a free edge twist the layers of a
+plate against each other in boundary layers exp(-k x), which polynomials resolve only at very high
+degree: of one homogeneous layer, the rotations of Reissner and Mindlin, one as wide as it is
+thick, k = sqrt(10) / h. So there is one more function for each, exp(-k x) +- exp(-k (L - x)).
+Integrals are by Gauss's rule on pieces that shrink towards the edges.
 """
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from typing import TypeAlias
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
-from scipy import special
+from numpy.polynomial.legendre import leggauss
+from scipy import linalg
 
 from model.arrays import FloatArray
+from model.fem.symmetry import CLASSES
+from model.structure.footprint import mean_over
+from model.structure.laminate_section import Section
 
 EVEN, ODD = 1, -1
 
-# A layer with less than this share of its norm outside the polynomials is left out.
-_NEGLIGIBLE = 1e-4
-
-
-Integrals: TypeAlias = dict[int, FloatArray]
-"""Integrals over the length of products of two functions, by parity of the first, (n, m)."""
+# A boundary layer with less than this share of its norm outside what is there already is left out.
+_NEGLIGIBLE = 0.02
+_ALIKE = 1.5  # ratio of decays for which one function serves
+_MAX_LAYERS = 3  # boundary layers of a side
+_PIECES = (0.0, 1.5, 5.0, 14.0)  # of a boundary layer, over its decay
 
 
 @dataclass(frozen=True, eq=False)
-class Direction:
+class EdgedFunctions:
     """Orthonormal functions of x in (0, length) [m], by parity: EVEN or ODD about the middle.
 
-    Those of a parity are its Legendre polynomials up to a degree, ascending, then the boundary
-    layer of decay k [1/m], orthogonalised to them, unless they represent it.
+    Those of a parity are its Legendre polynomials up to a degree, ascending, then boundary layers
+    of these decays [1/m] at both ends, orthogonalised.
     """
 
     length: float
     degree: int
-    decay: float
+    decays: tuple[float, ...] = ()
 
     def polynomial_count(self, parity: int) -> int:
         """Number of polynomials of a parity; these are its first functions."""
-        return (self.degree - first_degree(parity)) // 2 + 1
+        return (self.degree - first_degree(parity)) // 2 + 1 if self._has(parity) else 0
 
     def count(self, parity: int) -> int:
         """Number of functions of a parity."""
-        return len(self.slope_squares[parity])
-
-    def polynomials(self, x: FloatArray) -> FloatArray:
-        """Values [1/sqrt(m)] of all polynomials, by degree, at x [m] (p,), (p, degree + 1)."""
-        angle = np.arccos(np.clip(1 - 2 * x / self.length, -1, 1))
-        cosines = np.cos(np.multiply.outer(angle, np.arange(self.degree + 1)))
-        values = cosines @ _polynomials_in_cosines(self.degree)
-        return np.asarray(values / np.sqrt(self.length))
+        return int(self._values[parity].shape[1])
 
     @cached_property
-    def slope_products(self) -> Integrals:
+    def slope_products(self) -> dict[int, FloatArray]:
         """By parity: integrals of f' g over the length, f of the parity, g of the other, (n, m)."""
-        products, _ = _unit_integrals(self.degree, self.decay * self.length)
-        return {parity: each / self.length for parity, each in products.items()}
+        return {
+            parity: self._slopes[parity].T @ (self._weights[:, None] * self._values[-parity])
+            for parity in (EVEN, ODD)
+        }
 
     @cached_property
-    def slope_squares(self) -> Integrals:
+    def slope_squares(self) -> dict[int, FloatArray]:
         """By parity: integrals of f' g' over the length, both of the parity, (n, n)."""
-        _, squares = _unit_integrals(self.degree, self.decay * self.length)
-        return {parity: each / self.length**2 for parity, each in squares.items()}
+        return {
+            parity: slopes.T @ (self._weights[:, None] * slopes)
+            for parity, slopes in self._slopes.items()
+        }
+
+    def polynomial_products(self, values: FloatArray, parity: int) -> FloatArray:
+        """Integrals with the polynomials of a parity of functions at `points` (q, m), (n, m)."""
+        own = self._values[parity][:, : self.polynomial_count(parity)]
+        return np.asarray(own.T @ (self._weights[:, None] * values))
+
+    @property
+    def points(self) -> FloatArray:
+        """Points of the integrals [m] (q,)."""
+        return self._rule[0]
+
+    @property
+    def _weights(self) -> FloatArray:
+        return self._rule[1]
+
+    @cached_property
+    def _rule(self) -> tuple[FloatArray, FloatArray]:
+        half = self.length / 2
+        breaks = {piece / decay for decay in self.decays for piece in _PIECES}
+        edges = np.array(sorted({0.0, half, *(each for each in breaks if each < half)}))
+        t, w = leggauss(self.degree + 12)
+        sizes = np.diff(edges)
+        x = (edges[:-1, None] + sizes[:, None] * (1 + t) / 2).ravel()
+        weights = (sizes[:, None] * w / 2).ravel()
+        return np.concatenate([x, self.length - x[::-1]]), np.concatenate([weights, weights[::-1]])
+
+    def _has(self, parity: int) -> bool:
+        return self.degree >= first_degree(parity)
+
+    @property
+    def _values(self) -> dict[int, FloatArray]:
+        return self._functions[0]
+
+    @property
+    def _slopes(self) -> dict[int, FloatArray]:
+        return self._functions[1]
+
+    @cached_property
+    def _functions(self) -> tuple[dict[int, FloatArray], dict[int, FloatArray]]:
+        """Values and slopes at the points, by parity."""
+        x, weights = self._rule
+        n = np.arange(self.degree + 1)
+        scale = np.sqrt((2 * n + 1) / self.length)
+        t = 2 * x / self.length - 1
+        values, slopes = _legendre(t, self.degree)
+        values, slopes = values * scale, slopes * scale * (2 / self.length)
+        root = np.sqrt(weights)[:, None]
+        found: tuple[dict[int, FloatArray], dict[int, FloatArray]] = ({}, {})
+        for parity in (EVEN, ODD):
+            own = slice(first_degree(parity), None, 2)
+            value, slope = values[:, own], slopes[:, own]
+            for k in self.decays if self._has(parity) else ():
+                near, far = np.exp(-k * x), np.exp(-k * (self.length - x))
+                layer, rate = near + parity * far, -k * (near - parity * far)
+                size = np.linalg.norm(root[:, 0] * layer)
+                for _ in range(2):
+                    shares = value.T @ (weights * layer)
+                    layer, rate = layer - value @ shares, rate - slope @ shares
+                norm = np.linalg.norm(root[:, 0] * layer)
+                if norm > _NEGLIGIBLE * size:
+                    value = np.column_stack([value, layer / norm])
+                    slope = np.column_stack([slope, rate / norm])
+            found[0][parity], found[1][parity] = value, slope
+        return found
 
 
 def first_degree(parity: int) -> int:
     """Degree of the first polynomial of a parity."""
     return (1 - parity) // 2
+
+
+def deflections_by_class(
+    sides: tuple[float, float], degrees: tuple[int, int], points: FloatArray
+) -> Sequence[FloatArray]:
+    """Orthonormal polynomials [1/m] over a plate of sides [m] at points (p, 2), (p, m) by class.
+
+    At footprints (p, 3) their mean.
+    """
+    basis = mean_over(
+        partial(_deflections, sides, degrees), points, length=sides[0], width=sides[1]
+    )
+    counts = [[(degree - first_degree(a)) // 2 + 1 for a in (EVEN, ODD)] for degree in degrees]
+    of = {EVEN: 0, ODD: 1}
+    ends = np.cumsum([counts[0][of[a]] * counts[1][of[b]] for a, b in CLASSES[:-1]])
+    return np.split(basis, ends, axis=1)
+
+
+def _deflections(
+    sides: tuple[float, float], degrees: tuple[int, int], points: FloatArray
+) -> FloatArray:
+    """Products of polynomials of x and y at points (p, 2), class after class, (p, n)."""
+    along_x, along_y = map(_polynomials, points.T, sides, degrees)
+    products = []
+    for a, b in CLASSES:
+        of_x, of_y = along_x[:, first_degree(a) :: 2], along_y[:, first_degree(b) :: 2]
+        count = of_x.shape[1] * of_y.shape[1]
+        products.append((of_x[:, :, None] * of_y[:, None]).reshape(len(points), count))
+    return np.hstack(products)
+
+
+def _polynomials(x: FloatArray, length: float, degree: int) -> FloatArray:
+    """Values [1/sqrt(m)] of all polynomials, by degree, at x [m] (p,), (p, degree + 1)."""
+    angle = np.arccos(np.clip(1 - 2 * x / length, -1, 1))
+    cosines = np.cos(np.multiply.outer(angle, np.arange(degree + 1)))
+    return np.asarray(cosines @ _polynomials_in_cosines(degree) / np.sqrt(length))
 
 
 @lru_cache(maxsize=64)
@@ -93,56 +188,25 @@ def _polynomials_in_cosines(degree: int) -> FloatArray:
     return np.asarray(coefficients * (-1.0) ** n * np.sqrt(2 * n + 1))
 
 
-@lru_cache(maxsize=64)
-def _unit_integrals(degree: int, decay: float) -> tuple[Integrals, Integrals]:
-    """`Direction.slope_products` and `slope_squares` of a unit length."""
-    n = np.arange(degree + 1)
-    at_end = np.sqrt(2 * n + 1)  # values of the polynomials, and of their slopes
-    slope_at_end = at_end * n * (n + 1)
-    products, squares = {}, {}
-    layer = _layer_integrals(at_end, decay)
-    for parity in (EVEN, ODD):
-        own, other = (slice(first_degree(each), None, 2) for each in (parity, -parity))
-        shape = len(n[own]), len(n[other])
-        ends = 2 * at_end[own, None]
-        of_degree = n[own, None]
-        product = np.zeros((shape[0] + 1, shape[1] + 1))
-        product[:-1, :-1] = ends * at_end[other] * (of_degree > n[other])
-        square = np.empty((shape[0] + 1, shape[0] + 1))
-        least = np.minimum(of_degree, n[own])
-        square[:-1, :-1] = ends * at_end[own] * (least * (least + 1))
-        norm, norm_of_other, end = layer[parity][0], layer[-parity][0], layer[parity][1]
-        product[-1, :-1] = 2 * end * at_end[other]
-        square[-1, :-1] = square[:-1, -1] = 2 * end * slope_at_end[own]
-        if norm:
-            slope = decay * (parity - np.exp(-decay))
-            sum_of_slopes = layer[parity][2] @ slope_at_end[own]
-            square[-1, -1] = 2 * end * (slope - sum_of_slopes) / norm - decay**2
-            product[-1, -1] = -decay * norm_of_other / norm
-        rows, columns = (shape[0] + bool(norm), shape[1] + bool(norm_of_other))
-        products[parity] = product[:rows, :columns]
-        squares[parity] = square[:rows, :rows]
-    return products, squares
+def edge_decays(section: Section) -> tuple[float, ...]:
+    """Decays [1/m] of the boundary layers of a laminate's free edge, the widest first.
 
-
-def _layer_integrals(
-    at_end: FloatArray, decay: float
-) -> dict[int, tuple[float, float, FloatArray]]:
-    """By parity, of the layer beside the polynomials, which have these values at the end (n,).
-
-    Its norm, its value at the end at unit norm, and the integrals of the layer itself with the
-    polynomials of its parity. Norm and value are 0 where polynomials represent it.
+    Displacements along an edge twist the layers against each other: twist v'' = slip v over the
+    distance from it. Of one homogeneous layer k = sqrt(10) / h.
     """
-    n = np.arange(len(at_end))
-    bessel = math.sqrt(math.pi / decay) * special.ive(n + 0.5, decay / 2)
-    whole = 2 * (-1.0) ** n * at_end * bessel
-    both, far = (1 - math.exp(-2 * decay)) / decay, math.exp(-decay)
-    found = {}
-    for parity in (EVEN, ODD):
-        own = slice(first_degree(parity), None, 2)
-        square = both + 2 * parity * far
-        rest = square - whole[own] @ whole[own]
-        norm = math.sqrt(rest) if rest > _NEGLIGIBLE**2 * square else 0.0
-        end = float(parity + far - whole[own] @ at_end[own]) / norm if norm else 0.0
-        found[parity] = norm, end, np.asarray(whole[own])
-    return found
+    slip, twist = np.real(section.slip), np.real(section.twist)
+    squares = linalg.eigh(slip, twist, eigvals_only=True)[1:]
+    decays: list[float] = []
+    for k in np.sqrt(np.maximum(squares, 0)):
+        if k > 0 and (not decays or k > _ALIKE * decays[-1]):
+            decays.append(float(k))
+    return tuple(decays[:_MAX_LAYERS])
+
+
+def _legendre(t: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
+    """Legendre polynomials at t (q,) and their derivatives, (q, degree + 1)."""
+    values: FloatArray = np.asarray(np.polynomial.legendre.legvander(t, degree), dtype=float)
+    slopes: FloatArray = np.zeros(values.shape)
+    for n in range(1, degree + 1):
+        slopes[:, n] = n * values[:, n - 1] + t * slopes[:, n - 1]
+    return values, slopes

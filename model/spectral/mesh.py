@@ -7,8 +7,6 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from model.errors import InputError
-from model.fem.elements.element import rigidities
-from model.spectral.functions import Direction
 from model.spectral.local_compliance import edge_compliance
 from model.structure.plate import Plate
 
@@ -149,9 +147,3 @@ class SpectralMesh:
     def interpolation_error(self, plate: Plate, frequency: float) -> float:
         """0: its polynomials are evaluated wherever they are asked for."""
         return 0.0
-
-    def directions(self, plate: Plate) -> tuple[Direction, Direction]:
-        """Functions along x and y."""
-        bending, shear, _ = rigidities(plate)
-        decay = math.sqrt(shear / bending[2, 2])
-        return Direction(self.length, self.nx, decay), Direction(self.width, self.ny, decay)

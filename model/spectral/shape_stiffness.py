@@ -19,9 +19,9 @@ import numpy as np
 from model.arrays import FloatArray
 from model.fem.element_slopes import NUS, SQUARES
 from model.fem.symmetry import CLASSES
-from model.spectral.edged_functions import EdgedFunctions, edge_decays
-from model.spectral.layered_class import layers_of
-from model.spectral.layered_stiffness import ClassFunctions, follow, layered_stiffness
+from model.spectral.functions import EdgedFunctions, edge_decays
+from model.spectral.modes import layers_of
+from model.spectral.stiffness import ClassFunctions, class_stiffness, follow
 from model.structure.laminate import Layer
 from model.structure.laminate_section import (
     Section,
@@ -71,7 +71,7 @@ def stiffness_slopes(
     shift = (2 * np.pi * plate.lowest_bending_frequency) ** 2
     for parity, w in zip(CLASSES, unknowns, strict=True):
         of = ClassFunctions(x[1.0], y[1.0], parity, len(layers) + 1)
-        along = follow(of, layered_stiffness(of, nominal), interface_mass(layers), shift) @ w
+        along = follow(of, class_stiffness(of, nominal), interface_mass(layers), shift) @ w
         v = np.vstack([w, along])
         first_y = of.deflections + of.interfaces * of.of_x[0] * of.of_x[1]
         for axis, own in enumerate((slice(of.deflections, first_y), slice(first_y, None))):
@@ -79,7 +79,7 @@ def stiffness_slopes(
                 functions = replace(of, x=x[square]) if axis == 0 else replace(of, y=y[square])
                 stretched = v.copy()
                 stretched[own] *= square**0.5
-                K = layered_stiffness(functions, nominal)
+                K = class_stiffness(functions, nominal)
                 slopes[axis] += share * (stretched.T @ K @ stretched)
         low, high = NUS
         for changed, share in (
@@ -87,7 +87,7 @@ def stiffness_slopes(
             (section(moduli * (1 - low**2) / scale, low), -1 / (high - low)),
             (section(moduli * 2 * nus / scale), 1.0),
         ):
-            slopes[2] += share * (v.T @ layered_stiffness(of, changed) @ v)
+            slopes[2] += share * (v.T @ class_stiffness(of, changed) @ v)
     return slopes
 
 

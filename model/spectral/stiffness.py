@@ -1,79 +1,137 @@
-"""Stiffness of the free Reissner-Mindlin plate in the functions of both directions."""
+"""Stiffness and mass of a free plate of one layer or several in the functions of both directions.
 
-import math
-from itertools import pairwise
+Unknowns of a symmetry class: the deflection w, in polynomials; then the displacements along the
+plate u_x and u_y of every interface between the layers, with boundary layers. u_x has the other
+parity along x, u_y along y. Energy, with the sections of `model.structure.laminate` summed over the
+interfaces:
+
+    stretch (u_x,x u_x,x + u_y,y u_y,y) + 2 across u_x,x u_y,y + twist (u_x,y + u_y,x)²
+    + slip (u_x² + u_y²) + 2 lever (u_x w,x + u_y w,y) + shear (w,x² + w,y²)
+"""
+
+from dataclasses import dataclass
 
 import numpy as np
+from scipy import linalg
 
 from model.arrays import FloatArray
-from model.fem.elements.element import rigidities
-from model.spectral.functions import Direction
-from model.structure.plate import Plate
+from model.spectral.functions import EdgedFunctions
+from model.structure.laminate_section import Section
 
 
-def class_stiffness(
-    plate: Plate, x: Direction, y: Direction, parity: tuple[int, int]
-) -> FloatArray:
-    """Stiffness K (n, n) [rad²/s²] of one symmetry class, scaled so that its mass is the identity.
+@dataclass(frozen=True, eq=False)
+class ClassFunctions:
+    """Functions along x and y of one symmetry class, for a number of interfaces.
 
-    Only the upper triangle is filled in; below there are zeros in part.
-
-    Unknowns: w, beta_x, beta_y, each the products of functions of x and functions of y, y running
-    first. w has the class's parity along x and y and polynomials only; beta_x has the other parity
-    along x, beta_y along y. Energy, with C_b, S and H of `rigidities`:
-
-        (beta_x,x, beta_y,y, beta_x,y + beta_y,x) C_b (...) + S (w,x - beta_x)² + S (w,y - beta_y)²
+    of_w, of_x, of_y: numbers of functions along x and y of w and of one interface's u_x and u_y.
     """
-    bending, shear, inertia = rigidities(plate)
-    D, coupled, twist = bending[0, 0], bending[0, 1], bending[2, 2]
-    a, b = parity
-    of_w = x.polynomial_count(a), y.polynomial_count(b)
-    of_x, of_y = (x.count(-a), y.count(b)), (x.count(a), y.count(-b))
-    squares_x, squares_y = x.slope_squares, y.slope_squares
-    products_x, products_y = x.slope_products, y.slope_products
-    w, beta_x, beta_y = _blocks(of_w, of_x, of_y)
-    K = np.zeros((beta_y.stop, beta_y.stop))
 
-    # Products with the unit matrix along y fill the diagonals of blocks of y, and so on.
-    deflection, rotation = inertia[0, 0], inertia[1, 1]
-    ww, xx, yy = (
-        K[block, block].reshape(*shape, *shape)
-        for block, shape in ((w, of_w), (beta_x, of_x), (beta_y, of_y))
+    x: EdgedFunctions
+    y: EdgedFunctions
+    parity: tuple[int, int]
+    interfaces: int
+
+    @property
+    def of_w(self) -> tuple[int, int]:
+        """Functions of the deflection along x and y."""
+        a, b = self.parity
+        return self.x.polynomial_count(a), self.y.polynomial_count(b)
+
+    @property
+    def of_x(self) -> tuple[int, int]:
+        """Functions of u_x along x and y."""
+        a, b = self.parity
+        return self.x.count(-a), self.y.count(b)
+
+    @property
+    def of_y(self) -> tuple[int, int]:
+        """Functions of u_y along x and y."""
+        a, b = self.parity
+        return self.x.count(a), self.y.count(-b)
+
+    @property
+    def deflections(self) -> int:
+        """Number of unknowns of the deflection, the first ones."""
+        nx, ny = self.of_w
+        return nx * ny
+
+    @property
+    def size(self) -> int:
+        """Number of all unknowns."""
+        along = self.of_x[0] * self.of_x[1] + self.of_y[0] * self.of_y[1]
+        return self.deflections + self.interfaces * along
+
+
+def class_stiffness(of: ClassFunctions, section: Section) -> FloatArray:
+    """Stiffness (n, n) [N/m per m² of the orthonormal functions] of a section's real part."""
+    x, y = of.x, of.y
+    a, b = of.parity
+    (wx, wy), (xx, xy), (yx, yy) = of.of_w, of.of_x, of.of_y
+    stretch, across, twist, slip = (
+        np.real(each) for each in (section.stretch, section.across, section.twist, section.slip)
     )
-    nx, ny = of_w
-    _along_x(ww)[:] += shear / deflection * squares_x[a][:nx, :nx, None]
-    _along_y(ww)[:] += shear / deflection * squares_y[b][:ny, :ny]
-    _along_x(xx)[:] += D / rotation * squares_x[-a][:, :, None]
-    _along_y(xx)[:] += twist / rotation * squares_y[b]
-    _along_x(yy)[:] += twist / rotation * squares_x[a][:, :, None]
-    _along_y(yy)[:] += D / rotation * squares_y[-b]
-    diagonal = K.reshape(-1, copy=False)[:: len(K) + 1]
-    diagonal[w.stop :] += shear / rotation
+    lever, shear = np.real(section.lever), float(np.real(section.shear))
+    w = slice(0, of.deflections)
+    u = slice(w.stop, w.stop + of.interfaces * xx * xy)
+    v = slice(u.stop, of.size)
+    K = np.zeros((of.size, of.size))
 
-    mixed = -shear / math.sqrt(deflection * rotation)
-    wx = K[w, beta_x].reshape(*of_w, *of_x)
-    _along_x(wx[..., :ny])[:] = mixed * products_x[a][:nx, :, None]
-    wy = K[w, beta_y].reshape(*of_w, *of_y)
-    _along_y(wy[:, :, :nx])[:] = mixed * products_y[b][:ny]
-    xy = K[beta_x, beta_y].reshape(*of_x, *of_y)
-    along_x = coupled / rotation * products_x[-a], twist / rotation * products_x[a].T
-    along_y = products_y[-b].T, products_y[b]
-    np.multiply(along_x[0][:, None, :, None], along_y[0][None, :, None, :], out=xy)
-    xy += along_x[1][:, None, :, None] * along_y[1][None, :, None, :]
+    def laid(matrix: FloatArray, along_x: FloatArray, along_y: FloatArray) -> FloatArray:
+        return _product(matrix, _product(along_x, along_y))
+
+    K[w, w] = shear * (
+        _product(x.slope_squares[a][:wx, :wx], np.eye(wy))
+        + _product(np.eye(wx), y.slope_squares[b][:wy, :wy])
+    )
+    K[u, u] = (
+        laid(stretch, x.slope_squares[-a], np.eye(xy))
+        + laid(twist, np.eye(xx), y.slope_squares[b])
+        + laid(slip, np.eye(xx), np.eye(xy))
+    )
+    K[v, v] = (
+        laid(stretch, np.eye(yx), y.slope_squares[-b])
+        + laid(twist, x.slope_squares[a], np.eye(yy))
+        + laid(slip, np.eye(yx), np.eye(yy))
+    )
+    K[u, v] = laid(across, x.slope_products[-a], y.slope_products[-b].T)
+    K[u, v] += laid(twist, x.slope_products[a].T, y.slope_products[b])
+    row = lever[None]
+    K[w, u] = laid(row, x.slope_products[a][:wx], np.eye(wy, xy))
+    K[w, v] = laid(row, np.eye(wx, yx), y.slope_products[b][:wy])
+    K[v, u], K[u, w], K[v, w] = K[u, v].T, K[w, u].T, K[w, v].T
     return K
 
 
-def _blocks(*shapes: tuple[int, int]) -> list[slice]:
-    """Rows of the unknowns with these numbers of functions along x and y."""
-    ends = np.cumsum([0, *(nx * ny for nx, ny in shapes)]).tolist()
-    return [slice(*each) for each in pairwise(ends)]
+def _product(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Kronecker product of two matrices, as `numpy.kron`, without its checks."""
+    shape = len(left) * len(right), left.shape[1] * right.shape[1]
+    return np.asarray((left[:, None, :, None] * right[:, None]).reshape(shape))
 
 
-def _along_x(block: FloatArray) -> FloatArray:
-    """View of a block (nx, ny, mx, ny) between the same functions of y, (nx, mx, ny)."""
-    return np.asarray(np.einsum("ijkj->ikj", block))
+def along_mass(of: ClassFunctions, mass: FloatArray, forces: FloatArray) -> FloatArray:
+    """Mass matrix of the displacements along the plate times columns (m, k): (m, k).
+
+    mass: of `interface_mass`.
+    """
+    count = of.interfaces * of.of_x[0] * of.of_x[1]
+    parts = (
+        np.tensordot(mass, each.reshape(of.interfaces, -1, each.shape[1]), axes=1).reshape(
+            each.shape
+        )
+        for each in (forces[:count], forces[count:])
+    )
+    return np.vstack([*parts])
 
 
-def _along_y(block: FloatArray) -> FloatArray:
-    """View of a block (nx, ny, nx, my) between the same functions of x, (nx, ny, my)."""
-    return np.asarray(np.einsum("ijik->ijk", block))
+def follow(of: ClassFunctions, stiffness: FloatArray, mass: FloatArray, shift: float) -> FloatArray:
+    """Displacements along the plate under unit deflections, (m, deflections), by least energy.
+
+    shift [rad²/s²]: times the mass, keeps the rigid motions along the plate at rest.
+    """
+    w = of.deflections
+    own = stiffness[w:, w:].copy()
+    count = of.interfaces * of.of_x[0] * of.of_x[1]
+    for part, each in ((slice(0, count), of.of_x), (slice(count, None), of.of_y)):
+        own[part, part] += shift * _product(mass, np.eye(each[0] * each[1]))
+    factor = linalg.cho_factor(own, lower=True, overwrite_a=True, check_finite=False)
+    return -linalg.cho_solve(factor, stiffness[w:, :w], check_finite=False)

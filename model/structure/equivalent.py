@@ -1,7 +1,7 @@
 """The homogeneous plate that is like a laminate at one frequency.
 
 It gives wavelengths, meshes and estimates; loose layers and a single one are solved as it. Bonded
-layers are solved as they are (`model.spectral.layered_class`).
+layers are solved as they are (`model.spectral.modes`).
 """
 
 import math

@@ -39,6 +39,27 @@ class Section:
     lever: ComplexArray
     shear: complex
 
+    def in_motions(self, motions: FloatArray) -> "Section":
+        """The section in k motions of the interfaces, each a column (n + 1, k)."""
+        stretch, across, twist, slip = (
+            motions.T @ each @ motions
+            for each in (self.stretch, self.across, self.twist, self.slip)
+        )
+        return Section(stretch, across, twist, slip, motions.T @ self.lever, self.shear)
+
+
+def opposite_motions(layers: Sequence[Layer]) -> FloatArray:
+    """Motions of the interfaces that bending can excite, orthonormal columns (n + 1, k).
+
+    Where the layers are the same from above as from below, interfaces move opposite to their mirror
+    images: half of them, of a single layer its rotation.
+    """
+    count = len(layers) + 1
+    if tuple(layers) != tuple(layers)[::-1]:
+        return np.eye(count)
+    half = np.eye(count)[:, : count // 2]
+    return np.asarray((half - half[::-1]) / math.sqrt(2))
+
 
 def section_of(
     layers: Sequence[Layer], moduli: Sequence[complex], corrections: FloatArray

@@ -10,7 +10,6 @@ from model.fem.harmonic import direct_acceleration
 from model.fem.mesh import Mesh
 from model.fem.plate_mesh import PlateMesh
 from model.spectral.direct import direct_spectral_acceleration
-from model.spectral.layered_direct import direct_layered_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.actuator import Era
 from model.structure.plate import Plate
@@ -34,8 +33,6 @@ class Responder(Protocol):
 def direct_responder(plate: Plate, mesh: PlateMesh) -> Responder:
     """Direct solution of a plate on a mesh, the check of its reduction."""
     match mesh:
-        case SpectralMesh() if plate.is_layered:
-            return partial(direct_layered_acceleration, plate, mesh)
         case SpectralMesh():
             return partial(direct_spectral_acceleration, plate, mesh)
         case Mesh():

@@ -17,8 +17,6 @@ from model.arrays import ComplexArray, FloatArray
 from model.fem.mesh import Mesh
 from model.fem.plate_mesh import PlateMesh
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.reduction.layered_modes import LayeredModes
-from model.reduction.softer_modes import SofterModes
 from model.reduction.spectral_modes import SpectralModes
 from model.spectral.mesh import SpectralMesh
 from model.structure.actuator import Era
@@ -73,7 +71,7 @@ def estimate_error(
     better = solve_free_plate(free.plate, finer, frequency_max=free.frequency_max)
     own, exact = response(free), response(better)
     error = np.linalg.norm(own - exact, axis=2)
-    if isinstance(free.modes, SpectralModes | LayeredModes):
-        softer = response(replace(free, modes=SofterModes(free.modes)))
+    if isinstance(free.modes, SpectralModes):
+        softer = response(replace(free, modes=free.modes.softer()))
         error += np.linalg.norm(own - softer, axis=2)
     return np.asarray(error / np.linalg.norm(exact, axis=2))

@@ -8,7 +8,6 @@ import pytest
 
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
-from model.reduction.softer_modes import SofterModes
 from model.reduction.spectral_modes import SpectralModes
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
@@ -27,7 +26,7 @@ def plates():
     """The paper's plate without damping in polynomials, and the softer one."""
     free = solve_free_plate(PLATE, SpectralMesh(12, 9, LENGTH, WIDTH), frequency_max=500.0)
     assert isinstance(free.modes, SpectralModes)
-    return free, replace(free, modes=SofterModes(free.modes))
+    return free, replace(free, modes=free.modes.softer())
 
 
 def test_softer_plate_gives_way_by_a_fifth_and_a_decade_more():

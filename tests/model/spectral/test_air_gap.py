@@ -11,8 +11,8 @@ from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import parse_rig
 from model.spectral.air_motion import air_motion
-from model.spectral.layered_class import LayeredPlate
 from model.spectral.mesh import SpectralMesh
+from model.spectral.modes import SpectralPlate
 from model.structure.actuator import Era
 from model.structure.air_gap import HEAT_RATIO, PRESSURE, VISCOSITY, AirGap
 from model.structure.material import Material
@@ -28,7 +28,7 @@ CLASSES = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 def force_of(gap, frequency, parity, degrees=(12, 10)):
     """Matrix of the air's dynamic stiffness [N/m per m²] in the polynomials of a class."""
     plate = replace(PLATE, air_gap=gap)
-    of = LayeredPlate(plate, degrees, 150.0).functions(parity)
+    of = SpectralPlate(plate, degrees, 150.0).functions(parity)
     air, m = air_motion(of, gap), of.deflections
     full = gap.bulk_modulus(frequency) * air.stiffness.astype(complex)
     full -= (2 * np.pi * frequency) ** 2 * gap.inertia(frequency) * np.diag(air.inertia)
@@ -68,7 +68,7 @@ def test_a_slow_square_squeezes_as_reynolds_equation_says():
     """Damping of a rigid square in an open film, 0.4217 mu L⁴ / d³ (Bao and Yang 2007, Eq. 21)."""
     side, depth, frequency = 0.02, 0.1e-3, 1.0
     plate = Plate(side, side, 1e-3, GLASS, air_gap=AirGap(depth))
-    of = LayeredPlate(plate, (24, 24), 150.0).functions((1, 1))
+    of = SpectralPlate(plate, (24, 24), 150.0).functions((1, 1))
     air, m, gap = air_motion(of, plate.air_gap), of.deflections, plate.air_gap
     omega = 2 * np.pi * frequency
     full = 1e12 * air.stiffness.astype(complex)  # incompressible

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import eval_legendre
 
-from model.spectral.functions import EVEN, ODD, Direction
+from model.spectral.functions import EVEN, ODD, EdgedFunctions, _polynomials
 
 LENGTH, DEGREE, DECAY = 0.3, 8, 2000.0
 
@@ -17,7 +17,7 @@ def _layer(x: float, parity: int) -> float:
 @pytest.mark.parametrize("parity", [EVEN, ODD])
 def test_slope_integrals_are_those_of_legendre_polynomials(parity):
     """The integrals of f'g and f'g' of normalised Legendre polynomials, by adaptive quadrature."""
-    direction = Direction(LENGTH, DEGREE, DECAY)
+    direction = EdgedFunctions(LENGTH, DEGREE, (DECAY,))
     degrees = range((1 - parity) // 2, DEGREE + 1, 2)
     others = range((1 + parity) // 2, DEGREE + 1, 2)
 
@@ -45,7 +45,7 @@ def test_slope_integrals_are_those_of_legendre_polynomials(parity):
 @pytest.mark.parametrize("parity", [EVEN, ODD])
 def test_the_layer_is_orthogonal_to_the_polynomials_and_of_unit_norm(parity):
     """Its slope integral is that of the layer less its polynomials, by adaptive quadrature."""
-    direction = Direction(LENGTH, DEGREE, DECAY)
+    direction = EdgedFunctions(LENGTH, DEGREE, (DECAY,))
     degrees = range((1 - parity) // 2, DEGREE + 1, 2)
     near_edges = {"points": [3 / DECAY, LENGTH - 3 / DECAY], "limit": 400}
 
@@ -73,8 +73,8 @@ def test_the_layer_is_orthogonal_to_the_polynomials_and_of_unit_norm(parity):
 
 def test_a_layer_that_polynomials_resolve_is_left_out():
     """On a plate as thick as long, degree 24 has the layer's function already."""
-    assert Direction(LENGTH, 24, 3 / LENGTH).count(EVEN) == 13
-    assert Direction(LENGTH, 24, DECAY).count(EVEN) == 14
+    assert EdgedFunctions(LENGTH, 24, (3 / LENGTH,)).count(EVEN) == 13
+    assert EdgedFunctions(LENGTH, 24, (DECAY,)).count(EVEN) == 14
 
 
 def test_polynomials_are_normalised_legendre_polynomials_at_high_degree():
@@ -83,5 +83,5 @@ def test_polynomials_are_normalised_legendre_polynomials_at_high_degree():
     degrees = np.arange(61)
     expected = eval_legendre(degrees, 2 * x[:, None] / LENGTH - 1)
     expected *= np.sqrt((2 * degrees + 1) / LENGTH)
-    found = Direction(LENGTH, 60, DECAY).polynomials(x)
+    found = _polynomials(x, LENGTH, 60)
     np.testing.assert_allclose(found, expected, atol=1e-11)

@@ -15,8 +15,8 @@ from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.reduction.supported_modes import supported_modes
 from model.rig.file import load_rig
-from model.spectral.layered_class import Band, LayeredPlate
 from model.spectral.mesh import SpectralMesh
+from model.spectral.modes import Band, SpectralPlate
 from model.structure.actuator import Era
 from model.structure.air_gap import AirGap
 from model.structure.equivalent import equivalent_plate
@@ -46,7 +46,7 @@ def panel(layers, length=0.375, width=0.225, **changes):
 
 def frequencies_of(plate, degrees, *, parities=((1, 1), (-1, 1), (1, -1), (-1, -1)), cut=1500.0):
     """Natural frequencies [Hz] of elastic modes and their loss factors, ascending."""
-    layered = LayeredPlate(plate, degrees, 150.0)
+    layered = SpectralPlate(plate, degrees, 150.0)
     found = [
         layered.modes(
             each, shift=(2 * np.pi * 30) ** 2, cut=(2 * np.pi * cut) ** 2, band=Band(30.0, cut)
@@ -113,7 +113,7 @@ def test_complex_modes_equal_a_complex_eigenproblem():
     The eigenvalue of the dynamic stiffness, solved at its own frequency without a modal space.
     """
     plate = panel((PANEL[0], replace(PANEL[1], loss_factor=1.0), PANEL[2]), loss_factor=0.0)
-    layered = LayeredPlate(plate, (10, 8), 150.0)
+    layered = SpectralPlate(plate, (10, 8), 150.0)
     modes = layered.modes(
         (1, 1), shift=(2 * np.pi * 30) ** 2, cut=(2 * np.pi * 500) ** 2, band=Band(30.0, 500.0)
     )

@@ -19,7 +19,7 @@ from model.rig.meshes import mesh_of
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
-from model.spectral.stiffness import class_stiffness
+from model.spectral.modes import SpectralPlate
 from model.structure.actuator import Era
 from model.structure.material import Material
 from model.structure.plate import Plate
@@ -88,28 +88,16 @@ def test_response_on_feet_is_that_of_fine_elements(layout, foot):
     assert np.linalg.norm(high - exact) / size < 0.001
 
 
-@pytest.mark.parametrize(
-    ("before", "polynomials_per_point"),
-    [([], 50), (["edges"], 50), (["edges"], 1)],
-    ids=["first layout", "further layout", "further layout alone"],
-)
 @pytest.mark.parametrize("foot", [0.0, 0.004])
 @pytest.mark.parametrize("layout", ["corners", "inside", "close together"])
-def test_reduction_equals_direct_solution(layout, foot, before, polynomials_per_point, monkeypatch):
-    """Modes and truncated ones against a solution of all unknowns at each frequency, 1e-5.
-
-    Places of the first layout are solved for, those of others come from residual operators, or with
-    many polynomials for each point are solved for as well.
-    """
-    monkeypatch.setattr("model.reduction.spectral_modes._PER_POINT", polynomials_per_point)
+def test_reduction_equals_direct_solution(layout, foot):
+    """Modes and truncated ones against a solution of all unknowns at each frequency, 1e-5."""
     eras = [replace(era, foot=foot) for era in _on_plate(PAPER, LAYOUTS[layout])]
     loads = [PointLoad(0.1, 0.05, 2e3, 1.0, 0.01)]
     frequencies = np.array([45.0, 106.4, 250.0, 480.0])
     points = np.random.default_rng(1).uniform(0.01, 0.2, (25, 2))
     mesh = SpectralMesh(12, 9, PAPER.length, PAPER.width)
     free = solve_free_plate(PAPER, mesh, frequency_max=500.0)
-    for other in before:
-        free.acceleration(_on_plate(PAPER, LAYOUTS[other]), frequencies, points)
     found = free.acceleration(eras, frequencies, points, loads=loads)
     exact = direct_spectral_acceleration(PAPER, mesh, eras, frequencies, points, loads=loads)
     error = np.linalg.norm(found - exact, axis=2) / np.linalg.norm(exact, axis=2)
@@ -131,16 +119,27 @@ def test_modes_are_those_of_a_full_eigen_solution(plate, degrees, frequency):
     """LAPACK on all unknowns of each class finds the same modes below a cut-off, and no others."""
     of = PLATES[plate]
     mesh = SpectralMesh(*degrees, of.length, of.width)
-    modes = spectral_modes(of, mesh, shift=(2 * math.pi * 30) ** 2, cutoff_frequency=frequency)
-    every = np.concatenate(
-        [
-            linalg.eigvalsh(class_stiffness(of, *mesh.directions(of), each), lower=False)
-            for each in CLASSES
-        ]
+    modes = spectral_modes(
+        of,
+        mesh,
+        shift=(2 * math.pi * 30) ** 2,
+        cutoff_frequency=frequency,
+        frequency_max=frequency,
     )
+    every = np.concatenate([_all_eigenvalues(of, degrees, each) for each in CLASSES])
     expected = np.sqrt(np.maximum(every, 0)) / (2 * math.pi)
     found = np.sqrt(np.sort(modes.eigenvalues)) / (2 * math.pi)
     np.testing.assert_allclose(found, np.sort(expected[expected < frequency]), rtol=1e-5, atol=0.1)
+
+
+def _all_eigenvalues(plate: Plate, degrees, parity) -> np.ndarray:
+    """omega² of all unknowns of a class, displacements along the plate with their inertia."""
+    spectral = SpectralPlate(plate, degrees, 150.0)
+    of = spectral.functions(parity)
+    K = spectral._stiffness(of, [plate.material.E])
+    M = plate.material.rho * plate.thickness * np.eye(of.size)
+    M[of.deflections :, of.deflections :] /= 6  # of opposite unit motions
+    return linalg.eigvalsh(K, M)
 
 
 def test_local_compliance_is_smooth_over_the_plate():

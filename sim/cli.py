@@ -18,9 +18,9 @@ from sim.witness_cli import witness
 if TYPE_CHECKING:
     from sim.control.context import SimulationContext
     from sim.far_ends.wires import Wire
+    from sim.plant.accelerometer import Accelerometer
     from sim.process.simulation import Simulation
     from sim.process.view import PlateView
-    from sim.sensors.accelerometer import Accelerometer
 
 app = typer.Typer(pretty_exceptions_enable=False)
 app.command()(witness)
@@ -196,7 +196,7 @@ def _check_rate(rate: float, *, frequency_max: float) -> None:
 
 def _sensor(text: str) -> "Accelerometer":
     from model.config.points import parse_point
-    from sim.sensors.accelerometer import Accelerometer
+    from sim.plant.accelerometer import Accelerometer
 
     name, equals, position = text.partition("=")
     if not (name and equals):

@@ -10,7 +10,13 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.setting import RIG, random_contacts
-from examples.make_measured import FREQUENCIES, SENSOR, true_rig
+from examples.make_measured import (
+    FREQUENCIES,
+    SENSOR,
+    record_responses,
+    scanning_grid,
+    true_rig,
+)
 from model.calibration.calibrate import calibrate
 from model.calibration.calibration_result import Calibration
 from model.finger.contrast import contrast_db
@@ -20,8 +26,6 @@ from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.question import Question
 from model.table.table import LocalizationTable
-from sim.sensors.accelerometer import scanning_grid
-from sim.sensors.stepped_sine import record_responses
 
 GRIDS = ((2, 2), (3, 2), (4, 3), (6, 4))
 NOISE = (1.0, 10.0, 100.0)  # times that of the example's sensors

@@ -30,7 +30,8 @@ from model.transients.base_motion import Motion
 from sim.amplifier.contract import Amplifier
 from sim.bench.placement import Placement
 from sim.bench.reading import ToneReader
-from sim.bench.sensing import PlateSensor, Sensing
+from sim.bench.sensing import REACH, Sensing
+from sim.plant.accelerometer import Accelerometer
 from sim.plant.felt import Felt, measure_vibration
 from sim.plant.fingers import KEPT, Fingers, Position, Record
 from sim.plant.imperfections import Imperfections, PlateErrors, draw_noise, realised
@@ -248,13 +249,9 @@ class Bench:
         for sensing in self._sensing:
             sensing.changed(self._time)
 
-    def place_sensors(self, sensors: Sequence[PlateSensor]) -> None:
+    def place_sensors(self, sensors: Sequence[Accelerometer]) -> None:
         """Replace the sensors of the first amplifier beside those at its ERAs."""
         self._sensing[0].place(sensors)
-
-    def listen_to_plate(self, reader: ToneReader) -> None:
-        """Pass samples on to a reader from now on."""
-        self.probes.append(reader)
 
     def forget_reader(self, reader: ToneReader) -> None:
         """Pass no more samples on to a reader."""
@@ -431,15 +428,16 @@ def _reduced(
     return reduce_plate(plate, mesh, points, frequency_max=frequency_max)
 
 
-def _feet(rig: Rig, amplifier: str) -> list[PlateSensor]:
+def _feet(rig: Rig, amplifier: str) -> list[Accelerometer]:
     """A sensor at the foot of each ERA of an amplifier, in the order of its channels."""
-    wired = [
-        (channel.number, era)
-        for era in rig.eras
-        if (channel := rig.wiring[era.name]).amplifier == amplifier
-    ]
+    wired = {
+        channel.number: name
+        for name, channel in rig.wiring.items()
+        if channel.amplifier == amplifier
+    }
     return [
-        PlateSensor(era.x, era.y, number) for number, era in sorted(wired, key=lambda one: one[0])
+        Accelerometer(name, rig.era(name).x, rig.era(name).y, reach=REACH, channel=number)
+        for number, name in sorted(wired.items())
     ]
 
 

@@ -12,7 +12,7 @@ from typing import final
 import numpy as np
 
 from model.arrays import FloatArray
-from sim.plant.transducer import Transducer, read_accelerations
+from sim.plant.accelerometer import Accelerometer, readings
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class ToneReader:
     def __init__(
         self,
         measurement: Measurement,
-        transducers: Sequence[Transducer],
+        sensors: Sequence[Accelerometer],
         *,
         shapes: Callable[[], FloatArray],
         start: float,
@@ -50,17 +50,17 @@ class ToneReader:
         self.offset = 0.0 if origin is None else start - origin
         self.token = token
         self.is_disturbed = False
-        self._transducers = tuple(transducers)
+        self._sensors = tuple(sensors)
         self._shapes = shapes
         self._start = start
         self._sample_rate = sample_rate
         self._rng = rng
         self._on_end = on_end
-        self._reach = np.array([one.reach for one in transducers])
-        unknowns, sensors = 2 * len(measurement.frequencies) + 1, len(transducers)
+        self._reach = np.array([one.reach for one in sensors])
+        unknowns, count = 2 * len(measurement.frequencies) + 1, len(sensors)
         self._normal = np.zeros((unknowns, unknowns))
-        self._right = np.zeros((unknowns, sensors))
-        self._is_overloaded = np.zeros(sensors, dtype=bool)
+        self._right = np.zeros((unknowns, count))
+        self._is_overloaded = np.zeros(count, dtype=bool)
 
     @property
     def shapes(self) -> FloatArray:
@@ -70,17 +70,13 @@ class ToneReader:
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
         """Take samples: times (n,) [s], accelerations (n, s) [m/s²]."""
         inside = (times > self._start) & (times <= self.end)
-        readings = read_accelerations(
-            self._transducers,
-            accelerations[inside],
-            sample_rate=self._sample_rate,
-            rng=self._rng,
-        )
+        rate = self._sample_rate
+        read = readings(self._sensors, accelerations[inside], sample_rate=rate, rng=self._rng)
         angles = 2 * math.pi * np.outer(times[inside] - self._start, self.measurement.frequencies)
         columns = np.hstack([np.sin(angles), np.cos(angles), np.ones((len(angles), 1))])
         self._normal += columns.T @ columns
-        self._right += columns.T @ readings
-        self._is_overloaded |= (np.abs(readings) >= self._reach).any(axis=0)
+        self._right += columns.T @ read
+        self._is_overloaded |= (np.abs(read) >= self._reach).any(axis=0)
         if len(times) and times[-1] + 1 / self._sample_rate > self.end:
             self._on_end(self)
 

@@ -1,14 +1,14 @@
 """The sensors of one simulated amplifier: one at the foot of each ERA that it drives, and others.
 
-They read the acceleration of the plate in time. Not modelled: delay of the sensors.
+They read the acceleration of the plate in time.
 """
 
 import cmath
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
-from typing import Protocol, final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
@@ -22,8 +22,12 @@ from drivers.protocol.table import (
     UNKNOWN_PLACE,
     sensor_reading,
 )
-from model.arrays import FloatArray
+from sim.amplifier.contract import Amplifier
 from sim.bench.reading import Measurement, ToneReader
+from sim.plant.accelerometer import Accelerometer, positions
+
+if TYPE_CHECKING:
+    from sim.bench.bench import Bench
 
 REACH = 2000.0
 """Largest range [m/s²]; the paper's plate stays below with all ERAs at full stroke."""
@@ -35,65 +39,22 @@ _ROUNDING = 1e-6
 _BELOW_NYQUIST, _FREQUENCY_MAX = 0.8, 3000.0  # Hz
 
 
-@dataclass(frozen=True)
-class PlateSensor:
-    """A sensor at x, y [m]; channel: whose ERA it sits at. Characteristics as a `Transducer`."""
-
-    x: float
-    y: float
-    channel: int | None = None
-    noise_density: float = 0.0
-    reach: float = REACH
-    resolution: float = 0.0
-    scale: float = 1.0
-
-
-class SensedPlate(Protocol):
-    """The plate that sensors are on."""
-
-    sample_rate: float
-
-    def shapes_at(self, points: FloatArray) -> FloatArray:
-        """Reduced shapes (p, r) at points (p, 2) [m]."""
-        ...
-
-    def listen_to_plate(self, reader: ToneReader) -> None:
-        """Pass samples on to a reader from now on."""
-        ...
-
-    def forget_reader(self, reader: ToneReader) -> None:
-        """Pass no more samples on to a reader."""
-        ...
-
-
-class Played(Protocol):
-    """What an amplifier plays."""
-
-    @property
-    def token(self) -> int:
-        """Token of the set since arming from whose commit t counts; 0: none."""
-
-    @property
-    def committed_at(self) -> float:
-        """Time of that commit [s]."""
-
-
 @final
 class Sensing:
     """The sensors of an amplifier that plays on a plate; feet: those at its ERAs."""
 
     def __init__(
-        self, plate: SensedPlate, played: Played, feet: Sequence[PlateSensor], *, seed: int
+        self, bench: "Bench", amplifier: Amplifier, feet: Sequence[Accelerometer], *, seed: int
     ) -> None:
-        self._plate = plate
-        self._played = played
+        self._bench = bench
+        self._amplifier = amplifier
         self._feet = tuple(feet)
-        self._others: tuple[PlateSensor, ...] = ()
+        self._others: tuple[Accelerometer, ...] = ()
         self._rng = np.random.default_rng(seed)
         self.reader: ToneReader | None = None
         """What reads the tones, or has read them last."""
 
-    def place(self, others: Sequence[PlateSensor]) -> None:
+    def place(self, others: Sequence[Accelerometer]) -> None:
         """Replace the sensors that are not at ERAs; more than the protocol counts are left out."""
         self._others = tuple(replace(one, reach=min(one.reach, REACH)) for one in others)
 
@@ -114,16 +75,16 @@ class Sensing:
         """Forget the reading, as without supply."""
         reader, self.reader = self.reader, None
         if reader is not None:
-            self._plate.forget_reader(reader)
+            self._bench.forget_reader(reader)
 
     @property
-    def sensors(self) -> tuple[PlateSensor, ...]:
+    def sensors(self) -> tuple[Accelerometer, ...]:
         """All sensors, those at its ERAs first."""
         return (*self._feet, *self._others)[:_MAX_SENSORS]
 
     @property
     def _frequency_max(self) -> float:
-        nyquist = self._plate.sample_rate / 2
+        nyquist = self._bench.sample_rate / 2
         return _Q["frequency"].quantise(min(_BELOW_NYQUIST * nyquist, _FREQUENCY_MAX))
 
     def _listed(self, first: int) -> Values:
@@ -132,7 +93,7 @@ class Sensing:
         listed = described[first:][: (MAX_WORDS - 2) // _SENSOR_WORDS]
         return {"all": len(described), "count": len(listed), "sensors": listed}
 
-    def _described(self, sensor: PlateSensor) -> Values:
+    def _described(self, sensor: Accelerometer) -> Values:
         return {
             "unit": SENSOR_UNITS["ACCELERATION"],
             "channel": NO_CHANNEL if sensor.channel is None else sensor.channel,
@@ -161,20 +122,20 @@ class Sensing:
             raise Refusal(f"frequencies must be {1 / measurement.window:g} Hz apart, got {apart:g}")
         self.forget()
         sensors = self.sensors
-        points = np.array([[one.x, one.y] for one in sensors])
-        token = self._played.token
+        points = positions(sensors)
+        token = self._amplifier.token
         self.reader = ToneReader(
             measurement,
             sensors,
-            shapes=lambda: self._plate.shapes_at(points),
+            shapes=lambda: self._bench.shapes_at(points),
             start=now,
-            origin=self._played.committed_at if token else None,
+            origin=self._amplifier.committed_at if token else None,
             token=token,
-            sample_rate=self._plate.sample_rate,
+            sample_rate=self._bench.sample_rate,
             rng=self._rng,
-            on_end=self._plate.forget_reader,
+            on_end=self._bench.forget_reader,
         )
-        self._plate.listen_to_plate(self.reader)
+        self._bench.probes.append(self.reader)
 
     def _reading(self, first: int, now: float) -> Values:
         """Report the reading at a time [s], its sensors from one on, as many as fit."""

@@ -1,9 +1,10 @@
 """Control operations on sensors and recordings."""
 
 import asyncio
-import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from model.errors import InputError
 from sim.control.context import SimulationContext
@@ -16,16 +17,15 @@ from sim.control.values import (
     parse_position,
     parse_window,
 )
-from sim.sensors.accelerometer import Accelerometer
+from sim.plant.accelerometer import Accelerometer
 from sim.sensors.recording import Recording
-from sim.sensors.signal_measures import tone_phasors
 
 _MAX_TONES = 64
-_SENSOR_KEYS = {  # by key: unit, and the value where it is left out
-    "noise_m_s2_rthz": ("m/s²/√Hz", 0.0),
-    "reach_m_s2": ("m/s²", math.inf),
-    "resolution_m_s2": ("m/s²", 0.0),
-    "scale": ("reading per acceleration", 1.0),
+_SENSOR_KEYS = {  # by key: field and unit
+    "noise_m_s2_rthz": ("noise_density", "m/s²/√Hz"),
+    "reach_m_s2": ("reach", "m/s²"),
+    "resolution_m_s2": ("resolution", "m/s²"),
+    "scale": ("scale", "reading per acceleration"),
 }
 
 
@@ -47,11 +47,12 @@ def _sensor(name: str, given: object) -> Accelerometer:
     if unknown:
         raise InputError(f"{what}: {unknown[0][:40]!r} is unknown")
     x, y = parse_position(given.get("at_m"), what=what)
-    values = (
-        parse_number(given, key, unit) if key in given else default
-        for key, (unit, default) in _SENSOR_KEYS.items()
-    )
-    return Accelerometer(name, x, y, *values)
+    values: dict[str, Any] = {
+        field: parse_number(given, key, unit)
+        for key, (field, unit) in _SENSOR_KEYS.items()
+        if key in given
+    }
+    return replace(Accelerometer(name, x, y), **values)
 
 
 async def _signals(context: SimulationContext, request: Request, now: float) -> Response:
@@ -80,7 +81,7 @@ async def _tones(context: SimulationContext, request: Request, now: float) -> Re
         )
     recording = _recorded(context, request, now)
     # In a thread: a long fit must not delay the amplifiers' replies.
-    phasors = await asyncio.to_thread(tone_phasors, recording, frequencies)
+    phasors = await asyncio.to_thread(recording.tones, frequencies)
     columns = zip(recording.names, recording.points.tolist(), phasors.T, strict=True)
     return {
         "sensors": {

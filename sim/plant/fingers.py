@@ -53,12 +53,12 @@ class Record:
     accelerations: FloatArray
 
 
-def check_position(name: str, position: Position, *, plate: Plate) -> None:
+def check_on_plate(what: str, position: Position, plate: Plate) -> None:
     """Raise InputError for a position [m] off the plate."""
     x, y = position
     if not (math.isfinite(x) and math.isfinite(y) and plate.contains(x, y)):
         raise InputError(
-            f"finger {name} must be on the plate, (0, 0) to ({plate.length:g}, {plate.width:g}) m, "
+            f"{what} must be on the plate, (0, 0) to ({plate.length:g}, {plate.width:g}) m, "
             f"got ({x:g}, {y:g}) m"
             f"{in_metres(x, y, length=plate.length, width=plate.width)}"
         )
@@ -92,7 +92,7 @@ class Fingers:
                 f"number of fingers must be at most {MAX_FINGERS}, got {len(positions)}"
             )
         for name, position in positions.items():
-            check_position(name, position, plate=self._reduced.plate)
+            check_on_plate(f"finger {name}", position, self._reduced.plate)
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
         """Keep samples at the points of the layout: times (n,) [s], accelerations (n, p) [m/s²]."""

@@ -23,11 +23,11 @@ from sim.far_ends.wires import open_wires
 from sim.faults.fault_file import FaultFile
 from sim.firmware.bench import FirmwareBench
 from sim.firmware.programs import running
+from sim.plant.accelerometer import Accelerometer
 from sim.plant.fingers import Position
 from sim.plant.imperfections import Imperfections
 from sim.plant.plant import SAMPLE_RATE
 from sim.process.virtual_time import SteppedLoop
-from sim.sensors.accelerometer import Accelerometer
 from sim.transport.links import linked_urls
 
 _VIEW_INTERVAL = 0.2  # s

@@ -13,7 +13,7 @@ import numpy as np
 from model.arrays import FloatArray
 from model.errors import InputError
 from sim.bench.bench import Bench
-from sim.sensors.accelerometer import Accelerometer, positions, read_sensors
+from sim.plant.accelerometer import Accelerometer, positions, readings
 from sim.sensors.recording import Recording
 from sim.sensors.recording_file import check_recordable, max_values, write_recording
 
@@ -89,14 +89,10 @@ class Recorder:
         if not self._count:
             self._start = float(times[0])
         accelerations = accelerations[: self._room - self._count]
-        read = read_sensors(
-            self._sensors,
-            accelerations[:, : len(self._sensors)],
-            sample_rate=self._bench.sample_rate,
-            start=float(times[0]),
-            rng=self._rng,
-        )
-        together = np.hstack([read.samples, accelerations[:, len(self._sensors) :]])
+        of_sensors, of_fingers = np.split(accelerations, [len(self._sensors)], axis=1)
+        rate = self._bench.sample_rate
+        read = readings(self._sensors, of_sensors, sample_rate=rate, rng=self._rng)
+        together = np.hstack([read, of_fingers])
         left = memoryview(np.ascontiguousarray(together, dtype=np.float64).tobytes())
         try:
             while left:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
+from sim.plant.felt import fit_tones
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +53,20 @@ class Recording:
             float(self.times[inside[0]]),
             self.samples[inside],
         )
+
+    def tones(self, frequencies: Sequence[float]) -> ComplexArray:
+        """Complex amplitude (f, s) [m/s²] of tones, Im[a exp(i omega t)], t on the plate's clock.
+
+        Least squares of all tones and a constant; it must be longer than the inverse of the
+        smallest frequency difference. Raises InputError for fewer samples than unknowns.
+        """
+        needed = 2 * len(frequencies) + 1
+        if len(self.samples) < needed:
+            raise InputError(
+                f"{len(frequencies)} tones need {needed} samples, got {len(self.samples)}: record "
+                "longer"
+            )
+        return fit_tones(self.times, self.samples, frequencies, with_offset=True)
 
 
 @dataclass(frozen=True)

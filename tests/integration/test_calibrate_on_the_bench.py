@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from examples.make_measured import record_responses, scanning_grid
 from model.calibration import calibrate
 from model.calibration.calibration_result import Calibration
 from model.calibration.responses import Responses
@@ -21,8 +22,7 @@ from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.vibration.parametric_plate import parametric_plate
 from perturbed_plate import FREQUENCIES, perturbed
-from sim.sensors.accelerometer import Accelerometer, scanning_grid
-from sim.sensors.stepped_sine import record_responses
+from sim.plant.accelerometer import Accelerometer
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 

@@ -18,7 +18,8 @@ from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from model.vibration.direct import direct_responder
 from sim.amplifier.contract import Amplifier as SimulatedAmplifier
-from sim.sensors.accelerometer import Accelerometer, Accelerometers
+from sim.plant.accelerometer import Accelerometer
+from sim.sensors.accelerometers import Accelerometers
 from virtual_loop import in_virtual_time
 from wires import WIRES
 from words_bench import HostedRig, layer, rig_on_wire

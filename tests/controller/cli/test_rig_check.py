@@ -8,11 +8,11 @@ import pytest
 from typer.testing import CliRunner
 
 from controller.cli.demo import app
+from examples.make_measured import record_responses, scanning_grid
 from model.calibration.responses_file import write_responses_csv, write_responses_uff
 from model.rig.file import load_rig
 from rig_files import write_rig
-from sim.sensors.accelerometer import Accelerometer, scanning_grid
-from sim.sensors.stepped_sine import record_responses
+from sim.plant.accelerometer import Accelerometer
 
 
 @pytest.mark.parametrize("ending", ["csv", "uff"])

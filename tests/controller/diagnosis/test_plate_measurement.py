@@ -32,8 +32,8 @@ from model.vibration.direct import direct_responder
 from rig_on_wire import FarSide, far_side
 from sim.amplifier.contract import Amplifier
 from sim.bench import bench
-from sim.bench.sensing import PlateSensor as SimulatedSensor
-from sim.sensors.accelerometer import Accelerometer, Accelerometers
+from sim.plant.accelerometer import Accelerometer
+from sim.sensors.accelerometers import Accelerometers
 from virtual_loop import run_virtual
 from wires import SHARED_WIRES, WIRES, on_two_amplifiers
 
@@ -82,7 +82,7 @@ def noisy_feet(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sensors at the feet of ERAs with noise."""
     quiet = bench._feet
 
-    def noisy(rig: Rig, amplifier: str) -> list[SimulatedSensor]:
+    def noisy(rig: Rig, amplifier: str) -> list[Accelerometer]:
         return [replace(each, noise_density=NOISE) for each in quiet(rig, amplifier)]
 
     monkeypatch.setattr(bench, "_feet", noisy)

@@ -16,7 +16,7 @@ from model.fem.harmonic import direct_acceleration
 from model.rig.rig import Rig
 from plate_in_time import apart
 from sim.bench.bench import Bench
-from sim.bench.sensing import PlateSensor
+from sim.plant.accelerometer import Accelerometer
 from virtual_loop import in_virtual_time
 from wires import on_two_amplifiers
 from words_bench import layer, rig_in_memory
@@ -61,7 +61,7 @@ async def test_host_measures_at_the_feet_what_the_model_says(coarse_rig: Rig) ->
     frequencies = [110.0 + 20 * number for number in range(16)]
     x = np.linspace(0.02, 0.28, 28)
     async with rig_in_memory(coarse_rig) as rig:
-        rig.bench.place_sensors([PlateSensor(each, 0.11) for each in x])
+        rig.bench.place_sensors([Accelerometer("", each, 0.11) for each in x])
         await rig.group.arm()
         tones = [layer((0, 110.0, 1.0)), layer((3, 210.0, 0.5), number=1)]
         await rig.group.apply({"main": tones})

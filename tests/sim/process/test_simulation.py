@@ -19,9 +19,9 @@ from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.control.context import SimulationContext
 from sim.far_ends.wire_assignment import WireAssignment
 from sim.far_ends.wires import Wire
+from sim.plant.accelerometer import Accelerometer
 from sim.process.simulation import Simulation, run_simulation
 from sim.process.view import PlateView, draw
-from sim.sensors.accelerometer import Accelerometer
 from sim.sensors.recording_file import read_recording
 from words_bench import LIMITS, layer
 

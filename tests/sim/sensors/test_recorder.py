@@ -11,7 +11,7 @@ from full_disk import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig
 from sim.bench.bench import Bench
-from sim.sensors.accelerometer import Accelerometer
+from sim.plant.accelerometer import Accelerometer
 from sim.sensors.recorder import Recorder
 from sim.sensors.recording_file import read_recording
 

@@ -51,7 +51,7 @@ def test_unknown_name_lists_the_known_ones() -> None:
 @pytest.mark.parametrize(
     ("module", "not_loaded"),
     [
-        ("Client", "scipy matplotlib sim pymodbus"),
+        ("Client", "scipy matplotlib sim serial"),
         ("load_rig", "matplotlib sim controller"),
         ("plugins.wires", "model controller sim numpy scipy"),
         *(

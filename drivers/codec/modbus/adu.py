@@ -1,24 +1,16 @@
-"""Modbus ADUs of register requests, over TCP and RTU; the only module that imports pymodbus.
+"""Modbus ADUs of register requests, over TCP and RTU.
 
-Its framers and requests are used, its client is not: over RTU it credits a late response to the
-next request, it closes a TCP connection after a damaged response, and it discards partial data when
-the next request goes out. Responses are therefore parsed by `ResponseReader`.
+A response is credited to a request alone that it answers; what is late, of others or damaged is
+counted.
 """
 
 import struct
 from dataclasses import dataclass
 
-from pymodbus.framer import FramerRTU, FramerSocket
-from pymodbus.pdu import DecodePDU, ModbusPDU
-from pymodbus.pdu.register_message import (
-    ReadInputRegistersRequest,
-    WriteMultipleRegistersRequest,
-)
-
+from drivers.codec.modbus.crc import crc16
 from drivers.statistics import WireCounters
 
-_RTU = FramerRTU(DecodePDU(False))
-_TCP = FramerSocket(DecodePDU(False))
+_READ, _WRITE = 4, 16  # input registers, multiple registers
 _MBAP = 7  # transaction, protocol, length, unit
 _LENGTH_MAX = 254  # unit and PDU
 _RTU_MAX = 256
@@ -74,19 +66,18 @@ class ModbusResponse:
 
 def build_adu(transfer: Read | Write, *, unit: int, transaction: int, is_rtu: bool) -> RequestAdu:
     """Build the request that reads or writes."""
-    pdu: ModbusPDU
     if isinstance(transfer, Read):
-        pdu = ReadInputRegistersRequest(address=transfer.address, count=transfer.count)
-        head, size = bytes([pdu.function_code, 2 * transfer.count]), 2 + 2 * transfer.count
+        pdu = struct.pack(">BHH", _READ, transfer.address, transfer.count)
+        head, size = bytes([_READ, 2 * transfer.count]), 2 + 2 * transfer.count
     else:
         count = len(transfer.registers)
-        pdu = WriteMultipleRegistersRequest(
-            address=transfer.address, registers=[*transfer.registers]
-        )
-        head, size = struct.pack(">BHH", pdu.function_code, transfer.address, count), 5
-    pdu.dev_id = unit
-    pdu.transaction_id = transaction
-    frame = (_RTU if is_rtu else _TCP).buildFrame(pdu)
+        head, size = struct.pack(">BHH", _WRITE, transfer.address, count), 5
+        pdu = head + struct.pack(f">B{count}H", 2 * count, *transfer.registers)
+    if is_rtu:
+        frame = bytes([unit]) + pdu
+        frame += crc16(frame)
+    else:
+        frame = struct.pack(">HHHB", transaction, 0, 1 + len(pdu), unit) + pdu
     return RequestAdu(unit, transaction, frame, transfer, head, size)
 
 
@@ -151,7 +142,7 @@ class ResponseReader:
             size = self._rtu_size(start, to)
             if size and start + size <= len(self._buffer):
                 frame = bytes(self._buffer[start : start + size])
-                if FramerRTU.check_CRC(frame[:-2], int.from_bytes(frame[-2:], "big")):
+                if crc16(frame[:-2]) == frame[-2:]:
                     self._counters.invalid_frames += start > 0
                     del self._buffer[: start + size]
                     return 0, frame[0], frame[1:-2]

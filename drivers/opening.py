@@ -21,10 +21,12 @@ class _Opened:
 
     async def close(self) -> None:
         """Close it; what waits on the line fails."""
-        if self.line.loss is None:
-            self.line.lose(f"{self.line.name} was closed")
-        self.port.close()
-        await self.port.wait_closed()
+        try:
+            if self.line.loss is None:
+                self.line.lose(f"{self.line.name} was closed")
+        finally:
+            self.port.close()
+            await self.port.wait_closed()
 
 
 class Lines:
@@ -33,6 +35,7 @@ class Lines:
     def __init__(self) -> None:
         self._opened: dict[str, _Opened] = {}
         self._changing: dict[str, asyncio.Lock] = {}  # held while a line is opened
+        self._closing: set[asyncio.Task[None]] = set()
 
     async def amplifier(
         self,
@@ -80,9 +83,19 @@ class Lines:
         )
 
     async def close(self) -> None:
-        """Close all lines; disarm before, or vibrations last until the watchdogs trip."""
+        """Close all lines; disarm before, or vibrations last until the watchdogs trip.
+
+        A second call waits for the first. Lines are closed though the caller is cancelled.
+        """
         opened, self._opened = self._opened, {}
-        await asyncio.gather(*(each.close() for each in opened.values()))
+        for each in opened.values():
+            closing = asyncio.create_task(each.close(), name=f"close {each.line.name}")
+            self._closing.add(closing)
+            closing.add_done_callback(self._closing.discard)
+        if self._closing:
+            done, _ = await asyncio.wait(self._closing)
+            for closing in done:
+                closing.result()
 
 
 async def _open(address: WireAddress) -> _Opened:

@@ -322,6 +322,8 @@ class Supervisor:
                 await self._controller.close()
                 return
         except (LinkError, CommandRefused, FrameError) as error:
+            if self._is_closing:
+                return
             self._link_changed("retry", (), str(error))
             event = DaemonEvent(Trigger.NOT_FOUND, str(error), _SEARCHING)
             await self._in_background(self.handle(event))

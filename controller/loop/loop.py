@@ -234,12 +234,14 @@ class Controller:
         self._wake.set()
         if self._lines_if_open is not None and self._group.lost_by:
             self._missing = frozenset(self._group.lost_by)
+        lines = self._lines_if_open  # those of now: others may be opened meanwhile
         try:
             await self._group.close(CLOSING_RAMP)
         finally:
-            lines, self._lines_if_open = self._lines_if_open, None
             if lines is not None:
                 await lines.close()
+            if self._lines_if_open is lines:
+                self._lines_if_open = None
 
     async def run(self) -> None:
         """Run the loop until `close` or cancellation; raises LinkError when an amplifier is lost.

@@ -3,11 +3,13 @@
 import asyncio
 import contextlib
 import logging
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import serial
 
 from controller.api.jsonrpc import ErrorCode
 from controller.daemon.config import load_daemon_config
@@ -19,6 +21,7 @@ from daemon_bench import (
     ENABLED,
     PATIENCE,
     READY,
+    daemon_at,
     daemon_table,
     error_code,
     far_end,
@@ -109,7 +112,8 @@ async def test_reload_ends_after_unexpected_error(
     async with ready_daemon(tmp_path) as (bench, _):
         notices: list[str] = []
         await bench.daemon._supervisor.started.wait()
-        await asyncio.sleep(0)  # the start is reported
+        for _ in range(10):  # the start is reported within three cycles of the event loop
+            await asyncio.sleep(0)
         manager = bench.daemon._manager
         monkeypatch.setattr(manager, "reloading", lambda: notices.append("reloading"))
         monkeypatch.setattr(manager, "ready", lambda status: notices.append("ready"))
@@ -143,6 +147,31 @@ async def test_shutdown_cancels_reload(tmp_path: Path, monkeypatch: pytest.Monke
         with contextlib.suppress(asyncio.CancelledError):
             await reload
         assert reload.cancelled()
+
+
+async def test_shutdown_while_a_port_is_opened_leaves_none_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The system takes its time; the port is closed at last, free for others, not opened again."""
+    opened: list[serial.Serial] = []
+    may_open, open_now = threading.Event(), serial.Serial.open
+
+    def slow(port: serial.Serial) -> None:
+        opened.append(port)
+        assert may_open.wait(PATIENCE)
+        open_now(port)
+
+    monkeypatch.setattr("serial.Serial.open", slow)
+    async with far_end(tmp_path) as far:
+        async with daemon_at(far, tmp_path) as bench:
+            await until(lambda: opened)
+            bench.daemon.shut_down("end of the test")
+            await until(lambda: bench.daemon._supervisor._is_closing)
+            asyncio.get_running_loop().call_later(0.1, may_open.set)
+        await until(lambda: not opened[0].is_open)
+        assert len(opened) == 1
+        with serial.Serial(opened[0].port, exclusive=True):
+            pass
 
 
 async def test_shutdown_ends_wait_for_amplifier_at_start(tmp_path: Path) -> None:

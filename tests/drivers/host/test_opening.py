@@ -39,7 +39,7 @@ async def read_for_ever(amplifier: Amplifier) -> None:
 
 
 class SlowHardware(HardwareProvider):
-    """Opens a port in half a second; closed: how many were closed."""
+    """Opens and closes a port in half a second; closed: how many were closed."""
 
     is_blocked = False
     closed = 0
@@ -64,7 +64,22 @@ class SlowHardware(HardwareProvider):
         self.closed += 1
 
     async def wait_closed(self) -> None:
-        """It is closed."""
+        """It takes its time."""
+        await asyncio.sleep(0.5)
+
+
+@in_virtual_time
+async def test_lines_are_closed_before_a_second_close_returns() -> None:
+    """A reconnection closes them as well; opened before that, the port would still be taken."""
+    HARDWARE_PROVIDER.set(SlowHardware())
+    lines, loop = Lines(), asyncio.get_running_loop()
+    await lines.amplifier("serial:///dev/x?address=1", LIMITS, name="x")
+    first = asyncio.create_task(lines.close())
+    await asyncio.sleep(0.1)
+    began = loop.time()
+    first.cancel()
+    await lines.close()
+    assert loop.time() - began == pytest.approx(0.4)
 
 
 @in_virtual_time

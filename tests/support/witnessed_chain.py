@@ -47,8 +47,6 @@ SHARED: Excitation = {"SW": Tone(90.0, 30e-6, 0.0)}
 WITNESSED = ("serial", "modbus-tcp", "modbus-rtu", "socketcand", "slcan")
 """Every kind of wire."""
 
-Mangle = Callable[[str, bytes], bytes | None]
-
 
 class OneTable:
     """A table with one pattern for a single finger and one for more; both may be replaced."""
@@ -101,11 +99,13 @@ def make_rig(amplifiers: Sequence[str], limits: GuardLimits) -> Rig:
 
 @dataclass
 class Chain:
-    """A running chain and its witness; names of amplifiers as in the rig."""
+    """A running chain and its witness; names of amplifiers as in the rig.
+
+    delay [s]: of what goes to the host.
+    """
 
     loop: VirtualLoop
     machine: MemoryMachine
-    between: "Between"
     bench: Bench
     witness: Witness
     table: OneTable
@@ -115,6 +115,22 @@ class Chain:
     running: "asyncio.Task[None] | None" = None
     fingers: tuple[int, ...] = ()
     holding: "asyncio.Task[None] | None" = None
+    delay: float = 0.0
+    _due: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Delay what goes to the host, before the witness hears it."""
+        deliver = self.machine.deliver
+
+        def delayed(link: str, toward: str, data: bytes, to: Any) -> None:
+            if toward == "host" and self.delay:
+                # Timers of one moment fire in any order; bytes of one line stay in order.
+                self._due = max(self._due + 1e-9, self.loop.time() + self.delay)
+                self.loop.call_at(self._due, deliver, link, toward, data, to)
+            else:
+                deliver(link, toward, data, to)
+
+        self.machine.deliver = delayed  # type: ignore[method-assign]
 
     @property
     def amplifier(self) -> Amplifier:
@@ -203,12 +219,11 @@ class Chain:
         await self.rest(0.150)
         self.witness.contacts(heard + 0.150, ())
 
-    def inject(self, toward: str, data: bytes) -> None:
-        """Inject noise or a late copy of a frame on the first wire."""
-        terminal = self.machine._terminals[self.link]
-        port = self.machine._open[self.link]
-        direction = terminal.inward if toward == "amplifier" else port.outward
-        self.machine.deliver(self.link, toward, data, direction)
+    def inject(self, data: bytes) -> None:
+        """Inject bytes toward the amplifier on the first wire."""
+        self.machine.deliver(
+            self.link, "amplifier", data, self.machine._terminals[self.link].inward
+        )
 
     async def _try(self, work: Awaitable[Any]) -> None:
         try:
@@ -283,7 +298,6 @@ async def _play(
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
     machine = live_in_memory()
-    between = Between(machine)
     rig = make_rig(names, limits)
     bench = Bench(rig, now=loop.time())
     devices = [
@@ -299,7 +313,7 @@ async def _play(
         witness.contacts(loop.time(), ())
         table = OneTable(rig.plate)
         controller = Controller(rig, table, lines=Lines, urls=urls)
-        chain = Chain(loop, machine, between, bench, witness, table, controller, links)
+        chain = Chain(loop, machine, bench, witness, table, controller, links)
         async with _sensed(chain):
             await chain._try(controller.open())
             if not chain.errors:
@@ -327,31 +341,6 @@ async def _end(chain: Chain) -> None:
         await asyncio.gather(chain.running, return_exceptions=True)
 
 
-class Between:
-    """Changes bytes of lines before they reach the wire and the witness.
-
-    mangle: gives other bytes, or None where they are lost; delay [s]: of what goes to the host.
-    """
-
-    def __init__(self, machine: MemoryMachine) -> None:
-        self.mangle: Mangle = lambda toward, data: data
-        self.delay = 0.0
-        self._due = 0.0
-        self._deliver = machine.deliver
-        machine.deliver = self._changed  # type: ignore[method-assign]
-
-    def _changed(self, link: str, toward: str, data: bytes, to: Any) -> None:
-        passed = self.mangle(toward, data)
-        if passed is None:
-            return
-        if toward == "host" and self.delay:
-            # Timers of one moment fire in any order; bytes of one line stay in order.
-            self._due = max(self._due + 1e-9, clock.now() + self.delay)
-            asyncio.get_running_loop().call_at(self._due, self._deliver, link, toward, passed, to)
-        else:
-            self._deliver(link, toward, passed, to)
-
-
 @asynccontextmanager
 async def _sensed(chain: Chain) -> AsyncIterator[None]:
     """Sensors on every channel, a thousand times a second."""
@@ -371,21 +360,3 @@ async def _sensed(chain: Chain) -> AsyncIterator[None]:
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
-
-
-def with_level(
-    excitation: Excitation,
-    era: str,
-    level: float,
-    *,
-    frequency: float | None = None,
-    phase: float | None = None,
-) -> Excitation:
-    """The excitation with another tone of one ERA."""
-    tone = excitation[era]
-    other = Tone(
-        tone.frequency if frequency is None else frequency,
-        level * STROKE,
-        tone.phase if phase is None else phase,
-    )
-    return {**excitation, era: other}

@@ -13,28 +13,23 @@ import pytest
 from ruamel.yaml import YAML
 
 import witness_scenarios
-from long_form import shortly
 from witnessed_chain import WITNESSED, Chain, play
 
 ROOT = Path(__file__).parents[3]
-SCENARIOS: dict[str, Callable[[Chain], Awaitable[None]]] = {
-    name: scenario
-    for name, scenario in inspect.getmembers(witness_scenarios, inspect.iscoroutinefunction)
-    if not name.startswith("_") and name not in ("rough", "lossy")
-}
-SERIAL_ONLY = {"noise", "late_copy", "damaged_answer", "foreign_answer"}
+SCENARIOS: dict[str, Callable[[Chain], Awaitable[None]]]
+SCENARIOS = dict(inspect.getmembers(witness_scenarios, inspect.iscoroutinefunction))
 # Over RTU an answer begins within 10 ms, and nothing may be sent before it: 25 ms are a fault, and
 # the stop that follows a fault is still under way when the operator clears.
-NOT_OVER_RTU = {"slow_stop", "slow_lift", "slow_touch", "asked", "hung"}
+# A finger that comes again before a set was carried out changes nothing.
+NOT_OVER_RTU = {"slow", "arc", "hung", "hasty"}
 
 
 def _played() -> list[tuple[str, str, int]]:
     """Each scenario, a wire and the amplifiers: on two wires each, the day on every wire."""
-    wires: dict[str, tuple[str, ...]] = {"incomplete_set": ("slcan",)}
-    wires |= dict.fromkeys(SERIAL_ONLY, ("serial",))
+    wires: dict[str, tuple[str, ...]] = {"noise": ("serial",)}
     wires |= dict.fromkeys(NOT_OVER_RTU, ("serial", "modbus-tcp", "socketcand", "slcan"))
     played = [("day", wire, amplifiers) for wire in WITNESSED for amplifiers in (1, 2)]
-    played += [("asked", wire, 1) for wire in wires["asked"]]
+    played += [("arc", wire, 1) for wire in wires["arc"]]
     for number, name in enumerate(SCENARIOS):
         possible = wires.get(name, WITNESSED)
         played += [(name, wire, 1) for wire in (possible[0], possible[number % len(possible)])]
@@ -48,22 +43,6 @@ def test_witness_finds_nothing_in_the_chain(scenario: str, wire: str, amplifiers
     broken = sorted({one.invariant for one in outcome.found})
     assert not broken, f"broken {', '.join(broken)}: {outcome.found[0]}"
     assert outcome.errors == []
-    assert outcome.frames > 5
-
-
-@pytest.mark.parametrize("seed", shortly(range(3), [0]))
-@pytest.mark.parametrize("wire", ["serial", "modbus-rtu", "slcan"])
-def test_witness_excuses_noise(wire: str, seed: int) -> None:
-    """Lost and damaged frames on a line are borne by both sides as the pages say."""
-    scenario = witness_scenarios.lossy if wire == "slcan" else witness_scenarios.rough
-    outcome = play(wire, scenario, seed=seed)
-    assert not outcome.found, str(outcome.found[0])
-
-
-@pytest.mark.parametrize("seed", [3, 8])
-def test_chain_ends_with_a_hardly_reachable_node(seed: int) -> None:
-    """Nothing asks itself again and again in one moment, which the loop here calls stuck."""
-    outcome = play("slcan", witness_scenarios.rough, seed=seed)
     assert outcome.frames > 5
 
 

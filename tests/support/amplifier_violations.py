@@ -180,6 +180,11 @@ def _fault_without_a_cause() -> Talk:
     return Talk().armed().says(hand.FAULT, latch=1)
 
 
+@breaks("state")
+def _address_set_while_armed() -> Talk:
+    return Talk().armed().exchange(hand.SET_ADDRESS, (2, 1, 0x3700), hand.status())
+
+
 @breaks("ramp")
 def _without_a_ramp() -> Talk:
     talk = Talk().armed().staged(5, hand.layer(0, hand.tone(0, 100, 0.5), ramp=100))
@@ -207,6 +212,20 @@ def _another_channel_in_achieved() -> Talk:
 def _not_exact_without_a_reason() -> Talk:
     words = hand.part(5, hand.layer(0, hand.tone(0, 100, 0.5)))
     return Talk().armed().exchange(hand.SET, words, hand.taken(5, exact=False))
+
+
+@breaks("plays")
+def _limited_below_full_level() -> Talk:
+    return Talk().armed().playing().says(**HALF, limited=True)
+
+
+@breaks("plays")
+def _not_limited_above_full_level() -> Talk:
+    talk = Talk(level=1.5).armed().playing(level=0.7)
+    talk.staged(6, hand.layer(1, hand.tone(0, 150, 0.7)))
+    above: dict[str, Any] = {"token": 6, "tokens": (5, 6, 0, 0)}
+    talk.exchange(hand.COMMIT, (9, 6), hand.status(levels=(7000, 0), **above)).rest(0.03)
+    return talk.says(levels=(10000, 0), **above)
 
 
 @breaks("silent")

@@ -14,6 +14,7 @@ VERSION = 3
 REPLY = 0x80
 HELLO, GET_CAPS, ARM, DISARM, SET, COMMIT, SILENCE, STOP = 1, 2, 3, 4, 5, 6, 7, 8
 GET_STATUS, GET_FAULTS, CLEAR, PING, GET_ACHIEVED, NAK, EVENT = 9, 10, 11, 12, 13, 31, 30
+SET_ADDRESS = 15
 SWITCHED_OFF, SWITCHED_ON, ENABLED, STOPPED, REACTING, FAULT = 1, 3, 4, 5, 6, 7
 WATCHDOG, ARC = 1, 4
 """Faults, by their numbers."""
@@ -47,6 +48,7 @@ def status(
     *,
     fault: int = 0,
     high_voltage: bool | None = None,
+    limited: bool = False,
     latch: int = 0,
     left: int = 250,
     token: int = 0,
@@ -56,7 +58,8 @@ def status(
     """Return the words of a status: of two channels and four layers, at 25 degrees and 1800 V."""
     is_on = state in (ENABLED, SWITCHED_ON) if high_voltage is None else high_voltage
     counts = len(levels) << 8 | len(tokens)
-    head = [state, fault, int(is_on), latch, left if state == ENABLED else 0, 250, 1800, token]
+    flags = is_on | limited << 2
+    head = [state, fault, flags, latch, left if state == ENABLED else 0, 250, 1800, token]
     return [*head, counts, *levels, *tokens]
 
 

@@ -1,11 +1,7 @@
 """What is played before the witness: an ordinary day, and days on which something is wrong."""
 
-import contextlib
-
 import hand_written as hand
 from drivers.by_hand import reaching
-from drivers.errors import CommandRefused
-from drivers.protocol.sets import LayerSet, pack_layers, parts
 from model.vibration.excitation import Tone
 from witnessed_chain import ALONE, STROKE, Chain
 
@@ -108,35 +104,14 @@ async def arc(chain: Chain) -> None:
     await reaching.request(chain.amplifier, "GetFaults", {})
 
 
-async def noise(chain: Chain) -> None:
-    """A damaged stop comes to the amplifier, which must not mind it."""
-    await chain.operate("arm")
-    await chain.touch(1, rest=0.06)
-    chain.disturb()
-    stop = bytearray(hand.frame(hand.STOP, (5,), sequence=999))
-    stop[-4] = stop[-4] ^ 0x55 or 1  # another checksum, without a zero byte
-    chain.inject(bytes(stop))
+async def stranger(chain: Chain) -> None:
+    """Another program sends a silent set while disarmed, later a heartbeat of its own session."""
     await chain.rest(0.1)
-    chain.disturb(False)
-    await chain.touch(rest=0.05)
-
-
-async def strangers_set(chain: Chain) -> None:
-    """A program that goes round the controller sends a silent set to a disarmed amplifier."""
-    await chain.rest(0.02)
-    await chain.amplifier.read_status()
-    stream = pack_layers([LayerSet(0, 0, 0)])
-    (silent,) = parts(stream, session=9, token=7, now=True)
-    with contextlib.suppress(CommandRefused):
-        await reaching.request(chain.amplifier, "Set", silent)
-    await chain.rest(0.02)
-
-
-async def strangers_heartbeat(chain: Chain) -> None:
-    """Another program feeds the watchdog while a finger is felt; on CAN it is the same host."""
-    await chain.operate("arm")
+    chain.inject(hand.frame(hand.SET, hand.part(7, hand.layer(0), now=True), sequence=999))
+    await chain.rest(0.01)
+    await chain.operate("arm", rest=0.05)
     await chain.touch(1, rest=0.06)
     own = chain.amplifier.session
-    with contextlib.suppress(CommandRefused):
-        await reaching.request(chain.amplifier, "Ping", {"session": own % 65535 + 1})
+    chain.inject(hand.frame(hand.PING, (own % 65535 + 1,), sequence=999))
+    await chain.rest(0.01)
     await chain.touch(rest=0.05)

@@ -65,6 +65,20 @@ def test_commit_without_a_reply_shows_in_the_next_status() -> None:
     assert talk.found == []
 
 
+@pytest.mark.parametrize("to", [1, 0])
+def test_amplifier_is_followed_to_its_new_address(to: int) -> None:
+    """Set for serial number "7" by itself or as a broadcast; the status at address 3 is its own."""
+    talk = Talk().identified()
+    words = (3, 1, 0x3700)
+    if to:
+        talk.exchange(hand.SET_ADDRESS, words, hand.status(hand.SWITCHED_OFF))
+    else:
+        talk.sends(hand.SET_ADDRESS, words, address=0)
+    talk.exchange(hand.GET_STATUS, (), hand.status(hand.SWITCHED_OFF, limited=True), address=3)
+    talk.sends(hand.GET_STATUS, address=3)
+    assert talk.rest(0.04).found == ["plays", "answer"]
+
+
 def test_ramp_of_a_stop_is_clipped() -> None:
     """65.535 s are those 1000 ms that an amplifier has: half of the level after half a second."""
     talk = Talk().armed().playing()

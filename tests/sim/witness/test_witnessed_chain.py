@@ -26,7 +26,7 @@ NOT_OVER_RTU = {"slow", "arc", "hung", "hasty"}
 
 def _played() -> list[tuple[str, str, int]]:
     """Each scenario, a wire and the amplifiers: on two wires each, the day on every wire."""
-    wires: dict[str, tuple[str, ...]] = {"noise": ("serial",)}
+    wires: dict[str, tuple[str, ...]] = {"stranger": ("serial",)}
     wires |= dict.fromkeys(NOT_OVER_RTU, ("serial", "modbus-tcp", "socketcand", "slcan"))
     played = [("day", wire, amplifiers) for wire in WITNESSED for amplifiers in (1, 2)]
     played += [("arc", wire, 1) for wire in wires["arc"]]

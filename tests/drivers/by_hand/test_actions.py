@@ -101,13 +101,6 @@ async def test_status_that_proves_nothing_confirms_no_silence(
     assert "switch it off" in result["cause"]
 
 
-async def test_stop_at_a_missing_port_is_unconfirmed() -> None:
-    """Nothing could be sent."""
-    result = await actions.stop("serial:///dev/no-such-port")
-    assert result["silence"] == "may_play"
-    assert "no such port" in result["cause"]
-
-
 async def test_identity_has_units_and_the_limits_of_the_wire() -> None:
     """Frames of 32 and 18 bytes for sets of one channel: 10 and 3 words, and 12 bytes each.
 

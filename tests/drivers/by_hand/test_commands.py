@@ -64,7 +64,9 @@ def test_unconfirmed_stop_exits_3_and_a_confirmed_one_names_the_next_command() -
     """Nothing could be sent to a port that is not there."""
     result = invoke("stop", "serial:///dev/no-such-port", "--json")
     assert result.exit_code == 3
-    assert "no such port" in json.loads(result.stdout)["cause"]
+    said = json.loads(result.stdout)
+    assert said["silence"] == "may_play"
+    assert "no such port" in said["cause"]
     assert invoke("stop", URL).stdout.splitlines()[-1] == f"Next: era amp clear '{URL}'"
 
 

@@ -1,14 +1,12 @@
-"""What wires take from the machine, replaceable for tests in virtual time.
+"""The ports that wires take from the machine, replaceable for tests in virtual time.
 
-Serial ports and random numbers. Frames, retries and timeouts are the same with every provider. TCP
-connections belong to the event loop.
+Frames, retries and timeouts are the same whoever opens a port. TCP connections belong to the event
+loop.
 """
 
-import secrets
-from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 
 class Port(Protocol):
@@ -34,27 +32,10 @@ class Port(Protocol):
         """Wait until it is closed."""
 
 
-class HardwareProvider(ABC):
-    """Replacement of the machine's hardware and system resources."""
+PortOpener: TypeAlias = Callable[
+    [str, Callable[[bytes], None], Callable[[str], None]], Awaitable[Port]
+]
+"""Opens a serial port by its name, with what takes its data and its loss; raises LinkError."""
 
-    @abstractmethod
-    async def open_port(
-        self, name: str, *, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
-    ) -> Port:
-        """Open a serial port; raises LinkError."""
-
-    @abstractmethod
-    def below(self, limit: int) -> int:
-        """Return a random number, 0 to limit - 1."""
-
-
-HARDWARE_PROVIDER: ContextVar[HardwareProvider | None] = ContextVar(
-    "HARDWARE_PROVIDER", default=None
-)
-"""Provider in this context; None: the machine itself."""
-
-
-def number_below(limit: int) -> int:
-    """Return an unpredictable number, 0 to limit - 1, or one that the provider chooses."""
-    hardware = HARDWARE_PROVIDER.get()
-    return secrets.randbelow(limit) if hardware is None else hardware.below(limit)
+PORT_OPENER: ContextVar[PortOpener | None] = ContextVar("PORT_OPENER", default=None)
+"""Who opens serial ports in this context; None: the machine itself."""

@@ -5,10 +5,10 @@ Requests and replies are the bytes of a serial line. Not modelled: transmission 
 
 import asyncio
 import contextlib
+import random
 from collections.abc import Callable, Sequence
 
 from drivers.errors import LinkError
-from drivers.hardware import number_below
 from drivers.host.serial_wire import SerialWire
 from drivers.wires.address import WireAddress
 from sim.bench.amplifier_device import AmplifierDevice
@@ -98,7 +98,7 @@ class SimulatedAddress(WireAddress):
 
     def make_wire(self) -> SerialWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""
-        return SerialWire(0, sequence=number_below(1 << 16))
+        return SerialWire(0, sequence=random.getrandbits(16))
 
     async def open_port(
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]

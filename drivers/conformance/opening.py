@@ -1,5 +1,6 @@
 """Opens the line of an amplifier for its checks, by its URL."""
 
+import random
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
@@ -9,7 +10,6 @@ from drivers.conformance.client import Client, Port
 from drivers.conformance.modbus_client import ModbusClient
 from drivers.conformance.serial_client import SerialClient
 from drivers.errors import LinkError
-from drivers.hardware import number_below
 from drivers.protocol.table import MAX_WORDS
 from drivers.wires.known import address_of
 
@@ -50,7 +50,7 @@ async def opened(url: str) -> AsyncIterator[Client]:
     port = await address.open_port(behind.received, behind.lost)
     try:
         client = behind.client = CLIENTS[protocol](port, address.number)
-        client.session = number_below(1 << 16)
+        client.session = random.getrandbits(16)
         client.transit = address.make_wire().exchange_time(0, MAX_WORDS)
         yield client
     finally:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import serial
 
 from drivers.errors import LinkError, system_message
-from drivers.hardware import HARDWARE_PROVIDER, Port
+from drivers.hardware import PORT_OPENER, Port
 from drivers.ports.serial_port import READ_TIMEOUT, SerialPort
 from drivers.ports.tcp import open_connection
 from drivers.threads import in_thread
@@ -45,9 +45,9 @@ async def open_port(
     if place.host:
         return await open_connection(place.host, place.port, on_data, on_loss)
     name = place.device
-    hardware = HARDWARE_PROVIDER.get()
-    if hardware is not None:
-        return await hardware.open_port(name, on_data=on_data, on_loss=on_loss)
+    opener = PORT_OPENER.get()
+    if opener is not None:
+        return await opener(name, on_data, on_loss)
     try:
         port = await in_thread(
             lambda: _open_device(place), name=f"era-open {name}", undo=lambda port: port.close()

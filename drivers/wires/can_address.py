@@ -3,11 +3,11 @@
 How they are packed: `drivers.codec.can_bus.segments`.
 """
 
+import random
 from collections.abc import Mapping
 
 from drivers.codec.can_bus.canopen import BITRATE
 from drivers.codec.can_bus.segments import NODE_MAX, NUMBER_MAX
-from drivers.hardware import number_below
 from drivers.host.can_wire import CanWire
 from drivers.urls import ADDRESS, AmplifierUrl
 from drivers.wires.address import WireAddress
@@ -32,4 +32,5 @@ class CanAddress(WireAddress):
 
     def make_wire(self) -> CanWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""
-        return CanWire(self.bitrate, sequence=number_below(NUMBER_MAX + 1), delay=self._delay)
+        sequence = random.randint(0, NUMBER_MAX)  # noqa: S311  no secret
+        return CanWire(self.bitrate, sequence=sequence, delay=self._delay)

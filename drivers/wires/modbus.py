@@ -1,9 +1,10 @@
 """Modbus: modbus+tcp://HOST:PORT/UNIT and modbus+rtu:///dev/ttyS1?baud=115200#UNIT."""
 
+import random
 from collections.abc import Callable
 from dataclasses import replace
 
-from drivers.hardware import Port, number_below
+from drivers.hardware import Port
 from drivers.host.modbus_wire import ModbusWire
 from drivers.host.wire import NETWORK_DELAY
 from drivers.ports.opening import open_port
@@ -45,7 +46,7 @@ class ModbusAddress(WireAddress):
     def make_wire(self) -> ModbusWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""
         delay = 0.0 if self.place.device else NETWORK_DELAY
-        number = number_below(1 << 16)
+        number = random.getrandbits(16)
         return ModbusWire(self.place.baud, is_rtu=self._is_rtu, number=number, delay=delay)
 
     async def open_port(

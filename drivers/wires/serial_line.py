@@ -1,8 +1,9 @@
 """Serial lines: serial:///dev/ttyUSB0?baud=921600&address=1 and serial+tcp://HOST:PORT."""
 
+import random
 from collections.abc import Callable
 
-from drivers.hardware import Port, number_below
+from drivers.hardware import Port
 from drivers.host.serial_wire import SerialWire
 from drivers.ports.opening import open_port
 from drivers.urls import ADDRESS, ADDRESS_MAX, BAUD, AmplifierUrl
@@ -27,7 +28,7 @@ class SerialAddress(WireAddress):
     def make_wire(self) -> SerialWire:
         """Make the wire; a random start, so that a reply to an earlier host does not match."""
         baud = self.place.baud if self.place.device else 0
-        return SerialWire(baud, sequence=number_below(1 << 16))
+        return SerialWire(baud, sequence=random.getrandbits(16))
 
     async def open_port(
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from drivers.errors import LinkError
-from drivers.hardware import HARDWARE_PROVIDER, HardwareProvider
+from drivers.hardware import PORT_OPENER
 from sim.transport.pseudo_terminal import TERMINAL_MAKER, Terminal
 from virtual_loop import VirtualLoop
 
@@ -18,7 +18,7 @@ _SPLIT = 0.1  # share of pieces that arrive in two
 _NOTICED = 0.002  # s; until the host notices a hang-up
 
 
-class MemoryMachine(HardwareProvider):
+class MemoryMachine:
     """Ports by name; `make_terminal` is for far ends, the rest for hosts."""
 
     def __init__(self, loop: VirtualLoop) -> None:
@@ -34,7 +34,7 @@ class MemoryMachine(HardwareProvider):
         return terminal
 
     async def open_port(
-        self, name: str, *, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+        self, name: str, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
     ) -> "MemoryPort":
         """Open the host's side of a line; LinkError if it is unplugged or open already."""
         await asyncio.sleep(self._loop.rng.uniform(*_PASSING))
@@ -45,9 +45,6 @@ class MemoryMachine(HardwareProvider):
             raise LinkError(f"serial port {name} cannot be opened: in use by another program")
         port = self._open[name] = MemoryPort(self, terminal, on_data, on_loss)
         return port
-
-    def below(self, limit: int) -> int:
-        return self._loop.rng.randrange(limit)
 
     def kill_host(self) -> None:
         """Close the host's ports without notice, as when its process dies."""
@@ -82,8 +79,8 @@ def live_in_memory() -> MemoryMachine:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
     machine = MemoryMachine(loop)
-    random.seed(loop.rng.random())  # of tokens
-    HARDWARE_PROVIDER.set(machine)
+    random.seed(loop.rng.random())  # of tokens, and of numbers on wires
+    PORT_OPENER.set(machine.open_port)
     TERMINAL_MAKER.set(machine.make_terminal)
     return machine
 

@@ -47,7 +47,7 @@ RETIRED_WORDS = {
     "left_out": "skipped",
     "torn": "incomplete",
     "is_contradicted": "duplicate_responder",
-    "stand_in": "HardwareProvider",
+    "stand_in": "PORT_OPENER",
     "befalls?|episodes?": "inject_fault, FaultWindow",
     "stations?": "AmplifierDevice",
     "sites?": "SimulationContext",

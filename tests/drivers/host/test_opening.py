@@ -8,7 +8,7 @@ import pytest
 
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, LinkError, LinkTimeout
-from drivers.hardware import HARDWARE_PROVIDER, HardwareProvider, Port
+from drivers.hardware import PORT_OPENER, Port
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
@@ -38,20 +38,16 @@ async def read_for_ever(amplifier: Amplifier) -> None:
             await amplifier.read_status()
 
 
-class SlowHardware(HardwareProvider):
-    """Opens and closes a port in half a second; closed: how many were closed."""
+class SlowPort:
+    """Opens and closes in half a second; closed: how many were closed."""
 
     is_blocked = False
     closed = 0
 
-    async def open_port(self, name: str, **_: object) -> Port:
+    async def open(self, *_: object) -> Port:
         """Open a port, which is this one."""
         await asyncio.sleep(0.5)
         return self
-
-    def below(self, limit: int) -> int:
-        """The lowest number."""
-        return 0
 
     def write(self, data: bytes) -> None:
         """Nothing is there."""
@@ -71,7 +67,7 @@ class SlowHardware(HardwareProvider):
 @in_virtual_time
 async def test_lines_are_closed_before_a_second_close_returns() -> None:
     """A reconnection closes them as well; opened before that, the port would still be taken."""
-    HARDWARE_PROVIDER.set(SlowHardware())
+    PORT_OPENER.set(SlowPort().open)
     lines, loop = Lines(), asyncio.get_running_loop()
     await lines.amplifier("serial:///dev/x?address=1", LIMITS, name="x")
     first = asyncio.create_task(lines.close())
@@ -85,15 +81,15 @@ async def test_lines_are_closed_before_a_second_close_returns() -> None:
 @in_virtual_time
 async def test_line_that_is_closed_while_it_is_opened_stays_closed() -> None:
     """As by a shutdown during a reconnection; else the port would stay open, and taken."""
-    hardware = SlowHardware()
-    HARDWARE_PROVIDER.set(hardware)
+    port = SlowPort()
+    PORT_OPENER.set(port.open)
     lines = Lines()
     opening = asyncio.ensure_future(lines.amplifier("serial:///dev/x?address=1", LIMITS, name="x"))
     await asyncio.sleep(0.1)
     await lines.close()
     with pytest.raises(LinkError, match="closed"):
         await opening
-    assert hardware.closed == 1
+    assert port.closed == 1
 
 
 @pytest.mark.real_time

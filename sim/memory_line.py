@@ -92,7 +92,7 @@ class SimulatedAddress(WireAddress):
     """An amplifier of a rig simulated in this process, alone on its line; see `SimulationUrl`."""
 
     def __init__(self, url: str) -> None:
-        self._url = SimulationUrl.parse(url)
+        self._url = SimulationUrl(url)
         self.line, self.number = url, 1
         self.settings = {"protocol": "serial"}
 

@@ -9,13 +9,13 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import parse_qsl, unquote
+from urllib.parse import unquote
 from weakref import WeakValueDictionary
 
 from drivers import clock
 from drivers.errors import CommandError
+from drivers.urls import AmplifierUrl
 from model.errors import InputError
 from model.rig.file import load_rig
 from model.rig.rig import Rig
@@ -27,42 +27,31 @@ from sim.plant.imperfections import Imperfections, draw_imperfections
 _FORM = "sim://RIG.yaml, optionally with ?control=PATH, &amplifier=NAME, and &seed=N or &exact"
 
 
-@dataclass(frozen=True)
 class SimulationUrl:
-    """A URL `sim://RIG.yaml[?control=PATH][&amplifier=NAME][&seed=N]`.
+    """A URL `sim://RIG.yaml[?control=PATH][&amplifier=NAME][&seed=N]`; raises CommandError.
 
     `&exact` in place of a seed, None here: the rig's own plate, with no deviation.
     """
 
-    text: str
-    rig: Path
-    control: Path | None
-    amplifier: str | None
-    seed: int | None
-
-    @classmethod
-    def parse(cls, url: str) -> "SimulationUrl":
-        """Parse a URL; raises CommandError."""
-        path, _, query = url.removeprefix("sim://").partition("?")
-        options = dict(parse_qsl(query, keep_blank_values=True))
-        unknown = sorted(options.keys() - {"control", "amplifier", "seed", "exact"})
-        if not url.startswith("sim://") or not path or unknown:
-            what = f"unknown option {', '.join(unknown)}" if unknown else "no rig file"
-            raise CommandError(f"{url!r}: {what}; use {_FORM}")
-        is_exact, seed = "exact" in options, options.get("seed", "0")
-        if not seed.isdecimal() or (is_exact and "seed" in options):
-            raise CommandError(f"{url!r}: seed must be a whole number, without exact; use {_FORM}")
-        control = Path(options["control"]) if options.get("control") else None
-        drawn = None if is_exact else int(seed)
-        return cls(url, Path(unquote(path)), control, options.get("amplifier"), drawn)
+    def __init__(self, url: str) -> None:
+        self._url = AmplifierUrl(url, _FORM, ("control", "amplifier", "seed", "exact"))
+        options, file = self._url.options, unquote(self._url.place) + self._url.path
+        if not file:
+            raise self._url.refused("rig file must be named")
+        if {"seed", "exact"} <= options.keys():
+            raise self._url.refused("seed must not be given with exact")
+        self.rig = Path(file)
+        self.seed = None if "exact" in options else self._url.whole_option("seed", 0, 10**9, low=0)
+        self.control = Path(options["control"]) if options.get("control") else None
+        self.amplifier = options.get("amplifier")
 
     def select(self, names: tuple[str, ...]) -> str:
         """The amplifier that it names, or the only one; raises CommandError."""
         if self.amplifier is None and len(names) == 1:
             return names[0]
-        if self.amplifier in names:
-            return self.amplifier
-        raise CommandError(f"{self.text}: amplifier=NAME must name one of {', '.join(names)}")
+        if self.amplifier not in names:
+            raise self._url.refused(f"amplifier must be one of {', '.join(names)}")
+        return self.amplifier
 
 
 @asynccontextmanager
@@ -77,7 +66,7 @@ async def opened(url: SimulationUrl) -> AsyncIterator[tuple[SimulationContext, s
         shared = _shared(url)
         context = await shared.acquire(rig, url.seed)
     except (InputError, OSError) as error:
-        raise CommandError(f"{url.text}: {error}") from error
+        raise CommandError(f"sim://{url.rig}: {error}") from error
     try:
         yield context, name
     finally:

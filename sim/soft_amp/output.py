@@ -1,29 +1,15 @@
 """What an amplifier plays through: a device that PortAudio or JACK has opened."""
 
-from typing import Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
-from sim.soft_amp.engine import Engine
 from sim.soft_amp.settings import Settings
 
+if TYPE_CHECKING:
+    from sim.soft_amp.jack import JackOutput
+    from sim.soft_amp.portaudio import PortAudioOutput
 
-class Output(Protocol):
-    """An open device; its callback is called from `start` on.
-
-    name: of the device; rate [Hz]; block: frames of a callback, 0 if it varies.
-    """
-
-    name: str
-    rate: int
-    block: int
-
-    def start(self, engine: Engine) -> None:
-        """Begin to play; raises LinkError."""
-
-    def is_playing(self) -> bool:
-        """Whether the device still takes samples."""
-
-    def close(self) -> None:
-        """Stop, and leave the device."""
+Output: TypeAlias = "JackOutput | PortAudioOutput"
+"""An open device with its name, rate [Hz] and block [frames], 0 if it varies; see either."""
 
 
 def open_output(settings: Settings) -> Output:

@@ -4,82 +4,20 @@ import asyncio
 import os
 import tempfile
 import tty
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Protocol
 
 from drivers.errors import LinkError
 
 _READ_MAX = 4096
 
 
-class Terminal(ABC):
-    """The far end's side of a serial line that can be unplugged.
+class PseudoTerminal:
+    """The far end's side of a serial line: a pseudo-terminal of the system. Raises LinkError.
 
-    dropped: writes lost because the host did not read.
-    """
-
-    dropped: int
-
-    @property
-    @abstractmethod
-    def port(self) -> str:
-        """The path of the host's side."""
-
-    @abstractmethod
-    def plug_in(self) -> None:
-        """Create the line if it is unplugged; raises LinkError."""
-
-    @abstractmethod
-    def listen(self) -> None:
-        """Read from now on, in the running event loop."""
-
-    @abstractmethod
-    def unplug(self) -> None:
-        """Remove the line."""
-
-    def plug(self, is_plugged: bool) -> None:
-        """Unplug the line, or plug it in and read again."""
-        if is_plugged:
-            self.plug_in()
-            self.listen()
-        else:
-            self.unplug()
-
-    @abstractmethod
-    def close(self) -> None:
-        """Release all resources."""
-
-    @abstractmethod
-    def write(self, data: bytes) -> None:
-        """Write to the host; discarded while unplugged."""
-
-
-class TerminalMaker(Protocol):
-    """Factory of terminals; see `make_terminal`."""
-
-    def __call__(self, on_data: Callable[[bytes], None], *, unpluggable: bool) -> Terminal:
-        """A terminal."""
-
-
-TERMINAL_MAKER: ContextVar[TerminalMaker | None] = ContextVar("TERMINAL_MAKER", default=None)
-"""The factory in this context; None for the system's pseudo-terminals."""
-
-
-def make_terminal(on_data: Callable[[bytes], None], *, unpluggable: bool = False) -> Terminal:
-    """Create a serial line; on_data: called with bytes from the host. Raises LinkError.
-
-    unpluggable: its port keeps its path when it is plugged in again.
-    """
-    return (TERMINAL_MAKER.get() or PseudoTerminal)(on_data, unpluggable=unpluggable)
-
-
-class PseudoTerminal(Terminal):
-    """A pseudo-terminal of the system.
-
-    unpluggable: the port is a symbolic link, which outlives each pseudo-terminal.
+    on_data: called with bytes from the host; unpluggable: the port is a symbolic link, which
+    outlives each pseudo-terminal; dropped: writes lost because the host did not read.
     """
 
     def __init__(self, on_data: Callable[[bytes], None], *, unpluggable: bool = False) -> None:
@@ -131,6 +69,14 @@ class PseudoTerminal(Terminal):
         if self._folder is not None:
             Path(self.port).unlink(missing_ok=True)
 
+    def plug(self, is_plugged: bool) -> None:
+        """Unplug the line, or plug it in and read again."""
+        if is_plugged:
+            self.plug_in()
+            self.listen()
+        else:
+            self.unplug()
+
     def close(self) -> None:
         """Release all resources."""
         self.unplug()
@@ -158,3 +104,14 @@ class PseudoTerminal(Terminal):
         except BlockingIOError:  # another wake-up took the bytes
             return
         self._on_data(data)
+
+
+TERMINAL_MAKER: ContextVar[Callable[..., PseudoTerminal]] = ContextVar(
+    "TERMINAL_MAKER", default=PseudoTerminal
+)
+"""The factory in this context."""
+
+
+def make_terminal(on_data: Callable[[bytes], None], *, unpluggable: bool = False) -> PseudoTerminal:
+    """Create a serial line; see `PseudoTerminal`."""
+    return TERMINAL_MAKER.get()(on_data, unpluggable=unpluggable)

@@ -10,7 +10,7 @@ from typing import Any
 
 from drivers.errors import LinkError
 from drivers.hardware import PORT_OPENER
-from sim.transport.pseudo_terminal import TERMINAL_MAKER, Terminal
+from sim.transport.pseudo_terminal import TERMINAL_MAKER, PseudoTerminal
 from virtual_loop import VirtualLoop
 
 _PASSING = (50e-6, 900e-6)  # s; through driver and adapter
@@ -99,7 +99,7 @@ class _Direction:
             self._take(piece)
 
 
-class MemoryTerminal(Terminal):
+class MemoryTerminal(PseudoTerminal):
     """The far end's side of a line."""
 
     def __init__(self, machine: MemoryMachine, name: str, on_data: Callable[[bytes], None]) -> None:

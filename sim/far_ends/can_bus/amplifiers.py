@@ -87,17 +87,21 @@ class CanAmplifiers(FarEnd):
                 self._broadcast(message, now)
         elif node is not None and kind == REQUEST:
             node.request(frame.data, now)
-            if node.number != number:
-                self._nodes[node.number] = self._nodes.pop(number)
+            self._note_numbers()
         elif node is not None and kind == cob_id("sdo_request"):
             node.read(frame.data, now)
 
     def _broadcast(self, message: Message, now: float) -> None:
         known = BY_NUMBER.get(message.type)
         if known is not None and known.is_broadcast:
-            for node in [*self._nodes.values()]:
-                node.obey(message, now)
-            self._nodes = {node.number: node for node in self._nodes.values()}
+            for node in self._nodes.values():
+                if node.is_listening:
+                    node.carry_out(message, now)
+            self._note_numbers()
+
+    def _note_numbers(self) -> None:
+        """Note the numbers of nodes, which may have taken others."""
+        self._nodes = {node.number: node for node in self._nodes.values()}
 
 
 class _Node:
@@ -109,22 +113,27 @@ class _Node:
         self._amplifier = amplifier
         self._send = send
         self._counters = counters
+        self.number = number
         self._now = 0.0
-        self._state = _PRE_OPERATIONAL
         self._was_faulty = False
         self._heartbeat_due = 0.0
-        self._take_number(number)
+        self._reset()
         amplifier.listeners.append(self._tell)
 
-    def _take_number(self, number: int) -> None:
-        self.number = number
+    def _reset(self) -> None:
+        self._state = _PRE_OPERATIONAL
         self._requests = Assembler(self._counters)
-        self._objects = WordObjects(self._amplifier, number, lambda: self._now)
+        self._objects = WordObjects(self._amplifier, self.number, lambda: self._now)
         self._sdo = SdoServer(
             read=self._objects.read,
             write=self._objects.write,
-            send=lambda data: self._put(cob_id("sdo_answer", number), data),
+            send=lambda data: self._put(cob_id("sdo_answer", self.number), data),
         )
+
+    @property
+    def is_listening(self) -> bool:
+        """Whether it takes requests."""
+        return self._state == _OPERATIONAL and self._amplifier.is_answering
 
     @property
     def next_event(self) -> float:
@@ -142,10 +151,7 @@ class _Node:
 
     def boot(self, now: float) -> None:
         """Begin anew, not operational; what the amplifier plays is its own."""
-        self._objects.reset()
-        self._sdo.reset()
-        self._requests = Assembler(self._counters)
-        self._state = _PRE_OPERATIONAL
+        self._reset()
         self._put(cob_id("heartbeat", self.number), bytes([_BOOT_UP]))
         self._heartbeat_due = now + self._objects.heartbeat / 1000
 
@@ -173,30 +179,19 @@ class _Node:
             self._sdo.receive(data)
 
     def request(self, data: bytes, now: float) -> None:
-        """Take a frame of a request, and reply to the message that it completes."""
-        if self._state != _OPERATIONAL or not self._amplifier.is_answering:
-            return
-        message = self._requests.add(data, now)
-        if message is None:
-            return
+        """Take a frame of a request, and carry out the message that it completes."""
+        if self.is_listening and (message := self._requests.add(data, now)) is not None:
+            self.carry_out(message, now)
+
+    def carry_out(self, message: Message, now: float) -> None:
+        """Carry out a message; only one with a number has a reply."""
         sender = self.number
         try:
             kind, words = message.type, self._words(message, now)
         except Refusal as refusal:
             kind, words = NAK, nak_of(refusal, message.type)
-        self._put(REPLY + sender, *segments(message.number, kind, words))
-        if self.number != sender:
-            self.boot(now)
-
-    def obey(self, message: Message, now: float) -> None:
-        """Carry out a broadcast, without a reply."""
-        if self._state != _OPERATIONAL or not self._amplifier.is_answering:
-            return
-        sender = self.number
-        try:
-            self._words(message, now)
-        except Refusal:
-            return
+        if message.number:
+            self._put(REPLY + sender, *segments(message.number, kind, words))
         if self.number != sender:
             self.boot(now)
 
@@ -209,7 +204,7 @@ class _Node:
             raise Refusal(f"address must be 1 to {NODE_MAX}, got {values['address']}")
         reply = self._amplifier.handle(name, values, now)
         if name == "SetAddress":
-            self._take_number(values["address"])
+            self.number = values["address"]
         return BY_NUMBER[message.type].reply.pack(reply)
 
     def _leave(self, state: int, now: float) -> None:
@@ -221,12 +216,12 @@ class _Node:
 
     def _tell(self, event: Values, now: float) -> None:
         """Send an event, with an emergency where a fault comes or goes."""
-        is_answering = self._amplifier.is_answering
-        if self._state == _OPERATIONAL and is_answering:
+        if self.is_listening:
             self._put(REPLY + self.number, *segments(0, EVENT, EVENT_RECORD.pack(event)))
         fault = FAULT_NAMES[event["fault"]]
         is_faulty = fault != "NONE"
-        if (is_faulty or self._was_faulty) and self._state != _STOPPED and is_answering:
+        is_mute = self._state == _STOPPED or not self._amplifier.is_answering
+        if (is_faulty or self._was_faulty) and not is_mute:
             known = CANOPEN["emergencies"][fault]
             state = event["state"] | event["fault"] << 4
             head = (known["code"], known["error_register"], state, event["channel"])

@@ -43,10 +43,6 @@ class SdoServer:
         self._rest: bytes | None = None  # of an upload
         self._toggle = 0
 
-    def reset(self) -> None:
-        """Abandon the present transfer."""
-        self._rest = None
-
     def receive(self, data: bytes) -> None:
         """Process a request; frames of other than eight bytes are ignored."""
         if len(data) != LENGTH:
@@ -54,7 +50,7 @@ class SdoServer:
         command = data[0] >> 5
         try:
             if command in (_DOWNLOAD, _UPLOAD):
-                self.reset()
+                self._rest = None
                 self._object = struct.unpack_from("<HB", data, 1)
             if command == _DOWNLOAD and data[0] & _EXPEDITED:
                 self._download(data)
@@ -63,11 +59,11 @@ class SdoServer:
             elif command == _UPLOAD_SEGMENT and self._rest is not None:
                 self._upload_segment(self._rest, data[0] >> 4 & 1)
             elif command == _ABORT:
-                self.reset()
+                self._rest = None
             else:
                 raise SdoAbort(UNKNOWN_COMMAND)
         except SdoAbort as abort:
-            self.reset()
+            self._rest = None
             self._send(struct.pack("<BHBL", 0x80, *self._object, abort.code))
 
     def _download(self, data: bytes) -> None:

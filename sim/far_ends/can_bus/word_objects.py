@@ -28,10 +28,6 @@ class WordObjects:
         self._amplifier = amplifier
         self._node = node
         self._now = now
-        self.reset()
-
-    def reset(self) -> None:
-        """Reset the communication objects."""
         self.heartbeat: int = CANOPEN["heartbeat_ms"]
 
     def read(self, index: int, subindex: int) -> bytes:

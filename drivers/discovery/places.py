@@ -3,7 +3,6 @@
 But for `with_slcan`, which looks for CAN adapters on serial ports.
 """
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,18 +11,18 @@ from serial.tools.list_ports import comports
 
 from drivers.codec.can_bus.canopen import BITRATE
 from drivers.discovery.slcan import detect_slcan
+from drivers.ports.opening import remedy_of
 from drivers.urls import ADDRESS, BAUD, RTU_BAUD
 
 _NETWORK = Path("/sys/class/net")
 _CAN_TYPE = "280"  # ARPHRD_CAN of Linux
 _UNDESCRIBED = "n/a"  # by pyserial
 _SPEEDS = (BAUD, 115_200)
-_GROUP_MAY = 0o060  # read and write
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A port or interface: the URLs to try, and the remedy if it cannot be used."""
+    """A port or interface: the URLs to try, and the remedy if it is known to be unusable."""
 
     name: str
     description: str
@@ -43,12 +42,12 @@ def with_slcan(candidate: Candidate) -> Candidate:
 
     Blocks; see `drivers.discovery.slcan` for what is sent. Its amplifiers are not identified.
     """
-    if not candidate.is_serial or candidate.remedy is not None:
+    if not candidate.is_serial:
         return candidate
     try:
         adapter = detect_slcan(candidate.name)
     except (OSError, ValueError) as problem:
-        return replace(candidate, remedy=f"{candidate.name} cannot be used: {problem}")
+        return replace(candidate, remedy=f"{candidate.name} cannot be used: {remedy_of(problem)}")
     if adapter is None:
         return candidate
     heard = adapter.nodes or ("none",)
@@ -67,28 +66,11 @@ def _serial_ports() -> Iterator[Candidate]:
         urls = tuple(f"serial://{_absolute(path)}?baud={speed}" for speed in _SPEEDS)
         urls += (f"modbus+rtu://{_absolute(path)}?baud={RTU_BAUD}#{ADDRESS}",)
         description = "serial port" if port.description == _UNDESCRIBED else port.description
-        yield Candidate(path, description, urls, _permission_remedy(path), is_serial=True)
+        yield Candidate(path, description, urls, is_serial=True)
 
 
 def _absolute(path: str) -> str:
     return path if path.startswith("/") else f"/{path}"
-
-
-def _permission_remedy(path: str) -> str | None:
-    if not path.startswith("/") or os.access(path, os.R_OK | os.W_OK):
-        return None
-    momentary = f"sudo chmod a+rw {path}"
-    try:
-        is_for_group = Path(path).stat().st_mode & _GROUP_MAY == _GROUP_MAY
-        group = Path(path).group()
-    except (OSError, KeyError):  # removed meanwhile, or a group without a name
-        is_for_group = False
-    if not is_for_group:
-        return f"no permission for this user or its group; temporarily: {momentary}"
-    return (
-        f"no permission: sudo usermod -aG {group} $USER, then log in again "
-        f"(temporarily: {momentary})"
-    )
 
 
 def _can_interfaces() -> Iterator[Candidate]:

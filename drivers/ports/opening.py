@@ -54,7 +54,7 @@ async def open_port(
         )
     except _FAILURES as error:
         raise LinkError(
-            f"serial port {name} cannot be opened: {_remedy_of(error)} (the system says: "
+            f"serial port {name} cannot be opened: {remedy_of(error)} (the system says: "
             f"{system_message(error)})"
         ) from error
     return SerialPort(port, name, on_data, on_loss)
@@ -82,7 +82,7 @@ def _open_device(place: Place) -> serial.Serial:
     return port
 
 
-def _remedy_of(error: BaseException | None) -> str:
+def remedy_of(error: BaseException | None) -> str:
     """Return the remedy for an opening error by the error code of it or its cause."""
     while error is not None:
         code = getattr(error, "errno", None)

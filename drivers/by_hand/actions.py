@@ -68,7 +68,7 @@ async def status(url: str) -> dict[str, Any]:
             **status_rows(now),
             "measured": measured,
             "faults": fault_rows(faults),
-            "last_round_trip_s": amplifier.round_trip,
+            "last_round_trip_s": amplifier.counts.last_round_trip,
             **wire_rows(amplifier),
         }
 

@@ -108,7 +108,7 @@ class Amplifier(Dialogue):
         elif can != self.capabilities:
             self._ledger.adopt(can)
         self.identity, self.capabilities = identity, can
-        self._overtimes.clear()
+        self._times.clear()
         self._serial_number = identity["serial_number"]
         self.latch = None
         return await self.read_status()
@@ -172,7 +172,7 @@ class Amplifier(Dialogue):
         priority = Priority.SILENCE if is_silence(layers) else Priority.SET
         taken = await self.line.submit(self, priority, "Set", {}, make=first)
         for part in cuts[1:]:
-            make = partial(self._while_admitted, token, part)
+            make = partial(self.while_admitted, token, part)
             taken = await self.line.submit(self, priority, "Set", part, make=make)
         (staged,) = admitted
         if not (taken["played"] or (taken["staged"] and self._admitted is staged)):
@@ -183,7 +183,9 @@ class Amplifier(Dialogue):
         self, token: int, layers: Sequence[Layer], cuts: list[Values], *, now: bool
     ) -> Staged:
         """Have the ledger admit a set, and cut it into parts; raises CommandRefused."""
-        moment, delay = self._time(), self._commit_delay
+        moment = self._time()
+        # Longest time from the admission of a set until it is committed.
+        delay = max(COMMIT_DELAY, ATTEMPTS * len(self.line.members) * self.exchange_time("Set"))
         admitted = self.ledger.admit(layers, moment, delay=delay)
         stream = pack_layers(admitted)
         if len(stream) > self.capabilities["set_words"]:
@@ -200,19 +202,8 @@ class Amplifier(Dialogue):
         disarm came first, CommandRefused where it is too late for what the ledger has admitted.
         """
         values = {"session": self.session, "token": token}
-        make = partial(self._while_admitted, token, values)
+        make = partial(self.while_admitted, token, values)
         return self.line.submit(self, Priority.SET, "Commit", values, make=make, start=start)
-
-    def _while_admitted(self, token: int, values: Values) -> Values:
-        """Return the values of a request of the set that is admitted, as long as it is."""
-        self.check_admitted(token)
-        return values
-
-    @property
-    def _commit_delay(self) -> float:
-        """Longest time [s] from the admission of a set until it is committed."""
-        waiting = len(self.line.members) * self.exchange_time("Set")
-        return max(COMMIT_DELAY, ATTEMPTS * waiting)
 
     async def read_achieved(self, one: LayerSet) -> LayerSet:
         """Read what plays of a layer of the set committed last; the ledger goes on with it.

@@ -13,23 +13,18 @@ from drivers.codec.can_bus.segments import (
     REPLY,
     REQUEST,
     Assembler,
-    Message,
     frames_of,
     pack_frames,
     segments,
     unpack_frames,
 )
-from drivers.host.wire import Arrival, Broken, Event, OtherHost, Reply, Several, read_nak
-from drivers.protocol.records import Refusal, Values
+from drivers.host.wire import Arrival, OtherHost, Reply, Several, read_event, read_reply
+from drivers.protocol.records import Values
 from drivers.protocol.serial_payload import BROADCAST, HELLO
 from drivers.protocol.table import (
     BY_NUMBER,
-    EVENT,
-    EVENT_RECORD,
-    IDENTITY,
     MAX_WORDS,
     MESSAGES,
-    NAK,
     VERSION,
 )
 from drivers.statistics import WireCounters
@@ -84,8 +79,7 @@ class CanWire:
 
     def received(self, data: bytes) -> list[Arrival]:
         """Return what these frames complete."""
-        arrivals = [self._arrival(frame) for frame in unpack_frames(data)]
-        return [arrival for arrival in arrivals if arrival is not None]
+        return [arrival for frame in unpack_frames(data) for arrival in self._arrivals(frame)]
 
     def withdraw(self) -> None:
         """Take the request off the wire: its reply will be unexpected."""
@@ -99,7 +93,7 @@ class CanWire:
         """Return how long a request and a reply of so many words take [s]."""
         return self.transit(words) + self.transit(reply)
 
-    def _arrival(self, frame: CanFrame) -> Arrival | None:
+    def _arrivals(self, frame: CanFrame) -> list[Arrival]:
         node = frame.id & NODE_MAX
         kind = frame.id - node
         if node and kind == REPLY:
@@ -108,64 +102,41 @@ class CanWire:
             return self._from_host(node, frame.data)
         if kind == cob_id("sdo_answer") and frame.data.startswith(_VERSIONS_READ):
             return self._other_version(node, frame.data)
-        return None  # of other devices, or an echo
+        return []  # of other devices, or an echo
 
-    def _from_amplifier(self, node: int, data: bytes) -> Arrival | None:
+    def _from_amplifier(self, node: int, data: bytes) -> list[Arrival]:
+        now = clock.now()
         if data[:1] == b"\0":
             events = self._events.setdefault(node, Assembler(self.counters, is_numbered=False))
-            message = events.add(data, clock.now())
-            return None if message is None else self._event(node, message)
+            event = events.add(data, now)
+            return [] if event is None else read_event(node, event.type, event.words, self.counters)
         if node == self._requested and self._replies.contradicts(data):
-            self._replies.add(data, clock.now())  # which discards the message
-            return Several(node)
+            self._replies.add(data, now)  # which discards the message
+            return [Several(node)]
         if self._pending is None or (node, *data[:1]) != self._pending[:2]:
             self.counters.frames_in += 1
             self.counters.unexpected_frames += data[1:2] == b"\0"
-            return None
-        message = self._replies.add(data, clock.now())
+            return []
+        message = self._replies.add(data, now)
         if message is None:
-            return None
+            return []
         kind, self._pending = self._pending[2], None
-        try:
-            return _reply(message, kind)
-        except Refusal as refusal:
-            return Broken(str(refusal))
+        return [read_reply(kind, message.type, message.words)]
 
-    def _other_version(self, node: int, data: bytes) -> Reply | None:
+    def _other_version(self, node: int, data: bytes) -> list[Arrival]:
         """Take the versions for the reply to Hello, if it is of a node that will not reply."""
         versions = int.from_bytes(data[4:6], "little")
         if self._pending is None or self._pending[::2] != (node, HELLO) or versions >> VERSION & 1:
-            return None
+            return []
         self._pending = None
-        return Reply({"versions": versions})
+        return [Reply({"versions": versions})]
 
-    def _from_host(self, node: int, data: bytes) -> OtherHost | None:
+    def _from_host(self, node: int, data: bytes) -> list[Arrival]:
         """Note a frame of another host; one that reads or stops does not drive the amplifier."""
         self.counters.frames_in += 1
         if len(data) != BLOCK or data[1] != 0:
-            return None
+            return []
         self.counters.unexpected_frames += 1
         self._numbers[node] = data[0]  # the amplifier discards what is older
         message = BY_NUMBER.get(data[2])
-        return OtherHost(node) if message is not None and message.feeds else None
-
-    def _event(self, node: int, message: Message) -> Event | None:
-        try:
-            if message.type != EVENT:
-                raise Refusal(f"type must be {EVENT}, got {message.type}")
-            values = EVENT_RECORD.unpack(message.words, is_strict=False)
-        except Refusal:
-            self.counters.invalid_frames += 1
-            return None
-        self.counters.events += 1
-        return Event(node, values)
-
-
-def _reply(message: Message, kind: int) -> Arrival:
-    """Read the reply to a request of a type; raises Refusal."""
-    if message.type == NAK:
-        return read_nak(message.words)
-    if message.type != kind:
-        return Broken(f"type of the reply must be {kind}, got {message.type}")
-    record = IDENTITY if kind == HELLO else BY_NUMBER[kind].reply
-    return Reply(record.unpack(message.words, is_strict=False))
+        return [OtherHost(node)] if message is not None and message.feeds else []

@@ -9,7 +9,7 @@ from drivers.host.feeding import Feeding
 from drivers.host.ledger import Ledger
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import QUANTITIES, STATES, STATUS_FLAGS, has_feature
+from drivers.protocol.table import QUANTITIES, STATUS_FLAGS, has_feature
 
 MAX_CONTRADICTIONS = 2
 """Contradictions in a row that are a fault; a single one may be a moment between two sets."""
@@ -24,42 +24,29 @@ _WEAK = 0.25  # largest measuring error, relative to a weak level
 def problem_of(
     status: Values, ledger: Ledger, feeding: Feeding, *, sent_at: float, now: float, fed: bool
 ) -> str | None:
-    """Describe what a status contradicts; None if it agrees. The doubt is resolved before.
+    """Describe what the status of an armed one contradicts; None if it agrees.
 
     sent_at, now [s]: of the request and its reply; fed: whether the request feeds the watchdog.
     """
-    if status["state"] != STATES["OPERATION_ENABLED"]:
-        return f"state must be OPERATION_ENABLED, got {name_of(STATES, status['state'])}"
     if not status["flags"] >> STATUS_FLAGS["high_voltage"] & 1:
         return "high voltage must be on, got off"
     if not fed:
         left = feeding.problem(_LEFT.from_wire(status["watchdog_left"]), sent_at, now)
         if left is not None:
             return left
-    return _token_problem(status, ledger, now) or _level_problem(status, ledger, sent_at, now)
-
-
-def _token_problem(status: Values, ledger: Ledger, now: float) -> str | None:
     playback = ledger.playback
     playback.advance(now - ledger.lag)
-    if playback.next_due - 2 * ledger.lag <= now:  # a layer may have ended, or not yet
-        return None
-    expected = playback.tokens
-    for layer, token in enumerate(status["tokens"]):
-        expected_token = expected.get(layer, 0)
-        if token != expected_token:
-            return f"token of layer {layer} must be {expected_token}, got {token}"
-    return None
-
-
-def _level_problem(status: Values, ledger: Ledger, sent_at: float, now: float) -> str | None:
-    playback, late = ledger.playback, sent_at - ledger.lag
     if len(status["levels"]) != playback.channels:
         return f"levels must be {playback.channels}, got {len(status['levels'])}"
-    can = ledger.capabilities
+    is_steady = playback.next_due - 2 * ledger.lag > now
+    if is_steady:  # else a layer may have ended, or not yet
+        expected = playback.tokens
+        for layer, token in enumerate(status["tokens"]):
+            if token != expected.get(layer, 0):
+                return f"token of layer {layer} must be {expected.get(layer, 0)}, got {token}"
+    can, late = ledger.capabilities, sent_at - ledger.lag
     tolerance = _STEPS * max(can["level_step"], 1)
     is_measured = has_feature(can, "levels_measured")
-    is_steady = playback.next_due - 2 * ledger.lag > now
     for channel, level in enumerate(status["levels"]):
         highest, is_settled = 0.0, is_steady
         for voice in playback.all_voices[channel]:

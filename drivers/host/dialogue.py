@@ -3,16 +3,15 @@
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drivers.errors import CommandError, CommandRefused, LinkDegraded, LinkError, Preempted
 from drivers.host.comparison import MAX_CONTRADICTIONS, name_of, problem_of
 from drivers.host.feeding import Feeding
-from drivers.host.jobs import RequestCounts
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
-from drivers.host.timing import SET_WORDS, TAKEN_WORDS, overtime
-from drivers.host.wire import WIDEST, reply_words, request_words
+from drivers.host.timing import FAST, SET_WORDS, TAKEN_WORDS
+from drivers.host.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import FAULTS, MESSAGES, QUANTITIES, STATES
@@ -41,7 +40,7 @@ class Staged:
 
 
 class Dialogue:
-    """The exchanges with one amplifier, whose line is open; a `Member` of it."""
+    """The exchanges with one amplifier, whose line is open; as it sees it."""
 
     def __init__(self, line: Line, address: int, name: str) -> None:
         self.line, self.address, self.name = line, address, name
@@ -53,20 +52,18 @@ class Dialogue:
         """The last one."""
         self.status_at: float | None = None
         """When [s] it was read."""
-        self.round_trip: float | None = None
-        """Of the last request that was answered [s]."""
         self.played_at = -math.inf
         """When [s] a set or silence was sent last."""
         self.committed = 0
         """Token of the set that it committed last, 0 for none since it was armed."""
         self.feeding = Feeding(line.wire.delay)
-        self.counts = RequestCounts()
+        self.counts = LinkStatistics()
         self.silence_cause: str | None = None
         """Why it is degraded: it did not reply to a request, and may still play."""
         self.listeners: list[Callable[[Values], None]] = []
         self.silences = 0
         """Stops and disarms that were sent to it."""
-        self._overtimes: dict[str, float] = {}
+        self._times: dict[str, float] = {}  # of exchanges, by the name of the request
         self._time = line.time
         self._ledger: Ledger | None = None
         self._admitted: Staged | None = None
@@ -87,29 +84,17 @@ class Dialogue:
 
     def exchange_time(self, name: str) -> float:
         """Return how long the longest request of a name and its reply take on the wire [s]."""
-        can = self.capabilities
-        size = (can["channels"], can["layers"]) if can else WIDEST
-        return self.line.wire.exchange_time(request_words(name), reply_words(name, *size))
-
-    def overtime(self, name: str, values: Values) -> float:
-        """Return how much later than on a fast wire the reply to a request may come [s]."""
-        if name not in self._overtimes:
-            self._overtimes[name] = overtime(self.exchange_time(name))
-        if name == "Set" and self._overtimes[name]:  # much shorter, nearly always
-            words = SET_WORDS + len(values["stream"])
-            return overtime(self.line.wire.exchange_time(words, TAKEN_WORDS))
-        return self._overtimes[name]
+        if name not in self._times:
+            can = self.capabilities
+            size = (can["channels"], can["layers"]) if can else WIDEST
+            words = request_words(name), reply_words(name, *size)
+            self._times[name] = self.line.wire.exchange_time(*words)
+        return self._times[name]
 
     @property
     def statistics(self) -> LinkStatistics:
         """Counts of its requests, and of all frames on its line."""
-        frames, counts = self.line.wire.counters, self.counts
-        return LinkStatistics(
-            *(frames.frames_out, frames.frames_in, frames.invalid_frames),
-            *(frames.unexpected_frames, frames.events),
-            *(counts.retries, counts.timeouts, counts.refusals),
-            self.round_trip,
-        )
+        return replace(self.counts, **vars(self.line.wire.counters))
 
     def note_sent(self, name: str, values: Values, now: float) -> None:
         """Note a request that may have reached it."""
@@ -139,7 +124,7 @@ class Dialogue:
         """
         now = self._time()
         self.silence_cause = None
-        self.round_trip = now - sent_at
+        self.counts.last_round_trip = now - sent_at
         message = MESSAGES.get(name)
         if message is None:
             return
@@ -150,43 +135,40 @@ class Dialogue:
         elif name == "Set" and reply["played"]:
             self._confirm(values["token"], now)
 
-    def note_refusal(self) -> None:
-        """Note that it has replied, with a refusal or what cannot be read."""
-        self.silence_cause = None
+    def note_unasked(self, arrival: Event | OtherHost | Several) -> None:
+        """Note what came without a request; an event is handed on.
 
-    def note_silence(self, cause: str) -> None:
-        """Note that it has not replied to all attempts of a request."""
-        self.silence_cause = cause
-
-    def note_event(self, values: Values) -> None:
-        """Hand an event on."""
-        for listener in self.listeners:
-            try:
-                listener(values)
-            except Exception:
-                _logger.exception("amplifier %s: a listener failed", self.name)
-
-    def note_other_host(self) -> None:
-        """Note that another host drives it: it must feed the watchdog within its longest time."""
-        self._other_host_at = self._time()
-
-    def note_several(self) -> None:
-        """Note that a second amplifier has replied at its address."""
-        self._are_several = True
+        Another host must feed the watchdog within its longest time.
+        """
+        if isinstance(arrival, OtherHost):
+            self._other_host_at = self._time()
+        elif isinstance(arrival, Several):
+            self._are_several = True
+        else:
+            for listener in self.listeners:
+                try:
+                    listener(arrival.values)
+                except Exception:
+                    _logger.exception("amplifier %s: a listener failed", self.name)
 
     def check_other_host(self) -> None:
         """Raise LinkError if another host drives it."""
         if self._time() - self._other_host_at <= _WATCHDOG.high:
             raise self._driven_by_another()
 
-    def check_request(self, name: str) -> None:
-        """Raise for what plays or feeds, while it must not go out.
+    def next_request(self, name: str, values: Values) -> float:
+        """Return how much later than on a fast wire the reply to a request may come [s].
 
-        LinkError while degraded or beside another host, CommandRefused once a status has shown that
-        it is not armed any more.
+        Raises for what plays or feeds, while it must not go out: LinkError while degraded or beside
+        another host, CommandRefused once a status has shown that it is not armed any more.
         """
+        takes = self.exchange_time(name)
+        if name == "Set" and takes > FAST:  # much shorter, nearly always
+            words = SET_WORDS + len(values["stream"])
+            takes = self.line.wire.exchange_time(words, TAKEN_WORDS)
+        longer = takes - FAST if takes > FAST else 0.0
         if name in ("Hello", "Silence") or not MESSAGES[name].feeds:
-            return
+            return longer
         if self._other_host_at > -math.inf:
             self.check_other_host()
         if self.silence_cause is not None:
@@ -201,9 +183,10 @@ class Dialogue:
                 "clear and arm again",
                 is_disarmed=True,
             )
+        return longer
 
-    def check_admitted(self, token: int) -> None:
-        """Raise Preempted or CommandRefused unless a set may be played now."""
+    def while_admitted(self, token: int, values: Values) -> Values:
+        """Return the values of a request of a set; raises DriverError unless it may play now."""
         admitted = self._admitted
         if admitted is None or admitted.token != token:
             raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
@@ -212,6 +195,7 @@ class Dialogue:
                 f"amplifier {self.name}: set {token} must be committed {now - admitted.until:.3g} "
                 "s earlier; the wire is too slow or too busy"
             )
+        return values
 
     def _confirm(self, token: int, now: float) -> None:
         """Note that the amplifier plays the set with this token, as it says."""

@@ -19,11 +19,10 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import DISARM_RAMP, STOP_RAMP, WATCHDOG, Amplifier, Stopped
-from drivers.host.arming import Arming, Silences
 from drivers.host.heartbeats import Heartbeats
 from drivers.host.jobs import Priority
 from drivers.host.joint_sets import JointSets, Played
-from drivers.host.members import Members, is_lost, retried, to_completion
+from drivers.host.members import Members, is_lost, retried
 from drivers.host.stopping import Stopping
 from drivers.host.timing import check_watchdog
 from drivers.protocol.records import Values
@@ -44,7 +43,7 @@ class GroupState(Enum):
     LOST = auto()
 
 
-class Group:
+class Group(Members):
     """Amplifiers by name, their lines open. A failure of one stops all; nothing arms by itself.
 
     A stop runs to completion even if its caller is cancelled. watchdog [s]: of armed amplifiers.
@@ -58,19 +57,15 @@ class Group:
         watchdog: float = WATCHDOG,
         draw: Callable[[int, int], int] = random.randint,
     ) -> None:
-        self._members = Members(amplifiers, self._lost)
-        self.amplifiers: Mapping[str, Amplifier] = self._members.amplifiers
+        super().__init__(amplifiers)
         self.state = GroupState.CLOSED
         self._watchdog = watchdog
         self._draw = draw
-        first = draw(_TOKEN.minimum, _TOKEN.maximum)
-        self._heartbeats = Heartbeats(self._members, lambda: self.is_armed)
+        self._heartbeats = Heartbeats(self)
         self._stopping = Stopping(self.amplifiers)
-        self._arming_lock = asyncio.Lock()  # a second arm waits for the first
+        self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
-        self._silences = Silences()
-        self._sets = JointSets(self._members, first, self._silences)
-        self._arming = Arming(self._members, self._silences, self.stop)
+        self._sets = JointSets(self, draw(_TOKEN.minimum, _TOKEN.maximum))
         self._stops = self._cleared = 0  # stops so far, and at the last clear
         self._may_be_armed = False  # since the amplifiers were opened
         self._limit: asyncio.Timeout | None = None  # of an exchange in progress
@@ -79,26 +74,6 @@ class Group:
     def is_armed(self) -> bool:
         """Whether layers may be played."""
         return self.state is GroupState.ARMED
-
-    @property
-    def degraded(self) -> tuple[str, ...]:
-        """Names of amplifiers that do not reply but may still play; nothing new is played then."""
-        return self._members.degraded
-
-    @property
-    def lost_by(self) -> Mapping[str, str]:
-        """Causes by name of amplifiers that must be silent without a reply, or without a line."""
-        return self._members.lost_by
-
-    @property
-    def lost_from(self) -> float:
-        """When [s] the next beat stops all, since one that does not reply must be silent."""
-        return self._members.lost_from
-
-    @property
-    def last_sent_at(self) -> float:
-        """When [s] a set or silence was last sent to any amplifier."""
-        return self._members.last_sent_at
 
     @property
     def is_set_incomplete(self) -> bool:
@@ -111,7 +86,7 @@ class Group:
         Raises LinkError, and CommandError for a wire that is too slow for the watchdog.
         """
         stops = self._stops  # each amplifier says itself what it has latched before
-        await self._members.all([each.open() for each in self.amplifiers.values()])
+        await self.all([each.open() for each in self.amplifiers.values()])
         for amplifier in self.amplifiers.values():
             check_watchdog(self._watchdog, amplifier.exchange_time("Set"))
         self.state = GroupState.DISARMED
@@ -122,10 +97,11 @@ class Group:
         """Switch the high voltage on at level zero: on all amplifiers, or none stays armed.
 
         One session, so that a broadcast reaches all of a line. If all are armed, also by a request
-        that came first, nothing changes.
+        that came first, nothing changes. Raises DriverError, LinkDegraded where one only does not
+        reply for now.
         """
-        before = self._silences.count
-        async with self._arming_lock:
+        before = self.silences
+        async with self._arming:
             if self.state in (GroupState.CLOSED, GroupState.LOST):
                 raise CommandError(
                     f"amplifiers must be open to be armed, got {self.state.name}; close and open "
@@ -133,33 +109,60 @@ class Group:
                 )
             if self._stops > self._cleared:  # an amplifier that restarted does not know
                 raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
-            if self._silences:  # the result would depend on the order of frames
+            if self.silencing:  # the result would depend on the order of frames
                 raise CommandRefused(
                     "amplifiers are being stopped or disarmed; arm again if that is still wanted"
                 )
-            self._silences.check_none_since(before)
+            self.check_none_since(before)
+            amplifiers = [*self.amplifiers.values()]
             if self.is_armed:
                 statuses = await self._read(Priority.ARM)
-                self._silences.check_none_since(before)
+                self.check_none_since(before)
                 if all(each["state"] == _ENABLED for each in statuses.values()):
                     return
-                before = await self._disarm_rest()
-            for amplifier in self.amplifiers.values():
+                self._leave_armed()
+                before = self.silences
+                await self.silenced(self._disarm(amplifiers, STOP_RAMP))
+                self.check_none_since(before)
+            for amplifier in amplifiers:
                 amplifier.check_other_host()  # before a disarm of what failed ends its vibration
             self._may_be_armed = True
             session = self._draw(_SESSION.minimum, _SESSION.maximum)
-            await self._arming.arm(session, self._watchdog, before=before)
+            arming = asyncio.gather(
+                *[each.arm(session, self._watchdog) for each in amplifiers], return_exceptions=True
+            )
+            try:
+                self.checked(await asyncio.shield(arming))
+                self.check_none_since(before)
+            except BaseException as error:
+                self.note(error)
+                await self.silenced(self._disarm_armed(arming))
+                if isinstance(error, DriverError):
+                    self.check_none_since(before)
+                if self.is_degraded_only(error):
+                    raise LinkDegraded(str(error)) from error
+                if self.lost_by:
+                    self.lose()
+                raise
             self._sets.is_incomplete = False
             self.state = GroupState.ARMED
 
-    async def _disarm_rest(self) -> int:
-        """Disarm those that still are, when others no longer are; the count of silences then."""
-        self._leave_armed()
-        before = self._silences.count
-        with self._silences.in_progress():
-            await to_completion(self._disarm([*self.amplifiers.values()], STOP_RAMP))
-        self._silences.check_none_since(before)
-        return before
+    async def _disarm_armed(self, arming: "asyncio.Future[list[Any]]") -> None:
+        """Disarm what may have been armed by this; one that has refused may be another host's."""
+        results = zip(self.amplifiers.values(), await arming, strict=True)
+        disarmed = await asyncio.gather(
+            *[
+                retried(each, partial(each.disarm, STOP_RAMP))
+                for each, result in results
+                if not isinstance(result, CommandRefused)
+                or isinstance(result, Preempted)
+                or result.may_play
+            ],
+            return_exceptions=True,
+        )
+        failures = [each for each in disarmed if isinstance(each, BaseException)]
+        if not all(isinstance(each, LinkError) for each in failures):  # a mute one stops none
+            await self.stop()
 
     async def apply(self, layers: Mapping[str, Sequence[Layer]]) -> Played:
         """Play layers on the amplifiers of these names, all from one moment on.
@@ -183,7 +186,7 @@ class Group:
         """
         self._check_armed()
         requests = [each.silence(ramp) for each in self.amplifiers.values()]
-        await self._exchange(self._members.all(requests))
+        await self._exchange(self.all(requests))
         self._sets.is_incomplete = False
         return self.last_sent_at
 
@@ -210,7 +213,7 @@ class Group:
 
     async def _exchange(self, exchange: Coroutine[Any, Any, _T]) -> _T:
         """Run an exchange of the control loop; any unexplained failure stops all amplifiers."""
-        before = self._silences.count
+        before = self.silences
         limit = asyncio.timeout(None)
         try:
             try:
@@ -219,19 +222,19 @@ class Group:
             finally:
                 self._limit = None
         except Exception as error:
-            self._members.note(error)
+            self.note(error)
             if limit.expired() and (isinstance(error, TimeoutError | Preempted)):
                 raise Preempted("given up, since silence comes first") from error
-            if self._members.is_degraded_only(error):
+            if self.is_degraded_only(error):
                 raise LinkDegraded(str(error)) from error
-            is_explained = self._silences.count != before and self.state is not GroupState.LOST
+            is_explained = self.silences != before and self.state is not GroupState.LOST
             if is_explained and isinstance(error, DriverError):
                 raise Preempted("a stop or disarm came first") from error
             self._leave_armed()
             self._stops += 1
-            with self._silences.in_progress():  # those that are lost are not waited for
-                stopping = self._stopping.stop(STOP_RAMP, waits_for=self._members.replying)
-                await to_completion(stopping)
+            replying = [name for name, each in self.amplifiers.items() if not each.silence_cause]
+            stopping = self._stopping.stop(STOP_RAMP, waits_for=replying)
+            await self.silenced(stopping)
             raise
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> None:
@@ -240,12 +243,11 @@ class Group:
         It goes on to its end if its caller is cancelled. Where one fails all are stopped.
         """
         self._leave_armed()
-        with self._silences.in_progress():
-            await to_completion(self._disarm([*self.amplifiers.values()], ramp))
+        await self.silenced(self._disarm([*self.amplifiers.values()], ramp))
 
     async def _disarm(self, members: Sequence[Amplifier], ramp: float) -> None:
         try:
-            await self._members.all([retried(each, partial(each.disarm, ramp)) for each in members])
+            await self.all([retried(each, partial(each.disarm, ramp)) for each in members])
         except BaseException:
             await self.stop()
             raise
@@ -257,19 +259,18 @@ class Group:
         """
         self._leave_armed()
         self._stops += 1
-        with self._silences.in_progress():
-            return await to_completion(self._stopping.stop(ramp))
+        return await self.silenced(self._stopping.stop(ramp))
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone.
 
         Raises Preempted while amplifiers are being stopped or disarmed: nothing precedes that.
         """
-        if self._silences:
+        if self.silencing:
             raise Preempted("amplifiers are being stopped or disarmed; clear again afterwards")
         count = self._stops
         try:
-            await self._members.all([each.clear() for each in self.amplifiers.values()])
+            await self.all([each.clear() for each in self.amplifiers.values()])
         except LinkError:
             await self.stop()
             raise
@@ -288,7 +289,7 @@ class Group:
 
     async def _read(self, priority: Priority) -> dict[str, Values]:
         amplifiers = self.amplifiers.values()
-        statuses = await self._members.all(
+        statuses = await self.all(
             [retried(each, partial(each.read_status, priority)) for each in amplifiers]
         )
         return dict(zip(self.amplifiers, statuses, strict=True))
@@ -306,19 +307,18 @@ class Group:
             if not self._may_be_armed:
                 return
             try:
-                with self._silences.in_progress():
-                    await to_completion(self._disarm(members, ramp))
+                await self.silenced(self._disarm(members, ramp))
                 self._may_be_armed = False
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
 
     def _leave_armed(self) -> None:
         """Leave ARMED for DISARMED, if armed, so that nothing more is played."""
-        self._silences.count += 1
+        self.silences += 1
         if self.is_armed:
             self.state = GroupState.DISARMED
 
-    def _lost(self) -> None:
+    def lose(self) -> None:
         """Enter the state LOST, in which nothing is played."""
         if self.state is not GroupState.CLOSED:
             self.state = GroupState.LOST

@@ -5,10 +5,9 @@ amplifier: so its status is read just before it is fed. One that does not reply 
 """
 
 import asyncio
-from collections.abc import Callable
 
 from drivers import clock
-from drivers.errors import LinkTimeout, Preempted
+from drivers.errors import LinkTimeout
 from drivers.host.amplifier import Amplifier
 from drivers.host.jobs import Priority
 from drivers.host.members import Members, is_lost, seen
@@ -18,11 +17,10 @@ _MAX_STATUS_LOAD = 0.05  # of the line's time, for statuses that show whether th
 
 
 class Heartbeats:
-    """Heartbeats of the amplifiers of a group; is_armed: whether they may be fed at a moment."""
+    """Heartbeats of the amplifiers of a group."""
 
-    def __init__(self, members: Members, is_armed: Callable[[], bool]) -> None:
+    def __init__(self, members: Members) -> None:
         self._members = members
-        self._is_armed = is_armed
         self._running_read_at: dict[str, float] = {}
         self._readings: dict[str, asyncio.Future[Values]] = {}  # of amplifiers that do not reply
 
@@ -35,27 +33,22 @@ class Heartbeats:
         amplifiers = self._members.amplifiers.values()
         for amplifier in amplifiers:  # before the others are waited for: they are stopped then
             if is_lost(amplifier):
-                self._members.lost()
+                self._members.lose()
                 raise LinkTimeout(amplifier.line.loss or amplifier.silence_cause)
-        await self._members.all([self._beat(each) for each in amplifiers])
+        before = self._members.silences
+        await self._members.all([self._beat(each, before) for each in amplifiers])
 
-    async def _beat(self, amplifier: Amplifier) -> None:
+    async def _beat(self, amplifier: Amplifier, before: int) -> None:
+        name = amplifier.name
         if amplifier.silence_cause is None:
-            await self._read_running(amplifier)
-            if not self._is_armed():
-                raise Preempted("a stop or disarm came first")
+            # A status just before the watchdog is fed, unless the wire is too slow for that.
+            pause = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
+            if (now := clock.now()) - self._running_read_at.get(name, 0.0) >= pause:
+                self._running_read_at[name] = now
+                await amplifier.read_status(Priority.HEARTBEAT)
+            self._members.check_none_since(before)
             await amplifier.ping()
-            return
-        reading = self._readings.get(amplifier.name)
-        if reading is None or reading.done():
+        elif name not in self._readings or self._readings[name].done():
             reading = asyncio.ensure_future(amplifier.read_status(Priority.READING))
             reading.add_done_callback(seen)
-            self._readings[amplifier.name] = reading
-
-    async def _read_running(self, amplifier: Amplifier) -> None:
-        """Read a status just before the watchdog is fed, unless the wire is too slow for that."""
-        pause = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
-        last, now = self._running_read_at.get(amplifier.name), clock.now()
-        if last is None or now - last >= pause:
-            self._running_read_at[amplifier.name] = now
-            await amplifier.read_status(Priority.HEARTBEAT)
+            self._readings[name] = reading

@@ -7,10 +7,13 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from drivers.host.joint_start import JointStart
 from drivers.protocol.records import Values
+
+if TYPE_CHECKING:
+    from drivers.host.dialogue import Dialogue
 
 MAX_WAIT = 0.05  # s; after which a request goes before newer sets and heartbeats
 
@@ -40,54 +43,6 @@ _SUPERSEDED = {
 }
 
 
-@dataclass
-class RequestCounts:
-    """Counts of an amplifier: repeated requests, those without a reply in time, refused ones."""
-
-    retries: int = 0
-    timeouts: int = 0
-    refusals: int = 0
-
-
-class Member(Protocol):
-    """An amplifier as its line sees it."""
-
-    @property
-    def address(self) -> int:
-        """Its address."""
-
-    @property
-    def counts(self) -> RequestCounts:
-        """Counts of its requests."""
-
-    def overtime(self, name: str, values: Values) -> float:
-        """Return how much later than on a fast wire the reply to a request may come [s]."""
-
-    def note_sent(self, name: str, values: Values, now: float) -> None:
-        """Note a request that may have reached it."""
-
-    def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
-        """Note the reply to a request sent at a time [s]; raises CommandRefused for its caller."""
-
-    def note_refusal(self) -> None:
-        """Note that it has replied, with a refusal or what cannot be read."""
-
-    def note_silence(self, cause: str) -> None:
-        """Note that it has not replied to all attempts of a request."""
-
-    def note_event(self, values: Values) -> None:
-        """Note what it told unasked."""
-
-    def note_other_host(self) -> None:
-        """Note that another host drives it."""
-
-    def note_several(self) -> None:
-        """Note that a second amplifier has replied at its address."""
-
-    def check_request(self, name: str) -> None:
-        """Raise LinkError where a request of this name must not go out now."""
-
-
 @dataclass(eq=False, slots=True)
 class Job:
     """A request from its queueing to its result; member: None for a broadcast.
@@ -96,7 +51,7 @@ class Job:
     commit that goes out together with those of other lines. had_no_reply: to an earlier attempt.
     """
 
-    member: Member | None
+    member: "Dialogue | None"
     priority: Priority
     name: str
     values: Values
@@ -122,6 +77,10 @@ class Job:
             if rank > Priority.HEARTBEAT and (self.is_held or now - self.queued_at > MAX_WAIT):
                 rank = Priority.HEARTBEAT
         return rank, not self.is_held, self.number
+
+    def is_superseded_by(self, priority: Priority, member: "Dialogue | None") -> bool:
+        """Whether a request for an amplifier, None for all, makes it obsolete."""
+        return self.priority in _SUPERSEDED.get(priority, ()) and member in (self.member, None)
 
 
 class JobQueue:
@@ -154,20 +113,13 @@ class JobQueue:
                 return min(ready, key=lambda job: job.rank(now), default=None)
         return first if first.not_before <= now else None
 
-    def superseded_by(self, priority: Priority, member: Member | None) -> list[Job]:
+    def superseded_by(self, priority: Priority, member: "Dialogue | None") -> list[Job]:
         """Return the jobs that a request for an amplifier, None for all, makes obsolete."""
-        obsolete = _SUPERSEDED.get(priority, ())
-        return [
-            job for job in self.jobs if job.priority in obsolete and member in (job.member, None)
-        ]
+        return [job for job in self.jobs if job.is_superseded_by(priority, member)]
 
     def supersedes(self, job: Job) -> bool:
         """Whether one that waits makes a job obsolete."""
-        return any(
-            other.member in (job.member, None)
-            and job.priority in _SUPERSEDED.get(other.priority, ())
-            for other in self.jobs
-        )
+        return any(job.is_superseded_by(other.priority, other.member) for other in self.jobs)
 
     @property
     def next_due(self) -> float:

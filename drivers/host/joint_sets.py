@@ -8,7 +8,6 @@ from functools import partial
 from drivers.contents import Layer, is_silence
 from drivers.errors import CommandRefused, Preempted
 from drivers.host.amplifier import Amplifier
-from drivers.host.arming import Silences
 from drivers.host.comparison import name_of
 from drivers.host.dialogue import Staged
 from drivers.host.jobs import Priority
@@ -39,18 +38,17 @@ class Played:
 class JointSets:
     """Sets of the amplifiers of a group, under tokens from a first one on."""
 
-    def __init__(self, members: Members, token: int, silences: Silences) -> None:
+    def __init__(self, members: Members, token: int) -> None:
         self.is_incomplete = False
         """Whether possibly only some amplifiers have committed the last set."""
         self.token = token
         """Of the last set."""
         self._members = members
-        self._silences = silences
 
     async def play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | CommandRefused:
         """Stage and commit layers by amplifier; a refusal before the first commit is returned."""
         amplifiers = self._members.amplifiers
-        before = self._silences.count
+        before = self._members.silences
         if self.token % INTERVAL == 0:
             self.token = await close_gaps(amplifiers.values(), self.token)
         self.token = token = token_after(self.token)
@@ -73,8 +71,7 @@ class JointSets:
             return _merged(refusals)
         staged = self._members.checked(results)
         if not is_silent:
-            if self._silences.count != before:
-                raise Preempted("a stop or disarm came first")
+            self._members.check_none_since(before)
             self.is_incomplete = len(layers) > 1
             await self._commit(several, staged)
         self.is_incomplete = False
@@ -138,9 +135,10 @@ def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
 
 def _commit_of(several: Sequence[Amplifier], token: int) -> Values:
     """Return the commit of all amplifiers of a line; raises unless each may play its set now."""
+    values = {"session": several[0].session, "token": token}
     for amplifier in several:
-        amplifier.check_admitted(token)
-    return {"session": several[0].session, "token": token}
+        amplifier.while_admitted(token, values)
+    return values
 
 
 def _check_plays(name: str, status: Values, staged: Staged) -> None:

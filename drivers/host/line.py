@@ -8,16 +8,19 @@ against what really went out before. Times [s] are of the event loop's clock.
 import asyncio
 from collections.abc import Callable
 from functools import partial
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from drivers import trace
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
-from drivers.host.jobs import Job, JobQueue, Member, Priority
+from drivers.host.jobs import Job, JobQueue, Priority
 from drivers.host.joint_start import JointStart
 from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT
 from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 from drivers.protocol.records import Values
 from drivers.trace import Direction
+
+if TYPE_CHECKING:
+    from drivers.host.dialogue import Dialogue
 
 GRACE = 0.008  # s; how long a stop waits for the reply to another request
 BUSY_PAUSE = 0.005  # s; before a request goes again to a busy amplifier
@@ -49,7 +52,7 @@ class Line:
         self.wire = wire
         self.name = name
         self.loss: str | None = None
-        self.members: dict[int, Member] = {}
+        self.members: dict[int, Dialogue] = {}
         self._port = port
         self._queue = JobQueue()
         self._current: Job | None = None
@@ -62,7 +65,7 @@ class Line:
 
     def submit(
         self,
-        member: Member | None,
+        member: "Dialogue | None",
         priority: Priority,
         name: str,
         values: Values,
@@ -107,7 +110,7 @@ class Line:
         for arrival in arrivals:
             if isinstance(arrival, Event | OtherHost | Several):
                 if (member := self.members.get(arrival.address)) is not None:
-                    _note_unasked(member, arrival)
+                    member.note_unasked(arrival)
                 continue
             job = self._current
             if job is None:
@@ -150,7 +153,7 @@ class Line:
             if not job.result.done():
                 job.result.set_result(arrival.values)
             return
-        member.note_refusal()
+        member.silence_cause = None
         if isinstance(arrival, Nak):
             self._refused(job, member, arrival)
         else:
@@ -205,8 +208,7 @@ class Line:
                 self._write(0, job.name, job.values, now)
                 job.result.set_result({})
                 return
-            job.member.check_request(job.name)
-            longer = job.member.overtime(job.name, job.values)
+            longer = job.member.next_request(job.name, job.values)
             self._write(job.member.address, job.name, job.values, now)
             if self.loss is not None:  # by what the port did
                 raise LinkError(self.loss)
@@ -233,7 +235,7 @@ class Line:
         self._free_at = self._loop.time() + self.wire.busy
         self._port.write(data)
 
-    def _refused(self, job: Job, member: Member, nak: Nak) -> None:
+    def _refused(self, job: Job, member: "Dialogue", nak: Nak) -> None:
         member.counts.refusals += 1
         if nak.code == "BUSY" and job.attempts > 0:
             self._repeat(job, pause=BUSY_PAUSE)
@@ -329,17 +331,8 @@ class Line:
             self._repeat(job)
             return
         if job.member is not None:
-            job.member.note_silence(cause)
+            job.member.silence_cause = cause
         self._fail(job, LinkTimeout(f"{cause}; check that the amplifier is switched on"))
-
-
-def _note_unasked(member: Member, arrival: Event | OtherHost | Several) -> None:
-    if isinstance(arrival, Event):
-        member.note_event(arrival.values)
-    elif isinstance(arrival, OtherHost):
-        member.note_other_host()
-    else:
-        member.note_several()
 
 
 def _trace(job: Job, result: "asyncio.Future[Values]") -> None:

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from typing import Any, TypeVar
 
 from drivers import clock
-from drivers.errors import LinkError, LinkTimeout
+from drivers.errors import LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.protocol.records import Values
 
@@ -15,15 +15,18 @@ _T = TypeVar("_T")
 
 
 class Members:
-    """Amplifiers by name; lost: called where a request shows that one is lost."""
+    """Amplifiers by name, and the stops, disarms and closes of all of them."""
 
-    def __init__(self, amplifiers: Mapping[str, Amplifier], lost: Callable[[], None]) -> None:
+    def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
         self.amplifiers = dict(amplifiers)
-        self.lost = lost
+        self.silences = 0
+        """Stops, disarms and closes so far."""
+        self.silencing = 0
+        """Stops and disarms in progress."""
 
     @property
     def degraded(self) -> tuple[str, ...]:
-        """Names of amplifiers that do not reply but may still play."""
+        """Names of amplifiers that do not reply but may still play; nothing new is played then."""
         return tuple(
             name
             for name, each in self.amplifiers.items()
@@ -41,19 +44,17 @@ class Members:
 
     @property
     def lost_from(self) -> float:
-        """When [s] the first of those that do not reply is lost; infinite while all reply."""
+        """When [s] the next beat stops all, since one that does not reply must be silent."""
         mute = [each for each in self.amplifiers.values() if each.silence_cause is not None]
         return min((each.feeding.may_play_until for each in mute), default=math.inf)
-
-    @property
-    def replying(self) -> list[str]:
-        """Names of amplifiers that have replied last."""
-        return [name for name, each in self.amplifiers.items() if each.silence_cause is None]
 
     @property
     def last_sent_at(self) -> float:
         """When [s] a set or silence was last sent to any amplifier."""
         return max((each.played_at for each in self.amplifiers.values()), default=-math.inf)
+
+    def lose(self) -> None:
+        """Note that one is lost."""
 
     def is_degraded_only(self, error: BaseException) -> bool:
         """Whether an error says no more than that an amplifier does not reply for now."""
@@ -62,7 +63,23 @@ class Members:
     def note(self, error: BaseException) -> None:
         """Note an error of a request: it may show that an amplifier is lost."""
         if isinstance(error, LinkError) and not self.is_degraded_only(error):
-            self.lost()
+            self.lose()
+
+    def check_none_since(self, before: int) -> None:
+        """Raise Preempted if a silence was asked for since there were so many."""
+        if self.silences != before:
+            raise Preempted(
+                "amplifiers were disarmed, stopped or closed meanwhile; arm again if that is still "
+                "wanted"
+            )
+
+    async def silenced(self, work: Coroutine[Any, Any, _T]) -> _T:
+        """Await a stop or disarm to its end, whoever is cancelled; nothing arms meanwhile."""
+        self.silencing += 1
+        try:
+            return await _to_completion(work)
+        finally:
+            self.silencing -= 1
 
     async def all(self, requests: Sequence[Awaitable[_T]]) -> list[_T]:
         """Await all requests to their ends, then raise the most severe error."""
@@ -111,7 +128,7 @@ async def retried(amplifier: Amplifier, request: Callable[[], Awaitable[_T]]) ->
             await asyncio.sleep(_REPEAT_INTERVAL)
 
 
-async def to_completion(work: Coroutine[Any, Any, _T]) -> _T:
+async def _to_completion(work: Coroutine[Any, Any, _T]) -> _T:
     """Await work, however often the caller is cancelled meanwhile; re-raise that at the end."""
     task = asyncio.ensure_future(work)
     cancellation = None
@@ -121,6 +138,7 @@ async def to_completion(work: Coroutine[Any, Any, _T]) -> _T:
         except asyncio.CancelledError as error:
             cancellation = error
     if cancellation is not None:
+        task.exception()  # retrieved: what has failed is said by the amplifiers
         raise cancellation
     return task.result()
 

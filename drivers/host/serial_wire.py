@@ -8,7 +8,15 @@ from drivers.codec.serial_line.frame import (
     encode_frame,
     frame_length,
 )
-from drivers.host.wire import NETWORK_DELAY, Arrival, Broken, Event, Reply, Several, read_nak
+from drivers.host.wire import (
+    NETWORK_DELAY,
+    Arrival,
+    Broken,
+    Reply,
+    Several,
+    read_event,
+    read_reply,
+)
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import (
     BROADCAST,
@@ -18,9 +26,7 @@ from drivers.protocol.serial_payload import (
     unpack_words,
 )
 from drivers.protocol.table import (
-    BY_NUMBER,
     EVENT,
-    EVENT_RECORD,
     MESSAGES,
     NAK,
     VERSION,
@@ -60,8 +66,7 @@ class SerialWire:
         """Return what these bytes complete."""
         arrivals: list[Arrival] = []
         for frame in self._reader.feed(data):
-            if (arrival := self._arrival(frame)) is not None:
-                arrivals.append(arrival)
+            arrivals += self._arrivals(frame)
         return arrivals
 
     def withdraw(self) -> None:
@@ -76,10 +81,11 @@ class SerialWire:
         """Return how long a request and a reply of so many words take [s]; 0 behind a server."""
         return self.transit(words) + self.transit(reply)
 
-    def _arrival(self, frame: Frame) -> Arrival | None:
+    def _arrivals(self, frame: Frame) -> list[Arrival]:
         self.counters.frames_in += 1
         if frame.kind == EVENT:
-            return self._event(frame)
+            words = () if len(frame.payload) % 2 else unpack_words(frame.payload)
+            return read_event(frame.address, EVENT, words, self.counters)
         pending = self._pending
         if (
             pending is None
@@ -87,17 +93,19 @@ class SerialWire:
             or (frame.address, frame.sequence) != (pending.address, pending.sequence)
         ):
             self.counters.unexpected_frames += 1
-            return Several(frame.address) if self._is_second(frame) else None
+            return [Several(frame.address)] if self._is_second(frame) else []
         self._pending, self._replied = None, frame
+        kind = frame.kind ^ REPLY
         try:
-            if frame.kind != pending.kind | REPLY or pending.version == NEUTRAL:
-                return _special_reply(frame, pending)
-            if frame.version != pending.version:
-                return Broken(f"version of the reply must be {VERSION}, got {frame.version}")
-            record = BY_NUMBER[pending.kind].reply
-            return Reply(record.unpack(unpack_words(frame.payload), is_strict=False))
+            if kind != NAK and frame.version != pending.version:
+                return [
+                    Broken(f"version of the reply must be {pending.version}, got {frame.version}")
+                ]
+            if kind == pending.kind == HELLO:
+                return [Reply(unpack_identity(frame.payload))]
+            return [read_reply(pending.kind, kind, unpack_words(frame.payload))]
         except Refusal as refusal:
-            return Broken(str(refusal))
+            return [Broken(str(refusal))]
 
     def _is_second(self, frame: Frame) -> bool:
         """Whether a frame is another reply to the request that was replied to last."""
@@ -106,25 +114,5 @@ class SerialWire:
             return False
         return (frame.address, frame.sequence) == (last.address, last.sequence)
 
-    def _event(self, frame: Frame) -> Event | None:
-        try:
-            values = EVENT_RECORD.unpack(unpack_words(frame.payload), is_strict=False)
-        except Refusal:
-            self.counters.invalid_frames += 1
-            return None
-        self.counters.events += 1
-        return Event(frame.address, values)
-
     def _count_invalid(self, piece: bytes) -> None:
         self.counters.invalid_frames += 1
-
-
-def _special_reply(frame: Frame, request: Frame) -> Arrival:
-    """Read a refusal, the reply to Hello, or what is none; raises Refusal."""
-    if frame.kind == NAK | REPLY:
-        return read_nak(unpack_words(frame.payload))
-    if frame.kind != request.kind | REPLY:
-        return Broken(f"type of the reply must be {request.type}, got {frame.type}")
-    if frame.version != NEUTRAL:
-        return Broken(f"version of the reply must be {NEUTRAL}, got {frame.version}")
-    return Reply(unpack_identity(frame.payload))

@@ -7,6 +7,8 @@ from drivers.protocol.table import REACTION
 
 REPLY_TIMEOUT = 0.030
 """For a reply [s], on a wire that is fast; a heartbeat and three of these are less than 150 ms."""
+FAST = REPLY_TIMEOUT - REACTION
+"""Longest exchange [s] whose reply is here by then."""
 ATTEMPTS = 3
 """Of a request; one less where the wire is slow."""
 HEARTBEAT = 0.05
@@ -25,11 +27,6 @@ TAKEN_WORDS = 3
 def set_words(channels: int) -> int:
     """Return the words of a set of this many channels in one layer, without envelopes."""
     return SET_WORDS + _LAYER_HEAD + _COMMAND * channels
-
-
-def overtime(exchange: float) -> float:
-    """Return how much longer than on a fast wire a reply may take [s]; exchange: of both [s]."""
-    return max(exchange + REACTION - REPLY_TIMEOUT, 0.0)
 
 
 def shortest_watchdog(round_trip: float) -> float:
@@ -56,6 +53,6 @@ def loss_detection_time(round_trips: Iterable[float]) -> float:
     """
     detected = HEARTBEAT
     for round_trip in round_trips:
-        longer = overtime(round_trip)
+        longer = max(round_trip - FAST, 0.0)
         detected += (ATTEMPTS - (longer > 0)) * (REPLY_TIMEOUT + longer)
     return detected

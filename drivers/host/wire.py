@@ -16,15 +16,20 @@ from drivers.protocol.records import (
     Numbers,
     Real,
     Record,
+    Refusal,
     Rest,
     Rows,
     Text,
     Values,
 )
 from drivers.protocol.table import (
+    BY_NUMBER,
+    EVENT,
+    EVENT_RECORD,
     IDENTITY,
     MAX_WORDS,
     MESSAGES,
+    NAK,
     NAK_RECORD,
     NO_CHANNEL,
     QUANTITIES,
@@ -94,6 +99,34 @@ class More:
 
 
 Arrival: TypeAlias = Reply | Nak | Broken | Event | OtherHost | Several | More
+
+
+def read_reply(kind: int, received: int, words: Sequence[int]) -> Arrival:
+    """Read the reply to a request of a type, by its own type."""
+    if received not in (kind, NAK):
+        return Broken(f"type of the reply must be {kind}, got {received}")
+    try:
+        if received == NAK:
+            return read_nak(words)
+        record = BY_NUMBER[kind].reply if kind in BY_NUMBER else IDENTITY
+        return Reply(record.unpack(words, is_strict=False))
+    except Refusal as refusal:
+        return Broken(str(refusal))
+
+
+def read_event(
+    address: int, kind: int, words: Sequence[int], counters: WireCounters
+) -> list[Arrival]:
+    """Read an unasked message of an amplifier, and count it; nothing where it is no event."""
+    try:
+        if kind != EVENT:
+            raise Refusal(f"type must be {EVENT}, got {kind}")
+        values = EVENT_RECORD.unpack(words, is_strict=False)
+    except Refusal:
+        counters.invalid_frames += 1
+        return []
+    counters.events += 1
+    return [Event(address, values)]
 
 
 def read_nak(words: Sequence[int]) -> Nak:

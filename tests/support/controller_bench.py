@@ -17,6 +17,7 @@ from drivers.errors import LinkError
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.line import Line
 from drivers.host.serial_wire import SerialWire
+from drivers.host.wire import Event
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, unpack_layers
@@ -133,7 +134,8 @@ class FarEnd:
 
     def report(self, **event: int) -> None:
         """Let its host hear of an event."""
-        self.line.members[1].note_event({"channel": NO_CHANNEL, "latch": 0, **event})
+        values = {"channel": NO_CHANNEL, "latch": 0, **event}
+        self.line.members[1].note_unasked(Event(1, values))
 
     def close(self) -> None:
         """Close its line."""

@@ -1,7 +1,7 @@
 """CAN through a server: can+socketcand://HOST:PORT/can0#NODE."""
 
 import asyncio
-import re
+import contextlib
 from collections.abc import Callable
 
 from drivers.codec.can_bus.adapter_text import SOCKETCAND
@@ -15,7 +15,7 @@ from drivers.wires.text_port import TextPort
 
 _FORM = "can+socketcand://HOST:PORT/can0?bitrate=500000#NODE"
 _GREETING_TIMEOUT = 2.0  # s
-_IS_FRAME = re.compile(rb"\s*< frame ")
+_MAX_REPLIES = 9
 
 
 class SocketcandAddress(CanAddress):
@@ -33,30 +33,34 @@ class SocketcandAddress(CanAddress):
         self, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
     ) -> Port:
         """Connect, and open the bus in raw mode; raises LinkError."""
-        port = TextPort(SOCKETCAND, on_data)
-        said: asyncio.Queue[bytes | LinkError] = asyncio.Queue()
-        is_raw = False
+        replies: asyncio.Queue[str] = asyncio.Queue(_MAX_REPLIES)
 
-        def received(data: bytes) -> None:
-            if is_raw:
-                port.received(data)
-            else:
-                said.put_nowait(data)
+        def note(text: str) -> None:
+            with contextlib.suppress(asyncio.QueueFull):  # of a bus that is open
+                replies.put_nowait(text)
+
+        def replied(text: bytes) -> None:
+            element = text.decode(errors="replace").strip()
+            if not element.startswith("< frame"):  # with a long identifier
+                note(f"{element} >")
 
         def lost(cause: str) -> None:
-            if is_raw:
-                on_loss(cause)
-            else:
-                said.put_nowait(LinkError(cause))
+            note(cause)
+            on_loss(cause)
 
-        port.below = await open_port(self.place, received, lost)
+        async def expect(reply: str) -> None:
+            if (got := await replies.get()) != reply:
+                raise LinkError(f"reply must be {reply!r}, got {got!r}")
+
+        port = TextPort(SOCKETCAND, on_data, on_other=replied)
+        port.below = await open_port(self.place, port.received, lost)
         try:
             async with asyncio.timeout(_GREETING_TIMEOUT):
-                rest = await _expected(b"< hi >", b"", said)
+                await expect("< hi >")
                 port.below.write(f"< open {self.channel} >".encode())
-                rest = await _expected(b"< ok >", rest, said)
+                await expect("< ok >")
                 port.below.write(b"< rawmode >")
-                rest = await _expected(b"< ok >", rest, said)
+                await expect("< ok >")
         except BaseException as error:
             port.below.close()
             if not isinstance(error, TimeoutError | LinkError):
@@ -66,31 +70,4 @@ class SocketcandAddress(CanAddress):
                 f"CAN bus {self.line} cannot be opened: {cause}; check address and port, and that "
                 "socketcand serves this bus there"
             ) from None
-        is_raw = True
-        port.received(rest)
-        while not said.empty():
-            data = said.get_nowait()
-            if isinstance(data, LinkError):
-                lost(str(data))
-            else:
-                received(data)
         return port
-
-
-async def _expected(element: bytes, rest: bytes, said: "asyncio.Queue[bytes | LinkError]") -> bytes:
-    """Wait for an element of the server, and return what follows; LinkError for another one.
-
-    rest: what was said and not looked at yet. Frames may come before it.
-    """
-    while True:
-        while b">" not in rest:
-            data = await said.get()
-            if isinstance(data, LinkError):
-                raise data
-            rest += data
-        found, _, rest = rest.partition(b">")
-        if not _IS_FRAME.match(found):
-            break
-    if (found + b">").strip() != element:
-        raise LinkError(f"reply must be {element!r}, got {found + b'>'!r}")
-    return rest

@@ -14,18 +14,20 @@ from drivers.wires.port_above import PortAbove
 class TextPort(PortAbove):
     """A port of frames on one of text, below; implements `Port`.
 
-    on_data: called with packed frames; cut_off: ends a line of which a port that was blocked has
-    dropped the rest; goodbye: sent before it is closed.
+    on_data: called with packed frames; on_other: with other text; cut_off: ends a line of which a
+    port that was blocked has dropped the rest; goodbye: sent before it is closed.
     """
 
     def __init__(
         self,
         form: TextFormat,
         on_data: Callable[[bytes], None],
+        *,
+        on_other: Callable[[bytes], None] = lambda text: None,
         cut_off: bytes = b"",
         goodbye: bytes = b"",
     ) -> None:
-        self._encode, self._reader, self._on_data = form.encode, TextReader(form), on_data
+        self._encode, self._reader, self._on_data = form.encode, TextReader(form, on_other), on_data
         self._cut_off, self._goodbye = cut_off, goodbye
 
     def write(self, data: bytes) -> None:

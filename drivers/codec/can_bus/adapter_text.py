@@ -63,10 +63,12 @@ SOCKETCAND = TextFormat(re.compile(rb">"), _element, _of_element)
 
 
 class TextReader:
-    """Reads frames from the text of an adapter; invalid text is skipped."""
+    """Reads frames from the text of an adapter; on_other: called with any other text."""
 
-    def __init__(self, form: TextFormat) -> None:
-        self._form = form
+    def __init__(
+        self, form: TextFormat, on_other: Callable[[bytes], None] = lambda text: None
+    ) -> None:
+        self._form, self._on_other = form, on_other
         self._rest = b""
 
     def feed(self, data: bytes) -> Iterator[CanFrame]:
@@ -75,5 +77,7 @@ class TextReader:
         self._rest = rest if len(rest) <= _MAX_LENGTH else b""
         for text in texts:
             frame = self._form.decode(text)
-            if frame is not None:
+            if frame is None:
+                self._on_other(text)
+            else:
                 yield frame

@@ -89,13 +89,6 @@ class AmplifierUrl:
         """Parse an option that is an integer of a range."""
         return self.whole(self.options.get(name, str(default)), name, high, low=low)
 
-    def choice(self, name: str, default: str, choices: Collection[str]) -> str:
-        """Return an option that is one of these words."""
-        text = self.options.get(name, default)
-        if text not in choices:
-            raise self.refused(f"{name} must be one of {', '.join(choices)}, got {text!r}")
-        return text
-
     def device(self, baud: int) -> Place:
         """Return the serial device that the path names; baud: where no option names it."""
         if self.place or not self.path.strip("/"):

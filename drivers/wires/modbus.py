@@ -32,8 +32,11 @@ class ModbusAddress(WireAddress):
             if parsed.number:
                 raise parsed.refused("unit must follow the host")
             place, unit = parsed.server(port=_TCP_PORT, has_path=True), parsed.path.strip("/")
-        parity = _PARITIES[parsed.choice("parity", "even", _PARITIES)]
-        self.place = replace(place, parity=parity, stop=parsed.whole_option("stop", 1, 2))
+        parity = parsed.options.get("parity", "even")
+        if parity not in _PARITIES:
+            raise parsed.refused(f"parity must be one of {', '.join(_PARITIES)}, got {parity!r}")
+        stop = parsed.whole_option("stop", 1, 2)
+        self.place = replace(place, parity=_PARITIES[parity], stop=stop)
         self.number = parsed.whole(unit, "unit", ADDRESS_MAX) if unit else ADDRESS
         self.line = self.place.name
         self.settings = {

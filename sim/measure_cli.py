@@ -66,36 +66,28 @@ def measure(
     from model.config.points import parse_frequencies
     from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig
-    from sim.measuring.desk import Desk
     from sim.measuring.live_plot import live_plot
     from sim.measuring.measure import measure as measured_by
-    from sim.measuring.multisine import Multisine, default_frequencies
-    from sim.measuring.sound_card import open_card
+    from sim.measuring.measure import open_desk
     from sim.measuring.stepped import check_by_steps
-    from sim.sensors.sensor_file import read_sensors
 
     check_place(output, example="measured.uff")
     check_ending(output, ".uff", ".unv", ".csv", what="measured responses")
     rig = load_rig(rig_file)
-    desk = Desk(rig, read_sensors(sensors_file, rig.plate))
-    desk.check(level)
-    limits = rig.limits.frequency_min, rig.limits.frequency_max
-    lines = parse_frequencies(frequencies) if frequencies else default_frequencies(*limits)
-    desk.check_frequencies(lines)
+    lines = parse_frequencies(frequencies) if frequencies else None
     started = time.perf_counter()
-    card = open_card(device, outputs=desk.output, inputs=desk.input, limit=level)
     check: Stepped | None = None
-    try:
-        multisine = Multisine(lines, len(desk.eras) + 1, card.rate, level, seed)
-        with live_plot(multisine, desk.sensors) as (progress, show):
-            found = measured_by(
-                desk, card, multisine, periods=periods, progress=progress, show=show
-            )
+    with open_desk(rig, sensors_file, device, level=level, frequencies=lines, seed=seed) as (
+        desk,
+        card,
+        multisine,
+    ):
+        with live_plot(multisine, desk.sensors) as show:
+            found = measured_by(desk, card, multisine, periods=periods, show=show)
         if stepped:
             with progress_bar("tones") as progress:
                 check = check_by_steps(desk, card, found, level=level, progress=progress)
-    finally:
-        card.close()
+        rate = card.rate
     write = write_responses_csv if output.suffix.lower() == ".csv" else write_responses_uff
     write(output, found.responses, rig)
     elapsed = time.perf_counter() - started
@@ -104,7 +96,7 @@ def measure(
             json.dumps(_as_json(found, check) | {"measure_time_s": elapsed, "files": [str(output)]})
         )
         return
-    _print(found, check, rate=card.rate)
+    _print(found, check, rate=rate)
     print(f"measured in {elapsed:.1f} s; wrote {output}")
     print(next_line("era", "calibrate", rig_file, output, "-o", rig_file.with_stem("calibrated")))
 

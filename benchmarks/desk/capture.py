@@ -26,7 +26,8 @@ class Capture(SoundCard):
         self.rate, self.block = float(self._client.rate), self._client.block
         activate(self, self._client, outputs=0, inputs=channels)
         frames = round(longest * self.rate)
-        self._times = self.note_arrivals(frames // self.block + 1)
+        self._times = np.zeros(frames // self.block + 1, dtype=np.int64)  # us
+        self._transfer.arrivals = self._times.ctypes.data
         self._samples = self.begin(np.zeros((frames, 0)))
 
     def samples(self, count: int) -> Float32Array:

@@ -60,10 +60,11 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
             target, *quiet = (places[name] for name in names)
             desk.touch_plate([target, *quiet])
             status = _hold(era, [*quiet, target], _SETTLING)
-            heard = card.run(
-                np.zeros((round(_WINDOW * card.rate), 0)),
-                progress=lambda _done, held=(*quiet, target): era.touch(held),  # type: ignore[misc]
-            ).astype(float)
+            recorded = card.begin(np.zeros((round(_WINDOW * card.rate), 0)))
+            while card.position < len(recorded):
+                era.touch([*quiet, target])
+                time.sleep(0.02)
+            heard = recorded.astype(float)
             era.touch([])
             assert status.robust_felt_contrast_db is not None
             assert status.predicted_felt_contrast_db is not None

@@ -195,7 +195,7 @@ def _measured_by_device(
     from model.commands.progress import progress_bar
     from model.identification.measured_plate import measure_by_device
 
-    with progress_bar("ms") if is_shown else nullcontext(_ignore) as progress:
+    with progress_bar("runs") if is_shown else nullcontext(_ignore) as progress:
         return measure_by_device(rig, settings, progress=progress)
 
 

@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.responses import Responses
 from model.errors import InputError
 from model.rig.rig import Rig
+from sim.measuring.loopback import converters
 from sim.sensors.sensor_file import WiredSensor
 
 
@@ -36,6 +38,36 @@ class Desk:
     def input(self) -> int:
         """Input of the loop-back, the last one."""
         return max(sensor.input for sensor in self.sensors) + 1
+
+    @property
+    def columns(self) -> list[int]:
+        """Index of each sensor's input."""
+        return [sensor.input - 1 for sensor in self.sensors]
+
+    @property
+    def strokes(self) -> FloatArray:
+        """Stroke of each ERA [m]."""
+        return np.array([era.stroke for era in self.rig.eras])
+
+    @property
+    def sensitivities(self) -> FloatArray:
+        """Sensitivity of each sensor, see `WiredSensor`."""
+        return np.array([sensor.sensitivity for sensor in self.sensors])
+
+    def responses(
+        self, frequencies: FloatArray, values: ComplexArray, looped: ComplexArray
+    ) -> Responses:
+        """Accelerations per base displacement [1/s²] from those of samples (f, inputs, sources).
+
+        looped (f,): of the loop-back.
+        """
+        plain = values[:, self.columns, : len(self.strokes)] / converters(looped)[:, None, None]
+        return Responses(
+            tuple(sensor.name for sensor in self.sensors),
+            np.array([[sensor.x, sensor.y] for sensor in self.sensors]),
+            frequencies,
+            plain.transpose(0, 2, 1) / self.strokes[:, None] / self.sensitivities,
+        )
 
     def on_outputs(self, sources: FloatArray) -> FloatArray:
         """Samples (n, outputs) of the sources (n, eras + 1), the loop-back last."""

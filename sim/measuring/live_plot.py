@@ -1,26 +1,19 @@
 """Responses in plain text while they are measured: a line for each sensor, one screen in all."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Protocol
 
 import numpy as np
 
 from model.arrays import FloatArray
+from sim.measuring.measure import Show
 from sim.measuring.multisine import Multisine
 from sim.sensors.sensor_file import WiredSensor
 
 STEPS = "▁▂▃▄▅▆▇█"
 _RANGE = 60.0  # dB from the highest step to the lowest
 _BESIDE = 40  # columns of names and numbers
-_LINES = 6  # of a screen that are not of sensors
-
-
-class Show(Protocol):
-    """Takes what was recorded so far: whole periods of each run, (n, inputs)."""
-
-    def __call__(self, recorded: Sequence[FloatArray]) -> None:
-        """Show it."""
+_LINES = 5  # of a screen that are not of sensors
 
 
 def levels(multisine: Multisine, recorded: Sequence[FloatArray], columns: list[int]) -> FloatArray:
@@ -29,14 +22,9 @@ def levels(multisine: Multisine, recorded: Sequence[FloatArray], columns: list[i
     Relative to a sample by a sample. With all runs it is that over the sources, since the turns of
     their phases are orthogonal.
     """
-    count = len(recorded[0])
-    lines = multisine.lines * (count // multisine.samples)
-    power = np.zeros((len(columns), len(lines)))
-    for each in recorded:
-        spectrum = np.fft.rfft(each[:, columns], axis=0)[lines] * 2 / count
-        power += np.abs(spectrum.T) ** 2
-    size = np.abs(multisine.played(0)[:, 0])
-    return np.asarray(10 * np.log10(np.maximum(power / len(recorded) / size**2, 1e-30)))
+    found = [multisine.found(each[:, columns]).T for each in recorded]
+    power = (np.abs(found) ** 2).mean(axis=0) / np.abs(multisine.played(0)[:, 0]) ** 2
+    return np.asarray(10 * np.log10(np.maximum(power, 1e-30)))
 
 
 def plot(
@@ -76,29 +64,21 @@ def plot(
 
 
 @contextmanager
-def live_plot(
-    multisine: Multisine, sensors: Sequence[WiredSensor]
-) -> Iterator[tuple[Callable[[int, int], None], Show]]:
-    """Draw anew after each run, on standard error if that is a terminal.
-
-    Yields an update(done, total) of a bar below, in milliseconds, and what shows the runs.
-    """
-    from rich.console import Console, Group
+def live_plot(multisine: Multisine, sensors: Sequence[WiredSensor]) -> Iterator[Show]:
+    """Yield what draws the runs anew after each, on standard error if that is a terminal."""
+    from rich.console import Console
     from rich.live import Live
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
     from rich.text import Text
 
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield lambda done, total: None, lambda recorded: None
+        yield lambda recorded: None
         return
-    bar = Progress(BarColumn(), MofNCompleteColumn(), "ms", TimeRemainingColumn())
-    task = bar.add_task("", total=None)
-    with Live(bar, console=console) as live:
+    with Live(console=console) as live:
 
         def show(recorded: Sequence[FloatArray]) -> None:
             width, height = console.size
             text = plot(multisine, recorded, sensors, width=width, height=height)
-            live.update(Group(Text(text, no_wrap=True, overflow="crop"), bar), refresh=True)
+            live.update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
 
-        yield lambda done, total: bar.update(task, completed=done, total=total), show
+        yield show

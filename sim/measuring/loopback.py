@@ -4,7 +4,6 @@ import numpy as np
 
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
-from sim.measuring.multisine import Multisine
 
 SILENT = 1e-5
 """Of full scale, rms: what an input without a signal stays below."""
@@ -25,13 +24,6 @@ def is_whole(periods: FloatArray, *, samples: int) -> bool:
     size = np.linalg.norm(each[0])
     differ = np.linalg.norm(each - each[0], axis=1).max()
     return bool(size > SILENT * np.sqrt(samples) and differ <= _SAME * size)
-
-
-def gain_of(periods: FloatArray, multisine: Multisine, run: int) -> ComplexArray:
-    """Complex gain (f,) of the loop-back, the last source, from whole periods (n,) of a run."""
-    whole = len(periods) // multisine.samples
-    heard = np.fft.rfft(periods)[multisine.lines * whole] * 2 / len(periods)
-    return np.asarray(heard / multisine.played(run)[:, -1])
 
 
 def is_as_late(gain: ComplexArray, before: ComplexArray) -> bool:

@@ -1,23 +1,29 @@
 """A rig's plate measured through a sound card."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
+from model.rig.rig import Rig
 from sim.measuring.checks import check_clocks, check_coherence, check_wiring
 from sim.measuring.desk import Desk
-from sim.measuring.estimate import Estimate, estimate
-from sim.measuring.live_plot import Show
-from sim.measuring.loopback import converters, latency
-from sim.measuring.multisine import Multisine
+from sim.measuring.estimate import estimate
+from sim.measuring.loopback import latency
+from sim.measuring.multisine import Multisine, default_frequencies
 from sim.measuring.run import TRIES, blocks_lost, play_run, run_time
-from sim.measuring.sound_card import SoundCard
-from sim.sensors.sensor_file import WiredSensor
+from sim.measuring.sound_card import SoundCard, open_card
+from sim.sensors.sensor_file import read_sensors
 
-Progress = Callable[[int, int], None]
+LEVEL = 0.3
+"""Usual largest sample of each output."""
+
+Show = Callable[[Sequence[FloatArray]], None]
+"""Takes what was recorded so far: whole periods of each run, (n, inputs)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +32,7 @@ class Measured:
 
     coherence (f, sensors), std (f, sensors) relative to the root mean square of the sensor; latency
     [s] through the sound card; even (sensors,): of a square law; repeated: runs played again since
-    blocks were lost; converters (f,): response of the loop-back.
+    blocks were lost; looped (f,): response of the loop-back.
     """
 
     responses: Responses
@@ -35,7 +41,35 @@ class Measured:
     latency: float
     even: FloatArray
     repeated: int
-    converters: ComplexArray
+    looped: ComplexArray
+
+
+@contextmanager
+def open_desk(
+    rig: Rig,
+    sensors_file: Path,
+    device: str,
+    *,
+    level: float | None,
+    frequencies: FloatArray | None,
+    seed: int,
+) -> Iterator[tuple[Desk, SoundCard, Multisine]]:
+    """A rig at an open device, and the multisine for it.
+
+    level: None for 0.3, or less where the rig's limits allow less; frequencies (f,) [Hz], None for
+    odd ones within its limits. Raises InputError, LinkError.
+    """
+    desk = Desk(rig, read_sensors(sensors_file, rig.plate))
+    level = min(LEVEL, desk.highest) if level is None else level
+    desk.check(level)
+    if frequencies is None:
+        frequencies = default_frequencies(rig.limits.frequency_min, rig.limits.frequency_max)
+    desk.check_frequencies(frequencies)
+    card = open_card(device, outputs=desk.output, inputs=desk.input, limit=level)
+    try:
+        yield desk, card, Multisine(frequencies, len(desk.eras) + 1, card.rate, level, seed)
+    finally:
+        card.close()
 
 
 def measure(
@@ -44,41 +78,26 @@ def measure(
     multisine: Multisine,
     *,
     periods: int = 2,
-    progress: Progress = lambda done, total: None,
     show: Show = lambda recorded: None,
 ) -> Measured:
     """Play all runs of a multisine and estimate the responses.
 
-    periods: of each run that are analysed. progress: called with the milliseconds done and all;
-    show: with the runs recorded so far, after each.
+    periods: of each run that are analysed. show: called with the runs recorded so far, after each.
     Raises InputError, LinkError for what is clipped, silent, swapped, incoherent, or lost three
     times.
     """
-    runs = multisine.sources
     desk.check_times(seconds=run_time(periods), slew=multisine.slew)
-    total = round(1e3 * runs * run_time(periods))
     recorded: list[FloatArray] = []
     first: ComplexArray | None = None
     repeated, is_lost = 0, False
-    for number in range(runs):
-        run = play_run(
-            desk,
-            card,
-            multisine,
-            number,
-            periods=periods,
-            before=first,
-            tries=1 if is_lost else TRIES,
-            progress=lambda seconds, number=number: progress(  # type: ignore[misc]
-                round(1e3 * (number * run_time(periods) + seconds)), total
-            ),
-        )
+    for number in range(multisine.sources):
+        tries = 1 if is_lost else TRIES
+        run = play_run(desk, card, multisine, number, periods=periods, before=first, tries=tries)
         first = run.loopback if first is None else first
         repeated += run.repeated
         is_lost = is_lost or not run.is_whole
         recorded.append(run.recorded)
         show(recorded)
-    progress(total, total)
     found = estimate(multisine, recorded)
     # Another signal than the loop-back's, or another clock, looks like lost blocks; that is the
     # cause to be told.
@@ -87,42 +106,14 @@ def measure(
     if is_lost:
         raise blocks_lost()
     check_coherence(found, desk.sensors, desk.eras)
-    return _measured(desk, multisine, found, repeated)
-
-
-def _measured(desk: Desk, multisine: Multisine, found: Estimate, repeated: int) -> Measured:
-    looped = found.values[:, desk.input - 1, -1]
+    looped, columns = found.values[:, desk.input - 1, -1], desk.columns
+    rms = np.sqrt((np.abs(found.values[:, columns, :-1]) ** 2).mean(axis=(0, 2)))
     return Measured(
-        responses_of_samples(desk, multisine.frequencies, found.values, looped),
-        coherence=found.coherence[:, _columns(desk.sensors)],
-        std=_relative(found, _columns(desk.sensors)),
-        latency=latency(looped, multisine.frequencies),
-        even=found.even[_columns(desk.sensors)],
-        repeated=repeated,
-        converters=looped,
+        desk.responses(multisine.frequencies, found.values, looped),
+        found.coherence[:, columns],
+        found.std[:, columns] / rms,
+        latency(looped, multisine.frequencies),
+        found.even[columns],
+        repeated,
+        looped,
     )
-
-
-def responses_of_samples(
-    desk: Desk, frequencies: FloatArray, values: ComplexArray, looped: ComplexArray
-) -> Responses:
-    """Accelerations per base displacement [1/s²] from responses of samples (f, inputs, sources)."""
-    sensitivity = np.array([sensor.sensitivity for sensor in desk.sensors])
-    strokes = np.array([era.stroke for era in desk.rig.eras])
-    plain = values[:, _columns(desk.sensors), : len(strokes)] / converters(looped)[:, None, None]
-    return Responses(
-        tuple(sensor.name for sensor in desk.sensors),
-        np.array([[sensor.x, sensor.y] for sensor in desk.sensors]),
-        frequencies,
-        plain.transpose(0, 2, 1) / strokes[:, None] / sensitivity,
-    )
-
-
-def _columns(sensors: Sequence[WiredSensor]) -> list[int]:
-    return [sensor.input - 1 for sensor in sensors]
-
-
-def _relative(found: Estimate, columns: list[int]) -> FloatArray:
-    values = found.values[:, columns, :-1]
-    rms = np.sqrt((np.abs(values) ** 2).mean(axis=(0, 2)))
-    return np.asarray(found.std[:, columns] / rms)

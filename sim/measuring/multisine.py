@@ -90,19 +90,30 @@ class Multisine:
 
     def played(self, run: int) -> ComplexArray:
         """Complex amplitudes (f, sources) of the samples of a run."""
-        turns = np.exp(2j * np.pi * run * np.arange(self.sources) / self.sources)
-        return np.asarray(self._amplitudes[:, None] * turns)
+        return self._amplitudes[:, None] * self._phase_factors(run)
 
     def signal(self, run: int, *, periods: float) -> FloatArray:
         """Samples (n, sources) of so many periods, with ramps at both ends."""
-        turns = np.exp(2j * np.pi * run * np.arange(self.sources) / self.sources)
-        period = (self._analytic(self._amplitudes)[:, None] * turns).real
-        count = round(periods * self.samples)
-        found = np.resize(period, (count, self.sources))
-        ramp = np.sin(np.linspace(0, np.pi / 2, round(_RAMP * self.rate))) ** 2
-        found[: len(ramp)] *= ramp[:, None]
-        found[-len(ramp) :] *= ramp[::-1, None]
-        return found
+        period = (self._analytic(self._amplitudes)[:, None] * self._phase_factors(run)).real
+        found = np.resize(period, (round(periods * self.samples), self.sources))
+        return ramped(found, round(_RAMP * self.rate))
+
+    def found(self, recorded: FloatArray) -> ComplexArray:
+        """Complex amplitudes (f, ...) at the lines of whole periods of samples (n, ...)."""
+        lines = self.lines * (len(recorded) // self.samples)
+        return np.asarray(np.fft.rfft(recorded, axis=0)[lines] * 2 / len(recorded))
+
+    def _phase_factors(self, run: int) -> ComplexArray:
+        return np.asarray(np.exp(2j * np.pi * run * np.arange(self.sources) / self.sources))
+
+
+def ramped(samples: FloatArray, count: int) -> FloatArray:
+    """Samples (n, sources), ramped along squared sines over so many of them at both ends."""
+    ramp = np.sin(np.linspace(0, np.pi / 2, count)) ** 2
+    shape = np.ones((len(samples), 1))
+    shape[:count, 0] = ramp
+    shape[-count:, 0] *= ramp[::-1]
+    return samples * shape
 
 
 def default_frequencies(low: float, high: float) -> FloatArray:

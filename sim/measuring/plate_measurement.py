@@ -14,14 +14,10 @@ from model.identification.measurement import Measurement, Repeat
 from model.rig.rig import Rig
 from sim.measuring.desk import Desk
 from sim.measuring.loopback import converters
-from sim.measuring.measure import Measured, measure
-from sim.measuring.multisine import Multisine, default_frequencies
-from sim.measuring.run import Run, blocks_lost, play_run, run_time, spectrum
-from sim.measuring.sound_card import SoundCard, open_card
-from sim.sensors.sensor_file import read_sensors
-
-LEVEL = 0.3
-"""Usual largest sample of each output."""
+from sim.measuring.measure import Measured, measure, open_desk
+from sim.measuring.multisine import Multisine
+from sim.measuring.run import Run, blocks_lost, play_run
+from sim.measuring.sound_card import SoundCard
 
 _REPEATED = 1  # the run: phases differ between ERAs, so that modes of every symmetry vibrate
 _COMPARED = 2  # lines of it
@@ -32,55 +28,40 @@ def measure_plate(rig: Rig, settings: DeviceSettings, *, progress: Progress) -> 
 
     Raises InputError, LinkError, as `era measure` does.
     """
-    desk = Desk(rig, read_sensors(settings.sensors_file, rig.plate))
-    level = min(LEVEL, desk.highest) if settings.level is None else settings.level
-    desk.check(level)
-    limits = rig.limits
-    lines = settings.frequencies
-    if lines is None:
-        lines = default_frequencies(limits.frequency_min, limits.frequency_max)
-    desk.check_frequencies(lines)
-    card = open_card(settings.device, outputs=desk.output, inputs=desk.input, limit=level)
-    try:
-        multisine = Multisine(lines, len(desk.eras) + 1, card.rate, level, settings.seed)
+    with open_desk(
+        rig,
+        settings.sensors_file,
+        settings.device,
+        level=settings.level,
+        frequencies=settings.frequencies,
+        seed=settings.seed,
+    ) as (desk, card, multisine):
         return measure_through(desk, card, multisine, periods=settings.periods, progress=progress)
-    finally:
-        card.close()
 
 
 def measure_through(
     desk: Desk, card: SoundCard, multisine: Multisine, *, periods: int, progress: Progress
 ) -> MeasuredPlate:
-    """All runs; then one of them at half the level, and at the whole one again."""
-    started = time.monotonic()
-    own = 1e3 * run_time(periods)
-    total = round((multisine.sources + 2) * own)
+    """All runs; then one of them at half the level, and at the whole one again.
+
+    progress: called with the runs done and all.
+    """
+    started, runs = time.monotonic(), multisine.sources
     found = measure(
         desk,
         card,
         multisine,
         periods=periods,
-        progress=lambda done, _total: progress(done, total),
+        show=lambda recorded: progress(len(recorded), runs + 2),
     )
     repeats = []
-    for number, factor in enumerate((0.5, 1.0)):
-        before = round((multisine.sources + number) * own)
+    for number, factor in enumerate((0.5, 1.0), start=1):
         again = replace(multisine, level=factor * multisine.level)
-        run = play_run(
-            desk,
-            card,
-            again,
-            _REPEATED,
-            periods=periods,
-            before=found.converters,
-            progress=lambda seconds, before=before: progress(  # type: ignore[misc]
-                before + round(1e3 * seconds), total
-            ),
-        )
+        run = play_run(desk, card, again, _REPEATED, periods=periods, before=found.looped)
         if not run.is_whole:
             raise blocks_lost()
         repeats.append(_repeats(desk, found, again, run))
-    progress(total, total)
+        progress(runs + number, runs + 2)
     measurement = replace(
         _measurement(desk, found),
         half_level=repeats[0],
@@ -113,13 +94,10 @@ def _measurement(desk: Desk, found: Measured) -> Measurement:
 
 def _repeats(desk: Desk, found: Measured, multisine: Multisine, run: Run) -> tuple[Repeat, ...]:
     """The loudest lines of a run and what the responses make of them, all ERAs together."""
-    columns = [sensor.input - 1 for sensor in desk.sensors]
-    strokes = np.array([era.stroke for era in desk.rig.eras])
-    bases = multisine.played(_REPEATED)[:, : len(strokes)] * strokes  # (f, eras)
+    bases = multisine.played(_REPEATED)[:, : len(desk.strokes)] * desk.strokes  # (f, eras)
     first = np.einsum("fes,fe->fs", found.responses.values, bases)
-    sensitivity = np.array([sensor.sensitivity for sensor in desk.sensors])
-    heard = spectrum(run, multisine)[:, columns] / sensitivity
-    again = heard / converters(found.converters)[:, None]
+    heard = multisine.found(run.recorded)[:, desk.columns] / desk.sensitivities
+    again = heard / converters(found.looped)[:, None]
     size = np.linalg.norm(bases, axis=1, keepdims=True)
     first, again = first / size, again / size
     names = ", ".join(name for name, _ in desk.eras)

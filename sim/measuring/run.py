@@ -1,15 +1,12 @@
 """One run of a multisine, played until no block of it was lost."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-
-import numpy as np
 
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 from sim.measuring.checks import check_levels
 from sim.measuring.desk import Desk
-from sim.measuring.loopback import gain_of, is_as_late, is_whole
+from sim.measuring.loopback import is_as_late, is_whole
 from sim.measuring.multisine import PERIOD, Multisine
 from sim.measuring.sound_card import SoundCard
 
@@ -48,22 +45,20 @@ def play_run(
     periods: int,
     before: ComplexArray | None,
     tries: int = TRIES,
-    progress: Callable[[float], None] = lambda seconds: None,
 ) -> Run:
     """Play a run, again where blocks were lost in it or since the first one.
 
-    before (f,): the loop-back's gain in the first run, None in that; progress: called with the
-    seconds played. Raises InputError, LinkError for inputs that are clipped or silent.
+    before (f,): the loop-back's gain in the first run, None in that. Raises InputError, LinkError
+    for inputs that are clipped or silent.
     """
     signal = desk.on_outputs(multisine.signal(number, periods=run_time(periods) / PERIOD))
     start = round(_SETTLING * multisine.rate)
     repeated = 0
     while True:
-        heard = card.run(signal, progress=lambda frames: progress(frames / multisine.rate))
-        kept = heard[start : start + periods * multisine.samples].astype(float)
+        kept = card.run(signal)[start : start + periods * multisine.samples].astype(float)
         check_levels(kept, desk.sensors, cable=(desk.output, desk.input))
         looped = kept[:, desk.input - 1]
-        gain = gain_of(looped, multisine, number)
+        gain = multisine.found(looped) / multisine.played(number)[:, -1]
         # The cable decides: drivers report losses that were none, and miss others.
         same = is_whole(looped, samples=multisine.samples)
         same = same and (before is None or is_as_late(gain, before))
@@ -78,10 +73,3 @@ def blocks_lost() -> LinkError:
         f"blocks of sound were lost in {TRIES} attempts of a run; end other programs, give "
         "the sound server real-time priority, or choose larger blocks"
     )
-
-
-def spectrum(run: Run, multisine: Multisine) -> ComplexArray:
-    """Complex amplitudes (f, inputs) of the samples of a run at its lines."""
-    count = len(run.recorded)
-    lines = multisine.lines * (count // multisine.samples)
-    return np.asarray(np.fft.rfft(run.recorded, axis=0)[lines] * 2 / count)

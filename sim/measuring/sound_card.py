@@ -7,12 +7,11 @@ meanwhile is counted.
 import ctypes
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 
 import numpy as np
 
 from drivers.errors import LinkError
-from model.arrays import Float32Array, FloatArray, IntArray
+from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from sim.soft_amp.library import library
 
@@ -90,13 +89,11 @@ class SoundCard(ABC):
         assert found is not None  # noqa: S101  of a function
         return found
 
-    def run(
-        self, played: FloatArray, *, progress: Callable[[int], None] = lambda _frames: None
-    ) -> Float32Array:
+    def run(self, played: FloatArray) -> Float32Array:
         """Play samples (n, outputs), and return those recorded meanwhile (n, inputs).
 
-        progress: called with the frames done. `gaps` counts holes in the sound. Raises LinkError
-        for a device that is gone or takes no samples, ValueError for samples beyond the limit.
+        `gaps` counts holes in the sound. Raises LinkError for a device that is gone or takes no
+        samples, ValueError for samples beyond the limit.
         """
         transfer = self._transfer
         before = transfer.gaps
@@ -107,7 +104,6 @@ class SoundCard(ABC):
                 time.sleep(_POLL)
                 if transfer.position != done:
                     done, since = transfer.position, time.monotonic()
-                    progress(done)
                 elif transfer.is_lost or time.monotonic() - since > _STALLED:
                     raise LinkError(f"{self.name}: the device was lost, or takes no samples")
         finally:
@@ -136,16 +132,6 @@ class SoundCard(ABC):
     def position(self) -> int:
         """Frames that were played and recorded since `begin`."""
         return self._transfer.position
-
-    def note_arrivals(self, blocks: int) -> IntArray:
-        """Let the callback note when each block came [us of CLOCK_MONOTONIC]; returns its memory.
-
-        blocks: at most to come until the end.
-        """
-        found = np.zeros(blocks, dtype=np.int64)
-        self._arrivals = found  # kept, since the callback uses it
-        self._transfer.arrivals = found.ctypes.data
-        return found
 
     @abstractmethod
     def close(self) -> None:

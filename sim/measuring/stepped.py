@@ -1,5 +1,6 @@
 """Stepped tones as a check of a multisine: one ERA and one frequency at a time."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,15 +10,14 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from sim.measuring.desk import Desk
 from sim.measuring.loopback import is_whole
-from sim.measuring.measure import Measured, Progress, responses_of_samples
-from sim.measuring.multisine import PERIOD
+from sim.measuring.measure import Measured
+from sim.measuring.multisine import Multisine
+from sim.measuring.run import run_time
 from sim.measuring.sound_card import SoundCard
 
-_SETTLING = PERIOD  # s; whole periods, so that phases count from the first sample
 _PERIODS = 2
 _TONES = 5
 _LOUD = 0.05  # of the largest at a frequency; maxima sit in antiresonances
-_RAMP = 0.02  # s
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def check_by_steps(
     measured: Measured,
     *,
     level: float,
-    progress: Progress = lambda done, total: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Stepped:
     """Play some of the frequencies on each ERA alone; raises LinkError for lost blocks."""
     known = measured.responses
@@ -59,26 +59,21 @@ def check_by_steps(
         for row, frequency in enumerate(frequencies):
             values[row, :, era] = _played(desk, card, era, frequency, level)
             progress(era * len(rows) + row + 1, len(desk.eras) * len(rows))
-    found = responses_of_samples(desk, frequencies, values, measured.converters[rows])
+    found = desk.responses(frequencies, values, measured.looped[rows])
     return _compared(frequencies, known.values[rows], found)
 
 
 def _played(desk: Desk, card: SoundCard, era: int, frequency: float, level: float) -> ComplexArray:
     """Amplitudes (inputs,) by full scale of one ERA; the loop-back shows lost blocks."""
-    count = round((_SETTLING + _PERIODS * PERIOD + _RAMP) * card.rate)
-    tone = np.cos(2 * np.pi * frequency * np.arange(count) / card.rate)
-    ramp = np.sin(np.linspace(0, np.pi / 2, round(_RAMP * card.rate))) ** 2
-    tone[: len(ramp)] *= ramp
-    sources = np.zeros((count, len(desk.eras) + 1))
-    sources[:, era] = sources[:, -1] = level * tone
+    tone = Multisine(np.array([frequency]), 1, card.rate, level)
+    signal = tone.signal(0, periods=run_time(_PERIODS))
+    sources = np.zeros((len(signal), len(desk.eras) + 1))
+    sources[:, [era, -1]] = signal
     heard = card.run(desk.on_outputs(sources)).astype(float)
-    start = round(_SETTLING * card.rate)
-    period = round(PERIOD * card.rate)
-    kept = heard[start : start + _PERIODS * period]
-    if card.gaps or not is_whole(kept[:, desk.input - 1], samples=period):
+    kept = heard[tone.samples : (1 + _PERIODS) * tone.samples]  # once settled
+    if card.gaps or not is_whole(kept[:, desk.input - 1], samples=tone.samples):
         raise LinkError("blocks of sound were lost between stepped tones; measure again")
-    spectrum = np.fft.rfft(kept, axis=0)[round(frequency * PERIOD) * _PERIODS]
-    return np.asarray(spectrum * 2 / len(kept) / level)
+    return np.asarray(tone.found(kept)[0] / tone.played(0)[0])
 
 
 def _compared(frequencies: FloatArray, one: ComplexArray, other: Responses) -> Stepped:

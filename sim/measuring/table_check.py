@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 
 import numpy as np
 
@@ -25,8 +25,10 @@ from model.vibration.excitation import Excitation
 from sim.measuring.checks import check_levels
 from sim.measuring.desk import Desk
 from sim.measuring.loopback import is_whole
+from sim.measuring.multisine import ramped
 from sim.measuring.sound_card import SoundCard, open_card
-from sim.sensors.sensor_file import WiredSensor, read_sensors
+from sim.plant.felt import fit_tones
+from sim.sensors.sensor_file import read_sensors
 
 _SETTLING = 1.5  # s; T60 of a plate with little damping, and an amplifier that starts later
 _WINDOW = 1.0  # s
@@ -58,16 +60,23 @@ def check_table(
     desk.check(level)
     if settings.url is None:
         desk.check_times(seconds=_PLAYED, slew=np.pi / 2 * level / _RAMP)
-    places = {sensor.name: (sensor.x, sensor.y) for sensor in sensors}
+    by_name = {sensor.name: sensor for sensor in sensors}
+    places = {name: (sensor.x, sensor.y) for name, sensor in by_name.items()}
     found = []
-    with _recorder(desk, settings, level) as (card, record):
+    with _recorder(desk, settings, level) as (rate, record):
         for promise in promises(
             table, places, count=settings.samples, level=level, seed=settings.seed
         ):
-            _check_frequencies(promise.pattern.excitation, rig)
+            excitation = promise.pattern.excitation
+            _check_frequencies(excitation, rig)
             heard = record(promise)
-            check_levels(heard, _sensors_of(promise, desk))
-            frequencies, amplitudes = _amplitudes(heard, promise, desk, card.rate)
+            chosen = [by_name[name] for name in promise.sensors]
+            check_levels(heard, chosen)
+            # All tones are fitted together, since their frequencies need not fit into the window.
+            frequencies = np.unique([tone.frequency for tone in excitation.values()])
+            samples = heard[:, [sensor.input - 1 for sensor in chosen]]
+            tones = fit_tones(np.arange(len(samples)) / rate, samples, frequencies.tolist())
+            amplitudes = np.abs(tones / [sensor.sensitivity for sensor in chosen])
             found.append(measured_promise(table, promise, frequencies, amplitudes))
             progress(len(found), settings.samples)
     return MeasuredVerification(tuple(found))
@@ -76,50 +85,50 @@ def check_table(
 @contextmanager
 def _recorder(
     desk: Desk, settings: CheckSettings, level: float
-) -> Iterator[tuple[SoundCard, Recorder]]:
-    """An open card, and an amplifier where that plays; level: no sample is larger."""
-    with ExitStack() as stack:
+) -> Iterator[tuple[float, Recorder]]:
+    """The rate [Hz] of an open card, and an amplifier where that plays; no sample exceeds level."""
+    is_card = settings.url is None
+    card = open_card(
+        settings.device,
+        outputs=desk.output if is_card else 0,
+        inputs=desk.input,
+        limit=level if is_card else 0,
+    )
+    with closing(card):
         if settings.url is None:
-            card = open_card(settings.device, outputs=desk.output, inputs=desk.input, limit=level)
-            stack.callback(card.close)
-            yield card, lambda promise: _by_card(card, desk, promise.pattern, level)
+            yield card.rate, lambda promise: _by_card(card, desk, promise.pattern, level)
             return
-        card = open_card(settings.device, outputs=0, inputs=desk.input, limit=0)
-        stack.callback(card.close)
-        (name,) = {channel.amplifier for channel in desk.rig.wiring.values()}
-        amplifier = stack.enter_context(
-            BlockingAmplifier(
-                settings.url, limits=desk.rig.limits, is_output=name in desk.rig.outputs
-            )
-        )
-        amplifier.arm()
-        thread = stack.enter_context(ThreadPoolExecutor(max_workers=1))
+        rig = desk.rig
+        is_output = not rig.outputs.isdisjoint(rig.amplifiers)
+        with BlockingAmplifier(settings.url, limits=rig.limits, is_output=is_output) as amplifier:
+            amplifier.arm()
+            yield card.rate, lambda promise: _by_amplifier(card, amplifier, rig, promise)
 
-        def by_amplifier(promise: Promise) -> FloatArray:
-            seconds = _SETTLING + _WINDOW
-            tones = tones_of(desk.rig, promise.pattern.excitation)
-            count = round(seconds * card.rate)
-            try:
-                playing = thread.submit(
-                    amplifier.play, tones, duration=seconds + _SETTLING, ramp=_RAMP
-                )
-                heard = card.run(np.zeros((count, 0)))
-                playing.result()
-            except BaseException:  # leaving waits for the thread, which feeds the watchdog
-                with suppress(DriverError):
-                    amplifier.disarm()
-                raise
-            if card.gaps:
-                raise LinkError("blocks of sound were lost while a pattern played; verify again")
-            return heard[-round(_WINDOW * card.rate) :].astype(float)
 
-        yield card, by_amplifier
+def _by_amplifier(
+    card: SoundCard, amplifier: BlockingAmplifier, rig: Rig, promise: Promise
+) -> FloatArray:
+    """Record what an amplifier plays."""
+    seconds = _SETTLING + _WINDOW
+    tones = tones_of(rig, promise.pattern.excitation)
+    with ThreadPoolExecutor(max_workers=1) as thread:
+        try:
+            playing = thread.submit(amplifier.play, tones, duration=seconds + _SETTLING, ramp=_RAMP)
+            heard = card.run(np.zeros((round(seconds * card.rate), 0)))
+            playing.result()
+        except BaseException:  # leaving waits for the thread, which feeds the watchdog
+            with suppress(DriverError):
+                amplifier.disarm()
+            raise
+    if card.gaps:
+        raise LinkError("blocks of sound were lost while a pattern played; verify again")
+    return heard[-round(_WINDOW * card.rate) :].astype(float)
 
 
 def _check_frequencies(excitation: Excitation, rig: Rig) -> None:
     """Raise InputError for tones outside of the rig's limits: a table may have been built of more.
 
-    An amplifier's guard refuses them, too.
+    An amplifier's ledger refuses them, too.
     """
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
     for name, tone in excitation.items():
@@ -131,7 +140,7 @@ def _check_frequencies(excitation: Excitation, rig: Rig) -> None:
 
 
 def _by_card(card: SoundCard, desk: Desk, pattern: Pattern, level: float) -> FloatArray:
-    """Play a pattern from memory: a level is a sample, as of an amplifier of voltage.
+    """Play a pattern from memory: a level is a sample, as of an amplifier whose output it is.
 
     level: that no output exceeds, the loop-back's included, since cables may be swapped.
     """
@@ -143,10 +152,7 @@ def _by_card(card: SoundCard, desk: Desk, pattern: Pattern, level: float) -> Flo
             angle = 2 * np.pi * tone.frequency * times + tone.phase
             sources[:, number] = tone.amplitude / era.stroke * np.sin(angle)
     sources[:, -1] = min(_MARK_LEVEL, level) * np.sin(2 * np.pi * _MARK * times)
-    ramp = np.sin(np.linspace(0, np.pi / 2, round(_RAMP * card.rate))) ** 2
-    sources[: len(ramp)] *= ramp[:, None]
-    sources[-len(ramp) :] *= ramp[::-1, None]
-    played = desk.on_outputs(sources)
+    played = desk.on_outputs(ramped(sources, round(_RAMP * card.rate)))
     start, count = (round(each * card.rate) for each in (_SETTLING, _WINDOW))
     for _ in range(_TRIES):
         heard = card.run(played)[start : start + count].astype(float)
@@ -169,25 +175,3 @@ def tones_of(rig: Rig, excitation: Excitation) -> list[Tone]:
         )
         for name, tone in excitation.items()
     ]
-
-
-def _sensors_of(promise: Promise, desk: Desk) -> list[WiredSensor]:
-    by_name = {sensor.name: sensor for sensor in desk.sensors}
-    return [by_name[name] for name in promise.sensors]
-
-
-def _amplitudes(
-    heard: FloatArray, promise: Promise, desk: Desk, rate: float
-) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (f,) [Hz] and amplitudes (f, sensors) [m/s²] at the sensors of a promise.
-
-    All tones are fitted together, since their frequencies need not fit into the window.
-    """
-    frequencies = np.unique([tone.frequency for tone in promise.pattern.excitation.values()])
-    sensors = _sensors_of(promise, desk)
-    samples = heard[:, [sensor.input - 1 for sensor in sensors]]
-    angles = 2 * np.pi * np.outer(np.arange(len(samples)) / rate, frequencies)
-    basis = np.hstack([np.sin(angles), np.cos(angles)])
-    fitted, *_ = np.linalg.lstsq(basis, samples)
-    sizes = np.hypot(*np.split(fitted, 2))
-    return frequencies, sizes / np.abs([sensor.sensitivity for sensor in sensors])

@@ -1,6 +1,6 @@
 """A sound card in memory in front of a plate on the desk, with what can be wrong with its wires."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
@@ -40,9 +40,7 @@ class DeskCard(SoundCard):
         self._on_outputs = range(plate.outputs) if on_outputs is None else on_outputs
         self._on_inputs = range(plate.inputs) if on_inputs is None else on_inputs
 
-    def run(
-        self, played: FloatArray, *, progress: Callable[[int], None] = lambda _frames: None
-    ) -> Float32Array:
+    def run(self, played: FloatArray) -> Float32Array:
         """Advance the plate by so many samples."""
         blocks = np.split(played[:, self._on_outputs], range(BLOCK, len(played), BLOCK))
         heard = np.concatenate([self._plate.advance(block) for block in blocks])
@@ -56,7 +54,6 @@ class DeskCard(SoundCard):
         for number, drift in self._drifts.items():
             column = heard[:, number - 1]
             heard[:, number - 1] = np.interp(samples * (1 + drift), samples, column)
-        progress(len(played))
         return np.clip(self._gain * heard[:, self._on_inputs], -1, 1).astype(np.float32)
 
     def close(self) -> None:

@@ -8,7 +8,7 @@ from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth, draw_truth
 from desk_card import DeskCard
 from drivers.errors import LinkError
-from model.arrays import FloatArray
+from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from model.identification.identify import identify
 from model.identification.measured_plate import MeasuredPlate
@@ -40,11 +40,11 @@ def truth(rig: Rig) -> Truth:
 class ChangingCard(DeskCard):
     """Plays to the plate through amplifiers that change; gains: of each run, by its samples."""
 
-    def run(self, played: FloatArray, **options: object) -> np.ndarray:  # type: ignore[override]
+    def run(self, played: FloatArray) -> Float32Array:
         """Advance the plate by what the amplifiers make of the samples."""
         changed = played.copy()
         changed[:, :-1] = self.amplified(played[:, :-1])
-        return super().run(changed, **options)  # type: ignore[arg-type]
+        return super().run(changed)
 
     def amplified(self, played: FloatArray) -> FloatArray:
         """Compress large samples, by 10 % at the level."""

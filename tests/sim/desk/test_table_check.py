@@ -2,7 +2,7 @@
 
 import json
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -172,10 +172,8 @@ def test_dead_and_clipped_accelerometers_keep_no_promise(
     class WrongInput(DeskCard):
         """Input 3, of C, is dead or too sensitive."""
 
-        def run(
-            self, played: FloatArray, *, progress: Callable[[int], None] = lambda _frames: None
-        ) -> Float32Array:
-            heard = super().run(played, progress=progress)
+        def run(self, played: FloatArray) -> Float32Array:
+            heard = super().run(played)
             heard[:, 2] = np.clip(sensitivity * heard[:, 2], -1, 1)
             return heard
 
@@ -232,9 +230,7 @@ def test_limits_of_the_rig_hold_for_a_card(
         def __init__(self) -> None:
             self.rate = RATE
 
-        def run(
-            self, played: FloatArray, *, progress: Callable[[int], None] = lambda _frames: None
-        ) -> Float32Array:
+        def run(self, played: FloatArray) -> Float32Array:
             raise AssertionError
 
         def close(self) -> None:
@@ -257,11 +253,9 @@ def test_no_output_exceeds_half_of_what_the_rig_allows(
     class NotedCard(DeskCard):
         """Notes the largest sample of each output."""
 
-        def run(
-            self, played: FloatArray, *, progress: Callable[[int], None] = lambda _frames: None
-        ) -> Float32Array:
+        def run(self, played: FloatArray) -> Float32Array:
             played_to.extend(np.abs(played).max(axis=0))
-            return super().run(played, progress=progress)
+            return super().run(played)
 
     def opened(_device: str, *, limit: float, **_counts: int) -> DeskCard:
         assert limit == pytest.approx(0.05)
@@ -314,9 +308,7 @@ def test_amplifier_is_disarmed_as_soon_as_the_card_ends(
         def __init__(self) -> None:
             self.rate = RATE
 
-        def run(
-            self, played: FloatArray, *, progress: Callable[[int], None] = lambda _frames: None
-        ) -> Float32Array:
+        def run(self, played: FloatArray) -> Float32Array:
             assert playing.wait(10.0)
             raise trouble
 

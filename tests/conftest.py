@@ -25,8 +25,7 @@ from hypothesis import settings  # noqa: E402
 import preloaded  # noqa: E402
 from drivers import garbage_collection  # noqa: E402
 from model.config import document  # noqa: E402
-from model.reduction import finite_element_modes  # noqa: E402
-from model.reduction.class_modes import finite_element_classes  # noqa: E402
+from model.reduction import free_plate  # noqa: E402
 from model.rig.file import example_rig_path, load_rig  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
 from model.table.table_cache import cached_table  # noqa: E402
@@ -75,7 +74,7 @@ settings.register_profile("short", max_examples=40)  # of each property; a hundr
 settings.load_profile("short")
 
 
-finite_element_modes.finite_element_classes = lru_cache(24)(finite_element_classes)
+free_plate.finite_element_modes = lru_cache(12)(free_plate.finite_element_modes)
 """Free plates are solved once in a process: hundreds of tests are of the same ones."""
 
 _plain_yaml = document.plain_yaml

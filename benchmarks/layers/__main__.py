@@ -7,10 +7,10 @@ import numpy as np
 from benchmarks.layers.elasticity import strip_frequencies, wave_number
 from benchmarks.setting import RIG
 from model.arrays import FloatArray
-from model.fem.symmetry import CLASSES
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.spectral.functions import CLASSES
 from model.spectral.modes import Band, SpectralPlate
 from model.structure.air_gap import AirGap
 from model.structure.equivalent import bending, equivalent_plate

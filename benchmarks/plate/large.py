@@ -17,9 +17,9 @@ from benchmarks.plate.ours import eras_at  # noqa: E402
 from benchmarks.plate.problem import GLASS, OTHERS, STIFFNESS, Case, difference  # noqa: E402
 from model.arrays import ComplexArray  # noqa: E402
 from model.fem.mesh import Mesh  # noqa: E402
-from model.fem.plate_mesh import PlateMesh  # noqa: E402
 from model.reduction.free_plate import solve_free_plate  # noqa: E402
 from model.rig.meshes import mesh_of  # noqa: E402
+from model.spectral.mesh import PlateMesh  # noqa: E402
 from model.structure.plate import Plate  # noqa: E402
 
 FOOT = 0.02  # m

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray, lattice
 from model.calibration.parameters import Parameter
-from model.fem.element_slopes import element_slopes
 from model.fem.mesh import Mesh
+from model.fem.plate import element_slopes
 from model.reduction.place_slopes import place_slopes
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
@@ -259,7 +259,7 @@ def _stiffening(rig: Rig, unknowns: Sequence[FloatArray], frequency: float) -> F
     """Derivatives of the stiffness between shapes, with the moduli at a frequency [Hz]."""
     match rig.mesh:
         case Mesh():
-            return element_slopes(rig.plate, rig.mesh, unknowns)
+            return element_slopes(rig.plate, rig.mesh, unknowns[0])
         case _:
             degrees = rig.mesh.nx, rig.mesh.ny
             return stiffness_slopes(rig.plate, degrees, unknowns, frequency=frequency)

@@ -12,7 +12,7 @@ from model.commands.options import JsonOption, MeshOption, RigArgument
 from model.counting import counted
 
 if TYPE_CHECKING:
-    from model.fem.plate_mesh import PlateMesh
+    from model.spectral.mesh import PlateMesh
 
 
 def build(

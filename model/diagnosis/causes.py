@@ -20,8 +20,8 @@ from model.calibration.variable_projection import modal_assurance
 from model.choice import best_by, ranked_by
 from model.diagnosis.plate_match import Match, match_plate
 from model.errors import InputError
-from model.fem.plate_mesh import stretched
 from model.rig.rig import Rig
+from model.spectral.mesh import stretched
 from model.vibration.parametric_plate import ParametricPlate, parametric_plate
 
 _SIZES = (0.6, 0.67, 0.75, 0.82, 0.88, 0.94, 1.06, 1.13, 1.21, 1.33, 1.5, 1.67)

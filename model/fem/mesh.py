@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from scipy import sparse
@@ -13,6 +13,13 @@ from model.errors import InputError
 from model.fem.elements import MITC4, Q5, Element
 from model.structure.footprint import check_on_plate, mean_over
 from model.structure.plate import Plate
+
+
+class _Resolves(Protocol):
+    def highest_frequency(self, plate: Plate) -> float: ...
+
+    def resolving(self, plate: Plate, frequency: float) -> object: ...
+
 
 PAPER_ELEMENT = MITC4
 """The default element of a mesh."""
@@ -233,3 +240,17 @@ class Mesh:
         cell = np.clip(np.searchsorted(lines, position, side="right") - 1, 0, len(lines) - 2)
         start, end = lines[cell], lines[cell + 1]
         return cell, self.element.shape((2 * position - start - end) / (end - start))
+
+
+def check_frequencies(plate: Plate, mesh: _Resolves, frequencies: FloatArray) -> None:
+    """Raise InputError for frequencies (f,) [Hz] not above zero or too high for the mesh."""
+    for frequency in frequencies:
+        if not (np.isfinite(frequency) and frequency > 0):
+            raise InputError(f"frequency must be above zero, got {frequency} Hz")
+    highest = max(frequencies, default=0.0)
+    if highest > mesh.highest_frequency(plate):
+        raise InputError(
+            f"frequency must be at most {mesh.highest_frequency(plate):g} Hz, which mesh {mesh} "
+            f"resolves, got {highest:g} Hz; use mesh {mesh.resolving(plate, highest)} or finer, or "
+            f"with mesh: auto raise the upper limits.frequency to {highest:g} Hz"
+        )

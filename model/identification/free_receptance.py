@@ -18,8 +18,8 @@ from functools import cached_property
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.reduction.free_modes import RESIDUAL_ORDER, FreeModes
-from model.reduction.free_plate import FreePlate
+from model.reduction.free_modes import RESIDUAL_ORDER
+from model.reduction.free_plate import FreeModes, FreePlate
 from model.reduction.place_slopes import place_slopes
 from model.reduction.truncation import truncation_slopes, truncation_weights
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from model.errors import InputError
-from model.fem.plate_mesh import PlateMesh
 from model.identification.advice import unknowns
 from model.identification.held_out import HeldOut, hold_out
 from model.identification.identified_rig import rig_with
@@ -18,7 +17,7 @@ from model.quantities import with_error
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
-from model.spectral.mesh import SpectralMesh
+from model.spectral.mesh import PlateMesh, SpectralMesh
 
 MAX_CHI2 = 2.0
 """chi² beyond which a model does not explain a measurement, and nothing is promised from it."""

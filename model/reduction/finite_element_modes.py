@@ -1,161 +1,130 @@
 """Modes of the free plate on a mesh, and its truncated ones at points, solved on demand."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
 
 import numpy as np
-from scipy import sparse
+from scipy import linalg
 
 from model.arrays import FloatArray
+from model.fem.elements import DOF_PER_NODE
 from model.fem.mesh import Mesh
-from model.reduction.class_modes import ClassModes, finite_element_classes
-from model.reduction.free_modes import RESIDUAL_ORDER, CacheKey, PointSolutions, unknowns_of
+from model.fem.plate import RIGID_BODY_MODES, PlateMatrices, assemble, factorise, lowest_modes
+from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
 from model.structure.dispersion import Dispersion
 from model.structure.footprint import as_footprints
 from model.structure.plate import Plate
 
-MAX_CACHE_BYTES = 512 << 20
-"""Memory for solved points; beyond it the oldest are dropped."""
-
-MAX_CACHED_RASTERS = 4
-"""Sets of observed points whose interpolation is cached."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Solved:
-    """One point in one class: its force (size,), and residual vectors (RESIDUAL_ORDER, size).
-
-    Those are sums of phi (u / u_c)^j over the truncated modes. mass_weighted: the same sums times
-    the mass.
-    """
-
-    force: FloatArray
-    residual: FloatArray
-    mass_weighted: FloatArray
+_MAX_CACHE_BYTES = 256 << 20  # of solved points
 
 
 class FiniteElementModes:
-    """Modes of a free plate on a mesh, with a cache of solved points; see `FreeModes`."""
+    """Modes of a free plate on a mesh, with a cache of solved points; see `free_plate.FreeModes`.
 
-    def __init__(self, classes: Sequence[ClassModes]) -> None:
-        self._classes = tuple(classes)
-        self.eigenvalues = np.concatenate([part.eigenvalues for part in classes])
-        self.losses = np.zeros(len(self.eigenvalues))
+    cut: all modes of omega² [rad²/s²] below it are solved; shift [rad²/s²]: of the factorisation.
+    """
+
+    def __init__(self, matrices: PlateMatrices, *, shift: float, cut: float, count: int) -> None:
+        self._matrices = matrices
+        self._factor = factorise(matrices.stiffness + shift * matrices.mass)
+        eigenvalues, vectors = _modes_below(matrices, cut=cut, count=count, shift=shift)
+        kept = int(np.searchsorted(eigenvalues, cut))
+        self.eigenvalues, self._vectors = eigenvalues[:kept], vectors[:, :kept]
+        self.losses = np.zeros(kept)
         self.dispersion: Dispersion | None = None
-        self.largest_truncated = max(part.largest_truncated for part in classes)
-        self._solved: dict[tuple[float, ...], tuple[_Solved, ...]] = {}
-        self._observed: dict[CacheKey, tuple[FloatArray, tuple[sparse.csr_array, ...]]] = {}
+        self.largest_truncated = 1 / (float(eigenvalues[min(kept, len(eigenvalues) - 1)]) + shift)
+        self._solved: dict[tuple[float, ...], FloatArray] = {}
 
     def solve_at(self, points: FloatArray) -> PointSolutions:
         """Solve for forces at points [m] (n, 2), from the cache where possible."""
-        known = self._solutions(points)
-        shapes = [
-            np.array([each[number].force for each in known]).reshape(len(known), -1) @ part.vectors
-            for number, part in enumerate(self._classes)
-        ]
-        residuals = tuple(
-            np.array([each[number].residual for each in known]).reshape(
-                len(known), RESIDUAL_ORDER, part.size
-            )
-            for number, part in enumerate(self._classes)
+        residuals = self._residuals(points)
+        return PointSolutions(
+            points, self.shapes_at(points), residuals, self.truncated_terms(points, points)
         )
-        truncated_terms = self._between(known, known)
-        self._trim_cache()
-        return PointSolutions(points, np.hstack(shapes), residuals, truncated_terms)
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
-        shapes, _ = self._observe(np.asarray(points, dtype=float))
-        return shapes
+        return np.asarray(self._matrices.deflection_at(points) @ self._vectors)
 
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums between points (n, 2) and others (m, 2), as in `PointSolutions`."""
-        return self._between(self._solutions(points), self._solutions(others))
-
-    def _solutions(self, points: FloatArray) -> "list[tuple[_Solved, ...]]":
-        """Solutions for points [m] (n, 2), by point and class."""
-        keys = [tuple(place) for place in as_footprints(points).tolist()]
-        unknown = [key for key in dict.fromkeys(keys) if key not in self._solved]
-        if unknown:
-            self._solve_for(unknown)
-        return [self._solved[key] for key in keys]
-
-    def _between(
-        self, points: "list[tuple[_Solved, ...]]", others: "list[tuple[_Solved, ...]]"
-    ) -> FloatArray:
-        rows, columns = len(points), len(others)
-        truncated_terms = np.zeros((2 * RESIDUAL_ORDER, rows, columns))
-        for number, part in enumerate(self._classes):
-            size = part.size
-            force = np.array([each[number].force for each in points]).reshape(rows, size)
-            residual = np.array([each[number].residual for each in points]).reshape(-1, size)
-            mass_weighted = np.array([each[number].mass_weighted for each in others]).reshape(
-                -1, size
-            )
-            first = np.array([each[number].residual[0] for each in others]).reshape(columns, size)
-            truncated_terms[0] += force @ first.T
-            inner = (residual @ mass_weighted.T).reshape(
-                rows, RESIDUAL_ORDER, columns, RESIDUAL_ORDER
-            )
-            for power in range(2, 2 * RESIDUAL_ORDER + 1):
-                truncated_terms[power - 1] += inner[:, power // 2 - 1, :, (power + 1) // 2 - 1]
-        return truncated_terms
+        own, other = self._residuals(points), self._residuals(others)
+        heavy = np.array([self._matrices.mass @ each.T for each in other.swapaxes(0, 1)])
+        terms = np.empty((2 * RESIDUAL_ORDER, len(own), len(other)))
+        terms[0] = self._matrices.deflection_at(points) @ other[:, 0].T
+        for power in range(2, 2 * RESIDUAL_ORDER + 1):
+            terms[power - 1] = own[:, power // 2 - 1] @ heavy[(power + 1) // 2 - 1]
+        return terms
 
     def basis(self, attached: PointSolutions, points: FloatArray) -> FloatArray:
-        """Deflection at points of modes and residual vectors, (p, r + RESIDUAL_ORDER n).
-
-        Residual vectors come term by term, each for all attachments.
-        """
-        shapes, maps = self._observe(np.asarray(points, dtype=float))
-        extra = np.zeros((len(shapes), RESIDUAL_ORDER * len(attached.shapes)))
-        for each, residual in zip(maps, attached.residuals, strict=True):
-            extra += each @ residual.transpose(2, 1, 0).reshape(residual.shape[2], -1)
-        return np.hstack([shapes, extra])
+        """Deflection at points of modes and residual vectors, (p, r + RESIDUAL_ORDER n)."""
+        (unknowns,) = self.unknowns(attached)
+        return np.asarray(self._matrices.deflection_at(points) @ unknowns)
 
     def unknowns(self, attached: PointSolutions) -> tuple[FloatArray, ...]:
-        """The columns of `basis` by symmetry class."""
-        return unknowns_of([part.vectors for part in self._classes], attached.residuals)
+        """The columns of `basis` in degrees of freedom, in one part."""
+        columns = RESIDUAL_ORDER * len(attached.points)
+        residuals = attached.residuals.transpose(2, 1, 0).reshape(self._matrices.dof, columns)
+        return (np.hstack([self._vectors, residuals]),)
 
-    def _observe(self, points: FloatArray) -> tuple[FloatArray, tuple[sparse.csr_array, ...]]:
-        """Mode shapes at points (p, r), and by class the map to deflections there; cached."""
-        key = points.shape, points.tobytes()
-        if key not in self._observed:
-            maps = tuple(part.deflection_at(points) for part in self._classes)
-            pairs = zip(maps, self._classes, strict=True)
-            shapes = np.hstack([each @ part.vectors for each, part in pairs])
-            if len(self._observed) >= MAX_CACHED_RASTERS:
-                self._observed.clear()
-            self._observed[key] = shapes, maps
-        return self._observed[key]
-
-    def _solve_for(self, points: list[tuple[float, ...]]) -> None:
-        forces = [part.deflection_at(np.array(points)).toarray() for part in self._classes]
-        solved = [
-            part.residuals(force, terms=RESIDUAL_ORDER, scale=self.largest_truncated)
-            for part, force in zip(self._classes, forces, strict=True)
-        ]
-        for number, point in enumerate(points):
-            self._solved[point] = tuple(
-                _Solved(
-                    force[number].copy(), residual[0, number].copy(), residual[1, number].copy()
-                )
-                for force, residual in zip(forces, solved, strict=True)
-            )
-
-    def _trim_cache(self) -> None:
-        """Drop the oldest solved points beyond MAX_CACHE_BYTES."""
-        size = 8 * (2 * RESIDUAL_ORDER + 1) * sum(part.size for part in self._classes)
-        while len(self._solved) * size > MAX_CACHE_BYTES:
-            del self._solved[next(iter(self._solved))]
+    def _residuals(self, points: FloatArray) -> FloatArray:
+        """Residual vectors of forces at points or footprints, (n, RESIDUAL_ORDER, dof)."""
+        keys = [tuple(place) for place in as_footprints(points).tolist()]
+        unknown = [key for key in dict.fromkeys(keys) if key not in self._solved]
+        if 8 * RESIDUAL_ORDER * self._matrices.dof * len(self._solved) > _MAX_CACHE_BYTES:
+            self._solved, unknown = {}, list(dict.fromkeys(keys))
+        if unknown:
+            solved = np.empty((RESIDUAL_ORDER, self._matrices.dof, len(unknown)))
+            force = self._matrices.deflection_at(np.array(unknown)).T.toarray()
+            mass, vectors = self._matrices.mass, self._vectors
+            for term in solved:
+                term[:] = self._factor.solve(force)
+                term -= vectors @ (vectors.T @ (mass @ term))
+                term /= self.largest_truncated
+                force = mass @ term
+            self._solved |= zip(unknown, solved.transpose(2, 0, 1), strict=True)
+        found = [self._solved[key] for key in keys]
+        return np.array(found).reshape(len(keys), RESIDUAL_ORDER, self._matrices.dof)
 
 
 def finite_element_modes(
     plate: Plate, mesh: Mesh, *, shift: float, cutoff_frequency: float
 ) -> FiniteElementModes:
-    """Solve a free plate on a mesh for all modes below cutoff_frequency [Hz].
-
-    shift [rad²/s²]: of the factorisations.
-    """
+    """Solve a free plate on a mesh for all modes below cutoff_frequency [Hz]."""
     return FiniteElementModes(
-        finite_element_classes(plate, mesh, shift=shift, cutoff_frequency=cutoff_frequency)
+        assemble(plate, mesh),
+        shift=shift,
+        cut=(2 * math.pi * cutoff_frequency) ** 2,
+        count=plate.modes_below(cutoff_frequency) + RIGID_BODY_MODES + 4,
     )
+
+
+def _modes_below(
+    matrices: PlateMatrices, *, cut: float, count: int, shift: float
+) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues omega² (r,), ascending, beyond the cut, and vectors (dof, r).
+
+    count: of modes to compute at first; more where they do not reach it.
+    """
+    K, M = matrices.stiffness, matrices.mass
+    while True:
+        if count >= matrices.dof / 2:
+            eigenvalues, vectors = linalg.eigh(K.toarray(), M.toarray())
+            break
+        eigenvalues, vectors = lowest_modes(K, M, count, shift=shift)
+        if eigenvalues[-1] >= cut:
+            break
+        count += count // 3 + 1
+    eigenvalues[:RIGID_BODY_MODES] = 0.0
+    vectors[:, :RIGID_BODY_MODES] = _rigid_modes(matrices)
+    return eigenvalues, vectors
+
+
+def _rigid_modes(matrices: PlateMatrices) -> FloatArray:
+    """Up and down, and both tilts, (dof, 3): a solver's are some mixture of them."""
+    nodes, plate = matrices.mesh.nodes, matrices.plate
+    modes = np.zeros((len(nodes), DOF_PER_NODE, RIGID_BODY_MODES))
+    modes[:, 0, 0] = 1
+    modes[:, 0, 1:] = nodes - [plate.length / 2, plate.width / 2]
+    modes[:, 1, 1] = modes[:, 2, 2] = 1
+    found = modes.reshape(matrices.dof, RIGID_BODY_MODES)
+    return np.asarray(found / np.sqrt((found * (matrices.mass @ found)).sum(axis=0)))

@@ -17,13 +17,12 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.fem.mesh import Mesh
-from model.fem.plate_mesh import PlateMesh, check_frequencies
-from model.reduction.finite_element_modes import finite_element_modes
-from model.reduction.free_modes import RESIDUAL_ORDER, FreeModes, PointSolutions
-from model.reduction.spectral_modes import spectral_modes
+from model.fem.mesh import Mesh, check_frequencies
+from model.reduction.finite_element_modes import FiniteElementModes, finite_element_modes
+from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
+from model.reduction.spectral_modes import SpectralModes, spectral_modes
 from model.reduction.truncation import truncation_weights
-from model.spectral.mesh import SpectralMesh
+from model.spectral.mesh import PlateMesh
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.footprint import as_footprints
@@ -31,6 +30,15 @@ from model.structure.low_rank import coupled_forces, on_diagonal
 from model.structure.modal_elasticity import ModalElasticity, loss_factors
 from model.structure.plate import Plate
 from model.structure.point_load import Load, footprints_of
+
+FreeModes: TypeAlias = SpectralModes | FiniteElementModes
+"""Modes phi of a free plate up to a cut-off, and all truncated ones together by their sums.
+
+A truncated mode of eigenvalue lambda counts with u = 1 / (lambda + shift), in units of
+largest_truncated, u_c, that of the lowest [s²/rad²]. eigenvalues omega² (r,) [rad²/s²], and losses
+(r,), their imaginary part beside the plate's own loss factor; dispersion: how they change with
+frequency, None where they do not.
+"""
 
 _Functions: TypeAlias = Callable[[int], tuple[ComplexArray, ComplexArray]]
 
@@ -185,19 +193,14 @@ def solve_free_plate(plate: Plate, mesh: PlateMesh, *, frequency_max: float = 50
     shift = (2 * math.pi * min(plate.lowest_bending_frequency, frequency_max / 3)) ** 2
     cutoff_frequency = FREQUENCY_MARGIN * frequency_max
     modes: FreeModes
-    match mesh:
-        case SpectralMesh():
-            modes = spectral_modes(
-                plate,
-                mesh,
-                shift=shift,
-                cutoff_frequency=cutoff_frequency,
-                frequency_max=frequency_max,
-            )
-        case Mesh():
-            modes = finite_element_modes(
-                plate, mesh, shift=shift, cutoff_frequency=cutoff_frequency
-            )
-        case _:
-            raise TypeError(f"mesh must be a Mesh or SpectralMesh, got {type(mesh).__name__}")
+    if isinstance(mesh, Mesh):
+        modes = finite_element_modes(plate, mesh, shift=shift, cutoff_frequency=cutoff_frequency)
+    else:
+        modes = spectral_modes(
+            plate,
+            mesh,
+            shift=shift,
+            cutoff_frequency=cutoff_frequency,
+            frequency_max=frequency_max,
+        )
     return FreePlate(plate, mesh, frequency_max, shift, modes)

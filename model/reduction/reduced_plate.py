@@ -13,8 +13,8 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import FloatArray
-from model.fem.plate_mesh import PlateMesh
 from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.spectral.mesh import PlateMesh
 from model.structure.dispersion import Dispersion
 from model.structure.footprint import as_footprints
 from model.structure.plate import Plate

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import FloatArray
-from model.fem.symmetry import CLASSES
 from model.reduction.free_modes import RESIDUAL_ORDER, CacheKey, PointSolutions, unknowns_of
-from model.spectral.functions import deflections_by_class
+from model.spectral.functions import CLASSES, deflections_by_class
 from model.spectral.local_compliance import (
     Unresolved,
     compliance_between,
@@ -40,7 +39,7 @@ class _Observed:
 
 
 class SpectralModes:
-    """Modes of a free plate in the polynomials of a mesh; see `FreeModes`."""
+    """Modes of a free plate in the polynomials of a mesh; see `FreeModes` of `free_plate`."""
 
     def __init__(
         self,
@@ -76,7 +75,7 @@ class SpectralModes:
         """Solve for forces at points [m] (n, 2)."""
         at = self._observe(points)
         residuals = at.truncated[:, None] * self._powers[:RESIDUAL_ORDER]
-        return PointSolutions(points, at.shapes, (residuals,), self.truncated_terms(points, points))
+        return PointSolutions(points, at.shapes, residuals, self.truncated_terms(points, points))
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
@@ -92,7 +91,7 @@ class SpectralModes:
     def basis(self, attached: PointSolutions, points: FloatArray) -> FloatArray:
         """Deflection at points of modes and residual vectors, (p, r + RESIDUAL_ORDER n)."""
         at, count = self._observe(points), len(attached.points)
-        (residuals,) = attached.residuals
+        residuals = attached.residuals
         shape = RESIDUAL_ORDER * count, residuals.shape[2]
         extra = residuals.transpose(1, 0, 2).reshape(shape) @ at.truncated.T
         extra[:count] += self._local(self._observe(attached.points), at)
@@ -100,7 +99,7 @@ class SpectralModes:
 
     def unknowns(self, attached: PointSolutions) -> tuple[FloatArray, ...]:
         """The columns of `basis` by symmetry class, without the local compliance."""
-        (together,) = attached.residuals
+        together = attached.residuals
         ends = np.cumsum([len(part.truncated) for part in self._classes])[:-1]
         truncated = np.split(together, ends, axis=2)
         counts = [len(part.eigenvalues) for part in self._classes]

@@ -5,7 +5,7 @@ from typing import Any
 
 from model.config.document import ConfigError, Document, Problem
 from model.config.kinds import CheckedFile
-from model.fem.elements.element import SHEAR_CORRECTION
+from model.fem.elements import SHEAR_CORRECTION
 from model.rig.amplifiers import check_amplifiers
 from model.rig.checks import STIFF_MOUNT
 from model.rig.file import example_rig_path, rig_of, rig_schema

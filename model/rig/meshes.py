@@ -8,8 +8,7 @@ from model.config.units import LENGTH, quantity
 from model.errors import InputError
 from model.fem.elements import element_of
 from model.fem.mesh import PAPER_ELEMENT, Mesh
-from model.fem.plate_mesh import PlateMesh
-from model.spectral.mesh import MAX_DEGREE, MAX_POLYNOMIALS, POLYNOMIALS, SpectralMesh
+from model.spectral.mesh import MAX_DEGREE, MAX_POLYNOMIALS, POLYNOMIALS, PlateMesh, SpectralMesh
 from model.structure.plate import Plate
 
 _MAX_ELEMENTS_PER_SIDE = 1000

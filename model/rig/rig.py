@@ -9,10 +9,10 @@ from numbers import Real
 from typing import Protocol
 
 from model.errors import InputError
-from model.fem.plate_mesh import PlateMesh
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import DEFAULT_THRESHOLD
 from model.rig.uncertainty import Uncertainty
+from model.spectral.mesh import PlateMesh
 from model.structure.actuator import Era
 from model.structure.fingertip import Fingertip
 from model.structure.laminate import Laminate

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.fem.plate_mesh import check_frequencies
-from model.fem.symmetry import CLASSES
-from model.spectral.functions import deflections_by_class
+from model.fem.mesh import check_frequencies
+from model.spectral.functions import CLASSES, deflections_by_class
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralPlate

@@ -10,17 +10,20 @@ Integrals are by Gauss's rule on pieces that shrink towards the edges.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
+from itertools import product
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from scipy import linalg
 
 from model.arrays import FloatArray
-from model.fem.symmetry import CLASSES
 from model.structure.footprint import mean_over
 from model.structure.laminate_section import Section
 
 EVEN, ODD = 1, -1
+
+CLASSES = tuple(product((EVEN, ODD), (EVEN, ODD)))
+"""Parity about the middle along x and along y of the four symmetry classes."""
 
 # A boundary layer with less than this share of its norm outside what is there already is left out.
 _NEGLIGIBLE = 0.02

@@ -2,11 +2,12 @@
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 
 from model.errors import InputError
+from model.fem.mesh import Mesh
 from model.spectral.local_compliance import edge_compliance
 from model.structure.plate import Plate
 
@@ -147,3 +148,19 @@ class SpectralMesh:
     def interpolation_error(self, plate: Plate, frequency: float) -> float:
         """0: its polynomials are evaluated wherever they are asked for."""
         return 0.0
+
+
+PlateMesh: TypeAlias = Mesh | SpectralMesh
+"""Elements, or polynomials over the whole plate: they have the same properties and methods."""
+
+
+def stretched(mesh: PlateMesh, plate: Plate) -> PlateMesh:
+    """A mesh of its kind that resolves the same on a plate of another size."""
+    nx, ny = (
+        math.ceil(count * max(new / old, 1.0))
+        for count, new, old in (
+            (mesh.nx, plate.length, mesh.length),
+            (mesh.ny, plate.width, mesh.width),
+        )
+    )
+    return replace(mesh, nx=nx, ny=ny, length=plate.length, width=plate.width)

@@ -17,9 +17,8 @@ from dataclasses import replace
 import numpy as np
 
 from model.arrays import FloatArray
-from model.fem.element_slopes import NUS, SQUARES
-from model.fem.symmetry import CLASSES
-from model.spectral.functions import EdgedFunctions, edge_decays
+from model.fem.plate import NUS, SQUARES
+from model.spectral.functions import CLASSES, EdgedFunctions, edge_decays
 from model.spectral.modes import layers_of
 from model.spectral.stiffness import ClassFunctions, class_stiffness, follow
 from model.structure.laminate import Layer

@@ -26,12 +26,12 @@ from model.ensemble.attached_plate import AttachedPlate, attach
 from model.ensemble.contact_forms import modal_fields
 from model.ensemble.preselection import Preselection
 from model.errors import InputError
-from model.fem.plate_mesh import PlateMesh
 from model.finger.contrast import is_background
 from model.finger.grid import CELL_SAMPLES, Grid
 from model.finger.perception import decibels, detection_threshold
 from model.rig.rig import physics_fingerprint
 from model.rig.uncertainty import Uncertainty
+from model.spectral.mesh import PlateMesh
 from model.structure.actuator import Era
 from model.structure.dispersion import Dispersion
 from model.structure.fingertip import Fingertip, fingertip_loads

@@ -10,13 +10,13 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.fem.plate_mesh import PlateMesh
 from model.files.array_file import Arrays
 from model.finger.grid import Grid
 from model.finger.perception import check_has_threshold
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig, canonical_json
+from model.spectral.mesh import PlateMesh
 from model.structure.dispersion import Dispersion
 from model.structure.point_load import footprints_of
 from model.structure.support import check_supported

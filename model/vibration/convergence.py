@@ -9,11 +9,10 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray, lattice
 from model.errors import InputError
 from model.fem.mesh import Mesh
-from model.fem.plate_mesh import PlateMesh
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
-from model.spectral.mesh import SpectralMesh
+from model.spectral.mesh import PlateMesh, SpectralMesh
 from model.structure.actuator import Era
 from model.structure.plate import Plate
 from model.vibration.discretisation import estimate_error, reference_mesh
@@ -187,7 +186,7 @@ def _reference(rig: Rig) -> PlateMesh:
     if not rig.plate.is_layered:
         return reference_mesh(rig.plate, frequency_max=high)
     automatic = mesh_of("auto", rig.plate, frequency_max=high)
-    return replace(automatic, nx=2 * automatic.nx, ny=2 * automatic.ny)  # type: ignore[type-var]
+    return replace(automatic, nx=2 * automatic.nx, ny=2 * automatic.ny)
 
 
 def _natural_frequencies(rig: Rig, mesh: PlateMesh) -> FloatArray:

@@ -5,12 +5,10 @@ from functools import partial
 from typing import Protocol
 
 from model.arrays import ComplexArray, FloatArray
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
 from model.fem.mesh import Mesh
-from model.fem.plate_mesh import PlateMesh
+from model.fem.plate import assemble, direct_acceleration
 from model.spectral.direct import direct_spectral_acceleration
-from model.spectral.mesh import SpectralMesh
+from model.spectral.mesh import PlateMesh, SpectralMesh
 from model.structure.actuator import Era
 from model.structure.plate import Plate
 from model.structure.point_load import Load

@@ -15,10 +15,9 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.fem.mesh import Mesh
-from model.fem.plate_mesh import PlateMesh
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.spectral_modes import SpectralModes
-from model.spectral.mesh import SpectralMesh
+from model.spectral.mesh import PlateMesh, SpectralMesh
 from model.structure.actuator import Era
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad

@@ -9,13 +9,11 @@ from scipy import linalg
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.fem.assembly import assemble
 from model.fem.mesh import Mesh
-from model.fem.modal import RIGID_BODY_MODES, modes
-from model.fem.plate_mesh import PlateMesh
+from model.fem.plate import RIGID_BODY_MODES, assemble, modes
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.spectral.mesh import SpectralMesh
+from model.spectral.mesh import PlateMesh, SpectralMesh
 from model.structure.modal_elasticity import ModalElasticity
 from model.structure.point_load import PointLoad, footprints_of
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.fem.plate_mesh import check_frequencies
+from model.fem.mesh import check_frequencies
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.dispersion import Dispersion

@@ -14,9 +14,9 @@ from zlib import crc32
 import numpy as np
 
 from model.errors import InputError
-from model.fem.plate_mesh import PlateMesh
 from model.rig.meshes import mesh_of
 from model.rig.rig import Channel, Rig
+from model.spectral.mesh import PlateMesh
 from model.structure.actuator import Era
 from model.structure.fingertip import Fingertip
 from model.structure.point_load import PointLoad

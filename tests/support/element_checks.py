@@ -11,10 +11,9 @@ import numpy as np
 from scipy.linalg import eigh
 
 from model.arrays import FloatArray
-from model.fem.assembly import assemble
-from model.fem.elements.element import DOF_PER_NODE, Element, rigidities
+from model.fem.elements import DOF_PER_NODE, Element, rigidities
 from model.fem.mesh import Mesh
-from model.fem.modal import shift_invert_modes
+from model.fem.plate import assemble, lowest_modes
 from model.structure.material import Material
 from model.structure.plate import Plate
 
@@ -202,7 +201,7 @@ def frequency_error(element: Element, count: int) -> float:
     fixed = np.concatenate([3 * sides, 3 * sides + 2, 3 * ends, 3 * ends + 1])
     free = np.setdiff1d(np.arange(assembled.dof), fixed)
     exact = _exact_omega_squared(THIN)
-    eigenvalues, _ = shift_invert_modes(
+    eigenvalues, _ = lowest_modes(
         assembled.stiffness[free][:, free], assembled.mass[free][:, free], 1, shift=exact
     )
     return float(np.sqrt(max(eigenvalues[0], 0.0) / exact) - 1)

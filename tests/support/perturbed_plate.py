@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from model.calibration.responses import Responses
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
+from model.fem.plate import assemble, direct_acceleration
 from model.rig.rig import Rig
 
 # Relative to the rig, bolt masses in kg: what assembly and ageing do.

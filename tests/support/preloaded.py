@@ -48,7 +48,7 @@ _LOADED = (
     "controller.daemon.run",
     "controller.gateway.serving",
     "model.commands.progress",
-    "model.fem.modal",
+    "model.fem.plate",
     "model.design.run",
     "model.table.build",
     "scipy.ndimage",

@@ -16,8 +16,7 @@ from model.design.layouts import layouts_of
 from model.design.problem import DesignProblem
 from model.design.search import LayoutSearch
 from model.drive_modes import DRIVE_MODES
-from model.fem.assembly import assemble
-from model.fem.modal import modes
+from model.fem.plate import assemble, modes
 from model.table.build import build_in_parts
 from model.table.query import query_table
 from model.table.question import Question

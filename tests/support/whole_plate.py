@@ -12,8 +12,8 @@ import numpy as np
 from scipy import linalg, sparse
 
 from model.arrays import ComplexArray, FloatArray
-from model.fem.assembly import PlateMatrices, assemble
 from model.fem.mesh import Mesh
+from model.fem.plate import PlateMatrices, assemble
 from model.structure.actuator import Era
 from model.structure.fingertip import FingertipLoad
 from model.structure.plate import Plate

@@ -1,6 +1,6 @@
 """Diagnosis from responses that another solver computes for a known truth.
 
-Truth comes from one sparse solve a frequency (`model.fem.harmonic`), the comparison from the
+Truth comes from one sparse solve a frequency (`model.fem.plate`), the comparison from the
 reduced plate. Gains of 5 % and 5 degrees at random and noise of 2 % of each row are in every
 measurement.
 """
@@ -17,9 +17,8 @@ from model.diagnosis.diagnosis_report import as_json, channel_table, verdict_row
 from model.diagnosis.observation import Observation
 from model.diagnosis.verdict import Verdict, diagnose
 from model.errors import InputError
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
 from model.fem.mesh import Mesh
+from model.fem.plate import assemble, direct_acceleration
 from model.rig.rig import Rig
 from model.vibration.parametric_plate import parametric_plate
 

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
+from model.fem.plate import assemble, direct_acceleration
 from model.reduction.free_plate import solve_free_plate
 from model.structure.actuator import Era
 from model.structure.point_load import footprints_of

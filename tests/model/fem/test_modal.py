@@ -5,10 +5,9 @@ import pytest
 
 from long_form import shortly
 from model.errors import InputError
-from model.fem.assembly import assemble
 from model.fem.elements import ELEMENTS
 from model.fem.mesh import Mesh
-from model.fem.modal import modes
+from model.fem.plate import assemble, modes
 from model.structure.actuator import Era
 from model.structure.plate import Plate
 from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig

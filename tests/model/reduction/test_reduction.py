@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from model.fem.assembly import assemble
 from model.fem.elements import ELEMENTS
-from model.fem.harmonic import direct_acceleration
 from model.fem.mesh import Mesh
+from model.fem.plate import assemble, direct_acceleration
 from model.reduction.reduced_plate import reduce_plate
 from model.structure.actuator import Era
 from model.structure.plate import Plate

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
+from model.fem.plate import assemble, direct_acceleration
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.file import load_rig

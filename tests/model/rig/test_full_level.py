@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from model.config.document import ConfigError
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
+from model.fem.plate import assemble, direct_acceleration
 from model.rig.file import load_rig, parse_rig
 from model.rig.gain_notes import gain_notes
 from model.rig.rig import Rig

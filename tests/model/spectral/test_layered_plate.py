@@ -9,8 +9,8 @@ from scipy import linalg
 
 from benchmarks.layers.elasticity import strip_frequencies
 from model.errors import InputError
-from model.fem.assembly import assemble
 from model.fem.mesh import Mesh
+from model.fem.plate import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.reduction.supported_modes import supported_modes

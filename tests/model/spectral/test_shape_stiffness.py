@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.fem.element_slopes import element_slopes
 from model.fem.elements import ELEMENTS
 from model.fem.mesh import Mesh
+from model.fem.plate import element_slopes
 from model.reduction.free_plate import solve_free_plate
 from model.spectral.mesh import SpectralMesh
 from model.spectral.shape_stiffness import stiffness_slopes
@@ -43,7 +43,7 @@ def slopes_of(plate, mesh):
     """Eigenvalues (r,), and derivatives of the stiffness between their modes (3, r, r)."""
     eigenvalues, unknowns = elastic_modes(plate, mesh)
     if isinstance(mesh, Mesh):
-        return eigenvalues, element_slopes(plate, mesh, unknowns)
+        return eigenvalues, element_slopes(plate, mesh, unknowns[0])
     return eigenvalues, stiffness_slopes(plate, DEGREES, unknowns, frequency=200.0)
 
 

@@ -11,12 +11,12 @@ from long_form import in_turn
 from model.errors import InputError
 from model.fem.elements import Q5
 from model.fem.mesh import Mesh
-from model.fem.symmetry import CLASSES
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.reduction.spectral_modes import spectral_modes
 from model.rig.meshes import mesh_of
 from model.spectral.direct import direct_spectral_acceleration
+from model.spectral.functions import CLASSES
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralPlate

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from model.ensemble.measures import percentile
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
+from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold
 from model.rig.uncertainty import Uncertainty

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from model.drive_modes.sources import all_combinations, magnitudes_of_sources, sums_of_sources
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
+from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold
 from model.structure.fingertip import FingertipLoad

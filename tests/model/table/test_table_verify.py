@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
+from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.structure.fingertip import FingertipLoad
 from model.structure.point_load import PointLoad

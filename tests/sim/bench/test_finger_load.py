@@ -8,8 +8,7 @@ import pytest
 from bench_driving import keep_alive, play
 from drivers.contents import Tone
 from model.arrays import FloatArray
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
+from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import fingertip_points
 from model.rig.rig import Rig
 from model.structure.fingertip import Fingertip, FingertipLoad

@@ -11,8 +11,7 @@ from drivers.host.sensors import measure_tones, read_sensors
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import READING_STATES
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
+from model.fem.plate import assemble, direct_acceleration
 from model.rig.rig import Rig
 from plate_in_time import apart
 from sim.bench.bench import Bench

@@ -11,8 +11,7 @@ from drivers import clock
 from drivers.errors import CommandRefused, LinkError
 from drivers.protocol.table import FAULTS, STATES
 from memory_machine import live_in_memory
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
+from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import fingertip_points
 from model.rig.rig import Rig
 from model.structure.fingertip import Fingertip, FingertipLoad

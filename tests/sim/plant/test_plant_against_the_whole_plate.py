@@ -9,8 +9,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from driven_bases import BASES, STILL, STROKE, Base
 from model.arrays import ComplexArray, FloatArray
-from model.fem.assembly import assemble
-from model.fem.harmonic import direct_acceleration
+from model.fem.plate import assemble, direct_acceleration
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.actuator import Era

@@ -24,6 +24,7 @@ from drivers.host.comparison import name_of
 from drivers.host.jobs import Priority
 from drivers.host.sensors import check_tones, measure_tones, read_measured, read_sensors
 from drivers.host.timing import check_watchdog
+from drivers.protocol.records import bits_of
 from drivers.protocol.table import COMMAND, FAULTS, LATCHED, QUANTITIES, STATES, has_feature
 from drivers.urls import with_address
 
@@ -48,7 +49,7 @@ async def identify(url: str) -> dict[str, Any]:
         return {
             "url": url,
             **identity,
-            "versions": [version for version in range(16) if versions >> version & 1],
+            "versions": bits_of(versions),
             **capability_rows(amplifier.capabilities),
             **wire_rows(amplifier),
         }

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from drivers.host.comparison import name_of
-from drivers.protocol.records import Number, Record, Rows, Values
+from drivers.protocol.records import Number, Record, Rows, Values, bits_of
 from drivers.protocol.table import (
     FAULTS,
     FEATURES,
@@ -38,8 +38,7 @@ def in_units(record: Record, values: Values) -> dict[str, Any]:
 def names_of_bits(names: Mapping[str, int], value: int) -> list[str]:
     """Return the names of the bits that are set; of an unknown one its value."""
     known = {bit: name for name, bit in names.items()}
-    bits = (bit for bit in range(16) if value >> bit & 1)
-    return [known.get(bit, f"{1 << bit:#06x}") for bit in bits]
+    return [known.get(bit, f"{1 << bit:#06x}") for bit in bits_of(value)]
 
 
 def capability_rows(capabilities: Values) -> dict[str, Any]:

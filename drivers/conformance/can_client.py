@@ -15,7 +15,7 @@ from drivers.codec.can_bus.segments import (
     segments,
     unpack_frames,
 )
-from drivers.conformance.client import Answer, Client, Heard, Port, When, altered, expect_reply
+from drivers.conformance.client import Answer, Client, Heard, When, altered, expect_reply
 from drivers.conformance.findings import Violation, expect_equal
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import HELLO
@@ -32,9 +32,9 @@ class CanClient(Client):
     kind = "can"
     addresses = NODE_MAX
 
-    def __init__(self, port: Port, address: int, *, number: int = 0) -> None:
-        super().__init__(port, address)
-        self.number = number
+    def __init__(self, address: int) -> None:
+        super().__init__(address)
+        self.number = 0
         self.frames: list[CanFrame] = []
         self._counters = WireCounters()
         self._replies = Assembler(self._counters)

@@ -1,6 +1,7 @@
 """Checks and their execution: one attempt after the other until this machine was in time."""
 
 from collections.abc import Callable, Iterable, Sequence
+from inspect import isawaitable
 
 from drivers import clock
 from drivers.conformance.client import Client
@@ -99,7 +100,8 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Exceptio
         subject = await identified(client, level)
         if check.drives:
             await subject.rest()
-        await check.run(subject)
+        rows = check.run(subject)
+        await (rows if isawaitable(rows) else subject.run(rows))
         if client.heard:
             what = "messages that were not asked for"
             raise Violation(what, expected="none", seen=client.heard[0])

@@ -7,8 +7,8 @@ and what was not asked for is kept, so that checks see it.
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Protocol
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 from drivers import clock
 from drivers.conformance.findings import Violation, expect, expect_equal
@@ -49,13 +49,18 @@ class Heard:
 class Answer:
     """What became of a request: code of a refusal, empty where it was carried out; its words.
 
-    channel: that a refusal names; when: between sending and the reply [s].
+    channel: that a refusal names; when: between sending and the reply [s]; values: of the words.
     """
 
     code: str
     channel: int | None
     words: tuple[int, ...]
     when: When
+    values: Values = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a value."""
+        return self.values[name]
 
 
 class Client(ABC):
@@ -69,15 +74,15 @@ class Client(ABC):
 
     kind: ClassVar[str]
     """Kind of wire: serial, rtu, tcp or can."""
-    broadcasts: ClassVar[bool] = True
-    """Whether one request can be for all."""
     has_events: ClassVar[bool] = True
     """Whether the wire carries messages that were not asked for."""
     addresses: ClassVar[int] = 247
     """The highest address."""
 
-    def __init__(self, port: Port, address: int) -> None:
-        self.port = port
+    port: Port
+    """Of its line; given once it is open."""
+
+    def __init__(self, address: int) -> None:
         self.address = address
         self.heard: list[Heard] = []
         self.events: list[Heard] = []
@@ -107,6 +112,10 @@ class Client(ABC):
     @abstractmethod
     def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
         """Yield what is wrong, and frames that must have no effect and no reply, made in turn."""
+
+    def lost(self, cause: str) -> None:
+        """Note why the line was lost."""
+        self.loss = cause
 
     async def expect_silence(self, data: bytes, what: str) -> None:
         """Send bytes, to which nothing must be heard."""

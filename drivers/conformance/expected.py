@@ -8,11 +8,11 @@ import math
 from collections.abc import Mapping, Sequence
 
 from drivers.conformance.client import When
-from drivers.conformance.findings import expect, expect_equal
+from drivers.conformance.findings import expect, expect_equal, expect_one_of, expect_within
 from drivers.playback import Playback, playback_of
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import FAULTS, QUANTITIES, STATES, STATUS_FLAGS
+from drivers.protocol.table import FAULTS, MESSAGES, QUANTITIES, STATES, STATUS_FLAGS
 from drivers.protocol.tokens import token_after
 
 SLACK = 0.002  # s; of times in milliseconds
@@ -22,6 +22,7 @@ OFF, ENABLED, STOPPED = "SWITCH_ON_DISABLED", "OPERATION_ENABLED", "QUICK_STOP_A
 _FALLING = {"SWITCHED_ON": OFF, "FAULT_REACTION_ACTIVE": "FAULT"}
 """States that last until all is silent, with those that follow."""
 _TRIP, FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until a trip, of a fault, until a state shows
+_LASTING = 3.0  # s; what ends after it is not awaited
 _LATE = 0.002  # s; by which a set may begin later
 _SHARES = ((0, 0), (0, 1), (1, 0), (0.5, 0.5))
 """Of the interval of a commit, for the sets of even and odd number of each playback."""
@@ -34,14 +35,14 @@ _FULL = QUANTITIES["level"].per_unit
 class Expected:
     """An amplifier since a status at rest; times [s] are intervals of this machine's clock.
 
-    fed: when the watchdog was fed last. staged: token of the set that waits for its commit.
-    is_exact: whether its levels show how tones of one frequency interfere. sets: by their tokens.
+    fed: when the watchdog was fed last. sets: by their tokens. is_exact: whether its levels show
+    how tones of one frequency interfere.
     """
 
     def __init__(self, can: Values, rest: Values, when: When) -> None:
         self.can, self.latch, self.token = can, rest["latch"], rest["token"]
         self.state, self.fault = OFF, FAULTS["NONE"]
-        self.session = self.staged = 0
+        self.session = 0
         self.sets: dict[int, tuple[LayerSet, ...]] = {}
         self.is_exact = False
         self.watchdog = 0.0
@@ -59,15 +60,15 @@ class Expected:
     def carried_out(self, name: str, values: Values, when: When) -> None:
         """Note a request that was carried out within an interval."""
         ramp = min(values.get("ramp", 0), self.can["ramp_max"]) / 1000
-        if name in ("Arm", "Set", "Commit", "Silence", "Ping") and self.state == ENABLED:
+        if MESSAGES[name].feeds and self.state == ENABLED:
             self.fed = when
         if name == "Arm":
             self.watchdog, self.fed = values["watchdog"] / 1000, when
             if self.state != ENABLED or values["session"] != self.session:
-                self.session, self.token, self.sets = values["session"], 0, {}
+                self.session, self.token = values["session"], 0
                 self._fall_silent(ENABLED, when, FADE, has_floor=False)
         elif name == "Commit":
-            self._commit(values["token"], when)
+            self.commit(values["token"], when)
         elif name == "Silence":
             self._fall_silent(ENABLED, when, ramp)
         elif name == "Stop":
@@ -88,23 +89,22 @@ class Expected:
             expect_equal((shown["token"], shown["played"]), (token, 1), "token, played of a repeat")
             return
         if token != self._incoming:
-            self._incoming, self._received, self.staged = token, set(), 0
+            self._incoming, self._received = token, set()
         self._received.add(values["index"])
         missing = [each for each in range(values["parts"]) if each not in self._received]
         seen = tuple(shown[each] for each in ("token", "staged", "played", "missing"))
         required = token, not missing and not is_now, not missing and is_now, (*missing, 0)[0]
         what = f"token, staged, played, missing after part {values['index']} of a set"
         expect_equal(seen, required, what)
-        if not missing:
-            self.staged = token
-            if is_now:
-                self._commit(token, when)
+        if not missing and is_now:
+            self.commit(token, when)
 
     def forget_parts(self) -> None:
         """Note that what was staged, or not complete, has been discarded."""
-        self.staged = self._incoming = 0
+        self._incoming = 0
 
-    def _commit(self, token: int, when: When) -> None:
+    def commit(self, token: int, when: When) -> None:
+        """Note that a set was played within an interval, unless it is the one that plays."""
         if token == self.token:
             return
         layers = self.sets[token]
@@ -145,9 +145,7 @@ class Expected:
         if self.state == ENABLED:
             low = self.watchdog - (when.latest - self.fed.earliest) - SLACK
             high = max(self.watchdog - (when.earliest - self.fed.latest) + SLACK, 0.0)
-        limits = f"{low:.3f} to {high:.3f} s"
-        what = f"watchdog_left after {self.cause}"
-        expect(low <= left <= high, what, expected=limits, seen=left)
+        expect_within(left, low, high, f"watchdog_left after {self.cause}")
         self._expect_played(shown, when)
 
     def _expect_state(self, state: str, shown: Values, when: When) -> None:
@@ -159,11 +157,15 @@ class Expected:
         if (before := falling.get(max(known))) and self.state != OFF and not is_silent:
             known = {before, *known} if when.latest > self.silent.earliest - SLACK else {before}
         what = f"state {when.earliest - self.began.latest:.3f} s after {self.cause}"
-        expect(state in known, what, expected=" or ".join(sorted(known)), seen=state)
+        expect_one_of(state, known, what)
         if self.state == "SWITCHED_ON":
             self.state = state
         is_on = flag(shown, "high_voltage")
         must_be = self.state in (ENABLED, "SWITCHED_ON")
+        is_open = flag(shown, "interlock_open")
+        expect(
+            not (must_be and is_open), "interlock of one that is on", expected="closed", seen="open"
+        )
         what = f"high_voltage in {state} after {self.cause}"
         expect(is_on == must_be or not (must_be or is_silent), what, expected=must_be, seen=is_on)
 
@@ -188,12 +190,10 @@ class Expected:
         where = f"{after[0]:.1f} to {after[1]:.1f} ms after {self.cause}"
         for channel, (low, high) in enumerate(bounds):
             level, low = shown["levels"][channel] / _FULL, low * self._has_floor
-            is_met = low - self.tolerance <= level <= high + self.tolerance
-            limits = f"{low:.4f} to {high:.4f}"
-            expect(is_met, f"level of channel {channel}, {where}", expected=limits, seen=level)
+            slack, what = self.tolerance, f"level of channel {channel}, {where}"
+            expect_within(level, low - slack, high + slack, what)
         for number, known in enumerate(tokens):
-            seen = shown["tokens"][number]
-            expect(seen in known, f"token of layer {number}, {where}", expected=known, seen=seen)
+            expect_one_of(shown["tokens"][number], known, f"token of layer {number}, {where}")
 
     def _played(self, when: When) -> tuple[list[tuple[float, float]], list[set[int]]]:
         """Return least and largest level of each channel, and possible tokens of each layer."""
@@ -219,9 +219,9 @@ class Expected:
         return [(min(1.0, *each), min(1.0, max(each))) for each in levels], tokens
 
     def settled_at(self, now: float) -> float:
-        """Return when all that plays lasts or is silent [s], as far as is known."""
-        playback = self._playbacks[0].copied()
-        while (due := playback.next_due) < math.inf:
+        """Return when all that plays lasts for long or is silent [s], as far as is known."""
+        playback, last = self._playbacks[0].copied(), now + _LASTING
+        while (due := playback.next_due) < last:
             playback.advance(due)
             now = due
         ends = [voice.transition.end for voices in playback.all_voices for voice in voices]

@@ -28,8 +28,8 @@ class Material:
         self.other = next(each for each in both if each <= self.highest)
 
     def has(self, feature: str) -> bool:
-        """Whether it states a feature."""
-        return has_feature(self.can, feature)
+        """Whether it states a feature; empty: what all have."""
+        return not feature or has_feature(self.can, feature)
 
     def tone(
         self,
@@ -47,9 +47,33 @@ class Material:
         numbers = round(fraction * self.level * FULL), QUANTITIES["phase"].to_wire(phase)
         return Command(channel, frequency or self.frequency, *numbers, keep, skip, onset, ending)
 
-    def one(self, *commands: Command, ramp: int = 0, valid_for: int = 0) -> LayerSet:
+    def one(
+        self, *commands: Command, level: float = 1.0, ramp: int = 0, valid_for: int = 0
+    ) -> LayerSet:
         """Make what layer 0 is to play, by default the usual tone on channel 0."""
-        return layer(0, *(commands or [self.tone()]), ramp=ramp, valid_for=valid_for)
+        tones = commands or [self.tone(0, level)]
+        return layer(0, *tones, ramp=ramp, valid_for=valid_for)
+
+    def whole(self) -> LayerSet:
+        """Make the usual tone on all channels."""
+        return layer(0, *map(self.tone, self.channels))
+
+    def transitions(self, ramp: int) -> list[list[LayerSet]]:
+        """Make layers that play one after the other, the last of which changes what plays."""
+        slow = self.envelope(0.1, 1, 1, 1)
+        begins, ends = self.one(self.tone(onset=slow)), self.one(self.tone(ending=slow))
+        other = self.tone(frequency=self.other)
+        return [
+            [self.one(ramp=ramp)],
+            [self.one(), layer(0, ramp=ramp)],
+            [self.one(), layer(0, other, ramp=ramp)],
+            [self.one(valid_for=60_000)],
+            [begins],
+            [ends],
+            [ends, layer(0)],
+            [begins, layer(0, other, after=True)],
+            [layer(number, self.tone(0, 0.2)) for number in self.layers],
+        ]
 
     def envelope(self, step: float, *amplitudes: complex) -> Envelope:
         """Make an envelope of knots in fractions of the test level, or the nearest step [s]."""
@@ -61,6 +85,15 @@ class Material:
             for each, phase in zip(amplitudes, phases, strict=True)
         ]
         return Envelope(steps, tuple(knots))
+
+    def beside(self, number: int, fraction: float) -> Command:
+        """Make a tone on channel 0 that does not interfere with those of other layers."""
+        return self.tone(0, fraction, frequency=self.apart(number))
+
+    def near(self, number: int) -> int:
+        """Return one of many frequencies, all alike where there is no room."""
+        room = max(self.highest - self.frequency, 0)
+        return int(self.frequency + min(10 * number, room))
 
     def apart(self, number: int) -> int:
         """Return a frequency of a layer of its own, so that layers do not interfere."""

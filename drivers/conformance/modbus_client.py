@@ -12,7 +12,6 @@ from drivers.conformance.client import (
     Answer,
     Client,
     Heard,
-    Port,
     When,
     altered,
     expect_reply,
@@ -28,6 +27,7 @@ WRITE, READ_HOLDING, READ = 16, 3, 4
 PRESENT = tuple(MESSAGES[name].number for name in ("GetCaps", "GetStatus", "GetFaults"))
 EXCEPTION = 0x80
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol, length, unit
+_LEAST = 5  # bytes of a frame
 _EXCEPTIONS = {1: "UNKNOWN_TYPE", 2: "UNKNOWN_TYPE", 3: "BAD_LENGTH"}
 
 
@@ -44,52 +44,35 @@ class ModbusClient(Client):
 
     has_events = False
 
-    def __init__(self, port: Port, address: int, *, is_rtu: bool, number: int = 0) -> None:
-        super().__init__(port, address)
+    def __init__(self, address: int, *, is_rtu: bool) -> None:
+        super().__init__(address)
+        self.kind = "rtu" if is_rtu else "tcp"  # type: ignore[misc]
         self.is_rtu = is_rtu
-        self.number = number
+        self.number = 0
         self._buffer = b""
-
-    @property
-    def kind(self) -> str:  # type: ignore[override]
-        """Kind of wire."""
-        return "rtu" if self.is_rtu else "tcp"
-
-    @property
-    def broadcasts(self) -> bool:  # type: ignore[override]
-        """Whether one request can be for all: not over TCP."""
-        return self.is_rtu
 
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""
         self._buffer += data
-        while (found := self._next_rtu() if self.is_rtu else self._next_tcp()) is not None:
-            transaction, unit, pdu = found
+        while len(self._buffer) >= (size := self._size()):
+            frame, self._buffer = self._buffer[:size], self._buffer[size:]
+            transaction, unit, pdu = 0, frame[0], frame[1:-2]
+            if self.is_rtu:
+                check, seen = crc16(frame[:-2]).hex(), frame[-2:].hex()
+                expect(check == seen, "CRC of a response", expected=check, seen=seen)
+            else:
+                transaction, _, _, unit = _HEADER.unpack_from(frame)
+                pdu = frame[_HEADER.size :]
             self.take(Response(clock.now(), transaction, pdu[0], (), unit, pdu))
 
-    def _next_tcp(self) -> tuple[int, int, bytes] | None:
-        if len(self._buffer) < _HEADER.size:
-            return None
-        transaction, _, length, unit = _HEADER.unpack_from(self._buffer)
-        end = _HEADER.size - 1 + length
-        if len(self._buffer) < end:
-            return None
-        pdu, self._buffer = self._buffer[_HEADER.size : end], self._buffer[end:]
-        return transaction, unit, pdu
-
-    def _next_rtu(self) -> tuple[int, int, bytes] | None:
-        if len(self._buffer) < 5:
-            return None
-        unit, function, count = self._buffer[:3]
-        size = 5 if function & EXCEPTION else 5 + count if function in (3, 4) else 8
-        if len(self._buffer) < size:
-            return None
-        frame, self._buffer = self._buffer[:size], self._buffer[size:]
-        is_good = crc16(frame[:-2]) == frame[-2:]
-        expect(
-            is_good, "CRC of a response", expected=crc16(frame[:-2]).hex(), seen=frame[-2:].hex()
-        )
-        return 0, unit, frame[1:-2]
+    def _size(self) -> int:
+        """Return how long the frame is that the buffer begins with, at least."""
+        if len(self._buffer) < _LEAST:
+            return _LEAST
+        if not self.is_rtu:
+            return 6 + int.from_bytes(self._buffer[4:6], "big")
+        _, function, count = self._buffer[:3]
+        return 5 if function & EXCEPTION else 5 + count if function in (READ, READ_HOLDING) else 8
 
     def adu(self, pdu: bytes, *, unit: int | None = None) -> bytes:
         """Return a PDU in a frame under the next transaction number."""

@@ -3,11 +3,11 @@
 import asyncio
 import struct
 from collections.abc import Iterator
+from functools import partial
 from typing import cast
 
 from drivers.conformance.check import driving, reading
 from drivers.conformance.findings import expect, expect_equal
-from drivers.conformance.material import layer
 from drivers.conformance.modbus_client import (
     BOX,
     EXCEPTION,
@@ -77,18 +77,15 @@ async def areas(subject: Subject) -> None:
 async def present_areas(subject: Subject) -> None:
     """It shows the status of the moment at every read, and other replies as they were."""
     client = _client(subject)
-    await subject.arm()
-    await subject.play(subject.one())
-    await subject.ping()
+    await subject.run([subject.arm, subject.one(), subject.ping])
     kept = await client.read(BOX * _PING + REPLY, _AREA)
-    await subject.play(layer(0, subject.tone(0, 0.5)))
-    await subject.request("GetStatus")
+    await subject.run([subject.one(level=0.5), partial(subject.request, "GetStatus")])
     again = await client.read(BOX * _PING + REPLY, _AREA)
     expect_equal(again, kept, "reply to a Ping, read again after a set")
     if client.is_rtu:
         data = client.adu(client.write_of(_PING, [subject.session], tag=4242), unit=0)
         await client.expect_silence(data, "a Ping for all")
-        subject.starve()
+        await subject.starve()
         await client.send(client.adu(client.write_of(_STOP, [0], tag=4242), unit=0))
         (tag,) = await client.read(BOX * _STOP + REPLY, 1)
         expect(tag != 4242, "tag after a Stop for all", expected="as before", seen=tag)
@@ -136,8 +133,7 @@ async def exceptions(subject: Subject) -> None:
         # On RTU the length of a frame follows from its function: of others it ends with a pause.
         if client.is_rtu and pdu[0] not in known and len(pdu) != 5:
             continue
-        await subject.ping()
-        await asyncio.sleep(0.02)
+        await subject.run([subject.ping, 0.02])
         response, _ = await client.transact(pdu)
         shown = response.pdu[0], response.pdu[1:]
         expect_equal(shown, (pdu[0] | EXCEPTION, bytes([code])), f"response to {what}")

@@ -6,34 +6,20 @@ from contextlib import asynccontextmanager
 from functools import partial
 
 from drivers.conformance.can_client import CanClient
-from drivers.conformance.client import Client, Port
+from drivers.conformance.client import Client
 from drivers.conformance.modbus_client import ModbusClient
 from drivers.conformance.serial_client import SerialClient
 from drivers.errors import LinkError
 from drivers.protocol.table import MAX_WORDS
 from drivers.wires.known import address_of
 
-CLIENTS: Mapping[str, Callable[[Port, int], Client]] = {
+CLIENTS: Mapping[str, Callable[[int], Client]] = {
     "serial": SerialClient,
     "CAN": CanClient,
     "Modbus RTU": partial(ModbusClient, is_rtu=True),
     "Modbus TCP": partial(ModbusClient, is_rtu=False),
 }
 """Clients by the protocol that a wire's settings name."""
-
-
-class _Behind:
-    """What a port hands over, once there is a client."""
-
-    client: Client | None = None
-
-    def received(self, data: bytes) -> None:
-        if self.client is not None:
-            self.client.received(data)
-
-    def lost(self, cause: str) -> None:
-        if self.client is not None:
-            self.client.loss = cause
 
 
 @asynccontextmanager
@@ -46,10 +32,9 @@ async def opened(url: str) -> AsyncIterator[Client]:
     protocol = str(address.settings["protocol"])
     if protocol not in CLIENTS:
         raise LinkError(f"{url}: wire must be {', '.join(CLIENTS)}, got {protocol}")
-    behind = _Behind()
-    port = await address.open_port(behind.received, behind.lost)
+    client = CLIENTS[protocol](address.number)
+    port = client.port = await address.open_port(client.received, client.lost)
     try:
-        client = behind.client = CLIENTS[protocol](port, address.number)
         client.session = random.getrandbits(16)
         client.transit = address.make_wire().exchange_time(0, MAX_WORDS)
         yield client

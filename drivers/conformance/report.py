@@ -5,9 +5,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, TypeAlias
 
+from drivers.conformance.rows import Rows
 from drivers.conformance.subject import Subject
 
-Steps: TypeAlias = Callable[[Subject], Awaitable[None]]
+Steps: TypeAlias = Callable[[Subject], Awaitable[None] | Rows]
+"""What a check does, or the rows that are carried out."""
 
 
 @dataclass(frozen=True, slots=True)

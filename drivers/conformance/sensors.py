@@ -1,12 +1,22 @@
 """Checks of what is measured: voltages and currents of channels, and tones at sensors."""
 
 import asyncio
+import math
 
 from drivers.conformance.check import driving, reading
+from drivers.conformance.client import Answer
 from drivers.conformance.expected import SLACK
-from drivers.conformance.findings import Optional, Violation, expect, expect_equal
+from drivers.conformance.findings import (
+    Optional,
+    Violation,
+    expect,
+    expect_equal,
+    expect_one_of,
+    expect_within,
+)
 from drivers.conformance.material import layer
-from drivers.conformance.subject import Reply, Subject
+from drivers.conformance.rows import send
+from drivers.conformance.subject import Subject
 from drivers.protocol.records import Record, Refusal, Values
 from drivers.protocol.table import NO_CHANNEL, QUANTITIES, READING_STATES, sensor_reading
 
@@ -17,6 +27,7 @@ _LOW = 1  # steps of frequency: less than a period of the window
 _STEADY = 1.5  # s; until a plate moves steadily
 _ERROR, _LEAK, _ANGLE = 0.1, 0.1, 1000  # of an amplitude, of another tone; hundredths of degrees
 _POLL = 0.002  # s
+_LEAST = 1e-30  # of a range
 _RUNNING = READING_STATES["RUNNING"]
 
 
@@ -37,8 +48,8 @@ async def measured(subject: Subject) -> None:
         await subject.play(layer(0, subject.tone(channel)))
         await asyncio.sleep(0.05)
         playing = (await voltages())[channel]
-        limit, what = f"above {silent[channel]}", f"voltage of channel {channel} that plays"
-        expect(playing > silent[channel], what, expected=limit, seen=playing)
+        what = f"voltage of channel {channel} that plays"
+        expect_within(playing, silent[channel] + 1, math.inf, what)
 
 
 async def _described(subject: Subject, first: int = 0) -> list[Values]:
@@ -60,9 +71,9 @@ async def sensors(subject: Subject) -> None:
     found = await _described(subject)
     expect_equal(await _described(subject, 1), found[1:], "sensors from the second on, read again")
     for number, one in enumerate(found):
-        is_own = one["channel"] in (*subject.channels, NO_CHANNEL)
-        expect(is_own, f"channel of sensor {number}", expected="its own or none", seen=one)
-        expect(one["range"] > 0, f"range of sensor {number}", expected="above 0", seen=one["range"])
+        own = *subject.channels, NO_CHANNEL
+        expect_one_of(one["channel"], own, f"channel of sensor {number}")
+        expect_within(one["range"], _LEAST, math.inf, f"range of sensor {number}")
         expect(found.count(one) == 1, f"sensor {number}", expected="unlike others", seen=one)
 
 
@@ -71,7 +82,7 @@ def _request(number: int, *frequencies: int) -> Values:
     return {"reading": number, "window": _WINDOW, **tones}
 
 
-async def _start(subject: Subject, request: Values) -> Reply:
+async def _start(subject: Subject, request: Values) -> Answer:
     """Begin a reading, which says of which set and when."""
     await subject.ping()
     began = await subject.request("Measure", **request)
@@ -81,12 +92,11 @@ async def _start(subject: Subject, request: Values) -> Reply:
     start = QUANTITIES["window_start"].from_wire(began["window_start"])
     low = began.when.earliest - subject.shown.began.latest - 2 * SLACK
     high = began.when.latest - subject.shown.began.earliest + SLACK
-    what, limits = "window_start since the commit", f"{low:.4f} to {high:.4f} s"
-    expect(low <= start <= high, what, expected=limits, seen=start)
+    expect_within(start, low, high, "window_start since the commit")
     return began
 
 
-async def _complete(subject: Subject, began: Reply, state: str = "COMPLETE") -> list[Values]:
+async def _complete(subject: Subject, began: Answer, state: str = "COMPLETE") -> list[Values]:
     """Await the end of a reading at its time; return the values of every sensor."""
     window, is_running = _WINDOW / 1000, True
     while is_running:
@@ -95,9 +105,10 @@ async def _complete(subject: Subject, began: Reply, state: str = "COMPLETE") -> 
         left, is_running = shown["window_left"] / 1000, shown["state"] == _RUNNING
         low = max(window - (shown.when.latest - began.when.earliest) - SLACK, 0.0)
         high = max(window - (shown.when.earliest - began.when.latest) + SLACK, 0.0)
-        limits = f"{low:.4f} to {high:.4f} s"
-        is_met = low <= left <= high and (high > 0 or not is_running)
-        expect(is_met, "window_left", expected=limits, seen=left)
+        expect_within(left, low, high, "window_left")
+        expect(
+            high > 0 or not is_running, "state after the window", expected="over", seen="running"
+        )
     seen = shown["reading"], shown["state"]
     required = began["reading"], READING_STATES[state]
     expect_equal(seen, required, "number, state of a reading that is over")
@@ -136,19 +147,15 @@ async def readings(subject: Subject) -> None:
     loud = tones[0][0]["amplitude"]
     expected = [*(loud,) * 4, *(loud / 2,) * 2]
     for shown, required in zip(tones, expected, strict=True):
-        error, limit = abs(shown[0]["amplitude"] - required), _ERROR * required
-        what = f"amplitude of sensor {loudest}"
-        expect(error <= limit, what, expected=f"{required:g} within {limit:g}", seen=shown[0])
+        low, high = (1 - _ERROR) * required, (1 + _ERROR) * required
+        expect_within(shown[0]["amplitude"], low, high, f"amplitude of sensor {loudest}")
         for other in shown[1:]:
-            seen = other["amplitude"]
-            limit = f"at most {_LEAK * loud:g}"
-            expect(seen <= _LEAK * loud, "amplitude of a silent tone", expected=limit, seen=seen)
+            expect_within(other["amplitude"], 0, _LEAK * loud, "amplitude of a silent tone")
     for first, second in zip(tones[::2], tones[1::2], strict=True):
         apart = abs(first[0]["phase"] - second[0]["phase"])
-        is_same = min(apart, 36_000 - apart) <= _ANGLE
-        expect(is_same, "phase, read again", expected=first[0]["phase"], seen=second[0]["phase"])
+        expect_within(min(apart, 36_000 - apart), 0, _ANGLE, "phase against that read before")
     began = await _start(subject, _request(21, tone))
     await subject.play(full)
     for frequencies in ([_LOW], [tone, tone], [tone, tone + 1]):
-        await subject.refused("BAD_VALUE", "Measure", **_request(22, *frequencies))
+        await subject.send(send("Measure", **_request(22, *frequencies), code="BAD_VALUE"))
     await _complete(subject, began, "DISTURBED")

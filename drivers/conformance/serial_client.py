@@ -7,7 +7,7 @@ from cobs import cobs
 
 from drivers import clock
 from drivers.codec.serial_line.frame import NEUTRAL, REPLY, Frame, FrameReader, encode_frame
-from drivers.conformance.client import Answer, Client, Heard, Port, When, altered, expect_reply
+from drivers.conformance.client import Answer, Client, Heard, When, altered, expect_reply
 from drivers.conformance.findings import Violation, expect_equal
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.serial_payload import HELLO, pack_words, unpack_identity, unpack_words
@@ -22,9 +22,9 @@ class SerialClient(Client):
 
     kind = "serial"
 
-    def __init__(self, port: Port, address: int, *, sequence: int = 0) -> None:
-        super().__init__(port, address)
-        self.sequence = sequence
+    def __init__(self, address: int) -> None:
+        super().__init__(address)
+        self.sequence = 0
         self.invalid = 0
         self._reader = FrameReader(on_invalid=self._count)
         self._frames: dict[tuple[int, int], Frame] = {}

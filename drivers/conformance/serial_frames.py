@@ -1,6 +1,7 @@
 """Checks of frames on any wire, and of those on a serial line."""
 
 import asyncio
+from functools import partial
 from typing import cast
 
 from drivers import clock
@@ -22,34 +23,27 @@ async def damaged_frames(subject: Subject) -> None:
     """It takes no damaged frame, nor one for others: it neither plays, replies nor is fed."""
     await subject.arm()
     await subject.play(subject.one())
-    (part,) = subject.parts(layer(0, subject.tone(0, 0.5)))
-    for number, words in (
-        (_PING, [subject.session]),
-        (_SET, MESSAGES["Set"].request.pack(part)),
-    ):
-        for what, data in subject.client.damaged(number, words):
+    _, words = subject.words_of(layer(0, subject.tone(0, 0.5)))
+    for number, sent in ((_PING, [subject.session]), (_SET, words)):
+        for what, data in subject.client.damaged(number, sent):
             await subject.client.expect_silence(data, f"message {number} with {what}")
-            await subject.request("GetStatus")
-            await subject.ping()
+            await subject.run([partial(subject.request, "GetStatus"), subject.ping])
 
 
 @driving(_PLACE)
 async def doubled_frames(subject: Subject) -> None:
     """It carries a frame that comes twice, or late, out as one of its token, or not at all."""
     await subject.arm()
-    frames = []
-    for fraction in (0.5, 1.0):
-        (part,) = subject.parts(layer(0, subject.tone(0, fraction), valid_for=500))
-        frames.append((part, subject.client.request(_SET, MESSAGES["Set"].request.pack(part))))
-    for part, data in frames:
-        sent = clock.now()
+    sets = [layer(0, subject.tone(0, each), valid_for=500) for each in (0.5, 1.0)]
+    made = [subject.words_of(each) for each in sets]
+    frames = [subject.client.request(_SET, words) for _, words in made]
+    for (token, _), data in zip(made, frames, strict=True):
+        began = clock.now()
         await subject.client.send(data)
-        taken = {"token": part["token"], "staged": 0, "played": 1, "missing": 0}
-        subject.shown.taken(part, taken, When(sent, clock.now()))
+        subject.shown.commit(token, When(began, clock.now()))
     for at, pause in ((0, 0.0), (1, 0.5), (1, 0.0)):
-        await subject.client.send(frames[at][1])
-        await subject.ping()
-        await asyncio.sleep(pause)
+        await subject.client.send(frames[at])
+        await subject.run([subject.ping, pause])
 
 
 @driving("serial.md#receiving", "serial")

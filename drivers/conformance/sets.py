@@ -5,10 +5,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from drivers.conformance.check import driving
-from drivers.conformance.findings import Optional, expect, expect_equal
+from drivers.conformance.client import Answer
+from drivers.conformance.findings import Optional, expect_equal, expect_within
 from drivers.conformance.material import FULL, layer
-from drivers.conformance.subject import Reply, Subject
-from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers
+from drivers.conformance.rows import Rows, Send, play, send, stage
+from drivers.conformance.subject import Subject
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, Envelope, pack_layers
 from drivers.protocol.table import QUANTITIES
 
 _PLACE = "protocol.md#sets"
@@ -18,25 +21,24 @@ _TONE = "frequency", "level", "phase"
 
 
 @driving(_PLACE)
-async def every_channel(subject: Subject) -> None:
+def every_channel(subject: Subject) -> Rows:
     """It plays every channel at its own level, and silences those that a set does not name."""
-    await subject.arm()
     tones = [subject.tone(channel, 1 - 0.05 * channel) for channel in subject.channels]
     reverse = [replace(tones[-1 - at], channel=at) for at in reversed(subject.channels)]
-    but_one = max(len(tones) - 1, 1)
-    for one in (*([each] for each in tones), tones, reverse, reverse[:but_one], []):
-        await subject.play(layer(0, *one))
-        await subject.status()
+    but_one = reverse[: max(len(tones) - 1, 1)]
+    alone = [layer(0, tone) for tone in tones]
+    return [subject.arm, *alone, *(layer(0, *each) for each in (tones, reverse, but_one, []))]
 
 
 @driving(_PLACE)
-async def levels_of_every_frequency(subject: Subject) -> None:
+def levels_of_every_frequency(subject: Subject) -> Rows:
     """It plays the level that was asked for at its lowest and its highest frequency."""
-    await subject.arm()
-    for number, limits in enumerate(subject.can["limits"]):
-        for end in ("frequency_min", "frequency_max"):
-            await subject.play(layer(0, subject.tone(number, frequency=limits[end])))
-            await subject.status()
+    ends = [
+        (number, limits[end])
+        for number, limits in enumerate(subject.can["limits"])
+        for end in ("frequency_min", "frequency_max")
+    ]
+    return [subject.arm, *(layer(0, subject.tone(at, frequency=each)) for at, each in ends)]
 
 
 @driving("protocol.md#messages")
@@ -61,7 +63,7 @@ async def achieved(subject: Subject) -> None:
         await _expect_achieved(subject, number, is_exact=False)
 
 
-async def _expect_achieved(subject: Subject, number: int, *, is_exact: bool) -> Reply:
+async def _expect_achieved(subject: Subject, number: int, *, is_exact: bool) -> Answer:
     """Require that a layer plays its set, of a token of its own number, within half a step."""
     shown = await subject.request("GetAchieved", layer=number)
     (one,) = subject.shown.sets[number + 1]
@@ -77,8 +79,8 @@ async def _expect_achieved(subject: Subject, number: int, *, is_exact: bool) -> 
             half = 0 if is_exact else subject.can[f"{name}_step"] / 2
             error = abs(seen - requested)
             error = min(error, 36_000 - error) if name == "phase" else error
-            what = f"achieved {name} of channel {tone.channel} in layer {number}"
-            expect(error <= half, what, expected=f"{requested} within {half:g}", seen=seen)
+            what = f"error of achieved {name} of channel {tone.channel} in layer {number}"
+            expect_within(error, 0, half, what)
     return shown
 
 
@@ -96,125 +98,119 @@ async def steps_as_stated(subject: Subject) -> None:
             await subject.play(layer(0, replace(base, **{name: start + number * step // _SCANNED})))
             shown = await subject.request("GetAchieved", layer=0)
             found.add(shown["commands"][0][name])
-        what = f"values achieved of {_SCANNED} within a step of {name}"
-        expect(len(found) <= 2, what, expected="at most two", seen=found)
+        what = f"number of values achieved of {_SCANNED} within a step of {name}"
+        expect_within(len(found), 1, 2, what)
 
 
 class _Flawed(NamedTuple):
-    """A set that must be refused; channel: that the refusal names, or one of these."""
+    """Words of a set that must be refused; channels: one of which the refusal names."""
 
-    what: str
     words: list[int]
     code: str = "BAD_VALUE"
     channels: tuple[int | None, ...] = (None,)
 
+    def sent(self, *, token: int, now: int) -> Send:
+        """Send it as a set of one part."""
+        part: Values = {"token": token, "index": 0, "parts": 1, "now": now, "stream": self.words}
+        return send("Set", **part, code=self.code, channels=self.channels)
 
-def _bad_tones(subject: Subject) -> Iterator[tuple[str, Command]]:
+
+def _flawed_tones(subject: Subject) -> Iterator[Command]:
     """Yield commands beyond the limits of their channel, or the envelopes that there can be."""
     low, high = subject.can["envelope_step_min"], subject.can["envelope_step_max"]
+    count, knot = subject.can["knots"], (100, 0)
+    shapes = [Envelope(step, (knot,)) for step in {low - 1, high + 1} - {0, 1001}]
+    shapes += [Envelope(low, (knot,) * (count + 1))] if count < 32 else []
+    yield from (subject.tone(onset=shape) for shape in shapes)
     for number, limits in enumerate(subject.can["limits"]):
         own, loud = subject.tone(number), limits["level_max"] + 1
-        for end, beyond in (("frequency_min", -1), ("frequency_max", 1)):
-            frequency = limits[end] + beyond
+        for frequency in (limits["frequency_min"] - 1, limits["frequency_max"] + 1):
             if 0 <= frequency <= 0xFFFF:
-                yield f"{frequency} steps of frequency", replace(own, frequency=frequency)
+                yield replace(own, frequency=frequency)
         if loud <= FULL:
             above = Envelope(low, ((loud, 0),))
-            yield f"level {loud}", replace(own, level=loud)
-            yield f"a knot of level {loud}", replace(own, onset=above)
-            yield f"an ending with a knot of level {loud}", replace(own, ending=above)
-    for step in {low - 1, high + 1} - {0, 1001}:
-        shape = Envelope(step, ((100, 0),))
-        yield f"a step of {step}", subject.tone(onset=shape)
-    if (count := subject.can["knots"]) < 32:
-        many = Envelope(low, ((100, 0),) * (count + 1))
-        yield "a knot too many", subject.tone(onset=many)
+            yield from (
+                replace(own, level=loud),
+                replace(own, onset=above),
+                replace(own, ending=above),
+            )
 
 
-def _bad_sets(subject: Subject) -> Iterator[_Flawed]:
+def _flawed_sets(subject: Subject) -> Iterator[_Flawed]:
     """Yield sets that must be refused: beside a good layer, and as words that no set can have."""
     tone, good = subject.tone(), layer(1, subject.tone(0, 0.5))
     channels, layers, ramp = len(subject.channels), len(subject.layers), subject.can["ramp_max"]
-    for what, one in _bad_tones(subject):
-        yield _Flawed(what, pack_layers([good, layer(0, one)]), channels=(one.channel,))
-    twice = pack_layers([good, layer(0, tone, tone)])
-    yield _Flawed("a channel twice", twice, "BAD_CHANNEL", (0,))
+    for one in _flawed_tones(subject):
+        yield _Flawed(pack_layers([good, layer(0, one)]), channels=(one.channel,))
+    yield _Flawed(pack_layers([good, layer(0, tone, tone)]), "BAD_CHANNEL", (0,))
     if channels < 16:
         beyond = pack_layers([good, layer(0, replace(tone, channel=channels))])
-        yield _Flawed("a channel too many", beyond, "BAD_CHANNEL", (channels,))
-    flawed = [
-        ("a layer twice", layer(1, tone)),
-        ("renew with commands", layer(0, tone, renew=True)),
-        ("after without commands", layer(0, after=True)),
-        *([("a layer too many", layer(layers, tone))] if layers < 16 else []),
-        *([("a longer ramp", layer(0, tone, ramp=ramp + 1))] if ramp < 1000 else []),
-    ]
-    for what, layer_set in flawed:
-        yield _Flawed(what, pack_layers([good, layer_set]))
-    words = pack_layers([layer(0, tone)])
-    for at, word, names_channel in (
-        (0, words[0] | 1 << 15, False),
-        (1, QUANTITIES["ramp"].maximum + 1, False),
-        (2, QUANTITIES["valid_for"].maximum + 1, False),
-        (3, words[3] | 1 << 12, True),
-        (5, _LEVEL + 1, True),
-        (6, _PHASE.maximum + 1, True),
-        (6, 0x10000 + _PHASE.minimum - 1, True),
+        yield _Flawed(beyond, "BAD_CHANNEL", (channels,))
+    for layer_set in (
+        *(layer(1, tone), layer(0, tone, renew=True), layer(0, after=True)),
+        *([layer(layers, tone)] if layers < 16 else []),
+        *([layer(0, tone, ramp=ramp + 1)] if ramp < 1000 else []),
     ):
-        channels_named = (None, 0) if names_channel else (None,)
-        beyond = [*words[:at], word, *words[at + 1 :]]
-        yield _Flawed(f"{word:#x} as its word {at}", beyond, channels=channels_named)
-    yield _Flawed("its last word missing", words[:-1], "BAD_LENGTH")
-    yield _Flawed("a word too many", [*words, 0], "BAD_LENGTH")
-    yield _Flawed("a command missing", [words[0] + 1, *words[1:]], "BAD_LENGTH")
+        yield _Flawed(pack_layers([good, layer_set]))
+    words = pack_layers([layer(0, tone)])
+    for at, word, named in (
+        (0, words[0] | 1 << 15, (None,)),
+        (1, QUANTITIES["ramp"].maximum + 1, (None,)),
+        (2, QUANTITIES["valid_for"].maximum + 1, (None,)),
+        (3, words[3] | 1 << 12, (None, 0)),
+        (5, _LEVEL + 1, (None, 0)),
+        (6, _PHASE.maximum + 1, (None, 0)),
+        (6, 0x10000 + _PHASE.minimum - 1, (None, 0)),
+    ):
+        yield _Flawed([*words[:at], word, *words[at + 1 :]], channels=named)
+    for wrong in (words[:-1], [*words, 0], [words[0] + 1, *words[1:]]):
+        yield _Flawed(wrong, "BAD_LENGTH")
 
 
-@driving("protocol.md#sets")
-async def all_or_nothing(subject: Subject) -> None:
+@driving(_PLACE)
+def all_or_nothing(subject: Subject) -> Rows:
     """It refuses a set as a whole, says why and names the channel; what plays and waits stays."""
-    await subject.arm()
-    await subject.play(subject.one())
-    session = subject.session
-    for token, flawed in enumerate(_bad_sets(subject), 2):
-        for now in (1, 0):
-            answer = await subject.answer("Set", session, token, 1 << 1 | now, *flawed.words)
-            seen, what = answer.code or "carried out", f"refusal of a set with {flawed.what}"
-            expect_equal(seen, flawed.code, what)
-            is_named = answer.channel in flawed.channels
-            what = f"channel of the {what}"
-            expect(is_named, what, expected=flawed.channels, seen=answer.channel)
-        await subject.status()
-        await subject.refused("BAD_TOKEN", "Commit", session=session, token=token)
-    subject.token = token
-    await subject.play(layer(0, subject.tone(0, 0.5)))
-    staged = await subject.stage(layer(0, subject.tone(0, 0.25)))
-    for older in (staged - 2, 0):
-        words = [session, older, 1 << 1, *pack_layers([layer(0)])]
-        await subject.refused("BAD_TOKEN", "Set", *words, what=f"a set of token {older}")
-    await subject.commit(staged)
+    flawed = [
+        row
+        for token, each in enumerate(_flawed_sets(subject), 2)
+        for row in (
+            each.sent(token=token, now=1),
+            each.sent(token=token, now=0),
+            send("Commit", token=token, code="BAD_TOKEN"),
+        )
+    ]
+    last, silent = len(flawed) // 3 + 2, _Flawed(pack_layers([layer(0)]), "BAD_TOKEN")
+    return [
+        subject.arm,
+        subject.one(),
+        *flawed,
+        play(subject.one(level=0.5), token=last),
+        stage(subject.one(level=0.25)),
+        silent.sent(token=last - 1, now=1),
+        send("Set", raw=[subject.session, 0, 1 << 1, *silent.words], code="BAD_TOKEN"),
+        send("Commit", token=last + 1),
+    ]
 
 
 @driving("protocol.md#messages")
-async def accepts_its_ranges(subject: Subject) -> None:
+def accepts_its_ranges(subject: Subject) -> Rows:
     """It takes what is just within its ranges, and any frequency of a silent channel."""
-    await subject.arm()
     can, quiet = subject.can, round(subject.level * FULL)
-    sets: list[LayerSet] = [
-        layer(
-            0,
-            Command(number, limits[end], limits["level_max"], _PHASE.minimum),
-            ramp=can["ramp_max"],
-            valid_for=QUANTITIES["valid_for"].maximum,
-        )
+    shapes = [
+        Envelope(can[f"envelope_step_{end}"], ((quiet, _PHASE.maximum),) * count)
+        for end in ("min", "max")
+        for count in {0, 1, can["knots"]}
+    ]
+    loud = [
+        Command(number, limits[end], limits["level_max"], _PHASE.minimum)
         for number, limits in enumerate(can["limits"])
         for end in ("frequency_min", "frequency_max")
     ]
-    for step in (can["envelope_step_min"], can["envelope_step_max"]):
-        for count in {0, 1, can["knots"]}:
-            shape = Envelope(step, ((quiet, _PHASE.maximum),) * count)
-            sets.append(subject.one(subject.tone(onset=shape, ending=shape)))
-    for one in (*sets, layer(len(subject.layers) - 1, subject.tone(), ramp=can["ramp_max"])):
-        await subject.stage(one)
-    for frequency in (0, 0xFFFF):
-        await subject.play(layer(0, Command(0, frequency, 0, 0)))
-    await subject.status()
+    ramp, lasting = can["ramp_max"], QUANTITIES["valid_for"].maximum
+    return [
+        subject.arm,
+        *(stage(subject.one(each, ramp=ramp, valid_for=lasting)) for each in loud),
+        *(stage(subject.one(subject.tone(onset=each, ending=each))) for each in shapes),
+        stage(layer(len(subject.layers) - 1, subject.tone(), ramp=ramp)),
+        *(layer(0, Command(0, frequency, 0, 0)) for frequency in (0, 0xFFFF)),
+    ]

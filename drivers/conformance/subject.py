@@ -3,14 +3,23 @@
 import asyncio
 import math
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from drivers import clock
-from drivers.conformance.client import Answer, Client, When
+from drivers.conformance.client import Answer, Client
 from drivers.conformance.expected import ENABLED, NAMES, OFF, Expected
-from drivers.conformance.findings import Late, Optional, Violation, expect, expect_equal
+from drivers.conformance.findings import (
+    Late,
+    Optional,
+    Violation,
+    expect,
+    expect_equal,
+    expect_one_of,
+)
 from drivers.conformance.material import Material, layer
+from drivers.conformance.rows import Rows, Send, play, send
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import LayerSet, pack_layers, parts
 from drivers.protocol.table import MESSAGES, STATES
@@ -23,21 +32,11 @@ _SAMPLES, _EACH = 12, 0.02  # of a transition; s for which one must be in time
 _NARROW = 0.006  # s; of the uncertainty of a sample, beyond two exchanges
 _SETTLED = 1.2  # s; the longest ramp, and what a state may take
 _MAX_WATCHDOG_USE = 0.8
-_POLL = 0.0005  # s
+_DONE = "carried out"
+_POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
+_BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
 _MOVING = STATES["SWITCHED_ON"], STATES["FAULT_REACTION_ACTIVE"]
 _STATUSES = [name for name, each in MESSAGES.items() if "levels" in each.reply.names]
-
-
-@dataclass(frozen=True, slots=True)
-class Reply:
-    """Values of a reply, and when the request was carried out."""
-
-    values: Values
-    when: When
-
-    def __getitem__(self, name: str) -> Any:
-        """Return a value."""
-        return self.values[name]
 
 
 class Subject(Material):
@@ -49,7 +48,7 @@ class Subject(Material):
     def __init__(self, client: Client, identity: Values, can: Values, level: float) -> None:
         super().__init__(can, level)
         self.client, self.identity = client, identity
-        self.session = self.token = 0
+        self.session, self.token = 1, 0
         self.expected: Expected | None = None
         self.is_starving = True
         self.exchange_time = math.inf
@@ -68,75 +67,92 @@ class Subject(Material):
 
     # Requests
 
-    async def answer(self, name: str, *words: int, **values: object) -> Answer:
-        """Send a request by its words or values and return what became of it."""
+    async def run(self, rows: Rows) -> None:
+        """Carry rows out in turn; after each, the status must show what is expected."""
+        for row in rows:
+            if isinstance(row, float):
+                await self.pause(row)
+            elif isinstance(row, LayerSet | Send):
+                await self.send(row if isinstance(row, Send) else play(row))
+            elif isinstance(row, Sequence):
+                await self.in_time(partial(self.run, [self.arm, *row, self.follow]))
+            else:
+                await row()
+            await self.status()
+
+    async def send(self, row: Send) -> Answer:
+        """Send a request, whose answer must be one of its codes."""
+        several = [row.values]
+        if row.layers:
+            token, now = row.values.get("token", 0), row.values["now"]
+            parts = self.parts(*row.layers, token=token, now=now)
+            several = [{**each, **row.values} for each in parts]
+        for values in several:
+            answer = await self.answer(row.name, row.raw, **values)
+            if answer.code:
+                break
+            answer = self._carried_out(row.name, {"session": self.session, **values}, answer)
+        what = f"{row.name} {row.raw or _brief(values)}"
+        codes = [each or _DONE for each in row.codes]
+        expect_one_of(answer.code or _DONE, codes, f"answer to {what}")
+        is_named = self.client.kind not in ("rtu", "tcp") or answer.code not in _BY_EXCEPTION
+        if answer.code and is_named:
+            expect_one_of(answer.channel, row.channels, f"channel of the refusal of {what}")
+        return answer
+
+    async def answer(self, name: str, raw: Sequence[int] | None = None, **values: Any) -> Answer:
+        """Send a request by its values, or raw words, and return what became of it."""
         self._check_fed()
-        sent = MESSAGES[name].request.pack(values) if values else words
-        answer = await self.client.exchange(MESSAGES[name].number, sent)
+        message, values = MESSAGES[name], {"session": self.session, **values}
+        if raw is None:
+            try:
+                raw = message.request.pack(values)
+            except ValueError:  # beyond the table
+                raw = [values[each] for each in message.request.names]
+        answer = await self.client.exchange(message.number, raw)
         self._check_fed()  # or it may have been carried out after the watchdog
         took = answer.when.latest - answer.when.earliest
         self.exchange_time = min(self.exchange_time, took)
         self.heard_at = answer.when.latest
         return answer
 
-    async def request(self, name: str, **values: object) -> Reply:
+    async def request(self, name: str, **values: Any) -> Answer:
         """Send a request that must be carried out; its reply must show what is expected."""
-        answer = await self.answer(name, **values)
-        if answer.code:
-            where = "" if answer.channel is None else f" of channel {answer.channel}"
-            raise Violation(
-                f"{name} {_brief(values)}", expected="carried out", seen=answer.code + where
-            )
-        reply = Reply(self._read(name, answer.words), answer.when)
-        if self.expected is None:
-            return reply
-        if name == "Set":
-            self.expected.taken(values, reply.values, reply.when)
-        self.expected.carried_out(name, values, reply.when)
-        self.is_starving = self.is_starving or name in ("Stop", "Disarm")
-        if name in _STATUSES:
-            self.expected.check(reply.values, reply.when)
-        return reply
+        return await self.send(send(name, **values))
 
-    def _read(self, name: str, words: Sequence[int]) -> Values:
+    def _carried_out(self, name: str, values: Values, answer: Answer) -> Answer:
+        """Read the reply to a request, and compare it with what must be shown."""
         try:
-            values = MESSAGES[name].reply.unpack(words, is_strict=False)
+            shown = MESSAGES[name].reply.unpack(answer.words, is_strict=False)
         except Refusal as error:
             raise Violation(f"reply to {name}", expected="as in the table", seen=error) from None
-        if "levels" in values:
-            seen = values["channels"], values["layers"]
-            required = len(self.channels), len(self.layers)
+        if "levels" in shown:
+            seen, required = (
+                (shown["channels"], shown["layers"]),
+                (len(self.channels), len(self.layers)),
+            )
             expect_equal(seen, required, "number of levels and tokens in Status")
-        return values
+        if self.expected is not None:
+            if name == "Set":
+                self.expected.taken(values, shown, answer.when)
+                self.token = values["token"]
+            self.expected.carried_out(name, values, answer.when)
+            self.is_starving = self.is_starving or name in ("Stop", "Disarm")
+            if "levels" in shown:
+                self.expected.check(shown, answer.when)
+        return replace(answer, values=shown)
 
-    async def refused(
-        self,
-        code: str,
-        name: str,
-        *words: int,
-        what: str = "",
-        channel: int | None = None,
-        **values: object,
-    ) -> None:
-        """Require that a request is refused with a code, which names a channel or none."""
-        answer = await self.answer(name, *words, **values)
-        what = what or f"{name} {words or _brief(values)}"
-        expect_equal(answer.code or "carried out", code, f"refusal of {what}")
-        is_exception = self.client.kind in ("rtu", "tcp") and code in ("UNKNOWN_TYPE", "BAD_LENGTH")
-        if not is_exception:
-            expect_equal(answer.channel, channel, f"channel of the refusal of {what}")
-
-    async def status(self) -> Reply:
+    async def status(self) -> Answer:
         """Read the status; feeds the watchdog where that is due."""
         if self._is_hungry:
             return await self.ping()
         return await self.request("GetStatus")
 
-    async def ping(self) -> Reply:
+    async def ping(self) -> Answer:
         """Feed the watchdog."""
-        return await self.request("Ping", session=self.session)
+        return await self.request("Ping")
 
-    async def arm(self, watchdog: float = 2.0) -> Reply:
+    async def arm(self, watchdog: float = 2.0) -> Answer:
         """Arm under a new session with a watchdog [s], or the nearest that is possible."""
         self.session = self.client.session = self.client.session % 0xFFFF + 1
         low, high = self.can["watchdog_min"], self.can["watchdog_max"]
@@ -144,14 +160,9 @@ class Subject(Material):
         milliseconds = min(max(round(1000 * watchdog), low), high)
         return await self.request("Arm", session=self.session, watchdog=milliseconds)
 
-    async def clear(self) -> Reply:
+    async def clear(self) -> Answer:
         """Acknowledge the last stop or fault."""
         return await self.request("Clear", latch=self.shown.latch)
-
-    @property
-    def other_session(self) -> int:
-        """A session that is not the one that is held."""
-        return (self.session + 0x54) % 0xFFFF + 1
 
     def _check_fed(self) -> None:
         """Raise Late where this machine may have starved the watchdog."""
@@ -169,7 +180,7 @@ class Subject(Material):
     def _is_hungry(self) -> bool:
         return self._since_fed > 0.25
 
-    def starve(self) -> None:
+    async def starve(self) -> None:
         """From now on the watchdog may expire."""
         self.is_starving = True
 
@@ -188,28 +199,26 @@ class Subject(Material):
         expect_equal(NAMES.get(status["state"]), OFF, "state after Clear")
         self.expected = Expected(self.can, status.values, status.when)
 
-    # Sets
+    def parts(self, *layers: LayerSet, token: int = 0, now: int = 1) -> list[Values]:
+        """Make the parts of a set but for their session; token: 0 for the next."""
+        if not token:
+            token = self.token = self.token % 0xFFFF + 1
+        self.shown.sets[token] = layers
+        made = parts(pack_layers(layers), session=1, token=token, now=bool(now))
+        return [{name: each[name] for name in each if name != "session"} for each in made]
 
-    def parts(self, *layers: LayerSet, token: int | None = None, now: bool = True) -> list[Values]:
-        """Make the parts of a set; token: None for the next."""
-        self.token = self.token % 0xFFFF + 1 if token is None else token
-        if self.expected is not None:
-            self.expected.sets.setdefault(self.token, layers)
-        return [*parts(pack_layers(layers), session=self.session, token=self.token, now=now)]
+    def words_of(self, *layers: LayerSet) -> tuple[int, list[int]]:
+        """Return the token and the words of a set of one part that plays at once."""
+        (part,) = self.parts(*layers)
+        return self.token, MESSAGES["Set"].request.pack({"session": self.session, **part})
 
-    async def play(self, *layers: LayerSet, token: int | None = None) -> Reply:
+    async def play(self, *layers: LayerSet) -> Answer:
         """Play a set at once."""
-        return [await self.request("Set", **each) for each in self.parts(*layers, token=token)][-1]
+        return await self.send(play(*layers))
 
-    async def stage(self, *layers: LayerSet, token: int | None = None) -> int:
-        """Stage a set; returns its token."""
-        for part in self.parts(*layers, token=token, now=False):
-            await self.request("Set", **part)
-        return self.token
-
-    async def commit(self, token: int) -> Reply:
-        """Commit a staged set."""
-        return await self.request("Commit", session=self.session, token=token)
+    async def forget_parts(self) -> None:
+        """From now on what was staged, or not complete, is no more."""
+        self.shown.forget_parts()
 
     # In time
 
@@ -229,8 +238,10 @@ class Subject(Material):
             is_fed = self.is_starving or self.shown.state != ENABLED
             await asyncio.sleep(left if is_fed else min(left, self.shown.watchdog / 8))
         self.heard_at = end
+        if clock.now() > end + _OVERSLEPT:
+            raise Late("a pause took too long")
 
-    async def settle(self, pause: float = _POLL) -> Reply:
+    async def settle(self, pause: float = _POLL) -> Answer:
         """Read statuses until it is silent and in a state that lasts."""
         due = clock.now() + self.shown.watchdog + _SETTLED
         while True:
@@ -247,7 +258,7 @@ class Subject(Material):
         Raises Late where this machine was too slow to see what happens.
         """
         began = self.shown.began
-        end = self.shown.settled_at(clock.now()) + 0.01
+        end = self.shown.settled_at(clock.now()) + _SETTLING
         end = end if duration is None else began.earliest + duration
         time, seen = end - self.heard_at, 0
         pause = max(time / (2 * _SAMPLES) - min(self.exchange_time, 1.0), 0.0)
@@ -271,20 +282,6 @@ class Subject(Material):
             except Late:
                 if attempt == MAX_ATTEMPTS:
                     raise
-
-    async def course(self, *steps: LayerSet | float) -> None:
-        """Play sets and pause [s] from silence on, and follow the last set until all is settled."""
-
-        async def case() -> None:
-            await self.arm()
-            for step in steps:
-                if isinstance(step, LayerSet):
-                    await self.play(step)
-                else:
-                    await self.pause(step)
-            await self.follow()
-
-        await self.in_time(case)
 
     async def require_interference(self) -> None:
         """Raise Optional where levels do not show that tones of one frequency cancel."""

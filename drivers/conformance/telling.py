@@ -8,7 +8,9 @@ from drivers.conformance.client import Client, When
 from drivers.conformance.expected import NAMES
 from drivers.conformance.findings import Optional, Violation, expect_equal
 from drivers.conformance.material import layer
+from drivers.conformance.rows import send, stage
 from drivers.conformance.subject import Subject
+from drivers.protocol.records import Values
 from drivers.protocol.table import EVENT, EVENT_RECORD, MESSAGES, NO_CHANNEL
 
 _MOMENTARY = ("READY_TO_SWITCH_ON", "SWITCHED_ON", "FAULT_REACTION_ACTIVE")  # may last no time
@@ -24,21 +26,17 @@ async def events(subject: Subject) -> None:
         raise Optional("this wire carries no Events")
     client.events.clear()
     client.order.clear()
-    await subject.arm(subject.can["watchdog_min"] / 1000)
+    await subject.arm(0.0)
     types = [EVENT, MESSAGES["Arm"].number][not subject.has("events") :]
     seen = [each & _TYPE for each in client.order]
     expect_equal(seen, types, "types of the messages after Arm, the Event before the reply")
-    await subject.play(subject.one())
-    subject.starve()
-    await subject.settle()
-    await subject.clear()
-    await subject.arm()
-    await subject.play(subject.one())
-    await subject.request("Disarm", ramp=50)
-    await subject.settle()
-    await subject.request("Stop", ramp=0)
-    await subject.clear()
-    await asyncio.sleep(0.02)
+    await subject.run(
+        [
+            *(subject.one(), subject.starve, subject.settle, subject.clear),
+            *(subject.arm, subject.one(), send("Disarm", ramp=50), subject.settle),
+            *(send("Stop", ramp=0), subject.clear, 0.02),
+        ]
+    )
     second = subject.shown.latch
     first = second - 1
     required = [
@@ -62,33 +60,30 @@ async def events(subject: Subject) -> None:
 async def broadcasts(subject: Subject) -> None:
     """It obeys a Commit or Stop that is for all, without a reply, and no other broadcast."""
 
-    async def send(name: str, *, is_obeyed: bool = False, **values: object) -> None:
+    async def send_to_all(name: str, *, is_obeyed: bool = False, **values: object) -> None:
         message, sent = MESSAGES[name], clock.now()
-        data = subject.client.request(message.number, message.request.pack(values), to=0)
+        words = message.request.pack({"session": subject.session, **values})
+        data = subject.client.request(message.number, words, to=0)
         await subject.client.expect_silence(data, f"a {name} for all")
         if is_obeyed:
             subject.shown.carried_out(name, values, When(sent, clock.now()))
         await subject.request("GetStatus")
 
-    await send("Arm", session=9, watchdog=subject.can["watchdog_max"])
+    await send_to_all("Arm", watchdog=subject.can["watchdog_max"])
     await subject.arm(0.5)
-    session = subject.session
-    await subject.play(subject.one())
+    half = layer(0, subject.tone(0, 0.5))
     for name, values in (
-        ("Set", subject.parts(layer(0, subject.tone(0, 0.5)))[0]),
-        ("Silence", {"session": session, "ramp": 0}),
-        ("Ping", {"session": session}),
-        ("Disarm", {"ramp": 0}),
+        ("Set", subject.parts(half, token=2)[0]),
+        *(("Silence", {"ramp": 0}), ("Ping", {}), ("Disarm", {"ramp": 0})),
         ("Clear", {"latch": subject.shown.latch}),
-        ("Commit", {"session": subject.other_session, "token": subject.token}),
+        ("Commit", {"session": 77, "token": 2}),
     ):
-        await send(name, **values)
-        await subject.ping()
-    token = await subject.stage(layer(0, subject.tone(0, 0.5)))
-    await asyncio.sleep(0.1)
-    await send("Commit", is_obeyed=True, session=session, token=token)
-    subject.starve()
-    await send("Stop", is_obeyed=True, ramp=0)
+        await subject.run([subject.one(), subject.ping])
+        await send_to_all(name, **values)
+    await subject.run([stage(half), 0.1])
+    await send_to_all("Commit", is_obeyed=True, token=subject.token)
+    await subject.starve()
+    await send_to_all("Stop", is_obeyed=True, ramp=0)
 
 
 @driving("protocol.md#set-the-address")
@@ -99,17 +94,21 @@ async def addresses(subject: Subject) -> None:
     client, own = subject.client, subject.client.address
     serial = str(subject.identity["serial_number"])
     free = await _free(client, own)
-    for wrong in {serial + "x", serial[:-1], ""} - {serial}:
-        await subject.refused("BAD_VALUE", "SetAddress", address=free, serial_number=wrong)
-    _, *text = MESSAGES["SetAddress"].request.pack({"address": free, "serial_number": serial})
-    for address in (0, client.addresses + 1):
-        await subject.refused("BAD_VALUE", "SetAddress", address, *text)
-    await subject.arm()
-    await subject.refused("WRONG_STATE", "SetAddress", address=free, serial_number=serial)
-    await subject.request("Disarm", ramp=0)
-    await subject.settle()
+    right: Values = {"address": free, "serial_number": serial}
+    _, *text = MESSAGES["SetAddress"].request.pack(right)
+    others = {serial + "x", serial[:-1], ""} - {serial}
+    named: list[Values] = [{**right, "serial_number": other} for other in others]
+    beyond = [[address, *text] for address in (0, client.addresses + 1)]
+    await subject.run(
+        [
+            *(send("SetAddress", **each, code="BAD_VALUE") for each in named),
+            *(send("SetAddress", raw=each, code="BAD_VALUE") for each in beyond),
+            *(subject.arm, send("SetAddress", **right, code="WRONG_STATE")),
+            *(send("Disarm", ramp=0), subject.settle),
+        ]
+    )
     try:
-        await subject.request("SetAddress", address=free, serial_number=serial)
+        await subject.request("SetAddress", **right)
         await asyncio.sleep(_MOVED)
         expect_equal(await _is_at(client, own), False, "whether it replies at its old address")
         expect_equal(await _is_at(client, free), True, "whether it replies at its new address")

@@ -1,7 +1,7 @@
 """Whether an amplifier is the expected one, and its capabilities leave something to play."""
 
 from drivers.errors import LinkError
-from drivers.protocol.records import Values
+from drivers.protocol.records import Values, bits_of
 from drivers.protocol.serial_payload import speaks
 from drivers.protocol.table import VERSION, has_feature
 
@@ -15,7 +15,7 @@ def check_identity(identity: Values, name: str, serial_number: str | None) -> No
     serial_number: the expected one, None for any.
     """
     if not speaks(identity, VERSION):
-        spoken = [str(version) for version in range(16) if speaks(identity, version)]
+        spoken = map(str, bits_of(identity["versions"]))
         raise LinkError(
             f"amplifier {name} speaks protocol {', '.join(spoken) or 'none'}, needs {VERSION}; "
             "update it"

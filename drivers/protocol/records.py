@@ -23,6 +23,11 @@ _REAL_MAX = (2 - 2**-23) * 2.0**127  # of IEEE 754 binary32
 Values = dict[str, Any]
 
 
+def bits_of(word: int) -> list[int]:
+    """Return the numbers of the bits of a word that are set, as of versions and features."""
+    return [bit for bit in range(16) if word >> bit & 1]
+
+
 class Refusal(FrameError):
     """Words that no message can have; code: that of an amplifier's Nak, channel: at fault."""
 

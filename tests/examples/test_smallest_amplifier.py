@@ -80,7 +80,8 @@ class MovedLine:
         self._library.receive.argtypes = [ctypes.c_char_p, ctypes.c_int, ctypes.c_double]
         self._sent = ctypes.create_string_buffer(1 << 16)
         self._loop = asyncio.get_running_loop()
-        self.client = SerialClient(self, 1)
+        self.client = SerialClient(1)
+        self.client.port = self
         self._library.begin()
         self._turning = self._loop.create_task(self._turn())
 

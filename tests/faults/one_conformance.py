@@ -59,8 +59,8 @@ def test_firmware(name: str, firmware: Path) -> None:
 
     async def result() -> CheckResult:
         port = FirmwarePort("serial", firmware)
-        client = CLIENTS["serial"](port, 1)
-        port.take = client.received
+        client = CLIENTS["serial"](1)
+        client.port, port.take = port, client.received
         chosen = [each for each in of_kind("serial") if each[1].name == name]
         (found,) = await run_checks(chosen, client, level=LEVEL)
         return found

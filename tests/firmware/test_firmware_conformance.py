@@ -19,8 +19,8 @@ def test_firmware_passes_conformance(kind: str, replaying: Path) -> None:
 
     async def judged() -> list[CheckResult]:
         port = FirmwarePort(kind, replaying)
-        client = CLIENTS[kind](port, 1)
-        port.take = client.received
+        client = CLIENTS[kind](1)
+        client.port, port.take = port, client.received
         return [*await run_checks(of_kind(kind), client, level=LEVEL)]
 
     results = run_virtual(judged())

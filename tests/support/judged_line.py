@@ -7,7 +7,7 @@ from functools import partial
 from drivers.conformance import CHECKS, LEVEL, CheckResult, of_kind
 from drivers.conformance.can_client import CanClient
 from drivers.conformance.check import run_checks
-from drivers.conformance.client import Client, Port
+from drivers.conformance.client import Client
 from drivers.conformance.modbus_client import ModbusClient
 from drivers.conformance.serial_client import SerialClient
 from sim.amplifier.contract import Amplifier
@@ -19,7 +19,7 @@ from virtual_loop import run_virtual
 KINDS = ("serial", "rtu", "tcp", "can")
 DELAY = 0.0002  # s; of bytes on their way
 _TURN = 0.0005  # s; between looks at what is due
-CLIENTS: dict[str, Callable[[Port, int], Client]] = {
+CLIENTS: dict[str, Callable[[int], Client]] = {
     "serial": SerialClient,
     "can": CanClient,
     "rtu": partial(ModbusClient, is_rtu=True),
@@ -33,7 +33,8 @@ class JudgedLine:
 
     def __init__(self, kind: str, far: Amplifier) -> None:
         self._loop = asyncio.get_running_loop()
-        self.client = CLIENTS[kind](self, 1)
+        self.client = CLIENTS[kind](1)
+        self.client.port = self
         ends = {1: far}
         if kind == "can":
             self._end: SerialAmplifiers | ModbusAmplifiers | CanAmplifiers

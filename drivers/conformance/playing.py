@@ -134,10 +134,10 @@ def onsets(subject: Subject) -> Rows:
         subject.envelope(0.05, *fractions)
         for fractions in ([0.25, -0.5], [1, 0.25, 0.75], [0.5, -0.5, -0.5j], [])
     ]
-    begun = [[subject.one(subject.tone(0, 0.5, onset=shape))] for shape in shapes]
+    alone = [[subject.one(subject.tone(0, 0.5, onset=shape))] for shape in shapes]
     kept = subject.one(subject.tone(0, 0.5, onset=shapes[0], keep=True))
     rising = subject.one(ramp=subject.ramp), 0.4 * subject.ramp / 1000
-    return [*begun, (subject.one(), kept), (*rising, kept)]
+    return [*alone, (subject.one(), kept), (*rising, kept)]
 
 
 @driving(_PLACE)

@@ -187,7 +187,7 @@ def all_or_nothing(subject: Subject) -> Rows:
         play(subject.one(level=0.5), token=last),
         stage(subject.one(level=0.25)),
         silent.sent(token=last - 1, now=1),
-        send("Set", raw=[subject.session, 0, 1 << 1, *silent.words], code="BAD_TOKEN"),
+        send("Set", raw=[subject.next_session, 0, 1 << 1, *silent.words], code="BAD_TOKEN"),
         send("Commit", token=last + 1),
     ]
 

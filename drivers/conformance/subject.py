@@ -154,11 +154,16 @@ class Subject(Material):
 
     async def arm(self, watchdog: float = 2.0) -> Answer:
         """Arm under a new session with a watchdog [s], or the nearest that is possible."""
-        self.session = self.client.session = self.client.session % 0xFFFF + 1
+        self.session = self.client.session = self.next_session
         low, high = self.can["watchdog_min"], self.can["watchdog_max"]
         self.token, self.is_starving = 0, False
         milliseconds = min(max(round(1000 * watchdog), low), high)
         return await self.request("Arm", session=self.session, watchdog=milliseconds)
+
+    @property
+    def next_session(self) -> int:
+        """The session of the next Arm."""
+        return self.client.session % 0xFFFF + 1
 
     async def clear(self) -> Answer:
         """Acknowledge the last stop or fault."""

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
-from os import PathLike, fspath
+from os import PathLike
 
 from era_haptics.arguments import expect_rig
 from model.arguments import (
@@ -73,7 +73,8 @@ def design(
         expect_number(number, what=name, unit=unit)
     expect_at_least(lowest, MIN_RIGID_BODY_FREQUENCY, what="lowest")
     path = None if contacts is None else expect_path(contacts, what="contacts")
-    area, rule = area_of(fspath(where), rig.plate), contact_rule(path, rig.plate)
+    area = area_of(str(expect_path(where, what="where")), rig.plate)
+    rule = contact_rule(path, rig.plate)
     problem = DesignProblem(
         rig, count, area, rule, apart=float(apart), lowest=float(lowest), seed=seed
     )
@@ -81,7 +82,8 @@ def design(
     if layouts is None:
         found = search_layouts([problem], starts=starts, runner=runner)
     else:
-        given = supported_layouts(fspath(layouts), [problem])
+        text = str(expect_path(layouts, what="layouts"))
+        given = supported_layouts(text, [problem])
         found = rank_layouts(given, finalists=finalists, runner=runner)
     return tuple(map(_ranked, found.layouts))
 

@@ -28,9 +28,9 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "apart_hz": 30.0,
     },
     era.calibrate: {"rig": RIG, "measured": "measured.csv"},
-    era.study: {
-        "rig": RIG, "what": "count", "layouts": 9, "active": "1", "frequencies": [60],
-        "contacts": "contacts.yaml", "lowest": 20.0, "finalists": 1, "candidates": (7, 5),
+    era.design: {
+        "rig": RIG, "eras": 4, "layouts": "random:3", "where": "edge",
+        "contacts": "contacts.yaml", "apart": 0.03, "lowest": 20.0, "finalists": 1, "starts": 1,
         "seed": 0, "workers": 1,
     },
     era.SolvedPlate: {"rig": RIG, "seed": 1},

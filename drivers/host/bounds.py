@@ -6,7 +6,7 @@ largest where each transition is at one of its points.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -49,7 +49,7 @@ class Path:
 
 
 class ChannelBounds:
-    """What a channel may play once a set is committed, from a time on [s].
+    """What a channel may play once layers are committed, between two times [s].
 
     steady: sum of the largest magnitudes of voices that the set does not change; paths: of those
     that it changes or starts; rise: of the level, at the most [full levels/s].
@@ -57,51 +57,40 @@ class ChannelBounds:
 
     def __init__(
         self,
-        voices: Sequence[Voice],
+        playback: Playback,
         layers: Mapping[int, LayerSet],
-        waiting: Sequence[LayerSet],
         channel: int,
         time: float,
         *,
-        ramps: Mapping[int, float],
-        ending_soon: Collection[int],
+        until: float,
     ) -> None:
-        self._ramps = ramps
+        self._playback, self._time = playback, time
+        self._voices = playback.all_voices[channel]
         self.steady = 0.0
         self.paths: list[Path] = []
         self._rises: dict[float, list[tuple[float, float]]] = {}  # by frequency: rise, change
-        commands = {
-            number: next((each for each in one.commands if each.channel == channel), None)
-            for number, one in layers.items()
-        }
-        for one in waiting:
-            for waits in one.commands:
-                if waits.channel == channel and waits.is_driven:
-                    self._add_later(one, waits, voices, time)
         continued: set[int] = set()
-        for voice in voices:
-            is_kept = voice.layer not in layers or layers[voice.layer].after
-            if voice.has_ended or is_kept or voice.layer in ending_soon:
-                self.steady += max(voice.transition.peak(time), _peak(voice.ending))
-                self._note_change(voice, time)
-                if voice.layer in layers and not voice.has_ended:
-                    ramp = _RAMP.from_wire(layers[voice.layer].ramp)
-                    highest = voice.transition.peak(time)
-                    self._note(voice.frequency, (highest, 0j), ramp, is_cosine=True)
-                continue
-            one, command = layers[voice.layer], commands[voice.layer]
-            if command is not None and voice.is_continued_by(command):
+        for voice in self._voices:
+            one = layers.get(voice.layer)
+            command = None if one is None else _command_of(one, channel)
+            # A layer may have begun to end by itself when the set comes.
+            ends_soon = playback.end_of(voice.layer) <= until
+            if one is None or one.after or voice.has_ended or ends_soon:
+                self._keep(voice, one)
+            elif command is not None and voice.is_continued_by(command):
                 continued.add(voice.layer)
-                self._continue(voice, one, command, time)
+                self._lead(voice.frequency, _points(voice.transition, time), one, command)
             else:
-                self._fade(voice, one, command, time)
-        for number, command in commands.items():
-            if command is None or not command.is_driven or number in continued:
+                skips = command is not None and (command.is_driven or command.skip_ending)
+                self._fade(voice, one, None if skips else voice.ending)
+        for one in (*layers.values(), *playback.waiting):
+            command = _command_of(one, channel)
+            if command is None or not command.is_driven:
                 continue
-            if layers[number].after:
-                self._add_later(layers[number], command, voices, time)
-            else:
-                self._start(layers[number], command)
+            if one.after:
+                self._lead_later(one, command)
+            elif one.layer not in continued:
+                self._lead(command.frequency / _FREQUENCY.per_unit, (0j,), one, command)
 
     @property
     def rise(self) -> float:
@@ -119,85 +108,86 @@ class ChannelBounds:
         """Return the level between two times [s] after the commit, at the most."""
         return self.steady + sum([max(path.at(since), path.at(until)) for path in self.paths])
 
-    def _continue(self, voice: Voice, one: LayerSet, command: Command, time: float) -> None:
-        course = _course(command)
-        starts = _points(voice.transition, time)
-        farthest = max(starts, key=lambda start: abs(course[0] - start))
-        step, is_cosine = _way(one, command)
-        self.paths.append(_path(max(map(abs, starts)), one, command, step))
-        self._note(voice.frequency, (farthest, *course), step, is_cosine=is_cosine)
-        self._note_ending(voice.frequency, command, starts)
+    def _keep(self, voice: Voice, one: LayerSet | None) -> None:
+        """Add a voice that the set does not change, but for a layer that may let it fade later."""
+        transition, peak = voice.transition, voice.transition.peak(self._time)
+        self.steady += max(peak, _peak(voice.ending))
+        rise = change = 0.0
+        if transition.end > self._time:
+            change = transition.slope(self._time)
+            rise = 0.0 if transition.last == 0 and not transition.knots else change
+        if not voice.has_ended:
+            # A layer without `valid_for` ends by a set alone, which has a ramp of its own.
+            is_endless = self._playback.end_of(voice.layer) == math.inf
+            ramp = math.inf if is_endless else self._playback.ramp_of(voice.layer)
+            if voice.ending is None:
+                change = max(change, steepest((peak, 0j), ramp, is_cosine=True)[1])
+            for start in _points(transition, self._time):
+                ending = _steepest_of_ending(start, voice.ending)
+                rise, change = max(rise, ending[0]), max(change, ending[1])
+        # Also where it does not change: another voice of its frequency may cease to cancel it.
+        self._note(voice.frequency, rise, change)
+        if one is not None and not voice.has_ended:
+            fade = steepest((peak, 0j), _RAMP.from_wire(one.ramp), is_cosine=True)
+            self._note(voice.frequency, *fade)
 
-    def _fade(self, voice: Voice, one: LayerSet, command: Command | None, time: float) -> None:
-        starts = _points(voice.transition, time)
-        highest = max(starts, key=abs)
-        ending = voice.ending
-        skips = command is not None and (command.is_driven or command.skip_ending)
-        if ending is not None and not skips:
-            step, points = _STEP.from_wire(ending.step), (highest, *amplitudes_of(ending), 0j)
-            is_cosine = not ending.knots
-        else:
-            step, points, is_cosine = _RAMP.from_wire(one.ramp), (highest, 0j), True
-        self.paths.append(Path(step, tuple(map(abs, points)), is_cosine))
-        self._note(voice.frequency, points, step, is_cosine=is_cosine)
+    def _fade(self, voice: Voice, one: LayerSet, ending: Envelope | None) -> None:
+        """Add a voice that falls silent, along its ending or the ramp of the set."""
+        step = _RAMP.from_wire(one.ramp) if ending is None else _STEP.from_wire(ending.step)
+        points = (*amplitudes_of(ending), 0j)
+        is_cosine = len(points) == 1
+        starts = _points(voice.transition, self._time)
+        self._note(voice.frequency, *_steepest_from(starts, points, step, is_cosine=is_cosine))
+        magnitudes = (max(map(abs, starts)), *map(abs, points))
+        self.paths.append(Path(step, magnitudes, is_cosine))
 
-    def _start(self, one: LayerSet, command: Command) -> None:
-        frequency = _FREQUENCY.from_wire(command.frequency)
-        step, is_cosine = _way(one, command)
-        self.paths.append(_path(0.0, one, command, step))
-        self._note(frequency, (0j, *_course(command)), step, is_cosine=is_cosine)
-        self._note_ending(frequency, command, (0j,))
-
-    def _add_later(
-        self, one: LayerSet, command: Command, voices: Sequence[Voice], time: float
+    def _lead(
+        self, frequency: float, starts: Sequence[complex], one: LayerSet, command: Command
     ) -> None:
+        """Add a voice that a command leads from one of some amplitudes; its ending may follow."""
+        step, is_cosine = self._note_way(frequency, starts, one, command)
+        *others, last = map(abs, _course(command))
+        ending = _peak(command.ending)
+        magnitudes = (max(map(abs, starts)), *others, max(last, ending))
+        if one.valid_for and _VALID_FOR.from_wire(one.valid_for) < step * len(magnitudes[1:]):
+            magnitudes = tuple(max(each, ending) for each in magnitudes)  # it may begin amid
+        self.paths.append(Path(step, magnitudes, is_cosine))
+
+    def _lead_later(self, one: LayerSet, command: Command) -> None:
         """Add a command that starts at another time, with the largest that it may reach.
 
         It may continue a voice of its layer from wherever that is then, or let it fade.
         """
-        frequency, course = command.frequency / _FREQUENCY.per_unit, _course(command)
+        frequency = command.frequency / _FREQUENCY.per_unit
         starts = [0j]
-        for voice in voices:
+        for voice in self._voices:
             if voice.layer == one.layer and not voice.has_ended:
-                points = _points(voice.transition, time)
-                faded = (max(points, key=abs), 0j)
-                self._note(voice.frequency, faded, _RAMP.from_wire(one.ramp), is_cosine=True)
+                points = _points(voice.transition, self._time)
+                ramp = _RAMP.from_wire(one.ramp)
+                self._note(voice.frequency, *_steepest_from(points, (0j,), ramp, is_cosine=True))
                 starts += points if voice.frequency == frequency else ()
-        farthest = max(starts, key=lambda start: abs(course[0] - start))
-        step, is_cosine = _way(one, command)
-        self.steady += max(*map(abs, course), _peak(command.ending))
-        self._note(frequency, (farthest, *course), step, is_cosine=is_cosine)
-        self._note_ending(frequency, command, starts)
+        self._note_way(frequency, starts, one, command)
+        self.steady += max(*map(abs, _course(command)), _peak(command.ending))
 
-    def _note_ending(self, frequency: float, command: Command, starts: Sequence[complex]) -> None:
-        """Note the ending of a command, which may rise, from wherever its way is by then."""
-        if command.ending is None:
-            return
-        for start in (*starts, *_course(command)):
-            rise, change = _steepest_of_ending(start, command.ending)
-            before = self._rises[frequency].pop()
-            self._rises[frequency].append((max(before[0], rise), max(before[1], change)))
+    def _note_way(
+        self, frequency: float, starts: Sequence[complex], one: LayerSet, command: Command
+    ) -> tuple[float, bool]:
+        """Note how fast a command leads, and its ending from wherever it is by then.
 
-    def _note_change(self, voice: Voice, time: float) -> None:
-        """Note a voice that the set does not change."""
-        transition, rise, change = voice.transition, 0.0, 0.0
-        if transition.end > time:
-            change = transition.slope(time)
-            rise = 0.0 if transition.last == 0 and not transition.knots else change
-        if voice.ending is None and not voice.has_ended:
-            ends = (transition.peak(time), 0j), self._ramps[voice.layer]
-            change = max(change, steepest(*ends, is_cosine=True)[1])
-        if voice.ending is not None and not voice.has_ended:
-            for start in _points(transition, time):
-                ending = _steepest_of_ending(start, voice.ending)
-                rise, change = max(rise, ending[0]), max(change, ending[1])
-        # Also where it does not change: another voice of its frequency may cease to cancel it.
-        self._rises.setdefault(voice.frequency, []).append((rise, change))
+        Returns the step [s] of its onset or ramp, and whether it is a raised cosine.
+        """
+        course, onset = _course(command), command.onset
+        step = _RAMP.from_wire(one.ramp) if onset is None else _STEP.from_wire(onset.step)
+        is_cosine = len(course) == 1
+        rise, change = _steepest_from(starts, course, step, is_cosine=is_cosine)
+        for start in (*starts, *course):
+            ending = _steepest_of_ending(start, command.ending)
+            rise, change = max(rise, ending[0]), max(change, ending[1])
+        self._note(frequency, rise, change)
+        return step, is_cosine
 
-    def _note(
-        self, frequency: float, points: Sequence[complex], step: float, *, is_cosine: bool
-    ) -> None:
-        self._rises.setdefault(frequency, []).append(steepest(points, step, is_cosine=is_cosine))
+    def _note(self, frequency: float, rise: float, change: float) -> None:
+        self._rises.setdefault(frequency, []).append((rise, change))
 
 
 def worst(channels: Sequence[ChannelBounds]) -> tuple[list[float], float]:
@@ -259,26 +249,28 @@ def all_bounds(
 ) -> list[ChannelBounds]:
     """Return what each channel may play if layers are committed between two times [s]."""
     named = {one.layer: one for one in layers if not one.renew}
-    # They may have begun to end by themselves when the set comes.
-    ending_soon = [number for number in named if playback.end_of(number) <= until]
-    audible = {voice.layer for voices in playback.all_voices for voice in voices}
-    # A layer without `valid_for` ends by a set alone, which silences along a ramp of its own.
-    ramps = {
-        number: playback.ramp_of(number) if playback.end_of(number) < math.inf else math.inf
-        for number in audible
-    }
     return [
-        ChannelBounds(
-            *(voices, named, playback.waiting, channel, time),
-            ramps=ramps,
-            ending_soon=ending_soon,
-        )
-        for channel, voices in enumerate(playback.all_voices)
+        ChannelBounds(playback, named, channel, time, until=until)
+        for channel in range(playback.channels)
     ]
 
 
-def _steepest_of_ending(first: complex, ending: Envelope) -> tuple[float, float]:
-    points = (first, *amplitudes_of(ending), 0j)
+def _command_of(one: LayerSet, channel: int) -> Command | None:
+    return next((each for each in one.commands if each.channel == channel), None)
+
+
+def _steepest_from(
+    starts: Sequence[complex], points: Sequence[complex], step: float, *, is_cosine: bool
+) -> tuple[float, float]:
+    """Return the steepest rise and the fastest change from any of some amplitudes on."""
+    found = [steepest((start, *points), step, is_cosine=is_cosine) for start in starts]
+    return max(rise for rise, _ in found), max(change for _, change in found)
+
+
+def _steepest_of_ending(start: complex, ending: Envelope | None) -> tuple[float, float]:
+    if ending is None:
+        return 0.0, 0.0
+    points = (start, *amplitudes_of(ending), 0j)
     return steepest(points, _STEP.from_wire(ending.step), is_cosine=not ending.knots)
 
 
@@ -289,27 +281,6 @@ def _peak(envelope: Envelope | None) -> float:
 def _course(command: Command) -> tuple[complex, ...]:
     """Return the amplitudes through which a command leads, the last one lasting."""
     return (*amplitudes_of(command.onset), amplitude_of(command.level, command.phase))
-
-
-def _path(first: float, one: LayerSet, command: Command, step: float) -> Path:
-    """Return the magnitudes of a command from a first one on; the last covers its ending.
-
-    An ending that may begin amid the way is covered all along.
-    """
-    *others, last = map(abs, _course(command))
-    ending = _peak(command.ending)
-    path = Path(step, (first, *others, max(last, ending)), is_cosine=not others)
-    if one.valid_for and _VALID_FOR.from_wire(one.valid_for) < path.times[-1]:
-        magnitudes = tuple(max(each, ending) for each in path.magnitudes)
-        return Path(step, magnitudes, path.is_cosine)
-    return path
-
-
-def _way(one: LayerSet, command: Command) -> tuple[float, bool]:
-    """Return the step [s] of a command's onset or ramp, and whether it is a raised cosine."""
-    if command.onset is None:
-        return _RAMP.from_wire(one.ramp), True
-    return _STEP.from_wire(command.onset.step), not command.onset.knots
 
 
 def _points(transition: Transition, time: float) -> tuple[complex, ...]:

@@ -28,17 +28,15 @@ from drivers.host.wire import (
     read_nak,
     reply_words,
 )
-from drivers.protocol.records import Refusal, Values
-from drivers.protocol.serial_payload import BROADCAST
+from drivers.protocol.records import TEXT_MAX, Refusal, Values
+from drivers.protocol.serial_payload import BROADCAST, TEXTS
 from drivers.protocol.table import MESSAGES
 from drivers.statistics import WireCounters
 
 _BOX = 256  # registers of a message
 _REPLY = 128  # offset of its reply
 _REPLY_HEAD = 2  # registers: tag, result
-_TEXTS = ("vendor", "product", "serial_number", "firmware")
-_TEXT_SIZE = 32  # bytes
-_IDENTITY = Read(1065, 2 + len(_TEXTS) * _TEXT_SIZE // 2)
+_IDENTITY = Read(1065, 2 + len(TEXTS) * TEXT_MAX // 2)
 _WRITE_SIZE = 9  # bytes on RTU of a write, without its registers
 _FRAME_SIZE = 3  # bytes on RTU of a frame beside its PDU
 _ANSWERS_SIZE = 21  # bytes on RTU of the response to a write, of a read and its response
@@ -194,12 +192,7 @@ def _identity(registers: tuple[int, ...]) -> Values:
     """Read the identity: tag, versions, texts padded with zeros; raises Refusal."""
     raw = struct.pack(f">{len(registers)}H", *registers)
     identity: Values = {"versions": registers[1]}
-    for at, name in enumerate(_TEXTS):
-        text = raw[4 + at * _TEXT_SIZE :][:_TEXT_SIZE].rstrip(b"\0")
-        try:
-            identity[name] = text.decode("utf-8")
-        except UnicodeDecodeError:
-            raise Refusal(f"{name} must be UTF-8") from None
-        if not identity[name].isprintable():
-            raise Refusal(f"{name} must not have control characters")
+    for number, field in enumerate(TEXTS):
+        text = raw[4 + number * TEXT_MAX :][:TEXT_MAX].rstrip(b"\0")
+        field.read(text, len(text), identity)
     return identity

@@ -13,7 +13,8 @@ HELLO = 1
 """Its number."""
 BROADCAST = 0
 """The address of all amplifiers on a line."""
-_TEXTS = [field for field in IDENTITY.fields if isinstance(field, Text)]
+TEXTS = [field for field in IDENTITY.fields if isinstance(field, Text)]
+"""Of an identity, in their order."""
 
 
 def pack_words(words: Sequence[int]) -> bytes:
@@ -30,7 +31,7 @@ def unpack_words(payload: bytes) -> tuple[int, ...]:
 
 def pack_identity(identity: Values) -> bytes:
     """Return the payload of the reply; texts are cut at 32 bytes."""
-    texts = [field.encoded(identity) for field in _TEXTS]
+    texts = [field.encoded(identity) for field in TEXTS]
     return int(identity["versions"]).to_bytes(2, "little") + b"".join(
         bytes([len(text)]) + text for text in texts
     )
@@ -40,7 +41,7 @@ def unpack_identity(payload: bytes) -> Values:
     """Read the payload; what follows is ignored. Raises Refusal."""
     identity: Values = {"versions": int.from_bytes(payload[:2], "little")}
     at = 2
-    for field in _TEXTS:
+    for field in TEXTS:
         if at >= len(payload):
             raise Refusal(f"{field.name} must not be missing", "BAD_LENGTH")
         end = at + 1 + payload[at]

@@ -1,6 +1,9 @@
 """An armed group of amplifiers on lines of protocol 3 in virtual time."""
 
+import functools
+import inspect
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 from drivers.contents import Layer, Tone
 from drivers.host.group import Group
@@ -32,6 +35,30 @@ def with_group(
         await test(group, ends)
 
     run_virtual(run())
+
+
+def grouped(*lines: tuple[str, ...], wire: str = "") -> Callable[[Callable[..., Any]], Any]:
+    """Run a test with an armed group and the lines that it is on: `with_group` as a decorator.
+
+    wire: the kind of all lines, else the argument or fixture of that name.
+    """
+
+    def decorate(test: Callable[..., Any]) -> Callable[..., None]:
+        given = [*inspect.signature(test).parameters.values()][2:]
+        own = [each.name for each in given]
+        if not wire and "wire" not in own:
+            given.append(inspect.Parameter("wire", inspect.Parameter.KEYWORD_ONLY))
+
+        @functools.wraps(test)
+        def run(**arguments: Any) -> None:
+            passed = {name: arguments[name] for name in own}
+            kind = wire or arguments["wire"]
+            with_group(lambda group, ends: test(group, ends, **passed), kind, *lines)
+
+        run.__signature__ = inspect.Signature(given)  # type: ignore[attr-defined]
+        return run
+
+    return decorate
 
 
 def losing(*names: str, count: int = 1) -> Alter:

@@ -14,7 +14,7 @@ from drivers.host.can_wire import CanWire
 from drivers.host.group import Group
 from drivers.host.wire import Arrival, Broken, Event, Nak, OtherHost, Reply, Several
 from drivers.protocol.table import MESSAGES
-from virtual_loop import run_virtual
+from virtual_loop import in_virtual_time, run_virtual
 from words_line import MemoryLine
 
 NODE = 5
@@ -151,53 +151,23 @@ def test_random_frames_raise_nothing_and_are_no_reply(wire: CanWire) -> None:
     assert wire.received(ANSWERS["reply"][0]) == ANSWERS["reply"][1]
 
 
-def test_frames_in_any_order_and_doubled_play_the_same_set() -> None:
+@in_virtual_time
+async def test_frames_in_any_order_and_doubled_play_the_same_set() -> None:
     """Each message backwards, each frame twice, both ways; none is repeated for it."""
-
-    async def run() -> None:
-        end = MemoryLine("can", "a")
-        group = Group(end.hosts)
-        await group.open()
-        end.inward = end.outward = lambda name, data: [
-            (0.0002 + 1e-5 * at, pack_frames([frame] * 2))
-            for at, frame in enumerate(reversed(unpack_frames(data)))
-        ]
-        await group.arm()
-        tones = (Tone(0, 100.0, 0.5), Tone(1, 100.0, 0.5))
-        await group.apply({"a": [Layer(0, tones, 0.001)]})
-        await asyncio.sleep(0.002)
-        assert end.levels("a") == [0.5, 0.5]
-        assert (await group.stop())["a"].is_confirmed
-        assert end.retries == 0
-
-    run_virtual(run())
-
-
-def test_stop_over_damaged_frames_is_never_said_to_be_silent_while_it_plays() -> None:
-    """100 stops with lost, late and doubled frames: what is not confirmed ends when it is said."""
-    draw = random.Random(6)
-
-    def damaged(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        kept = [each for each in unpack_frames(data) if draw.random() > 0.1]
-        twice = draw.choices(kept, k=len(kept) // 5)
-        return [(draw.choice((0.0002, 0.001, 0.02)), pack_frames([each])) for each in kept + twice]
-
-    async def run() -> None:
-        confirmed = 0
-        for _ in range(100):
-            end = MemoryLine("can", "a")
-            group = Group(end.hosts)
-            await group.open()
-            await group.arm()
-            await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)]})
-            end.inward = end.outward = damaged
-            stopped = (await group.stop())["a"]
-            confirmed += stopped.is_confirmed
-            await asyncio.sleep(max(0.0, stopped.may_play_until - end.loop.time()))
-            assert end.levels("a") == [0.0, 0.0]
-        assert 0 < confirmed < 100
-
-    run_virtual(run())
+    end = MemoryLine("can", "a")
+    group = Group(end.hosts)
+    await group.open()
+    end.inward = end.outward = lambda name, data: [
+        (0.0002 + 1e-5 * at, pack_frames([frame] * 2))
+        for at, frame in enumerate(reversed(unpack_frames(data)))
+    ]
+    await group.arm()
+    tones = (Tone(0, 100.0, 0.5), Tone(1, 100.0, 0.5))
+    await group.apply({"a": [Layer(0, tones, 0.001)]})
+    await asyncio.sleep(0.002)
+    assert end.levels("a") == [0.5, 0.5]
+    assert (await group.stop())["a"].is_confirmed
+    assert end.retries == 0
 
 
 def beside_another_host(test: Callable[[Group, MemoryLine], Awaitable[None]]) -> None:
@@ -253,16 +223,13 @@ def test_another_host_beside_an_armed_one_ends_what_it_plays() -> None:
     beside_another_host(test)
 
 
-def test_another_host_is_heard_while_opening() -> None:
+@in_virtual_time
+async def test_another_host_is_heard_while_opening() -> None:
     """Its frames show it where its watchdog has not been seen to rise."""
-
-    async def run() -> None:
-        end = MemoryLine("can", "a")
-        far = end.far["a"]
-        far.handle("Arm", {"session": 5, "watchdog": 2000}, end.loop.time())
-        end.loop.call_later(0.1, heard, end)
-        with pytest.raises(LinkError):
-            await end.hosts["a"].open()
-        assert far.state == "OPERATION_ENABLED"
-
-    run_virtual(run())
+    end = MemoryLine("can", "a")
+    far = end.far["a"]
+    far.handle("Arm", {"session": 5, "watchdog": 2000}, end.loop.time())
+    end.loop.call_later(0.1, heard, end)
+    with pytest.raises(LinkError):
+        await end.hosts["a"].open()
+    assert far.state == "OPERATION_ENABLED"

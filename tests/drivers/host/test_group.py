@@ -4,12 +4,11 @@ What a person would feel is read from the simulated amplifiers themselves.
 """
 
 import asyncio
-import random
 from collections.abc import Awaitable, Callable, Sequence
 
 import pytest
 
-from armed_group import layer, losing, tone, with_group
+from armed_group import grouped, layer, losing, tone, with_group
 from drivers.contents import Shape, Tone
 from drivers.errors import CommandRefused, LinkDegraded, LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
@@ -18,7 +17,7 @@ from drivers.host.wire import Broken
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import STATES
-from virtual_loop import run_virtual
+from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine, unaltered
 
 
@@ -58,156 +57,131 @@ def test_layers_play_together_and_leave_each_other_alone(wire: str, lines: str) 
     with_group(test, wire, *LINES[lines])
 
 
-def test_refused_on_one_means_committed_on_none(wire: str) -> None:
+@grouped(("a",), ("b",))
+async def test_refused_on_one_means_committed_on_none(group: Group, ends: list[MemoryLine]) -> None:
     """The ledger of the second refuses a channel it does not have; the first plays on."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.apply({name: [layer(0, tone())] for name in "ab"})
-        with pytest.raises(CommandRefused) as raised:
-            await group.apply({"a": [layer(0, tone(level=0.9))], "b": [layer(0, tone(2))]})
-        assert (raised.value.channel, group.is_armed) == (2, True)
-        await asyncio.sleep(0.002)
-        assert [ends[0].levels("a"), ends[1].levels("b")] == [[0.5, 0.0]] * 2
-        await group.apply({name: [layer(0, tone(level=0.3))] for name in "ab"})
-
-    with_group(test, wire, ("a",), ("b",))
+    await group.apply({name: [layer(0, tone())] for name in "ab"})
+    with pytest.raises(CommandRefused) as raised:
+        await group.apply({"a": [layer(0, tone(level=0.9))], "b": [layer(0, tone(2))]})
+    assert (raised.value.channel, group.is_armed) == (2, True)
+    await asyncio.sleep(0.002)
+    assert [ends[0].levels("a"), ends[1].levels("b")] == [[0.5, 0.0]] * 2
+    await group.apply({name: [layer(0, tone(level=0.3))] for name in "ab"})
 
 
-def test_set_of_many_parts_arrives_whole(wire: str) -> None:
+@grouped(("a",))
+async def test_set_of_many_parts_arrives_whole(group: Group, ends: list[MemoryLine]) -> None:
     """Two channels with onsets and endings of 32 knots are four frames."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        shape = Shape(0.001, tuple(0.01 * n + 0j for n in range(32)))
-        tones = [tone(channel, 0.4, onset=shape, ending=shape) for channel in (0, 1)]
-        ends[0].sent.clear()
-        await group.apply({"a": [layer(0, *tones)]})
-        assert [each for _, each in ends[0].sent] == ["1:5"] * 3 + ["1:6"]
-        await asyncio.sleep(0.04)
-        assert ends[0].levels("a") == [0.4, 0.4]
-
-    with_group(test, wire, ("a",))
+    shape = Shape(0.001, tuple(0.01 * n + 0j for n in range(32)))
+    tones = [tone(channel, 0.4, onset=shape, ending=shape) for channel in (0, 1)]
+    ends[0].sent.clear()
+    await group.apply({"a": [layer(0, *tones)]})
+    assert [each for _, each in ends[0].sent] == ["1:5"] * 3 + ["1:6"]
+    await asyncio.sleep(0.04)
+    assert ends[0].levels("a") == [0.4, 0.4]
 
 
 @pytest.mark.parametrize("name", ["Set", "Commit"])
 @pytest.mark.parametrize("way", ["inward", "outward"])
-def test_lost_frame_is_repeated_and_played_once(wire: str, name: str, way: str) -> None:
+@grouped(("a",))
+async def test_lost_frame_is_repeated_and_played_once(
+    group: Group, ends: list[MemoryLine], name: str, way: str
+) -> None:
     """The request or its reply; the tone counts from the one commit."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        setattr(ends[0], way, losing(name))
-        await group.apply({"a": [layer(0, tone())]})
-        await asyncio.sleep(0.002)
-        assert ends[0].levels("a") == [0.5, 0.0]
-        assert ends[0].retries == 1
-        assert len(ends[0].far["a"].playback.voices_of(0)) == 1
-
-    with_group(test, wire, ("a",))
-
-
-def test_lost_broadcast_is_made_good(wire: str) -> None:
-    """Both amplifiers of a line play although the broadcast of the commit was lost."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        ends[0].inward = losing("Commit")
-        await group.apply({name: [layer(0, tone())] for name in "ab"})
-        await asyncio.sleep(0.002)
-        assert [ends[0].levels(name) for name in "ab"] == [[0.5, 0.0]] * 2
-
-    with_group(test, wire, ("a", "b"))
+    setattr(ends[0], way, losing(name))
+    await group.apply({"a": [layer(0, tone())]})
+    await asyncio.sleep(0.002)
+    assert ends[0].levels("a") == [0.5, 0.0]
+    assert ends[0].retries == 1
+    assert len(ends[0].far["a"].playback.voices_of(0)) == 1
 
 
 @pytest.mark.parametrize("way", ["inward", "outward"])
-def test_doubled_frames_are_carried_out_once(wire: str, way: str) -> None:
+@grouped(("a",))
+async def test_doubled_frames_are_carried_out_once(
+    group: Group, ends: list[MemoryLine], way: str
+) -> None:
     """Of a set, a stop and all between them."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        setattr(ends[0], way, lambda name, data: [(0.0002, data), (0.0003, data)])
-        await group.apply({"a": [layer(0, tone())]})
-        await group.apply({"a": [layer(0, tone(level=0.4))]})
-        await group.beat()
-        await asyncio.sleep(0.01)
-        assert ends[0].levels("a") == [0.4, 0.0]
-        assert len(ends[0].far["a"].playback.voices_of(0)) == 1
-        assert (await group.stop())["a"].is_confirmed
-        assert ends[0].retries == 0
-
-    with_group(test, wire, ("a",))
+    setattr(ends[0], way, lambda name, data: [(0.0002, data), (0.0003, data)])
+    await group.apply({"a": [layer(0, tone())]})
+    await group.apply({"a": [layer(0, tone(level=0.4))]})
+    await group.beat()
+    await asyncio.sleep(0.01)
+    assert ends[0].levels("a") == [0.4, 0.0]
+    assert len(ends[0].far["a"].playback.voices_of(0)) == 1
+    assert (await group.stop())["a"].is_confirmed
+    assert ends[0].retries == 0
 
 
-def test_degraded_amplifier_gets_nothing_that_plays_or_feeds(wire: str) -> None:
+@grouped(("a",))
+async def test_degraded_amplifier_gets_nothing_that_plays_or_feeds(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """After three requests without reply; a status ends it."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        (host,) = group.amplifiers.values()
-        ends[0].outward = lambda name, data: []
-        with pytest.raises(LinkTimeout):
-            await host.ping()
-        for request in (host.ping, lambda: host.stage(1, [layer(0, tone())])):
-            with pytest.raises(LinkDegraded):
-                await request()
-        ends[0].outward = unaltered
-        await host.read_status()
+    (host,) = group.amplifiers.values()
+    ends[0].outward = lambda name, data: []
+    with pytest.raises(LinkTimeout):
         await host.ping()
+    for request in (host.ping, lambda: host.stage(1, [layer(0, tone())])):
+        with pytest.raises(LinkDegraded):
+            await request()
+    ends[0].outward = unaltered
+    await host.read_status()
+    await host.ping()
 
-    with_group(test, wire, ("a",))
 
-
-def test_amplifier_without_reply_stops_the_others(wire: str) -> None:
+@grouped(("a",), ("b",))
+async def test_amplifier_without_reply_stops_the_others(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """Once its watchdog must have silenced it; until then nothing new plays, and the others go on.
 
     Until when it may play is told.
     """
+    await group.apply({name: [layer(0, tone())] for name in "ab"})
+    began = ends[0].loop.time()
+    ends[1].inward = lambda name, data: []
+    with pytest.raises(LinkDegraded):
+        await group.beat()
+    assert (group.degraded, group.state) == (("b",), GroupState.ARMED)
+    with pytest.raises(LinkDegraded):
+        await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
 
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.apply({name: [layer(0, tone())] for name in "ab"})
-        began = ends[0].loop.time()
-        ends[1].inward = lambda name, data: []
-        with pytest.raises(LinkDegraded):
+    async def go_on() -> None:
+        for _ in range(20):
             await group.beat()
-        assert (group.degraded, group.state) == (("b",), GroupState.ARMED)
-        with pytest.raises(LinkDegraded):
-            await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
+            assert ends[0].levels("a") == [0.5, 0.0]
+            await asyncio.sleep(0.05)
 
-        async def go_on() -> None:
-            for _ in range(20):
-                await group.beat()
-                assert ends[0].levels("a") == [0.5, 0.0]
-                await asyncio.sleep(0.05)
-
-        with pytest.raises(LinkError):
-            await go_on()
-        assert 0.25 <= ends[0].loop.time() - began <= 0.6
-        assert ([*group.lost_by], group.state) == (["b"], GroupState.LOST)
-        stopped = await group.stop()
-        assert (stopped["a"].is_confirmed, stopped["b"].is_confirmed) == (True, False)
-        assert began + 0.25 <= stopped["b"].may_play_until <= began + 0.4
-        assert ends[0].levels("a") == [0.0, 0.0]
-        assert ends[1].levels("b") == [0.0, 0.0]
-
-    with_group(test, wire, ("a",), ("b",))
+    with pytest.raises(LinkError):
+        await go_on()
+    assert 0.25 <= ends[0].loop.time() - began <= 0.6
+    assert ([*group.lost_by], group.state) == (["b"], GroupState.LOST)
+    stopped = await group.stop()
+    assert (stopped["a"].is_confirmed, stopped["b"].is_confirmed) == (True, False)
+    assert began + 0.25 <= stopped["b"].may_play_until <= began + 0.4
+    assert ends[0].levels("a") == [0.0, 0.0]
+    assert ends[1].levels("b") == [0.0, 0.0]
 
 
-def test_stop_overtakes_what_is_queued(wire: str) -> None:
+@grouped(("a",))
+async def test_stop_overtakes_what_is_queued(group: Group, ends: list[MemoryLine]) -> None:
     """With a set on the line and ten readings queued: silent within 20 ms, none is committed."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        (host,) = group.amplifiers.values()
-        await group.apply({"a": [layer(0, tone())]})
-        ends[0].outward = lambda name, data: [(0.004, data)]
-        reads = [asyncio.ensure_future(host.read_status()) for _ in range(10)]
-        applying = asyncio.ensure_future(group.apply({"a": [layer(0, tone(level=0.9))]}))
-        await asyncio.sleep(0.001)
-        began = ends[0].loop.time()
-        stopped = await group.stop()
-        assert stopped["a"].is_confirmed
-        sent = next(at for at, each in ends[0].sent if each == "1:8" and at >= began)
-        assert sent - began <= 0.009
-        with pytest.raises(Preempted):
-            await applying
-        await asyncio.gather(*reads)
-        assert ends[0].levels("a") == [0.0, 0.0]
-
-    with_group(test, wire, ("a",))
+    (host,) = group.amplifiers.values()
+    await group.apply({"a": [layer(0, tone())]})
+    ends[0].outward = lambda name, data: [(0.004, data)]
+    reads = [asyncio.ensure_future(host.read_status()) for _ in range(10)]
+    applying = asyncio.ensure_future(group.apply({"a": [layer(0, tone(level=0.9))]}))
+    await asyncio.sleep(0.001)
+    began = ends[0].loop.time()
+    stopped = await group.stop()
+    assert stopped["a"].is_confirmed
+    sent = next(at for at, each in ends[0].sent if each == "1:8" and at >= began)
+    assert sent - began <= 0.009
+    with pytest.raises(Preempted):
+        await applying
+    await asyncio.gather(*reads)
+    assert ends[0].levels("a") == [0.0, 0.0]
 
 
 def test_stop_does_not_wait_for_a_reply_that_is_lost(wire: str) -> None:
@@ -234,35 +208,33 @@ def test_stop_does_not_wait_for_a_reply_that_is_lost(wire: str) -> None:
     with_group(test, wire, ("a",))
 
 
-def test_mute_amplifier_is_stopped_over_its_open_line(wire: str) -> None:
+@grouped(("a",))
+async def test_mute_amplifier_is_stopped_over_its_open_line(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """It hears the host, which hears nothing: silent 10 ms after the stop, unconfirmed."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.apply({"a": [layer(0, tone())]})
-        ends[0].outward = lambda name, data: []
-        with pytest.raises(LinkError):
-            await group.beat()
-        assert ends[0].levels("a") == [0.5, 0.0]
-        stopping = asyncio.ensure_future(group.stop())
-        await asyncio.sleep(0.01)
-        assert ends[0].levels("a") == [0.0, 0.0]
-        assert not (await stopping)["a"].is_confirmed
-
-    with_group(test, wire, ("a",))
+    await group.apply({"a": [layer(0, tone())]})
+    ends[0].outward = lambda name, data: []
+    with pytest.raises(LinkError):
+        await group.beat()
+    assert ends[0].levels("a") == [0.5, 0.0]
+    stopping = asyncio.ensure_future(group.stop())
+    await asyncio.sleep(0.01)
+    assert ends[0].levels("a") == [0.0, 0.0]
+    assert not (await stopping)["a"].is_confirmed
 
 
-def test_stop_between_stage_and_commit_commits_nothing(wire: str) -> None:
+@grouped(("a",))
+async def test_stop_between_stage_and_commit_commits_nothing(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """The staged set is dropped by the amplifier, too."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        (host,) = group.amplifiers.values()
-        await host.stage(9, [layer(0, tone())])
-        assert (await group.stop())["a"].is_confirmed
-        with pytest.raises(CommandRefused):
-            await host.commit(9)
-        assert ends[0].levels("a") == [0.0, 0.0]
-
-    with_group(test, wire, ("a",))
+    (host,) = group.amplifiers.values()
+    await host.stage(9, [layer(0, tone())])
+    assert (await group.stop())["a"].is_confirmed
+    with pytest.raises(CommandRefused):
+        await host.commit(9)
+    assert ends[0].levels("a") == [0.0, 0.0]
 
 
 LIES: dict[str, Callable[[Values], Values]] = {
@@ -275,202 +247,160 @@ LIES: dict[str, Callable[[Values], Values]] = {
 
 
 @pytest.mark.parametrize("lie", LIES)
-def test_stop_is_confirmed_by_nothing_less_than_a_new_latch_and_all_levels(
-    wire: str, lie: str
+@grouped(("a",))
+async def test_stop_is_confirmed_by_nothing_less_than_a_new_latch_and_all_levels(
+    group: Group, ends: list[MemoryLine], lie: str
 ) -> None:
     """Whatever of it is missing: not confirmed, within 0.5 s, with the time that it may play."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.apply({"a": [layer(0, tone())]})
-        far = ends[0].far["a"]
-        status = far.status
-        far.status = lambda now: LIES[lie](status(now))
-        began = ends[0].loop.time()
-        stopped = (await group.stop())["a"]
-        assert not stopped.is_confirmed
-        assert stopped.cause
-        assert ends[0].loop.time() - began < 0.5
-        assert stopped.may_play_until > began
-
-    with_group(test, wire, ("a",))
+    await group.apply({"a": [layer(0, tone())]})
+    far = ends[0].far["a"]
+    status = far.status
+    far.status = lambda now: LIES[lie](status(now))
+    began = ends[0].loop.time()
+    stopped = (await group.stop())["a"]
+    assert not stopped.is_confirmed
+    assert stopped.cause
+    assert ends[0].loop.time() - began < 0.5
+    assert stopped.may_play_until > began
 
 
-def test_stop_is_never_said_to_be_silent_while_it_plays(wire: str) -> None:
-    """50 stops with lost, late and doubled frames; what is not confirmed ends when it is said."""
-    chance = random.Random(6)
-    confirmed = 0
-
-    def damaged(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        copies = chance.choice((0, 1, 1, 2))
-        return [(chance.choice((0.0002, 0.004, 0.05)), data) for _ in range(copies)]
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        nonlocal confirmed
-        await group.apply({"a": [layer(0, tone())]})
-        ends[0].inward = ends[0].outward = damaged
-        stopped = (await group.stop())["a"]
-        confirmed += stopped.is_confirmed
-        if not stopped.is_confirmed:
-            await asyncio.sleep(stopped.may_play_until - ends[0].loop.time())
-        assert ends[0].levels("a") == [0.0, 0.0]
-
-    for _ in range(50):
-        with_group(test, wire, ("a",))
-    assert 10 < confirmed < 50
-
-
-def test_stop_is_repeated_after_a_reply_that_is_none(wire: str) -> None:
+@grouped(("a",))
+async def test_stop_is_repeated_after_a_reply_that_is_none(
+    group: Group, ends: list[MemoryLine], wire: str
+) -> None:
     """The first reply to it cannot be read; the second confirms it."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        host_side = ends[0].line.wire
-        received, broken = host_side.received, iter([[Broken("cut")]])
-        host_side.received = lambda data: next(broken, None) or received(data)
-        assert (await group.stop())["a"].is_confirmed
-        assert [each for _, each in ends[0].sent][-2:] == ["1:8", "1:8"]
-
-    with_group(test, wire, ("a",))
+    host_side = ends[0].line.wire
+    received, broken = host_side.received, iter([[Broken("cut")]])
+    host_side.received = lambda data: next(broken, None) or received(data)
+    assert (await group.stop())["a"].is_confirmed
+    assert [each for _, each in ends[0].sent][-2:] == ["1:8", "1:8"]
 
 
-def test_watchdog_is_fed_by_the_group_alone(wire: str) -> None:
+@grouped(("a",))
+async def test_watchdog_is_fed_by_the_group_alone(group: Group, ends: list[MemoryLine]) -> None:
     """Beats keep it playing; without them it is silent after 0.255 s."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.apply({"a": [layer(0, tone())]})
-        for _ in range(20):
-            await asyncio.sleep(0.05)
-            await group.beat()
-        assert ends[0].levels("a") == [0.5, 0.0]
-        await asyncio.sleep(0.256)
-        assert ends[0].levels("a") == [0.0, 0.0]
-        with pytest.raises(CommandRefused):
-            await group.beat()
-
-    with_group(test, wire, ("a",))
-
-
-def test_contradictions_twice_in_a_row_are_a_fault(wire: str) -> None:
-    """A derated channel: half of the level once is passed over, twice stops."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.apply({"a": [layer(0, tone())]})
-        await asyncio.sleep(0.01)
-        ends[0].far["a"].set_temperature(71.0, ends[0].loop.time())
-        await asyncio.sleep(0.03)
-        await group.beat()
+    await group.apply({"a": [layer(0, tone())]})
+    for _ in range(20):
         await asyncio.sleep(0.05)
-        with pytest.raises(CommandRefused):
-            await group.beat()
-        assert not group.is_armed
+        await group.beat()
+    assert ends[0].levels("a") == [0.5, 0.0]
+    await asyncio.sleep(0.256)
+    assert ends[0].levels("a") == [0.0, 0.0]
+    with pytest.raises(CommandRefused):
+        await group.beat()
 
-    with_group(test, wire, ("a",))
+
+@grouped(("a",))
+async def test_contradictions_twice_in_a_row_are_a_fault(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """A derated channel: half of the level once is passed over, twice stops."""
+    await group.apply({"a": [layer(0, tone())]})
+    await asyncio.sleep(0.01)
+    ends[0].far["a"].set_temperature(71.0, ends[0].loop.time())
+    await asyncio.sleep(0.03)
+    await group.beat()
+    await asyncio.sleep(0.05)
+    with pytest.raises(CommandRefused):
+        await group.beat()
+    assert not group.is_armed
 
 
-def test_host_that_drives_already_is_seen_and_left_alone(wire: str) -> None:
+@in_virtual_time
+async def test_host_that_drives_already_is_seen_and_left_alone(wire: str) -> None:
     """Its heartbeats raise the watchdog unasked; without them the amplifier is taken over."""
+    end = MemoryLine(wire, "a")
+    far = end.far["a"]
+    far.handle("Arm", {"session": 5, "watchdog": 2000}, end.loop.time())
 
-    async def run() -> None:
-        end = MemoryLine(wire, "a")
-        far = end.far["a"]
-        far.handle("Arm", {"session": 5, "watchdog": 2000}, end.loop.time())
+    async def feed() -> None:
+        while True:
+            await asyncio.sleep(0.07)
+            far.handle("Ping", {"session": 5}, end.loop.time())
 
-        async def feed() -> None:
-            while True:
-                await asyncio.sleep(0.07)
-                far.handle("Ping", {"session": 5}, end.loop.time())
-
-        other = asyncio.ensure_future(feed())
-        with pytest.raises(LinkError):
-            await end.hosts["a"].open()
-        assert far.state == "OPERATION_ENABLED"
-        other.cancel()
+    other = asyncio.ensure_future(feed())
+    with pytest.raises(LinkError):
         await end.hosts["a"].open()
-        assert far.state != "OPERATION_ENABLED"
-
-    run_virtual(run())
+    assert far.state == "OPERATION_ENABLED"
+    other.cancel()
+    await end.hosts["a"].open()
+    assert far.state != "OPERATION_ENABLED"
 
 
 IDENTITIES: Values = {"versions": 0b110, "serial_number": "SIM-b"}
 
 
 @pytest.mark.parametrize("name", IDENTITIES)
-def test_another_amplifier_or_version_is_refused(wire: str, name: str) -> None:
+@in_virtual_time
+async def test_another_amplifier_or_version_is_refused(wire: str, name: str) -> None:
     """An amplifier of version 2, and one of another serial number."""
-
-    async def run() -> None:
-        end = MemoryLine(wire, "a")
-        end.far["a"].identity[name] = IDENTITIES[name]
-        host = Amplifier(end.line, 1, end.hosts["a"].limits, name="a", serial_number="SIM-a")
-        with pytest.raises(LinkError):
-            await host.open()
-
-    run_virtual(run())
+    end = MemoryLine(wire, "a")
+    end.far["a"].identity[name] = IDENTITIES[name]
+    host = Amplifier(end.line, 1, end.hosts["a"].limits, name="a", serial_number="SIM-a")
+    with pytest.raises(LinkError):
+        await host.open()
 
 
-def test_opening_disarms_what_an_earlier_host_left_armed(wire: str) -> None:
+@in_virtual_time
+async def test_opening_disarms_what_an_earlier_host_left_armed(wire: str) -> None:
     """It plays on until then, with a watchdog of 2 s."""
-
-    async def run() -> None:
-        end = MemoryLine(wire, "a")
-        (host,) = end.hosts.values()
-        await host.open()
-        await host.arm(9, 2.0)
-        await host.stage(7, [layer(0, tone())], now=True)
-        await asyncio.sleep(0.02)  # its ramp
-        assert end.levels("a") == [0.5, 0.0]
-        await host.open()
-        assert end.levels("a") == [0.0, 0.0]
-        assert end.far["a"].state == "SWITCH_ON_DISABLED"
-
-    run_virtual(run())
+    end = MemoryLine(wire, "a")
+    (host,) = end.hosts.values()
+    await host.open()
+    await host.arm(9, 2.0)
+    await host.stage(7, [layer(0, tone())], now=True)
+    await asyncio.sleep(0.02)  # its ramp
+    assert end.levels("a") == [0.5, 0.0]
+    await host.open()
+    assert end.levels("a") == [0.0, 0.0]
+    assert end.far["a"].state == "SWITCH_ON_DISABLED"
 
 
-def test_late_replies_are_credited_to_nothing(wire: str) -> None:
+@grouped(("a",))
+async def test_late_replies_are_credited_to_nothing(
+    group: Group, ends: list[MemoryLine], wire: str
+) -> None:
     """A reply after 70 ms: its request was repeated, and it is counted as unexpected."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        (host,) = group.amplifiers.values()
-        delays = iter([0.07])
-        ends[0].outward = lambda name, data: [(next(delays, 0.0002), data)]
-        await host.ping()
-        await asyncio.sleep(0.1)
-        assert ends[0].line.wire.counters.unexpected_frames == 1
-
-    with_group(test, wire, ("a",))
+    (host,) = group.amplifiers.values()
+    delays = iter([0.07])
+    ends[0].outward = lambda name, data: [(next(delays, 0.0002), data)]
+    await host.ping()
+    await asyncio.sleep(0.1)
+    assert ends[0].line.wire.counters.unexpected_frames == 1
 
 
 @pytest.mark.parametrize("alone", ["b", "abcd"])
-def test_stop_reaches_those_beside_a_mute_amplifier(alone: str) -> None:
+@grouped(tuple("abcde"), wire="serial")
+async def test_stop_reaches_those_beside_a_mute_amplifier(
+    group: Group, ends: list[MemoryLine], alone: str
+) -> None:
     """On one serial line: all that hear are silent within 10 ms, and the last is confirmed."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        (end,) = ends
-        await group.apply({name: [layer(0, tone())] for name in end.hosts})
-        muted = {end.hosts[name].address for name in alone}
-        end.inward = lambda name, data: [] if end.kind.request_of(data)[0] in muted else [(0, data)]  # type: ignore[index]
-        stopping = asyncio.ensure_future(group.stop())
-        await asyncio.sleep(0.01)
-        assert all(end.levels(name) == [0.0, 0.0] for name in end.hosts)
-        stopped = await stopping
-        assert stopped["e"].is_confirmed
-        assert not any(stopped[name].is_confirmed for name in alone)
-
-    with_group(test, "serial", tuple("abcde"))
+    (end,) = ends
+    await group.apply({name: [layer(0, tone())] for name in end.hosts})
+    muted = {end.hosts[name].address for name in alone}
+    end.inward = lambda name, data: [] if end.kind.request_of(data)[0] in muted else [(0, data)]  # type: ignore[index]
+    stopping = asyncio.ensure_future(group.stop())
+    await asyncio.sleep(0.01)
+    assert all(end.levels(name) == [0.0, 0.0] for name in end.hosts)
+    stopped = await stopping
+    assert stopped["e"].is_confirmed
+    assert not any(stopped[name].is_confirmed for name in alone)
 
 
-def test_ledger_knows_what_a_lost_broadcast_started(wire: str) -> None:
+@grouped(("a", "b"))
+async def test_ledger_knows_what_a_lost_broadcast_started(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """The repeated commit is noted: what is too loud beside it is refused."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        ends[0].inward = losing("Commit")
-        await group.apply({name: [layer(0, tone(level=0.6))] for name in "ab"})
-        for name in "ab":
-            assert group.amplifiers[name].ledger.playback.tokens == {0: 78}
-        with pytest.raises(CommandRefused):
-            await group.apply({name: [layer(1, Tone(0, 150.0, 0.5))] for name in "ab"})
-        await group.beat()
-
-    with_group(test, wire, ("a", "b"))
+    ends[0].inward = losing("Commit")
+    await group.apply({name: [layer(0, tone(level=0.6))] for name in "ab"})
+    await asyncio.sleep(0.002)
+    for name in "ab":
+        assert group.amplifiers[name].ledger.playback.tokens == {0: 78}
+        assert ends[0].levels(name) == [0.6, 0.0]
+    with pytest.raises(CommandRefused):
+        await group.apply({name: [layer(1, Tone(0, 150.0, 0.5))] for name in "ab"})
+    await group.beat()
 
 
 async def stopped_by_hand(group: Group) -> None:
@@ -479,180 +409,156 @@ async def stopped_by_hand(group: Group) -> None:
 
 
 @pytest.mark.parametrize("end_by", [stopped_by_hand, Group.disarm])
-def test_nothing_is_fed_or_played_once_it_is_not_armed(
-    end_by: Callable[[Group], Awaitable[None]],
+@grouped(("a",), wire="serial")
+async def test_nothing_is_fed_or_played_once_it_is_not_armed(
+    group: Group, ends: list[MemoryLine], end_by: Callable[[Group], Awaitable[None]]
 ) -> None:
     """A beat and a set after a stop or disarm send nothing, also where that was not confirmed."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await end_by(group)
-        ends[0].sent.clear()
-        for late in (group.beat(), group.apply({"a": [layer(0, tone())]})):
-            with pytest.raises(CommandRefused):
-                await late
-        assert ends[0].sent == []
-
-    with_group(test, "serial", ("a",))
+    await end_by(group)
+    ends[0].sent.clear()
+    for late in (group.beat(), group.apply({"a": [layer(0, tone())]})):
+        with pytest.raises(CommandRefused):
+            await late
+    assert ends[0].sent == []
 
 
-def test_disarm_goes_on_where_its_caller_is_cancelled() -> None:
+@grouped(("a",), wire="serial")
+async def test_disarm_goes_on_where_its_caller_is_cancelled(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """Behind a request that has no reply: silent and switched off all the same."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.apply({"a": [layer(0, tone())]})
-        ends[0].outward = losing("GetStatus")
-        reading = asyncio.ensure_future(group.amplifiers["a"].read_status())
-        disarming = asyncio.ensure_future(group.disarm())
-        await asyncio.sleep(0.001)
-        disarming.cancel()
-        await asyncio.wait([reading, disarming])
-        await asyncio.sleep(0.1)
-        assert ends[0].levels("a") == [0.0, 0.0]
-        assert ends[0].far["a"].state == "SWITCH_ON_DISABLED"
-
-    with_group(test, "serial", ("a",))
+    await group.apply({"a": [layer(0, tone())]})
+    ends[0].outward = losing("GetStatus")
+    reading = asyncio.ensure_future(group.amplifiers["a"].read_status())
+    disarming = asyncio.ensure_future(group.disarm())
+    await asyncio.sleep(0.001)
+    disarming.cancel()
+    await asyncio.wait([reading, disarming])
+    await asyncio.sleep(0.1)
+    assert ends[0].levels("a") == [0.0, 0.0]
+    assert ends[0].far["a"].state == "SWITCH_ON_DISABLED"
 
 
-def test_disarm_that_is_ignored_stops() -> None:
+@grouped(("a",), wire="serial")
+async def test_disarm_that_is_ignored_stops(group: Group, ends: list[MemoryLine]) -> None:
     """A far end that keeps playing after Disarm: an error, and silent by the stop."""
+    (far,) = ends[0].far.values()
+    handle = far.handle
 
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        (far,) = ends[0].far.values()
-        handle = far.handle
+    def ignore(name: str, values: Values, now: float) -> Values:
+        return handle("GetStatus", {}, now) if name == "Disarm" else handle(name, values, now)
 
-        def ignore(name: str, values: Values, now: float) -> Values:
-            return handle("GetStatus", {}, now) if name == "Disarm" else handle(name, values, now)
-
-        await group.apply({"a": [layer(0, tone())]})
-        far.handle = ignore  # type: ignore[method-assign]
-        with pytest.raises(CommandRefused):
-            await group.disarm()
-        assert ends[0].levels("a") == [0.0, 0.0]
-
-    with_group(test, "serial", ("a",))
+    await group.apply({"a": [layer(0, tone())]})
+    far.handle = ignore  # type: ignore[method-assign]
+    with pytest.raises(CommandRefused):
+        await group.disarm()
+    assert ends[0].levels("a") == [0.0, 0.0]
 
 
-def test_silence_that_one_does_not_hear_is_repeated() -> None:
+@grouped(("a",), ("b",), wire="serial")
+async def test_silence_that_one_does_not_hear_is_repeated(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """A finger was lifted: the other is silent at once, and this one by the next silence."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.apply({name: [layer(0, tone())] for name in "ab"})
-        ends[1].inward = losing("Silence", count=3)
-        with pytest.raises(LinkDegraded):
-            await group.silence(0.001)
-        assert (ends[0].levels("a"), ends[1].levels("b")) == ([0.0, 0.0], [0.5, 0.0])
+    await group.apply({name: [layer(0, tone())] for name in "ab"})
+    ends[1].inward = losing("Silence", count=3)
+    with pytest.raises(LinkDegraded):
         await group.silence(0.001)
-        await asyncio.sleep(0.002)
-        assert ends[1].levels("b") == [0.0, 0.0]
-        assert group.is_armed
+    assert (ends[0].levels("a"), ends[1].levels("b")) == ([0.0, 0.0], [0.5, 0.0])
+    await group.silence(0.001)
+    await asyncio.sleep(0.002)
+    assert ends[1].levels("b") == [0.0, 0.0]
+    assert group.is_armed
 
-    with_group(test, "serial", ("a",), ("b",))
 
-
-def test_set_that_would_be_committed_too_late_is_not() -> None:
+@grouped(("a",), ("b",), wire="serial")
+async def test_set_that_would_be_committed_too_late_is_not(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """The ledger admitted it for a tenth of a second; its commit is lost until after that."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        ends[0].inward = losing("Commit", count=2)
-        ends[1].inward = losing("Set", count=2)
-        with pytest.raises(CommandRefused):
-            await group.apply({name: [layer(0, tone())] for name in "ab"})
-        assert (ends[0].levels("a"), group.is_armed) == ([0.0, 0.0], False)
-
-    with_group(test, "serial", ("a",), ("b",))
+    ends[0].inward = losing("Commit", count=2)
+    ends[1].inward = losing("Set", count=2)
+    with pytest.raises(CommandRefused):
+        await group.apply({name: [layer(0, tone())] for name in "ab"})
+    assert (ends[0].levels("a"), group.is_armed) == ([0.0, 0.0], False)
 
 
-def test_set_that_plays_in_part_stops() -> None:
+@grouped(("a",), wire="serial")
+async def test_set_that_plays_in_part_stops(group: Group, ends: list[MemoryLine]) -> None:
     """An amplifier that commits one of two layers says the token of the set all the same."""
+    far = ends[0].far["a"].playback
+    commit = far.commit
 
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        far = ends[0].far["a"].playback
-        commit = far.commit
+    def first_alone(layers: Sequence[LayerSet], token: int, time: float) -> None:
+        commit(layers[:1], token, time)
 
-        def first_alone(layers: Sequence[LayerSet], token: int, time: float) -> None:
-            commit(layers[:1], token, time)
-
-        far.commit = first_alone  # type: ignore[method-assign]
-        with pytest.raises(CommandRefused):
-            await group.apply({"a": [layer(0, tone()), layer(1, Tone(0, 150.0, 0.2))]})
-        assert (ends[0].levels("a"), group.is_armed) == ([0.0, 0.0], False)
-
-    with_group(test, "serial", ("a",))
+    far.commit = first_alone  # type: ignore[method-assign]
+    with pytest.raises(CommandRefused):
+        await group.apply({"a": [layer(0, tone()), layer(1, Tone(0, 150.0, 0.2))]})
+    assert (ends[0].levels("a"), group.is_armed) == ([0.0, 0.0], False)
 
 
-def test_listener_that_fails_loses_no_reply() -> None:
+@grouped(("a",), wire="serial")
+async def test_listener_that_fails_loses_no_reply(group: Group, ends: list[MemoryLine]) -> None:
     """An event and the reply of the stop that caused it come in one read."""
 
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        def fail(values: Values) -> None:
-            raise RuntimeError("listener")
+    def fail(values: Values) -> None:
+        raise RuntimeError("listener")
 
-        group.amplifiers["a"].listeners.append(fail)
-        assert (await group.stop())["a"].is_confirmed
-
-    with_group(test, "serial", ("a",))
+    group.amplifiers["a"].listeners.append(fail)
+    assert (await group.stop())["a"].is_confirmed
 
 
-def test_stop_over_a_lost_line_says_so_at_once() -> None:
+@grouped(("a",), ("b",), wire="serial")
+async def test_stop_over_a_lost_line_says_so_at_once(group: Group, ends: list[MemoryLine]) -> None:
     """Not after the time in which a reply could have come; the other amplifier is stopped."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        ends[0].line.lose("cut")
-        began = ends[0].loop.time()
-        stopped = await group.stop()
-        assert ends[0].loop.time() - began < 0.1
-        assert (stopped["a"].is_confirmed, stopped["a"].cause) == (False, "cut")
-        assert stopped["b"].is_confirmed
-
-    with_group(test, "serial", ("a",), ("b",))
+    ends[0].line.lose("cut")
+    began = ends[0].loop.time()
+    stopped = await group.stop()
+    assert ends[0].loop.time() - began < 0.1
+    assert (stopped["a"].is_confirmed, stopped["a"].cause) == (False, "cut")
+    assert stopped["b"].is_confirmed
 
 
-def test_exchange_that_is_aborted_is_no_fault() -> None:
+@grouped(("a",), ("b",), wire="serial")
+async def test_exchange_that_is_aborted_is_no_fault(group: Group, ends: list[MemoryLine]) -> None:
     """A set that has no reply yet is given up at once; silence comes next, and all stay armed."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        for end in ends:
-            end.outward = lambda name, data: [(0.02, data)]
-        applying = asyncio.ensure_future(group.apply({name: [layer(0, tone())] for name in "ab"}))
-        await asyncio.sleep(0.03)  # staged, and the commits have no reply yet
-        began = ends[0].loop.time()
-        group.abort_exchange()
-        with pytest.raises(Preempted):
-            await applying
-        assert (group.is_set_incomplete, group.is_armed) == (True, True)
-        await group.silence(0.001)
-        sent = min(at for at, each in ends[0].sent if each == "1:7")
-        assert sent - began <= 0.0081
-        assert (ends[0].levels("a"), ends[1].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
-        assert not group.is_set_incomplete
-
-    with_group(test, "serial", ("a",), ("b",))
+    for end in ends:
+        end.outward = lambda name, data: [(0.02, data)]
+    applying = asyncio.ensure_future(group.apply({name: [layer(0, tone())] for name in "ab"}))
+    await asyncio.sleep(0.03)  # staged, and the commits have no reply yet
+    began = ends[0].loop.time()
+    group.abort_exchange()
+    with pytest.raises(Preempted):
+        await applying
+    assert (group.is_set_incomplete, group.is_armed) == (True, True)
+    await group.silence(0.001)
+    sent = min(at for at, each in ends[0].sent if each == "1:7")
+    assert sent - began <= 0.0081
+    assert (ends[0].levels("a"), ends[1].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
+    assert not group.is_set_incomplete
 
 
-def test_clear_comes_after_stops_alone() -> None:
+@grouped(("a",), wire="serial")
+async def test_clear_comes_after_stops_alone(group: Group, ends: list[MemoryLine]) -> None:
     """It is refused while amplifiers are being stopped, and arming before it is."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        stopping = asyncio.ensure_future(group.stop())
-        await asyncio.sleep(0)
-        with pytest.raises(Preempted):
-            await group.clear()
-        await stopping
-        with pytest.raises(CommandRefused, match="cleared"):
-            await group.arm()
+    stopping = asyncio.ensure_future(group.stop())
+    await asyncio.sleep(0)
+    with pytest.raises(Preempted):
         await group.clear()
+    await stopping
+    with pytest.raises(CommandRefused, match="cleared"):
+        await group.arm()
+    await group.clear()
 
-    with_group(test, "serial", ("a",))
 
-
-def test_broadcast_may_have_fed_every_amplifier(wire: str) -> None:
+@grouped(("a", "b"))
+async def test_broadcast_may_have_fed_every_amplifier(
+    group: Group, ends: list[MemoryLine], wire: str
+) -> None:
     """How long each may play counts from the commit of both."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await asyncio.sleep(0.1)
-        before = ends[0].loop.time()
-        await group.apply({name: [layer(0, tone())] for name in "ab"})
-        commit = max(at for at, each in ends[0].sent if each == "0:6") if wire != "tcp" else before
-        assert all(each.feeding.may >= commit for each in group.amplifiers.values())
-
-    with_group(test, wire, ("a", "b"))
+    await asyncio.sleep(0.1)
+    before = ends[0].loop.time()
+    await group.apply({name: [layer(0, tone())] for name in "ab"})
+    commit = max(at for at, each in ends[0].sent if each == "0:6") if wire != "tcp" else before
+    assert all(each.feeding.may >= commit for each in group.amplifiers.values())

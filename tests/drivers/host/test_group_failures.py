@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-from armed_group import layer, losing, tone, with_group
+from armed_group import grouped, layer, losing, tone, with_group
 from drivers.errors import CommandRefused, DriverError
 from drivers.host.group import Group
 from drivers.host.joint_start import JointStart
@@ -25,79 +25,76 @@ def altered(
 
 
 @pytest.mark.parametrize("wire", ["serial", "can"])
-def test_set_refused_by_one_that_has_tripped_stops_the_others(wire: str) -> None:
+@grouped(("a",), ("b",))
+async def test_set_refused_by_one_that_has_tripped_stops_the_others(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """Not only at the next heartbeat: a refusal of the ledger leaves others playing, this not."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.apply({name: [layer(0, tone())] for name in "ab"})
-        ends[1].far["b"].trip("OVER_VOLTAGE", ends[1].loop.time())
-        with pytest.raises(CommandRefused):
-            await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
-        assert not group.is_armed
-        await asyncio.sleep(0.01)
-        assert ends[0].levels("a") == [0.0, 0.0]
-
-    with_group(test, wire, ("a",), ("b",))
+    await group.apply({name: [layer(0, tone())] for name in "ab"})
+    ends[1].far["b"].trip("OVER_VOLTAGE", ends[1].loop.time())
+    with pytest.raises(CommandRefused):
+        await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
+    assert not group.is_armed
+    await asyncio.sleep(0.01)
+    assert ends[0].levels("a") == [0.0, 0.0]
 
 
-def test_nothing_is_sent_to_play_behind_a_status_that_shows_a_fault() -> None:
+@grouped(("a",), ("b",), wire="serial")
+async def test_nothing_is_sent_to_play_behind_a_status_that_shows_a_fault(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """A set that waits behind the reading does not go out, and the others are stopped."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.apply({name: [layer(0, tone())] for name in "ab"})
-        ends[1].far["b"].trip("OVER_VOLTAGE", ends[1].loop.time())
-        reading = asyncio.ensure_future(group.amplifiers["b"].read_status())
-        await asyncio.sleep(0)
-        ends[1].sent.clear()
-        with pytest.raises(CommandRefused, match="OVER_VOLTAGE"):
-            await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
-        await reading
-        assert [each for _, each in ends[1].sent if each in ("1:5", "1:6")] == []
-        assert (ends[0].levels("a"), group.is_armed) == ([0.0, 0.0], False)
-
-    with_group(test, "serial", ("a",), ("b",))
+    await group.apply({name: [layer(0, tone())] for name in "ab"})
+    ends[1].far["b"].trip("OVER_VOLTAGE", ends[1].loop.time())
+    reading = asyncio.ensure_future(group.amplifiers["b"].read_status())
+    await asyncio.sleep(0)
+    ends[1].sent.clear()
+    with pytest.raises(CommandRefused, match="OVER_VOLTAGE"):
+        await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
+    await reading
+    assert [each for _, each in ends[1].sent if each in ("1:5", "1:6")] == []
+    assert (ends[0].levels("a"), group.is_armed) == ([0.0, 0.0], False)
 
 
-def test_reply_that_cannot_be_noted_keeps_nobody_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+@grouped(("a",), ("b",), wire="serial")
+async def test_reply_that_cannot_be_noted_keeps_nobody_waiting(
+    group: Group, ends: list[MemoryLine], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The exchange fails, all are stopped; a stop whose reply cannot be noted ends in time."""
 
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        def fail(*_: object) -> None:
-            raise ZeroDivisionError("planted")
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("planted")
 
-        await group.apply({name: [layer(0, tone())] for name in "ab"})
-        monkeypatch.setattr(group.amplifiers["b"].ledger, "resolve", fail)
-        with pytest.raises(ZeroDivisionError):
-            async with asyncio.timeout(1.0):
-                await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
-        assert not group.is_armed
-        await asyncio.sleep(0.01)
-        assert (ends[0].levels("a"), ends[1].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
-        monkeypatch.setattr(group.amplifiers["b"].ledger, "silenced", fail)
+    await group.apply({name: [layer(0, tone())] for name in "ab"})
+    monkeypatch.setattr(group.amplifiers["b"].ledger, "resolve", fail)
+    with pytest.raises(ZeroDivisionError):
         async with asyncio.timeout(1.0):
-            await group.stop()
+            await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
+    assert not group.is_armed
+    await asyncio.sleep(0.01)
+    assert (ends[0].levels("a"), ends[1].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
+    monkeypatch.setattr(group.amplifiers["b"].ledger, "silenced", fail)
+    async with asyncio.timeout(1.0):
+        await group.stop()
 
-    with_group(test, "serial", ("a",), ("b",))
 
-
-def test_stop_is_sent_to_each_where_the_broadcast_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+@grouped(("a", "b"), wire="serial")
+async def test_stop_is_sent_to_each_where_the_broadcast_fails(
+    group: Group, ends: list[MemoryLine], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whatever fails in the broadcast, which comes first."""
+    await group.apply({name: [layer(0, tone())] for name in "ab"})
+    submit = ends[0].line.submit
 
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.apply({name: [layer(0, tone())] for name in "ab"})
-        submit = ends[0].line.submit
+    def fail(member: object, *values: object, **other: object) -> object:
+        if member is None:
+            raise ZeroDivisionError("planted")
+        return submit(member, *values, **other)  # type: ignore[arg-type]
 
-        def fail(member: object, *values: object, **other: object) -> object:
-            if member is None:
-                raise ZeroDivisionError("planted")
-            return submit(member, *values, **other)  # type: ignore[arg-type]
-
-        monkeypatch.setattr(ends[0].line, "submit", fail)
-        stopped = await group.stop()
-        assert all(each.is_confirmed for each in stopped.values())
-        assert (ends[0].levels("a"), ends[0].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
-
-    with_group(test, "serial", ("a", "b"))
+    monkeypatch.setattr(ends[0].line, "submit", fail)
+    stopped = await group.stop()
+    assert all(each.is_confirmed for each in stopped.values())
+    assert (ends[0].levels("a"), ends[0].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
 
 
 def test_arm_that_was_busy_after_a_lost_reply_does_not_stay_armed() -> None:
@@ -126,48 +123,46 @@ def test_arm_that_was_busy_after_a_lost_reply_does_not_stay_armed() -> None:
     with_group(test, "serial", ("a",))
 
 
-def test_amplifier_that_is_not_armed_after_arm_is_not_said_to_be() -> None:
+@grouped(("a",), ("b",), wire="serial")
+async def test_amplifier_that_is_not_armed_after_arm_is_not_said_to_be(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """It tells a fault in its reply: none stays armed, not even the one that was."""
+    await group.disarm()
+    for end in ends:
+        for far in end.far.values():
+            far.session = 1  # that of the test never changes, and is not taken twice
+    far = ends[1].far["b"]
 
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.disarm()
-        for end in ends:
-            for far in end.far.values():
-                far.session = 1  # that of the test never changes, and is not taken twice
-        far = ends[1].far["b"]
+    def trip(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
+        reply = handle(name, values, now)
+        if name != "Arm":
+            return reply
+        far.trip("OVER_VOLTAGE", now)
+        return far.status(now)
 
-        def trip(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
-            reply = handle(name, values, now)
-            if name != "Arm":
-                return reply
-            far.trip("OVER_VOLTAGE", now)
-            return far.status(now)
-
-        altered(far, trip)
-        with pytest.raises(CommandRefused, match="OVER_VOLTAGE"):
-            await group.arm()
-        assert not group.is_armed
-        assert ends[0].far["a"].state != "OPERATION_ENABLED"
-
-    with_group(test, "serial", ("a",), ("b",))
+    altered(far, trip)
+    with pytest.raises(CommandRefused, match="OVER_VOLTAGE"):
+        await group.arm()
+    assert not group.is_armed
+    assert ends[0].far["a"].state != "OPERATION_ENABLED"
 
 
-def test_arming_anew_stops_what_cannot_be_disarmed() -> None:
+@grouped(("a",), ("b",), wire="serial")
+async def test_arming_anew_stops_what_cannot_be_disarmed(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """One has tripped, so the other is to be disarmed first; it ignores that and is stopped."""
+    await group.apply({name: [layer(0, tone())] for name in "ab"})
 
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.apply({name: [layer(0, tone())] for name in "ab"})
+    def ignore(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
+        return handle("GetStatus" if name == "Disarm" else name, values, now)
 
-        def ignore(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
-            return handle("GetStatus" if name == "Disarm" else name, values, now)
-
-        altered(ends[0].far["a"], ignore)
-        ends[1].far["b"].trip("OVER_VOLTAGE", ends[1].loop.time())
-        with pytest.raises(DriverError):
-            await group.arm()
-        assert ends[0].levels("a") == [0.0, 0.0]
-
-    with_group(test, "serial", ("a",), ("b",))
+    altered(ends[0].far["a"], ignore)
+    ends[1].far["b"].trip("OVER_VOLTAGE", ends[1].loop.time())
+    with pytest.raises(DriverError):
+        await group.arm()
+    assert ends[0].levels("a") == [0.0, 0.0]
 
 
 @in_virtual_time

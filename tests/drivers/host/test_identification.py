@@ -9,7 +9,7 @@ from drivers.errors import CommandRefused, DriverError, LinkError, LinkTimeout, 
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from sim.amplifier.capabilities import capabilities
-from virtual_loop import run_virtual
+from virtual_loop import in_virtual_time, run_virtual
 from words_line import KINDS, LIMITS, MemoryLine, unaltered
 
 
@@ -34,109 +34,91 @@ def restart(end: MemoryLine, **changes: object) -> None:
         end.boot(1)
 
 
-def test_amplifier_that_was_switched_off_is_armed_with_its_new_limits(wire: str) -> None:
+@in_virtual_time
+async def test_amplifier_that_was_switched_off_is_armed_with_its_new_limits(wire: str) -> None:
     """It plays at most 0.3 since: 0.4 is refused here, before anything is sent."""
-
-    async def run() -> None:
-        end = MemoryLine(wire, "a")
-        group = Group(end.hosts, draw=lambda low, high: 77)
-        await group.open()
-        restart(end, level_max=3000)
-        await group.arm()
-        end.sent.clear()
-        with pytest.raises(CommandRefused):
-            await group.apply({"a": [loud(0.4)]})
-        assert end.sent == []
-        await group.apply({"a": [loud(0.3)]})
-
-    run_virtual(run())
+    end = MemoryLine(wire, "a")
+    group = Group(end.hosts, draw=lambda low, high: 77)
+    await group.open()
+    restart(end, level_max=3000)
+    await group.arm()
+    end.sent.clear()
+    with pytest.raises(CommandRefused):
+        await group.apply({"a": [loud(0.4)]})
+    assert end.sent == []
+    await group.apply({"a": [loud(0.3)]})
 
 
-def test_another_amplifier_is_not_armed(wire: str) -> None:
+@in_virtual_time
+async def test_another_amplifier_is_not_armed(wire: str) -> None:
     """Exchanged while it was switched off: its serial number is another."""
-
-    async def run() -> None:
-        end = MemoryLine(wire, "a")
-        group = Group(end.hosts, draw=lambda low, high: 77)
-        await group.open()
-        end.far["a"].identity["serial_number"] = "SIM-other"
-        with pytest.raises(LinkError):
-            await group.arm()
-        assert end.far["a"].state == "SWITCH_ON_DISABLED"
-
-    run_virtual(run())
+    end = MemoryLine(wire, "a")
+    group = Group(end.hosts, draw=lambda low, high: 77)
+    await group.open()
+    end.far["a"].identity["serial_number"] = "SIM-other"
+    with pytest.raises(LinkError):
+        await group.arm()
+    assert end.far["a"].state == "SWITCH_ON_DISABLED"
 
 
-def test_amplifier_that_restarts_amid_a_session_can_be_cleared_and_armed(wire: str) -> None:
+@in_virtual_time
+async def test_amplifier_that_restarts_amid_a_session_can_be_cleared_and_armed(wire: str) -> None:
     """Its latches begin anew, so that the stop is not confirmed; clear and arm know it again."""
-
-    async def run() -> None:
-        end = MemoryLine(wire, "a")
-        group = Group(end.hosts, draw=lambda low, high: 77)
-        await group.open()
-        await group.arm()
-        assert (await group.stop())["a"].is_confirmed
-        await group.clear()
-        group._draw = lambda low, high: 78
-        await group.arm()
-        await group.apply({"a": [loud(0.5)]})
-        restart(end)
-        with pytest.raises(DriverError):
-            await group.beat()
-        await group.stop()
-        group._draw = lambda low, high: 79
-        await group.clear()
-        await group.arm()
-        await group.apply({"a": [loud(0.5)]})
-        await group.stop()
-        assert end.levels("a") == [0.0, 0.0]
-
-    run_virtual(run())
+    end = MemoryLine(wire, "a")
+    group = Group(end.hosts, draw=lambda low, high: 77)
+    await group.open()
+    await group.arm()
+    assert (await group.stop())["a"].is_confirmed
+    await group.clear()
+    group._draw = lambda low, high: 78
+    await group.arm()
+    await group.apply({"a": [loud(0.5)]})
+    restart(end)
+    with pytest.raises(DriverError):
+        await group.beat()
+    await group.stop()
+    group._draw = lambda low, high: 79
+    await group.clear()
+    await group.arm()
+    await group.apply({"a": [loud(0.5)]})
+    await group.stop()
+    assert end.levels("a") == [0.0, 0.0]
 
 
-def test_stop_while_it_is_identified_again_leaves_it_disarmed(wire: str) -> None:
+@in_virtual_time
+async def test_stop_while_it_is_identified_again_leaves_it_disarmed(wire: str) -> None:
     """Arm waits 20 ms for a second reply to Hello; a stop then comes first."""
-
-    async def run() -> None:
-        end = MemoryLine(wire, "a")
-        (host,) = end.hosts.values()
-        await host.open()
-        arming = asyncio.ensure_future(host.arm(77))
-        await asyncio.sleep(0.01)
-        await host.stop()
-        await host.clear()
-        with pytest.raises(Preempted):
-            await arming
-        assert end.far["a"].state == "SWITCH_ON_DISABLED"
-
-    run_virtual(run())
+    end = MemoryLine(wire, "a")
+    (host,) = end.hosts.values()
+    await host.open()
+    arming = asyncio.ensure_future(host.arm(77))
+    await asyncio.sleep(0.01)
+    await host.stop()
+    await host.clear()
+    with pytest.raises(Preempted):
+        await arming
+    assert end.far["a"].state == "SWITCH_ON_DISABLED"
 
 
-def test_reply_that_comes_twice_is_not_of_two_amplifiers(wire: str) -> None:
+@in_virtual_time
+async def test_reply_that_comes_twice_is_not_of_two_amplifiers(wire: str) -> None:
     """The same amplifier's, doubled on its way."""
-
-    async def run() -> None:
-        end = MemoryLine(wire, "a")
-        end.outward = lambda name, data: [(0.0002, data), (0.004, data)]
-        await end.hosts["a"].open()
-
-    run_virtual(run())
+    end = MemoryLine(wire, "a")
+    end.outward = lambda name, data: [(0.0002, data), (0.004, data)]
+    await end.hosts["a"].open()
 
 
 @pytest.mark.parametrize("is_output", [True, False])
-def test_full_level_must_be_what_the_rig_says(wire: str, is_output: bool) -> None:
+@in_virtual_time
+async def test_full_level_must_be_what_the_rig_says(wire: str, is_output: bool) -> None:
     """A linear amplifier where the rig has a stiff source, and the other way round."""
-
-    async def run() -> None:
-        end = MemoryLine(wire, "a")
-        end.far["a"].capabilities = capabilities(2, is_output=not is_output)
-        host = Host(end.line, 1, LIMITS, name="a", is_output=is_output)
-        with pytest.raises(LinkError, match="full level"):
-            await host.open()
-        end.far["a"].capabilities = capabilities(2, is_output=is_output)
+    end = MemoryLine(wire, "a")
+    end.far["a"].capabilities = capabilities(2, is_output=not is_output)
+    host = Host(end.line, 1, LIMITS, name="a", is_output=is_output)
+    with pytest.raises(LinkError, match="full level"):
         await host.open()
-
-    run_virtual(run())
+    end.far["a"].capabilities = capabilities(2, is_output=is_output)
+    await host.open()
 
 
 def test_request_that_waits_on_a_busy_machine_contradicts_nothing(wire: str) -> None:
@@ -167,47 +149,41 @@ def test_request_that_waits_on_a_busy_machine_contradicts_nothing(wire: str) -> 
         run_virtual(run(is_answered))
 
 
-def test_ping_that_a_network_delivers_late_is_accounted_for() -> None:
+@in_virtual_time
+async def test_ping_that_a_network_delivers_late_is_accounted_for() -> None:
     """It arrives 0.2 s late: the amplifier plays for longer than its watchdog after the last one.
 
     By hand: the last of three attempts goes out at 60 ms and feeds at 260 ms, for 250 ms.
     """
-
-    async def run() -> None:
-        end = MemoryLine("tcp", "a")
-        group = Group(end.hosts, draw=lambda low, high: 77)
-        await group.open()
-        await group.arm()
-        await group.apply({"a": [loud(0.5)]})
-        (host,) = end.hosts.values()
-        end.inward = lambda name, data: [(0.2, data)]
-        end.outward = lambda name, data: []
-        began = end.loop.time()
-        with pytest.raises(LinkTimeout):
-            await host.ping()
-        await asyncio.sleep(began + 0.5 - end.loop.time())
-        assert end.levels("a") == [0.5, 0.0]
-        assert began + 0.515 < host.feeding.may_play_until < began + 1.4
-        await asyncio.sleep(0.02)
-        assert end.levels("a") == [0.0, 0.0]
-
-    run_virtual(run())
+    end = MemoryLine("tcp", "a")
+    group = Group(end.hosts, draw=lambda low, high: 77)
+    await group.open()
+    await group.arm()
+    await group.apply({"a": [loud(0.5)]})
+    (host,) = end.hosts.values()
+    end.inward = lambda name, data: [(0.2, data)]
+    end.outward = lambda name, data: []
+    began = end.loop.time()
+    with pytest.raises(LinkTimeout):
+        await host.ping()
+    await asyncio.sleep(began + 0.5 - end.loop.time())
+    assert end.levels("a") == [0.5, 0.0]
+    assert began + 0.515 < host.feeding.may_play_until < began + 1.4
+    await asyncio.sleep(0.02)
+    assert end.levels("a") == [0.0, 0.0]
 
 
-def test_mute_amplifier_leaves_the_others_disarmed_and_without_a_fault(wire: str) -> None:
+@in_virtual_time
+async def test_mute_amplifier_leaves_the_others_disarmed_and_without_a_fault(wire: str) -> None:
     """It is known within 0.1 s not to reply: before the watchdogs of those armed pass."""
-
-    async def run() -> None:
-        ends = [MemoryLine(wire, "a"), MemoryLine(wire, "b")]
-        hosts = {name: host for end in ends for name, host in end.hosts.items()}
-        group = Group(hosts, draw=lambda low, high: 77)
-        await group.open()
-        ends[1].outward = lambda name, data: []
-        began = ends[0].loop.time()
-        with pytest.raises(LinkError):
-            await group.arm()
-        assert ends[0].loop.time() - began < 0.6
-        assert ends[0].levels("a") == [0.0, 0.0]
-        assert ends[0].far["a"].fault == "NONE"
-
-    run_virtual(run())
+    ends = [MemoryLine(wire, "a"), MemoryLine(wire, "b")]
+    hosts = {name: host for end in ends for name, host in end.hosts.items()}
+    group = Group(hosts, draw=lambda low, high: 77)
+    await group.open()
+    ends[1].outward = lambda name, data: []
+    began = ends[0].loop.time()
+    with pytest.raises(LinkError):
+        await group.arm()
+    assert ends[0].loop.time() - began < 0.6
+    assert ends[0].levels("a") == [0.0, 0.0]
+    assert ends[0].far["a"].fault == "NONE"

@@ -13,7 +13,7 @@ from drivers.host.group import Group
 from drivers.host.modbus_wire import ModbusWire
 from drivers.host.serial_wire import SerialWire
 from drivers.host.wire import Wire
-from virtual_loop import run_virtual
+from virtual_loop import in_virtual_time
 from words_line import MemoryLine
 
 LAYER = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
@@ -43,73 +43,64 @@ def started(end: MemoryLine) -> list[float]:
 
 
 @pytest.mark.parametrize("names", [*combinations(LINES, 2)], ids="-".join)
-def test_commits_arrive_together_on_lines_of_any_speed_that_are_busy(
+@in_virtual_time
+async def test_commits_arrive_together_on_lines_of_any_speed_that_are_busy(
     names: tuple[str, str],
 ) -> None:
     """Within 0.2 ms, while the second line carries a status whose reply takes 9 ms or more."""
+    ends = [timed_line(name, each) for name, each in zip(names, "ab", strict=True)]
+    hosts = {name: host for end in ends for name, host in end.hosts.items()}
+    group = Group(hosts, watchdog=1.0, draw=lambda low, high: 77)
+    await group.open()
+    await group.arm()
+    ends[1].outward = lambda name, data: [(0.009 if name == "GetStatus" else 0.0002, data)]
 
-    async def run() -> None:
-        ends = [timed_line(name, each) for name, each in zip(names, "ab", strict=True)]
-        hosts = {name: host for end in ends for name, host in end.hosts.items()}
-        group = Group(hosts, watchdog=1.0, draw=lambda low, high: 77)
-        await group.open()
-        await group.arm()
-        ends[1].outward = lambda name, data: [(0.009 if name == "GetStatus" else 0.0002, data)]
+    async def keep_busy() -> None:
+        await asyncio.sleep(0.0005)
+        await hosts["b"].read_status()
 
-        async def keep_busy() -> None:
-            await asyncio.sleep(0.0005)
-            await hosts["b"].read_status()
-
-        busy = asyncio.ensure_future(keep_busy())
-        await group.apply({name: [LAYER] for name in hosts})
-        await busy
-        first, second = [*started(ends[0]), *started(ends[1])]
-        assert abs(first - second) < 0.0002
-
-    run_virtual(run())
+    busy = asyncio.ensure_future(keep_busy())
+    await group.apply({name: [LAYER] for name in hosts})
+    await busy
+    first, second = [*started(ends[0]), *started(ends[1])]
+    assert abs(first - second) < 0.0002
 
 
-def test_line_that_is_busy_for_too_long_commits_nothing() -> None:
+@in_virtual_time
+async def test_line_that_is_busy_for_too_long_commits_nothing() -> None:
     """Three readings without reply take 270 ms, a set is admitted for 100: silent, not armed."""
-
-    async def run() -> None:
-        ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
-        hosts = {name: host for end in ends for name, host in end.hosts.items()}
-        group = Group(hosts, watchdog=1.0, draw=lambda low, high: 77)
-        await group.open()
-        await group.arm()
-        ends[1].outward = lambda name, data: [] if name == "GetStatus" else [(0.0002, data)]
-        reads = [asyncio.ensure_future(hosts["b"].read_status()) for _ in range(3)]
-        with pytest.raises(DriverError):
-            await group.apply({name: [LAYER] for name in hosts})
-        await asyncio.gather(*reads, return_exceptions=True)
-        assert [started(end) for end in ends] == [[], []]
-        assert not group.is_armed
-
-    run_virtual(run())
+    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
+    hosts = {name: host for end in ends for name, host in end.hosts.items()}
+    group = Group(hosts, watchdog=1.0, draw=lambda low, high: 77)
+    await group.open()
+    await group.arm()
+    ends[1].outward = lambda name, data: [] if name == "GetStatus" else [(0.0002, data)]
+    reads = [asyncio.ensure_future(hosts["b"].read_status()) for _ in range(3)]
+    with pytest.raises(DriverError):
+        await group.apply({name: [LAYER] for name in hosts})
+    await asyncio.gather(*reads, return_exceptions=True)
+    assert [started(end) for end in ends] == [[], []]
+    assert not group.is_armed
 
 
-def test_stop_while_a_line_is_kept_for_its_commit_commits_nothing() -> None:
+@in_virtual_time
+async def test_stop_while_a_line_is_kept_for_its_commit_commits_nothing() -> None:
     """One line is free, the other busy for 90 ms: the stop goes out at once on the first."""
-
-    async def run() -> None:
-        ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
-        hosts = {name: host for end in ends for name, host in end.hosts.items()}
-        group = Group(hosts, draw=lambda low, high: 77)
-        await group.open()
-        await group.arm()
-        ends[1].outward = lambda name, data: [(0.025, data)]
-        applying = asyncio.ensure_future(group.apply({name: [LAYER] for name in hosts}))
-        reading = asyncio.ensure_future(hosts["b"].read_status())
-        await asyncio.sleep(0.04)
-        assert [name for _, name in ends[0].sent][-1] == "1:5"
-        began = ends[0].loop.time()
-        stopped = await group.stop()
-        assert stopped["a"].is_confirmed
-        assert [each for each in ends[0].sent if each[0] == began] == [(began, "1:8")]
-        with pytest.raises(DriverError):
-            await applying
-        await reading
-        assert [started(end) for end in ends] == [[], []]
-
-    run_virtual(run())
+    ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
+    hosts = {name: host for end in ends for name, host in end.hosts.items()}
+    group = Group(hosts, draw=lambda low, high: 77)
+    await group.open()
+    await group.arm()
+    ends[1].outward = lambda name, data: [(0.025, data)]
+    applying = asyncio.ensure_future(group.apply({name: [LAYER] for name in hosts}))
+    reading = asyncio.ensure_future(hosts["b"].read_status())
+    await asyncio.sleep(0.04)
+    assert [name for _, name in ends[0].sent][-1] == "1:5"
+    began = ends[0].loop.time()
+    stopped = await group.stop()
+    assert stopped["a"].is_confirmed
+    assert [each for each in ends[0].sent if each[0] == began] == [(began, "1:8")]
+    with pytest.raises(DriverError):
+        await applying
+    await reading
+    assert [started(end) for end in ends] == [[], []]

@@ -19,7 +19,7 @@ from drivers.host.group import Group
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import MESSAGES
 from sim.far_ends import serial_amplifiers
-from virtual_loop import run_virtual
+from virtual_loop import in_virtual_time, run_virtual
 from words_line import KINDS, Alter, MemoryLine, unaltered
 
 LOUD = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
@@ -96,41 +96,35 @@ def test_capabilities_that_cannot_be_are_refused(
 
 
 @pytest.mark.parametrize("lie", STATUS)
-def test_status_that_cannot_be_ends_in_silence(
+@in_virtual_time
+async def test_status_that_cannot_be_ends_in_silence(
     wire: str, lie: str, altered: Callable[[str, int, int], None]
 ) -> None:
     """Two beats at most; a stop that cannot be read is not confirmed."""
-
-    async def run() -> None:
-        group, end = await armed(wire)
-        await group.apply({"a": [LOUD]})
-        await asyncio.sleep(0.01)
-        altered("GetStatus", *STATUS[lie])
-        if lie != "latch":
-            with contextlib.suppress(DriverError):
-                await group.beat()
-            await asyncio.sleep(0.03)
-            with pytest.raises(DriverError):
-                await group.beat()
-            assert not group.is_armed
-        stopped = (await group.stop())["a"]
-        assert not stopped.is_confirmed
-        await stops_truthfully(group, end)
-
-    run_virtual(run())
+    group, end = await armed(wire)
+    await group.apply({"a": [LOUD]})
+    await asyncio.sleep(0.01)
+    altered("GetStatus", *STATUS[lie])
+    if lie != "latch":
+        with contextlib.suppress(DriverError):
+            await group.beat()
+        await asyncio.sleep(0.03)
+        with pytest.raises(DriverError):
+            await group.beat()
+        assert not group.is_armed
+    stopped = (await group.stop())["a"]
+    assert not stopped.is_confirmed
+    await stops_truthfully(group, end)
 
 
 @pytest.mark.parametrize("text", ["vendor\n", "a\x1b[2J"])
-def test_name_with_control_characters_is_refused(wire: str, text: str) -> None:
+@in_virtual_time
+async def test_name_with_control_characters_is_refused(wire: str, text: str) -> None:
     """It could rewrite a terminal."""
-
-    async def run() -> None:
-        end = MemoryLine(wire, "a")
-        end.far["a"].identity["vendor"] = text
-        with pytest.raises(DriverError, match="control characters"):
-            await end.hosts["a"].open()
-
-    run_virtual(run())
+    end = MemoryLine(wire, "a")
+    end.far["a"].identity["vendor"] = text
+    with pytest.raises(DriverError, match="control characters"):
+        await end.hosts["a"].open()
 
 
 def ignored(name: str, values: Values) -> Values | None:
@@ -144,33 +138,30 @@ def refused(name: str, values: Values) -> Values | None:
 
 
 @pytest.mark.parametrize("reply", [ignored, refused])
-def test_stop_that_is_not_carried_out_is_not_confirmed_while_it_plays(
+@in_virtual_time
+async def test_stop_that_is_not_carried_out_is_not_confirmed_while_it_plays(
     wire: str, reply: Callable[[str, Values], Values | None]
 ) -> None:
     """Stop and Disarm are ignored or refused: it plays until its watchdog has passed."""
+    group, end = await armed(wire)
+    await group.apply({"a": [LOUD]})
+    far = end.far["a"]
+    handle = far.handle
 
-    async def run() -> None:
-        group, end = await armed(wire)
-        await group.apply({"a": [LOUD]})
-        far = end.far["a"]
-        handle = far.handle
+    def lying(name: str, values: Values, now: float) -> Values:
+        if name in ("Stop", "Disarm"):
+            return reply(name, values) or handle("GetStatus", {}, now)
+        return handle(name, values, now)
 
-        def lying(name: str, values: Values, now: float) -> Values:
-            if name in ("Stop", "Disarm"):
-                return reply(name, values) or handle("GetStatus", {}, now)
-            return handle(name, values, now)
-
-        far.handle = lying  # type: ignore[method-assign]
-        began = end.loop.time()
-        stopping = asyncio.ensure_future(group.stop())
-        await asyncio.sleep(0.24)
-        assert end.levels("a") == [0.5, 0.0]
-        assert not stopping.done()
-        await stopping
-        assert end.loop.time() - began < 1.0
-        await stops_truthfully(group, end)
-
-    run_virtual(run())
+    far.handle = lying  # type: ignore[method-assign]
+    began = end.loop.time()
+    stopping = asyncio.ensure_future(group.stop())
+    await asyncio.sleep(0.24)
+    assert end.levels("a") == [0.5, 0.0]
+    assert not stopping.done()
+    await stopping
+    assert end.loop.time() - began < 1.0
+    await stops_truthfully(group, end)
 
 
 def late(kind: str) -> Alter:
@@ -268,37 +259,34 @@ def lies_of(kind: str) -> Iterator[str]:
 
 
 @pytest.mark.parametrize(("kind", "lie"), [(kind, lie) for kind in KINDS for lie in lies_of(kind)])
-def test_line_that_lies_has_no_effect_but_counts(kind: str, lie: str) -> None:
+@in_virtual_time
+async def test_line_that_lies_has_no_effect_but_counts(kind: str, lie: str) -> None:
     """Sets and beats succeed or stop it; the stop says the truth; afterwards all is as before."""
-
-    async def run() -> None:
-        group, end = await armed(kind)
-        await group.apply({"a": [LOUD]})
-        end.outward = WIRE_LIES[lie](kind)
-        has_failed = False
-        try:
-            for level in (0.4, 0.3, 0.2):
-                await group.apply({"a": [Layer(0, (Tone(0, 100.0, level),), 0.001)]})
-                await asyncio.sleep(0.02)
-                assert end.levels("a") == [level, 0.0]
-                await group.beat()
-        except LinkDegraded:  # armed, but nothing new is played until it replies
-            pass
-        except DriverError:
-            has_failed = True
-        assert group.is_armed is not has_failed
-        await stops_truthfully(group, end)
-        end.outward = unaltered
-        await asyncio.sleep(0.3)
-        await group.open()
-        await group.clear()
-        await group.arm()
-        await group.apply({"a": [LOUD]})
-        assert (await group.stop())["a"].is_confirmed
-        counters = end.line.wire.counters
-        has_noise = lie not in ("byte by byte", "half open", "every second cut")
-        if has_noise and not (kind in ("tcp", "rtu") and lie == "after events"):
-            odd = counters.invalid_frames + counters.unexpected_frames + counters.events
-            assert odd > 0 or (kind == "can" and lie.startswith("after"))
-
-    run_virtual(run())
+    group, end = await armed(kind)
+    await group.apply({"a": [LOUD]})
+    end.outward = WIRE_LIES[lie](kind)
+    has_failed = False
+    try:
+        for level in (0.4, 0.3, 0.2):
+            await group.apply({"a": [Layer(0, (Tone(0, 100.0, level),), 0.001)]})
+            await asyncio.sleep(0.02)
+            assert end.levels("a") == [level, 0.0]
+            await group.beat()
+    except LinkDegraded:  # armed, but nothing new is played until it replies
+        pass
+    except DriverError:
+        has_failed = True
+    assert group.is_armed is not has_failed
+    await stops_truthfully(group, end)
+    end.outward = unaltered
+    await asyncio.sleep(0.3)
+    await group.open()
+    await group.clear()
+    await group.arm()
+    await group.apply({"a": [LOUD]})
+    assert (await group.stop())["a"].is_confirmed
+    counters = end.line.wire.counters
+    has_noise = lie not in ("byte by byte", "half open", "every second cut")
+    if has_noise and not (kind in ("tcp", "rtu") and lie == "after events"):
+        odd = counters.invalid_frames + counters.unexpected_frames + counters.events
+        assert odd > 0 or (kind == "can" and lie.startswith("after"))

@@ -10,7 +10,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
-from virtual_loop import run_virtual
+from virtual_loop import in_virtual_time
 from words_line import MemoryLine, unaltered
 
 LAYER = LayerSet(0, 20, 500, (Command(3, 2200, 2000, -9000),))
@@ -209,70 +209,61 @@ def test_request_of_all_units_has_no_reply() -> None:
     assert wire.counters.unexpected_frames == 0
 
 
-def test_damaged_length_costs_one_attempt() -> None:
+@in_virtual_time
+async def test_damaged_length_costs_one_attempt() -> None:
     """A write that seems to go on for 255 bytes ends with the pause before its repetition."""
+    end = MemoryLine("rtu", "a")
+    damaged = iter([True])
 
-    async def run() -> None:
-        end = MemoryLine("rtu", "a")
-        damaged = iter([True])
+    def lengthened(name: str, data: bytes) -> list[tuple[float, bytes]]:
+        if next(damaged, False):
+            data = data[:6] + b"\xff" + data[7:]
+        return unaltered(name, data)
 
-        def lengthened(name: str, data: bytes) -> list[tuple[float, bytes]]:
-            if next(damaged, False):
-                data = data[:6] + b"\xff" + data[7:]
-            return unaltered(name, data)
-
-        await end.hosts["a"].open()
-        end.inward = lengthened
-        await end.hosts["a"].read_status()
-        assert end.retries == 1
-
-    run_virtual(run())
+    await end.hosts["a"].open()
+    end.inward = lengthened
+    await end.hosts["a"].read_status()
+    assert end.retries == 1
 
 
 @pytest.mark.parametrize("kind", ["rtu", "tcp"])
-def test_each_response_has_its_time(kind: str) -> None:
+@in_virtual_time
+async def test_each_response_has_its_time(kind: str) -> None:
     """25 ms for that of the write and 25 ms for that of the read: no attempt is repeated.
 
     A stop that waits is not kept waiting for the second one.
     """
-
-    async def run() -> None:
-        end = MemoryLine(kind, "a")
-        host = end.hosts["a"]
-        await host.open()
-        end.outward = lambda name, data: [(0.025, data)]
-        await host.read_status()
-        assert end.retries == 0
-        begin = end.loop.time()
-        reading = asyncio.ensure_future(host.read_status())
-        await asyncio.sleep(0.02)
-        stopping = asyncio.ensure_future(host.stop())
-        await asyncio.gather(reading, stopping)
-        stopped = min(time for time, request in end.sent if request == "1:8")
-        assert stopped - begin <= 0.02 + 0.008 + 0.001
-
-    run_virtual(run())
+    end = MemoryLine(kind, "a")
+    host = end.hosts["a"]
+    await host.open()
+    end.outward = lambda name, data: [(0.025, data)]
+    await host.read_status()
+    assert end.retries == 0
+    begin = end.loop.time()
+    reading = asyncio.ensure_future(host.read_status())
+    await asyncio.sleep(0.02)
+    stopping = asyncio.ensure_future(host.stop())
+    await asyncio.gather(reading, stopping)
+    stopped = min(time for time, request in end.sent if request == "1:8")
+    assert stopped - begin <= 0.02 + 0.008 + 0.001
 
 
-def test_stop_is_not_sent_over_a_reply() -> None:
+@in_virtual_time
+async def test_stop_is_not_sent_over_a_reply() -> None:
     """On RTU a status of two channels, 8 + 39 characters and two silences, begins 4 ms late."""
-
-    async def run() -> None:
-        end = MemoryLine("rtu", "a")
-        host = end.hosts["a"]
-        await host.open()
-        takes = 47 * 11 / 115_200 + 2 * 0.00175 + 0.004
-        end.outward = lambda name, data: [(takes if len(data) > 8 else 0.0, data)]
-        begin = end.loop.time()
-        reading = asyncio.ensure_future(host.read_status())
-        await asyncio.sleep(0.001)
-        assert (await host.stop()).is_confirmed
-        await reading
-        stopped = min(time for time, request in end.sent if request == "1:8")
-        assert stopped - begin >= takes
-        assert (end.retries, end.line.wire.counters.unexpected_frames) == (0, 0)
-
-    run_virtual(run())
+    end = MemoryLine("rtu", "a")
+    host = end.hosts["a"]
+    await host.open()
+    takes = 47 * 11 / 115_200 + 2 * 0.00175 + 0.004
+    end.outward = lambda name, data: [(takes if len(data) > 8 else 0.0, data)]
+    begin = end.loop.time()
+    reading = asyncio.ensure_future(host.read_status())
+    await asyncio.sleep(0.001)
+    assert (await host.stop()).is_confirmed
+    await reading
+    stopped = min(time for time, request in end.sent if request == "1:8")
+    assert stopped - begin >= takes
+    assert (end.retries, end.line.wire.counters.unexpected_frames) == (0, 0)
 
 
 def test_times_on_a_line_are_those_of_its_characters() -> None:

@@ -6,7 +6,7 @@
 
 #include <string.h>
 
-#define HEADER SERIAL_HEADER
+#define HEADER 5
 #define TYPE 0
 #define VERSION 1
 #define ADDRESS 2
@@ -57,7 +57,7 @@ static uint16_t stuff(const uint8_t *frame, uint16_t length, uint8_t *line)
     return out;
 }
 
-uint16_t serial_finish(uint8_t *frame, uint16_t length, uint8_t *line)
+static uint16_t finish(uint8_t *frame, uint16_t length, uint8_t *line)
 {
     uint32_t crc = crc32_of(frame, length);
     for (int i = 0; i < 4; i++)
@@ -138,7 +138,7 @@ static uint16_t frame_received(struct serial *serial)
     frame[TYPE] = request[TYPE] | REPLY;
     if (request[TYPE] == MESSAGE_HELLO) {
         frame[VERSION] = NEUTRAL;
-        return serial_finish(frame, put_identity(frame, serial->amplifier), serial->reply);
+        return finish(frame, put_identity(frame, serial->amplifier), serial->reply);
     }
     struct verdict verdict = handle(serial, request, length, &reply);
     if (verdict.nak != NAK_NONE) {
@@ -147,7 +147,7 @@ static uint16_t frame_received(struct serial *serial)
     }
     if (verdict.nak == NAK_UNSUPPORTED_VERSION)
         frame[VERSION] = NEUTRAL;
-    return serial_finish(frame, put_words(frame, &reply), serial->reply);
+    return finish(frame, put_words(frame, &reply), serial->reply);
 }
 
 uint16_t serial_byte(struct serial *serial, uint8_t byte)
@@ -178,5 +178,5 @@ uint16_t serial_event(struct serial *serial, const struct words *event,
     serial->events++;
     frame[SEQUENCE] = (uint8_t)serial->events;
     frame[SEQUENCE + 1] = (uint8_t)(serial->events >> 8);
-    return serial_finish(frame, put_words(frame, event), line);
+    return finish(frame, put_words(frame, event), line);
 }

@@ -10,8 +10,7 @@
 
 #include "amplifier.h"
 
-#define SERIAL_HEADER 5
-#define SERIAL_FRAME_MAX (SERIAL_HEADER + 2 * WORDS_MAX + 4)
+#define SERIAL_FRAME_MAX (5 + 2 * WORDS_MAX + 4)
 #define SERIAL_STUFFED_MAX (SERIAL_FRAME_MAX + 1)
 
 struct serial {
@@ -29,9 +28,6 @@ void serial_init(struct serial *serial, struct amplifier *amplifier, uint8_t add
 
 // Take a byte; return the length of the reply, or 0 for none.
 uint16_t serial_byte(struct serial *serial, uint8_t byte);
-
-// Put the CRC behind a frame, and write it to the line stuffed and between zeros; return its length.
-uint16_t serial_finish(uint8_t *frame, uint16_t length, uint8_t *line);
 
 // Write an Event as a frame, where no other amplifier is on the line; return its length.
 uint16_t serial_event(struct serial *serial, const struct words *event,

@@ -1,5 +1,6 @@
 """The firmware's programs, each built once where a test needs it."""
 
+import os
 import shutil
 from collections.abc import Callable
 from functools import cache
@@ -30,7 +31,8 @@ def moved(compiled: Path) -> Callable[..., Path]:
 
     @cache
     def build(*options: str) -> Path:
-        flags = ("-O1", "-fsanitize=undefined", "-fno-sanitize-recover=all", *options)
+        sanitizers = os.environ.get("SANITIZERS", "undefined")
+        flags = ("-O1", f"-fsanitize={sanitizers}", "-fno-sanitize-recover=all", *options)
         folder = compiled / "-".join(
             ["moved", *(each.strip("-").replace("=", "") for each in options)]
         )

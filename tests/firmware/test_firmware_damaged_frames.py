@@ -1,0 +1,125 @@
+"""The firmware under damaged frames on every line, built with sanitizers.
+
+`make firmware-test` has 20 000 for each line, under the sanitizer of addresses as well, and a
+million with --long.
+"""
+
+import os
+import random
+import struct
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from drivers.codec.can_bus.adapter_text import SLCAN
+from drivers.codec.can_bus.canopen import CanFrame
+from drivers.codec.can_bus.segments import REQUEST, segments
+from drivers.protocol.table import MESSAGES, STATES, STATUS_FLAGS
+from firmware_requests import RandomHost
+from firmware_script import request, stuffed, unstuffed
+from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware
+from mutation import damage
+from sim.far_ends.modbus.frames import rtu_frame
+
+COUNT = int(os.environ.get("FRAMES", "1000"))
+GET_CAPS, GET_STATUS = 2, 9
+LINES = {"serial": SERIAL, "rtu": MODBUS, "tcp": TCP, "can": CAN}
+OPERATIONAL = b"O\rt0002" + b"0100\r"
+
+Bodies = Iterator[bytes]
+
+
+def on_serial(number: int, words: Sequence[int], sequence: int) -> Bodies:
+    """A frame without its checksum."""
+    yield struct.pack(f"<BBBH{len(words)}H", number, 3, 1, sequence % 65536, *words)
+
+
+def on_modbus(number: int, words: Sequence[int], sequence: int) -> Bodies:
+    """PDUs of a write and of the read of its reply."""
+    count = len(words) + 1
+    head = struct.pack(">BHHB", 16, 256 * number, count, 2 * count)
+    yield head + struct.pack(f">{count}H", sequence % 65536, *words)
+    yield struct.pack(">BHH", 3, 256 * number + 128, 122)
+
+
+def on_can(number: int, words: Sequence[int], sequence: int) -> Bodies:
+    """Frames of a message, with their identifiers."""
+    for data in segments(sequence % 255 + 1, number, words):
+        yield struct.pack("<H", REQUEST + 1) + data
+
+
+def objects_and_management(draw: random.Random) -> Bodies:
+    """A frame to the objects of a node, most of which are there, or of network management."""
+    yield struct.pack("<HB", 0x601, draw.randrange(256)) + bytes(
+        [draw.randrange(4), 0x20, draw.randrange(32), *draw.randbytes(4)]
+    )
+    yield struct.pack("<HBB", 0, draw.choice([1, 1, 1, 128, 129, 130]), 0)
+
+
+def can_line(body: bytes) -> bytes:
+    """The text of a frame."""
+    can_id = int.from_bytes(body[:2], "little") & 0x7FF
+    return SLCAN.encode(CanFrame(can_id, body[2:10]))
+
+
+WIRES: dict[str, tuple[Callable[..., Bodies], Callable[[bytes], bytes]]] = {
+    "serial": (on_serial, lambda body: stuffed(body + struct.pack("<I", zlib.crc32(body)))),
+    "rtu": (on_modbus, lambda body: rtu_frame(1, body)),
+    "tcp": (on_modbus, lambda body: struct.pack(">HHHB", 7, 0, len(body) + 1, 1) + body),
+    "can": (on_can, can_line),
+}
+"""The bodies of a request on each wire, and the frame of a body, with a good checksum."""
+
+
+def words_of(firmware: MovedFirmware, number: int) -> tuple[int, ...]:
+    """The reply on its serial line, behind a zero that ends what was begun there."""
+    firmware.sent(SERIAL)
+    firmware.receive(SERIAL, b"\0" + request(number))
+    frame = unstuffed(firmware.sent(SERIAL).split(b"\0")[-2])
+    assert frame[0] == 0x80 | number
+    return struct.unpack(f"<{len(frame[5:-4]) // 2}H", frame[5:-4])
+
+
+@pytest.mark.parametrize("wire", LINES)
+def test_damaged_frames_leave_a_valid_amplifier(wire: str, moved: Callable[..., Path]) -> None:
+    """Half of the requests are whole, so that it plays; damaged ones have a good checksum mostly.
+
+    Its states, levels, watchdog and high voltage keep what the protocol says of them.
+    """
+    draw, firmware = random.Random(wire), MovedFirmware(moved())
+    capabilities = MESSAGES["GetCaps"].reply.unpack(words_of(firmware, GET_CAPS), is_strict=True)
+    host = RandomHost(draw, capabilities)
+    bodies, frame_of = WIRES[wire]
+    time, latch, sequence, damaged, tokens = 0.0, 0, 0, 0, set[int]()
+    while damaged < COUNT:
+        if wire == "can":
+            firmware.receive(CAN, OPERATIONAL)
+        for number, words in host.requests(latch):
+            sequence += 1
+            sent = [*bodies(number, words, sequence)]
+            if wire == "can" and draw.random() < 0.05:
+                sent += objects_and_management(draw)
+            may_be_damaged = draw.random() < 0.5
+            for body in sent:
+                is_whole = not may_be_damaged or draw.random() < 0.3
+                frame = frame_of(body if is_whole else damage(body, draw)[:250])
+                frame = damage(frame, draw) if not is_whole and draw.random() < 0.1 else frame
+                damaged += not is_whole
+                firmware.receive(LINES[wire], frame)
+                if wire == "rtu":  # which ends its frames with silence
+                    time += draw.choice([0.002, 0.002, 0.002, 0.021])
+                    firmware.move(time)
+        time += 0.3 if draw.random() < 0.02 else draw.choice([0.0, 0.001, 0.002, 0.01])
+        firmware.move(time)
+        status = MESSAGES["GetStatus"].reply.unpack(words_of(firmware, GET_STATUS), is_strict=True)
+        is_on = bool(status["flags"] & 1 << STATUS_FLAGS["high_voltage"])
+        is_armed = status["state"] == STATES["OPERATION_ENABLED"]
+        assert status["state"] in STATES.values()
+        assert max(status["levels"]) <= 10_000 * is_on
+        assert is_on or not is_armed
+        assert (status["watchdog_left"] > 0) <= is_armed
+        latch = status["latch"]
+        tokens.add(status["token"])
+    assert len(tokens) > COUNT / 200  # sets were played

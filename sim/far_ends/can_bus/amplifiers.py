@@ -47,12 +47,8 @@ class CanAmplifiers(FarEnd):
     """Amplifiers by their nodes on one bus; send: called with their frames."""
 
     def __init__(self, amplifiers: Mapping[int, AmplifierPort], send: Send) -> None:
-        self.counters = WireCounters()
-        self._nodes = {
-            node: _Node(amplifier, node, send, self.counters)
-            for node, amplifier in amplifiers.items()
-        }
-        self._broadcasts = Assembler(self.counters, is_numbered=False)
+        self._nodes = {node: _Node(amplifier, node, send) for node, amplifier in amplifiers.items()}
+        self._broadcasts = Assembler(WireCounters(), is_numbered=False)
 
     def start(self, now: float) -> None:
         """Boot all nodes at a time [s]."""
@@ -107,12 +103,9 @@ class CanAmplifiers(FarEnd):
 class _Node:
     """An amplifier at a node number."""
 
-    def __init__(
-        self, amplifier: AmplifierPort, number: int, send: Send, counters: WireCounters
-    ) -> None:
+    def __init__(self, amplifier: AmplifierPort, number: int, send: Send) -> None:
         self._amplifier = amplifier
         self._send = send
-        self._counters = counters
         self.number = number
         self._now = 0.0
         self._was_faulty = False
@@ -122,7 +115,7 @@ class _Node:
 
     def _reset(self) -> None:
         self._state = _PRE_OPERATIONAL
-        self._requests = Assembler(self._counters)
+        self._requests = Assembler(WireCounters())
         self._objects = WordObjects(self._amplifier, self.number, lambda: self._now)
         self._sdo = SdoServer(
             read=self._objects.read,

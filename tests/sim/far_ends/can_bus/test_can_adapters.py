@@ -1,8 +1,6 @@
 """The far end's adapters against python-can's own interfaces, and against text by hand."""
 
 import asyncio
-import os
-import tty
 from collections.abc import AsyncIterator
 from functools import partial
 
@@ -128,20 +126,6 @@ async def test_socketcand_refuses_another_bus(talk: Talk) -> None:
         assert await talk.reader.read() == b""
 
 
-async def test_socketcand_disconnects_a_client_that_does_not_read(bus: CanBus, talk: Talk) -> None:
-    """A flood of frames takes no memory: the connection ends, the bus goes on."""
-    member = Member(bus)
-    await talk.open()
-    for number in range(300_000):
-        member.send(FRAME)
-        if number % 1000 == 0 and len(bus._members) == 1:
-            break
-        if number % 1000 == 0:
-            await asyncio.sleep(0)
-    await asyncio.sleep(0)
-    assert len(bus._members) == 1
-
-
 @pytest.fixture
 async def adapter(bus: CanBus, coarse_rig: Rig) -> AsyncIterator[TerminalEnd]:
     """A serial adapter."""
@@ -206,17 +190,3 @@ def test_slcan_replies_like_lawicel(
 ) -> None:
     """CR for what was done, BELL for what makes no sense, z and Z for frames that were sent."""
     assert answers(bus, text) == (written, sent)
-
-
-async def test_slcan_host_may_reconnect(bus: CanBus, adapter: TerminalEnd) -> None:
-    """The port outlives its users, and a closed channel passes nothing on."""
-    member = Member(bus)
-    for _ in range(3):
-        port = os.open(adapter.port, os.O_RDWR | os.O_NOCTTY)
-        tty.setraw(port)
-        os.write(port, b"C\rS6\rO\rt1230\rC\r")
-        await member.hears(1)
-        member.heard.clear()
-        os.close(port)
-    member.send(FRAME)
-    assert adapter.dropped_replies == 0

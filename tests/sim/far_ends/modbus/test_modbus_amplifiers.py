@@ -4,7 +4,6 @@ import asyncio
 import os
 import struct
 import tty
-from collections.abc import Callable
 
 import minimalmodbus
 import pytest
@@ -61,52 +60,6 @@ def test_present_state_is_read_without_a_write() -> None:
     port.write(0x900, 6)
     port.now = 0.2
     assert port.read(STATUS, 7) == (6, 0, 4, 0, 1, 0, 50)
-
-
-def test_refusal_is_a_result_and_no_exception() -> None:
-    """A word too many for a status is told once; a set without a session is not armed."""
-    port = Port()
-    assert port.write(0x900, 7, 0) == bytes.fromhex("10 0900 0002")
-    assert port.read(STATUS, 3) == (7, REFUSALS["BAD_LENGTH"] << 8 | 255, 0)
-    assert port.read(STATUS, 3) == (7, 0, STATES["SWITCH_ON_DISABLED"])
-    port.write(0x600, 8, 9, 1)
-    assert port.read(0x680, 122) == (8, REFUSALS["WRONG_STATE"] << 8 | 255, *[0] * 120)
-
-
-EXCEPTIONS: dict[str, tuple[Callable[[Port], object], object]] = {
-    "write one register": (lambda port: port.ask(bytes.fromhex("06 0900 0001")), b"\x86\1"),
-    "write and read": (
-        lambda port: port.ask(bytes.fromhex("17 0980 0001 0900 0001 02 0001")),
-        b"\x97\1",
-    ),
-    "identification": (lambda port: port.ask(bytes.fromhex("2B 0E 01 00")), b"\xab\1"),
-    "no message": (lambda port: port.write(0x1300, 1), b"\x90\2"),
-    "message 0": (lambda port: port.write(0, 1), b"\x90\2"),
-    "not from its tag on": (lambda port: port.write(0x901, 1), b"\x90\2"),
-    "into the reply": (lambda port: port.write(0x980, 1), b"\x90\2"),
-    "into the identity": (lambda port: port.write(1065, 1), b"\x90\2"),
-    "122 registers": (lambda port: port.write(0x500, *range(122)), b"\x90\2"),
-    "bytes that are not two a register": (
-        lambda port: port.ask(bytes.fromhex("10 0900 0002 02 0001")),
-        b"\x90\3",
-    ),
-    "nothing read": (lambda port: port.read(STATUS, 0), (3,)),
-    "126 registers read": (lambda port: port.read(STATUS, 126), (3,)),
-    "what is written": (lambda port: port.read(0x900, 1), (2,)),
-    "beyond the reply": (lambda port: port.read(STATUS, 123), (2,)),
-    "before the identity": (lambda port: port.read(1064, 2), (2,)),
-    "beyond the identity": (lambda port: port.read(1065, 67), (2,)),
-    "beyond the last register": (lambda port: port.read(65535, 2), (2,)),
-}
-
-
-@pytest.mark.parametrize("case", EXCEPTIONS)
-def test_exceptions_are_those_that_modbus_defines(case: str) -> None:
-    """1 for a function, 2 for an address, 3 for a count; the state is as before."""
-    port = Port()
-    ask, expected = EXCEPTIONS[case]
-    assert ask(port) == expected
-    assert port.read(STATUS, 3) == (0, 0, STATES["SWITCH_ON_DISABLED"])
 
 
 def test_broadcast_reaches_all_units_and_has_no_response() -> None:

@@ -14,7 +14,6 @@ from sim.plant.loaded_plates import BLOCK, LoadedPlate, exponentials
 
 _NEGLIGIBLE = 1e-17  # of the strongest free vibration: a tenth of what rounding leaves of it
 _SMALLEST = 1e-60  # m/s²; what is subnormal is slow
-_ROOM = 16  # for forced exponentials, at first
 _TABLES_KEPT = 8  # sets of omegas
 
 
@@ -36,21 +35,17 @@ class Sampler:
         self.sample_rate = sample_rate
         self.precision = precision
         plate = loaded.plate
-        at_points = points @ plate.free_acceleration
-        self._strengths = np.abs(at_points).max(axis=0, initial=0.0)
         self._by_forced = np.ascontiguousarray((points @ plate.displacement).T)
-        # Of all exponentials, forced ones before the free ones, those that decay fastest last:
-        # conjugate exponents, conjugate amplitudes at the points, parts over time.
-        self._room = self._first = _ROOM  # for forced ones, and the first of those in use
-        self._exponents = np.pad(plate.decay.conj(), (_ROOM, 0))
-        self._amplitudes = np.zeros((len(self._exponents), len(points)), dtype=complex)
-        self._amplitudes[_ROOM:] = at_points.conj().T
-        self._columns = np.empty((BLOCK, 2 * len(self._exponents)), dtype=precision)
-        self._columns[:, 2 * _ROOM :] = loaded.exponentials(sample_rate).view(float)
+        # Conjugate exponents and amplitudes at the points (m, q), those that decay fastest last.
+        self._decay = plate.decay.conj()
+        self._free = (points @ plate.free_acceleration).conj().T
+        self._strengths = np.abs(self._free).max(axis=1, initial=0.0)
+        self._free_table = self._columns(loaded.exponentials(sample_rate))
         self._forced: ForcedVibration | None = None
-        self._solution = -1  # which these are
-        self._constant = self._amplitudes[:0]  # conjugate amplitudes of all its solutions (n, q),
-        self._growth: ComplexArray | None = None  # and per second
+        self._solution = -1  # which these are, with their conjugate amplitudes (n, q):
+        self._constant = self._growth = self._free[:0]  # of all its solutions, and per second
+        self._exponents = self._decay[:0]
+        self._forced_table = self._free_table[:, :0]
 
     def sample(
         self,
@@ -68,21 +63,28 @@ class Sampler:
         """
         if forced is not self._forced or solution != self._solution:
             self._use(forced, solution)
-        exponents, columns = self._exponents[self._first :], self._columns[:, 2 * self._first :]
-        count = self._room - self._first
+        rows = forced.rows(solution)
         for start in range(0, len(times), BLOCK):
             into = out[start : start + BLOCK]
             tau = float(times[start] - forced.times[solution])
-            now = np.exp(exponents * tau)
-            now[count:] *= free.conj()
-            kept = count + self._kept(now[count:])
-            amplitudes = self._amplitudes[self._first : self._first + kept] * now[:kept, None]
-            if self._growth is not None:
-                amplitudes[: count // 2] += tau * amplitudes[count // 2 : count]
-            parts = np.empty((kept, 2, len(self.points)), dtype=self.precision)
-            parts[:, 0], parts[:, 1] = amplitudes.real, amplitudes.imag
-            rows = parts.reshape(2 * kept, len(self.points))
-            np.matmul(columns[: len(into), : 2 * kept], rows, out=into)
+            now = np.exp(self._decay * tau) * free.conj()
+            kept = self._kept(now)
+            amplitudes = self._rows(self._free[:kept] * now[:kept, None])
+            np.matmul(self._free_table[: len(into), : 2 * kept], amplitudes, out=into)
+            driven: ComplexArray = self._constant[rows]
+            if forced.a1 is not None:
+                driven = np.vstack([driven + tau * self._growth[rows], self._growth[rows]])
+            turned = driven * np.exp(self._exponents * tau)[:, None]
+            into += self._forced_table[: len(into)] @ self._rows(turned)
+
+    def _rows(self, amplitudes: ComplexArray) -> FloatArray:
+        """Real and imaginary parts (2 n, q) of amplitudes (n, q), one after the other."""
+        parts = np.stack([amplitudes.real, amplitudes.imag], axis=1, dtype=self.precision)
+        return parts.reshape(-1, len(self.points))
+
+    def _columns(self, table: ComplexArray) -> FloatArray:
+        """Real and imaginary parts (n, 2 k) of a table (n, k)."""
+        return np.ascontiguousarray(table).view(float).astype(self.precision, copy=False)
 
     def _kept(self, free: ComplexArray) -> int:
         """How many free vibrations count."""
@@ -92,42 +94,28 @@ class Sampler:
         return int(last[0]) + 1 if len(last) else 0
 
     def _use(self, forced: ForcedVibration, solution: int) -> None:
-        """Put the exponentials of a solution before the free ones."""
+        """Tabulate the exponentials of a solution."""
         if forced is not self._forced:
             self._find_amplitudes(forced)
         self._solution = solution
-        rows = forced.rows(solution)
-        table = _sinusoids(forced.omegas[rows].tobytes(), self.sample_rate)
-        exponents, amplitudes = -1j * forced.omegas[rows], self._constant[rows]
-        if self._growth is not None:
+        omegas = forced.omegas[forced.rows(solution)]
+        table = _sinusoids(omegas.tobytes(), self.sample_rate)
+        self._exponents = np.asarray(-1j * omegas, dtype=complex)
+        if forced.a1 is not None:
             table = np.hstack([table, np.arange(BLOCK)[:, None] / self.sample_rate * table])
-            exponents = np.concatenate([exponents, exponents])
-            amplitudes = np.concatenate([amplitudes, self._growth[rows]])
-        if len(exponents) > self._room:
-            self._make_room(len(exponents))
-        self._first = self._room - len(exponents)
-        self._exponents[self._first : self._room] = exponents
-        self._amplitudes[self._first : self._room] = amplitudes
-        self._columns[:, 2 * self._first : 2 * self._room] = table.view(float)
+            self._exponents = np.tile(self._exponents, 2)
+        self._forced_table = self._columns(table)
 
     def _find_amplitudes(self, forced: ForcedVibration) -> None:
         """Find the amplitudes of all solutions at the points, all at once."""
         self._forced = forced
-        s, self._growth = 1j * forced.omegas[:, None], None
+        s = 1j * forced.omegas[:, None]
         constant = s**2 * forced.a0
         if forced.a1 is not None:
             constant += 2 * s * forced.a1
             # Im[a exp(s t)] is Re[-i a exp(s t)].
             self._growth = np.asarray(1j * ((s**2 * forced.a1) @ self._by_forced).conj())
         self._constant = np.asarray(1j * (constant @ self._by_forced).conj())
-
-    def _make_room(self, count: int) -> None:
-        """Make room for so many forced exponentials."""
-        more = count - self._room
-        self._exponents = np.pad(self._exponents, (more, 0))
-        self._amplitudes = np.pad(self._amplitudes, ((more, 0), (0, 0)))
-        self._columns = np.pad(self._columns, ((0, 0), (2 * more, 0)))
-        self._room = count
 
 
 @lru_cache(_TABLES_KEPT)

@@ -10,7 +10,7 @@ from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.lifted_blocks import LiftedBlocks, sampled
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters
-from benchmarks.desk_plate.truth import Truth, draw_truth
+from benchmarks.desk_plate.truth import Truth
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
@@ -23,18 +23,6 @@ RATE = 48_000.0
 POINTS = np.array([[0.03, 0.05], [0.20, 0.11], [0.29, 0.20]])
 FREQUENCIES = np.array([61.0, 150.0, 233.0, 410.0])
 FINGERS = [(0.1, 0.1), (0.25, 0.06)]
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    """The paper's plate as its file has it."""
-    return load_rig(example_rig_path())
-
-
-@pytest.fixture(scope="module")
-def truth(rig: Rig) -> Truth:
-    """A plate that deviates from it, on a coarse mesh."""
-    return draw_truth(rig, seed=3, mesh="6x4 Q3")
 
 
 @pytest.fixture(scope="module")

@@ -5,14 +5,13 @@ import pytest
 
 from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.sensing import Converters
-from benchmarks.desk_plate.truth import Truth, draw_truth
+from benchmarks.desk_plate.truth import Truth
 from desk_card import DeskCard
 from drivers.errors import LinkError
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from model.identification.identify import identify
 from model.identification.measured_plate import MeasuredPlate
-from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from sim.measuring.desk import Desk
 from sim.measuring.multisine import Multisine
@@ -23,18 +22,6 @@ RATE, LEVEL = 8_000.0, 0.3
 PLACES = ((0.03, 0.05), (0.20, 0.11), (0.29, 0.20), (0.11, 0.19), (0.25, 0.03))
 SENSORS = tuple(WiredSensor(f"P{n}", x, y, n, 2e-3) for n, (x, y) in enumerate(PLACES, start=1))
 FREQUENCIES = np.arange(51.0, 500.0, 40.0)
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    """The paper's plate as its file has it."""
-    return load_rig(example_rig_path())
-
-
-@pytest.fixture(scope="module")
-def truth(rig: Rig) -> Truth:
-    """A plate that deviates from it, with actuators that resonate, on a coarse mesh."""
-    return draw_truth(rig, seed=3, mesh="6x4 Q3")
 
 
 class ChangingCard(DeskCard):

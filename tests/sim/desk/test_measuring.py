@@ -8,11 +8,10 @@ import pytest
 from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters
-from benchmarks.desk_plate.truth import Truth, draw_truth
+from benchmarks.desk_plate.truth import Truth
 from desk_card import DeskCard
 from drivers.errors import LinkError
 from model.errors import InputError
-from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from sim.measuring.desk import Desk
 from sim.measuring.loopback import latency
@@ -27,18 +26,6 @@ LEVEL = 0.3
 PLACES = ((0.03, 0.05), (0.20, 0.11), (0.29, 0.20))
 SENSORS = tuple(WiredSensor(f"P{n}", x, y, n, 2e-3) for n, (x, y) in enumerate(PLACES, start=1))
 FREQUENCIES = np.array([61.0, 151.0, 233.0, 311.0])
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    """The paper's plate as its file has it."""
-    return load_rig(example_rig_path())
-
-
-@pytest.fixture(scope="module")
-def truth(rig: Rig) -> Truth:
-    """A plate that deviates from it, on a coarse mesh."""
-    return draw_truth(rig, seed=3, mesh="6x4 Q3")
 
 
 def card(truth: Truth, *, noise: float = 0.0, **wires: object) -> DeskCard:

@@ -2,7 +2,7 @@
 
 import json
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,6 +54,21 @@ def rig() -> Rig:
 def table(rig: Rig) -> LocalizationTable:
     """Its table, of few frequencies."""
     return build_table(rig, frequencies=np.array([110.0, 170.0, 230.0]), drive_mode="phased")
+
+
+class EndingCard(SoundCard):
+    """A card whose only run ends in an exception that a call raises."""
+
+    def __init__(self, end: Callable[[], None]) -> None:
+        self.rate, self._end = RATE, end
+
+    def run(self, played: FloatArray) -> Float32Array:
+        """Raise it."""
+        self._end()
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Nothing is open."""
 
 
 def as_written(rig: Rig) -> Truth:
@@ -181,25 +196,19 @@ def test_dead_and_clipped_accelerometers_keep_no_promise(
         measured_on(as_written(rig), table, tmp_path, monkeypatch, card=WrongInput)
 
 
-def test_amplifier_at_a_url_needs_a_rig(table: LocalizationTable, tmp_path: Path) -> None:
-    """A table has no limits of an amplifier, so that none is opened."""
+@pytest.mark.parametrize(
+    ("options", "said"), [(["--url", "sim://"], "rig is missing"), ([], "--level")]
+)
+def test_limits_are_those_of_a_rig(
+    table: LocalizationTable, tmp_path: Path, options: list[str], said: str
+) -> None:
+    """A table has none: an amplifier needs the rig, a card that or a level; nothing is opened."""
     save_table(table, tmp_path / "t.npz")
     (tmp_path / "sensors.csv").write_text(SENSORS)
-    arguments = ["table", "verify", str(tmp_path / "t.npz"), "--device", "memory"]
-    arguments += ["--sensors", str(tmp_path / "sensors.csv"), "--url", "sim://"]
-    result = CliRunner().invoke(app, arguments)
-    assert isinstance(result.exception, InputError)
-    assert "rig is missing" in str(result.exception)
-
-
-def test_card_without_a_limit_is_refused(table: LocalizationTable, tmp_path: Path) -> None:
-    """A table knows none: without a rig the level has to be stated, and nothing is opened."""
-    save_table(table, tmp_path / "t.npz")
-    (tmp_path / "sensors.csv").write_text(SENSORS)
-    arguments = ["table", "verify", str(tmp_path / "t.npz"), "--device", "memory"]
+    arguments = ["table", "verify", str(tmp_path / "t.npz"), "--device", "memory", *options]
     result = CliRunner().invoke(app, [*arguments, "--sensors", str(tmp_path / "sensors.csv")])
     assert isinstance(result.exception, InputError)
-    assert "--level" in str(result.exception)
+    assert said in str(result.exception)
 
 
 @pytest.mark.parametrize(
@@ -224,19 +233,10 @@ def test_limits_of_the_rig_hold_for_a_card(
 ) -> None:
     """No guard is behind a card: each limit is checked before a sample is played."""
 
-    class SilentCard(SoundCard):
-        """Must not be played to."""
+    def refuse() -> None:
+        raise AssertionError
 
-        def __init__(self) -> None:
-            self.rate = RATE
-
-        def run(self, played: FloatArray) -> Float32Array:
-            raise AssertionError
-
-        def close(self) -> None:
-            """Nothing is open."""
-
-    monkeypatch.setattr(table_check, "open_card", lambda _device, **_counts: SilentCard())
+    monkeypatch.setattr(table_check, "open_card", lambda _device, **_counts: EndingCard(refuse))
     (tmp_path / "sensors.csv").write_text(SENSORS)
     bounded = replace(rig, limits=replace(rig.limits, **limits))
     settings = CheckSettings("memory", tmp_path / "sensors.csv", None, 1, 0, level)
@@ -302,21 +302,12 @@ def test_amplifier_is_disarmed_as_soon_as_the_card_ends(
             ended.append("played to its end")
             return staged
 
-    class EndingCard(SoundCard):
-        """Ends while the amplifier plays."""
-
-        def __init__(self) -> None:
-            self.rate = RATE
-
-        def run(self, played: FloatArray) -> Float32Array:
-            assert playing.wait(10.0)
-            raise trouble
-
-        def close(self) -> None:
-            """Nothing is open."""
+    def end() -> None:
+        assert playing.wait(10.0)
+        raise trouble
 
     monkeypatch.setattr(table_check, "BlockingAmplifier", Observed)
-    monkeypatch.setattr(table_check, "open_card", lambda _device, **_counts: EndingCard())
+    monkeypatch.setattr(table_check, "open_card", lambda _device, **_counts: EndingCard(end))
     (tmp_path / "sensors.csv").write_text(SENSORS)
     url = f"sim://{example_rig_path()}"
     settings = CheckSettings("memory", tmp_path / "sensors.csv", url, 1, 0, LEVEL)

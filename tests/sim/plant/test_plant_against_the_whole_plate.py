@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
 
-from driven_bases import BASES, STILL, STROKE, Base
+from driven_bases import BASES, STROKE, Base
 from model.arrays import ComplexArray, FloatArray
 from model.fem.plate import assemble, direct_acceleration
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
@@ -62,18 +62,6 @@ def set_bases(plant: Plant, bases: Sequence[Base]) -> None:
 def felt(samples: FloatArray) -> FloatArray:
     """What lies below 1 kHz, all that a finger can feel and more, without delay."""
     return np.asarray(sosfiltfilt(butter(6, 1000.0, fs=RATE, output="sos"), samples, axis=0))
-
-
-@pytest.mark.long
-def test_plant_ramps_agree_with_newmark(rig: Rig, whole: WholePlate, reduced: ReducedPlate) -> None:
-    """Without a finger: within 0.1 % of Newmark's method, over the plate, nothing filtered."""
-    plant = Plant(reduced, rig.eras)
-    set_bases(plant, BASES[:3])
-    shapes = reduced.at(rig.mesh.nodes)
-    _, found = plant.advance(0.12, sample_rate=10_000.0, shapes=shapes)
-    motions = [base.motion for base in (*BASES[:3], STILL)]
-    _, _, stepped = whole.stepped(motions, [], until=0.12, step=1e-5, every=10)
-    assert apart(found, stepped[:, 0::3]) < 1e-3
 
 
 def test_plant_with_changing_contacts_agrees_with_newmark(
@@ -133,34 +121,6 @@ def test_plant_steady_state_agrees_with_the_full_model(
         plant.skip(until)
         found = phasors(plant, points, 2, frequency, until)
         assert apart(found, whole.steady(2, frequency, points, contacts)) < 1e-3
-
-
-def test_plant_steady_state_under_fingers_agrees_with_the_direct_solve(rig: Rig) -> None:
-    """Where only ERAs and fingers damp, both domains have one law: within 0.1 % of the tables' own.
-
-    On a mesh as fine as tables use, against the sparse solve that they are checked with.
-    """
-    fine = make_paper_rig(24, 18)
-    lossless = replace(fine.plate, loss_factor=0.0)
-    reduced = reduce_plate(lossless, fine.mesh, footprints_of(rig.eras))
-    contacts = resting(FIRST, SECOND)
-    plant = Plant(reduced, rig.eras)
-    plant.skip(1.0)
-    plant.set_contacts(resting(MOVED))
-    points = np.array([[0.05, 0.05], [0.11, 0.07], [0.25, 0.15], [0.3048, 0.1]])
-    frequencies = np.array([60.0, 110.0, 250.0, 500.0])
-    direct = direct_acceleration(
-        assemble(lossless, fine.mesh), rig.eras, frequencies, points, loads=[*contacts.values()]
-    )
-    for row, frequency in enumerate(frequencies):
-        plant.set_input(1, [Term(plant.time, np.inf, 2 * np.pi * frequency, STROKE)])
-        plant.set_contacts(contacts)
-        begin = plant.time
-        plant.skip(begin + 50.0)
-        found = phasors(plant, points, 1, float(frequency), begin + 50.0)
-        turn = np.exp(2j * np.pi * frequency * begin)
-        assert apart(found * turn, direct[row, 1] / rig.eras[1].stroke) < 1e-3
-        plant.set_contacts(resting(MOVED))
 
 
 def test_plant_viscous_equivalent_agrees_with_the_loss_factor() -> None:

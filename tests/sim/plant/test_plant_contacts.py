@@ -8,7 +8,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 from driven_bases import Base, faded_base, shaped_base
-from finger_energy import held_by_fingers
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.reduction.modal_matrices import modal_matrices
@@ -105,46 +104,6 @@ def test_contacts_drop_vectors_of_lifted_fingers(coarse_rig: Rig, reduced: Reduc
         assert_allclose(new, old, rtol=0, atol=1e-4 * np.abs(old).max())
 
 
-def test_contacts_tap_is_passive(coarse_rig: Rig, reduced: ReducedPlate) -> None:
-    """While nothing drives, plate and finger together only lose, whatever the length of a tap.
-
-    What a finger brings is what its pulp and contact mass hold at the moment at which it lands.
-    """
-    rng = np.random.default_rng(4)
-    plant = Plant(reduced, coarse_rig.eras)
-    plant.set_input(1, [Term(0.0, 0.4, 2 * np.pi * 110.0, STROKE)])
-    plant.skip(0.4)
-    start = stored(plant, coarse_rig)
-    for _ in range(60):
-        before = stored(plant, coarse_rig)
-        plant.set_contacts(resting(PLACES[rng.integers(3)]))
-        brought = held_by_fingers(plant)
-        plant.skip(plant.time + rng.uniform(0.0001, 0.01))
-        together = stored(plant, coarse_rig) + held_by_fingers(plant)
-        assert together < before + brought
-        plant.set_contacts({})
-        assert stored(plant, coarse_rig) <= together
-        plant.skip(plant.time + rng.uniform(0.0002, 0.004))
-    assert stored(plant, coarse_rig) < 0.1 * start
-
-
-def test_contacts_apply_to_later_drives(coarse_rig: Rig, reduced: ReducedPlate) -> None:
-    """It does not matter whether the drive or the finger is announced first."""
-    shapes, samples = reduced.at(np.array([[0.05, 0.2]])), []
-    for drive_first in (True, False):
-        plant = Plant(reduced, coarse_rig.eras)
-        if drive_first:
-            plant.set_input(0, [Term(0.02, 0.05, 1500.0, STROKE)])
-        plant.skip(0.01)
-        plant.set_contacts(THREE)
-        if not drive_first:
-            plant.set_input(0, [Term(0.02, 0.05, 1500.0, STROKE)])
-        shapes = plant.reduced.at(np.array([[0.05, 0.2]]))
-        samples.append(plant.advance(0.1, sample_rate=1e4, shapes=shapes)[1])
-    assert np.abs(samples[0]).max() > 1
-    assert_allclose(samples[1], samples[0], rtol=0, atol=1e-9 * np.abs(samples[0]).max())
-
-
 POINTS = np.array([[0.11, 0.07], [0.03, 0.2], [0.3, 0.02]])
 COMING: list[tuple[float, Mapping[str, FingertipLoad]]] = [
     (0.013, ONE), (0.0305, TWO), (0.047, resting(*PLACES[1:])), (0.06, {}),
@@ -173,16 +132,6 @@ def test_contacts_result_is_independent_of_steps(coarse_rig: Rig, reduced: Reduc
     whole = run(coarse_rig, reduced, BASES, np.array([]))
     cut = run(coarse_rig, reduced, BASES, np.random.default_rng(1).uniform(0, 0.1, 300))
     assert_allclose(cut, whole, rtol=0, atol=1e-10 * np.abs(whole).max())
-
-
-def test_contacts_superpose_drives(coarse_rig: Rig, reduced: ReducedPlate) -> None:
-    """Superposition holds while fingers come and go, since the plate is linear throughout."""
-    together = run(coarse_rig, reduced, BASES, np.array([]))
-    alone = sum(
-        run(coarse_rig, reduced, [b if b is base else None for b in BASES], np.array([]))
-        for base in BASES
-    )
-    assert_allclose(alone, together, rtol=0, atol=1e-10 * np.abs(together).max())
 
 
 def test_contacts_are_solved_once(

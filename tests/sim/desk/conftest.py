@@ -1,0 +1,19 @@
+"""The plate of a desk, shared by its tests."""
+
+import pytest
+
+from benchmarks.desk_plate.truth import Truth, draw_truth
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
+
+
+@pytest.fixture(scope="session")
+def rig() -> Rig:
+    """The paper's plate as its file has it."""
+    return load_rig(example_rig_path())
+
+
+@pytest.fixture(scope="session")
+def truth(rig: Rig) -> Truth:
+    """A plate that deviates from it, with actuators that resonate, on a coarse mesh."""
+    return draw_truth(rig, seed=3, mesh="6x4 Q3")

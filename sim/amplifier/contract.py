@@ -44,6 +44,7 @@ _ENDING = ("SWITCHED_ON", "FAULT_REACTION_ACTIVE")
 _LATCHED = ("QUICK_STOP_ACTIVE", "FAULT")
 _SENSING = ("GetSensors", "Measure", "GetReading")
 _Q = QUANTITIES
+_LIMITED = 1 + _Q["level"].step
 
 
 class SensorPort(Protocol):
@@ -163,6 +164,10 @@ class Amplifier:
         levels, is_on = self._levels(now)
         left = self._last_fed + self._watchdog - now if self.state == _ENABLED else 0.0
         decayed = math.exp(min(0.0, (self._silent_from - now) / _DISCHARGE))
+        # A sum that lasts is limited again and again.
+        self._is_limited |= any(
+            self.playback.level(each, now) > _LIMITED for each in self._channels
+        )
         flags = {
             "high_voltage": is_on,
             "interlock_open": self._is_interlock_open,
@@ -374,8 +379,7 @@ class Amplifier:
         for voice in self.playback.voices_of(channel):
             length = voice.transition.end - now
             times.update(now + length * part / _FRACTIONS for part in range(1, _FRACTIONS + 1))
-        highest = 1 + _Q["level"].step
-        return any(self.playback.level(channel, at) > highest for at in times if at >= now)
+        return any(self.playback.level(channel, at) > _LIMITED for at in times if at >= now)
 
     def _silence(self, moment: float, *, ramp: float) -> None:
         """Silence every channel within the ramp [s], and discard what is staged."""

@@ -189,3 +189,16 @@ def test_high_voltage_is_on_while_armed_and_discharges() -> None:
     assert measured["channel_current"] == pytest.approx(math.pi * 100 * voltage * 1e-3, abs=1)
     amplifier.handle("Disarm", {"ramp": 0}, 0.1)
     assert amplifier.handle("GetStatus", {}, 0.12)["voltage"] == round(1800 / math.e)
+
+
+def test_sum_that_lasts_is_limited_in_every_status() -> None:
+    """Two layers of 0.7 exceed full level, as each status since says; one alone does not."""
+    amplifier = armed()
+    shown = []
+    for token, layer in enumerate((0, 1), 1):
+        play(amplifier, token, 0.1 * token, tone(level=7000, frequency=2000 + layer), layer=layer)
+        flags = [
+            amplifier.handle("GetStatus", {}, 0.1 * token + at)["flags"] for at in (0.05, 0.09)
+        ]
+        shown.append([each >> 2 & 1 for each in flags])
+    assert shown == [[0, 0], [1, 1]]

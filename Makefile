@@ -100,7 +100,7 @@ desk-test: .venv/installed-test
 	$(BIN)/python -m benchmarks.desk --plates 1 --promises 10 --touches 4 $(DESK)
 
 # The whole chain in virtual time, thousands of seeds; `make test` takes twelve short ones.
-# Others: make soak SOAK='--hours 10 --wire serial', or one again: make soak SOAK='--seed 17'
+# Others: make soak SOAK='--minutes 10 --wire serial', or one again: make soak SOAK='--seed 17'
 soak: .venv/installed-test
 	$(BIN)/python tests/support/soak.py $(SOAK)
 

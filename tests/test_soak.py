@@ -36,7 +36,7 @@ def test_soak_short_seeds_break_no_rule() -> None:
     """Every wire, fault and gesture: silence in time, no excess, touches are felt."""
     totals: Counter[str] = Counter()
     broken = {}
-    for outcome in (run_seed(seed, short=True) for seed in SEEDS):
+    for outcome, _ in (run_seed((seed, True)) for seed in SEEDS):
         totals.update(outcome.counts)
         if outcome.violations:
             broken[f"{SOAK.name} --short --seed {outcome.seed}"] = outcome.violations

@@ -16,6 +16,7 @@ from sim.witness.capture import Direction
 from sim.witness.decoded import (
     NAMES,
     DecodedFrame,
+    Decoder,
     Message,
     Notice,
     damaged,
@@ -39,19 +40,19 @@ _TEXT = {
 _IS_FRAME = re.compile(rb"t|< (?:send|frame) ")
 
 
-class CanDecoder:
+class CanDecoder(Decoder):
     """Decodes the text of an adapter of this kind."""
 
     def __init__(self, kind: str) -> None:
+        super().__init__()
         self._end, self._text = _END[kind], _TEXT[kind]
-        self._rest: dict[Direction, bytes] = {"amplifier": b"", "host": b""}
         self._sent: deque[CanFrame] = deque(maxlen=_KEPT)
         self._senders: dict[tuple[int, bool], _Sender] = {}  # by identifier, and whether numbered
 
     def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
         """Decode bytes; returns the complete frames."""
-        *pieces, rest = self._end.split(self._rest[direction] + data)
-        self._rest[direction] = rest[-_MAX_REST:]
+        *pieces, rest = self._end.split(self.rest[direction] + data)
+        self.rest[direction] = rest[-_MAX_REST:]
         seen: list[DecodedFrame] = []
         for piece in map(bytes.strip, pieces):
             frame = self._frame(direction, piece)
@@ -67,10 +68,6 @@ class CanDecoder:
                 sender.cut_short = None
             seen.append((piece, message))
         return seen
-
-    def has_partial_frame(self, direction: Direction) -> bool:
-        """Whether the last bytes in this direction begin a frame."""
-        return bool(self._rest[direction])
 
     def _frame(self, direction: Direction, piece: bytes) -> CanFrame | None:
         found = self._text[direction].fullmatch(piece)

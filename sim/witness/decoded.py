@@ -1,5 +1,6 @@
 """Decoded messages, the same for every kind of wire."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
@@ -18,6 +19,7 @@ from drivers.protocol.table import (
     STATES,
     read_request,
 )
+from sim.witness.capture import Direction
 
 HELLO = "Hello"
 A_READ = "a read"
@@ -78,6 +80,17 @@ class Notice:
     key: Hashable = None
     values: Values = field(default_factory=dict)
     text: str = ""
+
+
+class Decoder(ABC):
+    """Decodes both directions of a kind of wire; rest: bytes that begin a frame."""
+
+    def __init__(self) -> None:
+        self.rest: dict[Direction, bytes] = {"amplifier": b"", "host": b""}
+
+    @abstractmethod
+    def feed(self, direction: Direction, time: float, data: bytes) -> list["DecodedFrame"]:
+        """Decode bytes; returns the complete frames."""
 
 
 Message: TypeAlias = Request | Reply | Notice

@@ -12,6 +12,7 @@ from sim.witness.decoded import (
     A_READ,
     HELLO,
     DecodedFrame,
+    Decoder,
     Message,
     Notice,
     Reply,
@@ -20,10 +21,11 @@ from sim.witness.decoded import (
     reply_of,
     request_of,
 )
-from sim.witness.modbus_frames import READS, WRITE, Adu, AduReader
+from sim.witness.modbus_frames import READS, WRITE, Adu, split_rtu, split_tcp
 
 _BOX, _REPLY, _HEAD = 256, 128, 2  # registers: of a message, before its reply, of tag and result
 _IDENTITY, _IDENTITY_SIZE, _TEXT_SIZE = 1065, 66, 32  # registers, and bytes of a text
+_PAUSE = 0.04  # s; a longer pause ends a partial frame on RTU
 _PRESENT = ("GetCaps", "GetStatus", "GetFaults")
 """Replies that are read as they are at that moment, written before or not."""
 _EXCEPTIONS = {
@@ -65,15 +67,13 @@ class _Transaction:
         return "" if is_whole else f"registers must be {self.count}"
 
 
-class ModbusDecoder:
+class ModbusDecoder(Decoder):
     """Decodes both directions, over TCP or RTU."""
 
     def __init__(self, *, over_tcp: bool) -> None:
+        super().__init__()
         self._over_tcp = over_tcp
-        self._readers: dict[Direction, AduReader] = {
-            "amplifier": AduReader("amplifier", over_tcp=over_tcp),
-            "host": AduReader("host", over_tcp=over_tcp),
-        }
+        self._last: dict[Direction, float] = {}  # times of the last bytes [s]
         self._open: dict[int, _Transaction] = {}  # by number; over RTU at most one
         self._written: dict[tuple[int, int], _Written] = {}  # by unit and number of the message
         self._requests = 0
@@ -82,15 +82,22 @@ class ModbusDecoder:
         """Decode bytes; returns the complete frames."""
         take = self._request if direction == "amplifier" else self._response
         seen: list[DecodedFrame] = []
-        for adu in self._readers[direction].feed(time, data):
-            seen.append((adu.raw, take(adu) if adu.is_good else damaged("a malformed ADU")))
-            if not adu.is_good and direction == "amplifier" and not self._over_tcp:
+        for adu in self._split(direction, time, data):
+            seen.append((adu.raw, take(adu) if adu.function else damaged("a malformed ADU")))
+            if not adu.function and direction == "amplifier" and not self._over_tcp:
                 self._open.clear()
         return seen
 
-    def has_partial_frame(self, direction: Direction) -> bool:
-        """Whether the last bytes in this direction begin a frame."""
-        return self._readers[direction].has_partial_frame
+    def _split(self, direction: Direction, time: float, data: bytes) -> list[Adu]:
+        before = self.rest[direction]
+        if self._over_tcp:
+            found, self.rest[direction] = split_tcp(before + data)
+            return found
+        is_late = before and time > self._last.get(direction, time) + _PAUSE
+        cut_off = [Adu(before)] if is_late else []
+        found, self.rest[direction] = split_rtu(direction, data if is_late else before + data)
+        self._last[direction] = time
+        return [*cut_off, *found]
 
     def _request(self, adu: Adu) -> Message:
         self._requests += 1

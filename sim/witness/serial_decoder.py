@@ -8,6 +8,7 @@ from drivers.protocol.table import EVENT, REFUSALS, VERSION
 from sim.witness.capture import Direction
 from sim.witness.decoded import (
     DecodedFrame,
+    Decoder,
     Message,
     Reply,
     Request,
@@ -19,21 +20,14 @@ from sim.witness.decoded import (
 _MAX_REST = 512  # bytes kept of a frame that does not end
 
 
-class SerialDecoder:
-    """Decodes both directions."""
-
-    def __init__(self) -> None:
-        self._rest: dict[Direction, bytes] = {"amplifier": b"", "host": b""}
+class SerialDecoder(Decoder):
+    """Decodes frames between zero bytes."""
 
     def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
         """Decode bytes; returns the complete frames."""
-        *pieces, rest = (self._rest[direction] + data).split(b"\0")
-        self._rest[direction] = rest[-_MAX_REST:]
+        *pieces, rest = (self.rest[direction] + data).split(b"\0")
+        self.rest[direction] = rest[-_MAX_REST:]
         return [(b"\0" + one + b"\0", _decode(direction, one)) for one in pieces if one]
-
-    def has_partial_frame(self, direction: Direction) -> bool:
-        """Whether the last bytes in this direction begin a frame."""
-        return bool(self._rest[direction])
 
 
 def _decode(direction: Direction, piece: bytes) -> Message:

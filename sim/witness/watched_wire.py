@@ -3,7 +3,6 @@
 import math
 from collections import deque
 from collections.abc import Hashable, Mapping
-from typing import Protocol
 
 from sim.witness.amplifier_session import AmplifierSession
 from sim.witness.can_decoder import CanDecoder
@@ -14,7 +13,7 @@ from sim.witness.decoded import (
     BROADCAST,
     FEEDING,
     HELLO,
-    DecodedFrame,
+    Decoder,
     Message,
     Notice,
     Reply,
@@ -33,16 +32,6 @@ _PENDING_TIMEOUT = 1.0  # s; then a reply matches nothing any more
 _PRESENT = ("GetStatus", "GetFaults")
 """Requests that are carried out when their reply is read, on Modbus."""
 _CONSTANT = (HELLO, "GetCaps")
-
-
-class Decoder(Protocol):
-    """Decoder for one kind of wire."""
-
-    def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
-        """Decode bytes; returns the complete frames."""
-
-    def has_partial_frame(self, direction: Direction) -> bool:
-        """Whether the last bytes in this direction begin a frame."""
 
 
 def decoder_of(kind: str) -> Decoder:
@@ -77,37 +66,35 @@ class WatchedWire:
         self._pending: dict[Hashable, Sent] = {}  # by key of the reply
         self._recent: deque[bytes] = deque(maxlen=_COPIES)  # frames of the host
         self._replied: deque[Hashable] = deque(maxlen=_COPIES)
-        self._abandoned: set[Hashable] = set()  # of a host that has closed the wire since
         self._number = self._preempted_by = 0  # of the last request, and of one that preempts
         self._damaged_at = -math.inf  # when a frame of the host was damaged last [s]
         self._faults_until = self._disturbed_until = -math.inf
 
     # host and faults
 
-    def opened(self) -> None:
+    def opened(self, time: float) -> None:
         """Note that a host has opened it: its amplifiers are not identified yet."""
         self._decoder, self._begun = decoder_of(self._kind), {}
-        self._forget_pending()
+        self._forget_pending(time)
         for session in self.sessions.values():
             session.is_open, session.is_identified, session.session = True, False, None
             session.forget_amplifier()
 
     def closed(self, time: float) -> None:
         """Note that the host has closed or lost it."""
-        if self._pending:
-            self.disturb(time)  # the next host may receive their replies
         for sent in self._pending.values():
             if sent.request.name in CHANGING:  # it may be executed unheard
                 self.sessions[sent.request.address].amplifier.forget_state()
-        self._forget_pending()
+        self._forget_pending(time)
         for session in self.sessions.values():
             session.is_open = False
             session.stop_requested_at = session.last_feed = session.first_stop = None
 
-    def _forget_pending(self) -> None:
-        """Abandon the pending requests; their replies may still arrive."""
+    def _forget_pending(self, time: float) -> None:
+        """Abandon the pending requests; their replies may still arrive, and at another host."""
         if self._pending:
-            self._abandoned = set(self._pending)
+            self.disturb(time)
+        self._replied.extend(self._pending)
         self._pending.clear()
 
     def is_pending(self, session: AmplifierSession) -> bool:
@@ -140,7 +127,7 @@ class WatchedWire:
         if begun < time and begun <= self._faults_until < time:
             self.disturb(time)
         found = self._decoder.feed(direction, time, data)
-        if self._decoder.has_partial_frame(direction):
+        if self._decoder.rest[direction]:
             self._begun[direction] = time if found else begun
         for raw, message in found:
             self._report.frame(self.name, time, direction, raw)
@@ -292,13 +279,12 @@ class WatchedWire:
             self.sessions = {**others, request.values["address"]: session}
 
     def _check_unexpected(self, session: AmplifierSession, time: float, reply: Reply) -> None:
-        is_abandoned = reply.key in self._abandoned
-        self._abandoned.discard(reply.key)
-        is_disturbed = self.is_disturbed(time)
-        is_new = not is_disturbed if reply.key is None else reply.key not in self._replied
-        if time < self._damaged_at + self._times.reply and is_new and not is_abandoned:
+        is_new = reply.key not in self._replied
+        if reply.key is None:
+            is_new = not self.is_disturbed(time)
+        if time < self._damaged_at + self._times.reply and is_new:
             session.report_always("damage", time, f"{session.name} executed a damaged frame")
-        elif not is_abandoned:
+        else:
             why = f": {reply.problem}" if reply.problem else ""
             what = f"{session.name}: reply without a pending request{why}"
             session.report("credit", time, what)

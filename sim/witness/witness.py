@@ -94,7 +94,7 @@ class Witness:
     def opened(self, link: str, time: float) -> None:
         """Note that a host has opened a wire: its amplifiers are not identified yet."""
         self._advance(time)
-        self._wires[link].opened()
+        self._wires[link].opened(time)
 
     def closed(self, link: str, time: float) -> None:
         """Note that the host has closed or lost a wire."""

@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import math
 import random
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -259,18 +259,12 @@ def play(
     wire: str,
     scenario: Scenario,
     *,
-    amplifiers: Collection[str] = ("main",),
-    limits: GuardLimits | None = None,
-    seed: int = 1,
+    amplifiers: Sequence[str] = ("main",),
 ) -> Outcome:
     """Play a scenario to its end on a wire of this kind; returns the outcome."""
     probe = _Probe()
-    rng = random.Random(seed)
-    main = _play(wire, scenario, tuple(amplifiers), limits or _LIMITS, probe)
-    return run_virtual(main, rng=rng, seen=probe.seen)
-
-
-_LIMITS = GuardLimits(40.0, 500.0, 0.5)
+    main = _play(wire, scenario, amplifiers, probe)
+    return run_virtual(main, rng=random.Random(1), seen=probe.seen)
 
 
 class _Probe:
@@ -291,14 +285,13 @@ class _Probe:
 async def _play(
     wire: str,
     scenario: Scenario,
-    names: tuple[str, ...],
-    limits: GuardLimits,
+    names: Sequence[str],
     probe: _Probe,
 ) -> Outcome:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
     machine = live_in_memory()
-    rig = make_rig(names, limits)
+    rig = make_rig(names, GuardLimits(40.0, 500.0, 0.5))
     bench = Bench(rig, now=loop.time())
     devices = [
         AmplifierDevice(bench, name, address=number)

@@ -50,7 +50,7 @@ class Day:
         swelling = Tone(0, 150.0, 0.2, onset=SWELL, ending=SWELL)
         await self.apply(Layer(1, (swelling,), 0.005), rest=0.1)
         await self.apply(Layer(1, (Tone(0, 150.0, 0.2, onset=SLOW),), 0.005), rest=0.02)
-        waiting = (Tone(0, 150.0, 0.2), Tone(1, 100.0, 0.3))
+        waiting = (Tone(0, 150.0, 0.2, ending=SWELL), Tone(1, 100.0, 0.3))
         await self.apply(Layer(1, waiting, 0.005, after=True), rest=0.2)
         await self.apply(Layer(1, (), 0.005), rest=0.2)
 

@@ -2,7 +2,6 @@
 
 import sys
 from contextlib import suppress
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,18 +10,12 @@ import typer
 from drivers.errors import LinkError
 from model.errors import InputError
 from sim.port_option import port_option
+from sim.soft_amp.settings import Law, Protocol, Settings
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from sim.soft_amp.place import Place
-
-
-class LawName(StrEnum):
-    """What a sample is of the wanted one."""
-
-    linear = "linear"
-    square = "square"
 
 
 def soft_amp(
@@ -59,9 +52,9 @@ def soft_amp(
         ),
     ] = None,
     law: Annotated[
-        LawName,
+        Law,
         typer.Option(help="Play the wanted force, or the root of a bias plus half of it."),
-    ] = LawName.linear,
+    ] = Law.LINEAR,
     limit: Annotated[
         float, typer.Option(metavar="LEVEL", help="Largest sample, as a share of full scale.")
     ] = 1.0,
@@ -84,7 +77,6 @@ def soft_amp(
     Level 1 is full scale of the device. Silent within 50 ms once its host or itself is killed.
     """
     from sim.soft_amp.library import library
-    from sim.soft_amp.settings import Law, Protocol, Settings
     from sim.soft_amp.supervisor import Supervisor, underruns
 
     if list_devices:
@@ -101,7 +93,7 @@ def soft_amp(
         serial_number=_serial_number(serial_number, device=device),
         rate=rate,
         block=block,
-        law=Law[law.name.upper()],
+        law=law,
         limit=limit,
         max_gaps=max_gaps,
     )
@@ -144,7 +136,6 @@ def _place(
     *, serial: bool, tcp: int | None, modbus_tcp: int | None, link: Path | None
 ) -> "AbstractContextManager[Place]":
     from sim.soft_amp.place import tcp_place, terminal_place
-    from sim.soft_amp.settings import Protocol
 
     given = [
         name

@@ -52,11 +52,6 @@ class AmplifierDevice:
         return self._amplifier.identity
 
     @property
-    def capabilities(self) -> Values:
-        """Values of its capabilities."""
-        return self._amplifier.capabilities
-
-    @property
     def state(self) -> str:
         """Name of its state."""
         return self._amplifier.state

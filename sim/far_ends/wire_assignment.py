@@ -4,7 +4,7 @@ A serial port in a URL becomes a pseudo-terminal, a network address a loopback p
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from model.errors import InputError
@@ -22,24 +22,16 @@ _KIND_OF_SCHEME = {
 _EXAMPLE = "; as in --wire main=serial"
 
 
-@dataclass(frozen=True)
-class WireAssignment:
-    """The wire of an amplifier; address: unit, node or address there, None for any."""
-
-    wire: Wire
-    address: int | None = None
-
-
 def assign_wires(
     amplifiers: Mapping[str, str], *, common: Wire | None, options: Sequence[str], defaults: Wire
-) -> dict[str, WireAssignment]:
+) -> dict[str, Wire]:
     """The wire of each amplifier, by name.
 
     amplifiers: URLs by name; options: texts like `main=modbus-tcp:5020`; common: the wire of all
     others, None to follow their URLs; defaults: speed and sharing of those wires. Equal wires are
     shared. Raises InputError.
     """
-    assigned: dict[str, WireAssignment] = {}
+    assigned: dict[str, Wire] = {}
     for text in options:
         name, equals, kind = text.partition("=")
         if not equals:
@@ -49,10 +41,10 @@ def assign_wires(
             raise InputError(f"--wire {text}: amplifier must be one of {known}{_EXAMPLE}")
         if name in assigned:
             raise InputError(f"--wire {text}: must be given once per amplifier{_EXAMPLE}")
-        assigned[name] = WireAssignment(_wire_of_option(kind, text, defaults))
+        assigned[name] = _wire_of_option(kind, text, defaults)
     for name, url in amplifiers.items():
         if name not in assigned:
-            assigned[name] = WireAssignment(common) if common else _wire_of_url(name, url, defaults)
+            assigned[name] = common or _wire_of_url(name, url, defaults)
     return {name: assigned[name] for name in amplifiers}
 
 
@@ -66,7 +58,7 @@ def _wire_of_option(text: str, option: str, defaults: Wire) -> Wire:
     raise InputError(f"--wire {option}: wire must be one of {', '.join(_KINDS)}, got {text!r}")
 
 
-def _wire_of_url(name: str, url: str, defaults: Wire) -> WireAssignment:
+def _wire_of_url(name: str, url: str, defaults: Wire) -> Wire:
     """The wire that a URL names."""
     parts = urlsplit(url)
     kind = _KIND_OF_SCHEME.get(parts.scheme)
@@ -81,10 +73,10 @@ def _wire_of_url(name: str, url: str, defaults: Wire) -> WireAssignment:
             "add --serial (a pseudo-terminal each), --modbus-tcp PORT, --modbus-rtu, --socketcand "
             f"PORT or --slcan for all, or --wire {name}=serial"
         )
-    wire = replace(defaults, kind=kind, port=port or 0)
+    wire = replace(defaults, kind=kind, port=port or 0, address=_address(parts))
     if port is None:  # amplifiers whose URLs name one line share it
         wire = replace(wire, line=parts.netloc + parts.path, shared=True)
-    return WireAssignment(wire, _address(parts))
+    return wire
 
 
 def _address(parts: SplitResult) -> int | None:

@@ -11,7 +11,7 @@ from contextlib import (
     asynccontextmanager,
     contextmanager,
 )
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 from drivers.codec.can_bus.canopen import BITRATE
@@ -38,7 +38,7 @@ class Wire:
     kind: a key of `_OPENERS`; speed [bit/s]: None for no transmission time; port: on the loopback
     interface, 0 for any; shared: all amplifiers on one serial line, at addresses 1, 2, ...;
     unpluggable: URLs stay valid when the wire is unplugged and plugged in again; line: tells apart
-    wires that are otherwise equal.
+    wires that are otherwise equal; address: unit, node or address there, None for any.
     """
 
     kind: str
@@ -47,6 +47,7 @@ class Wire:
     shared: bool = False
     unpluggable: bool = False
     line: str = ""
+    address: int | None = field(default=None, compare=False)
 
 
 @asynccontextmanager

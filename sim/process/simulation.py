@@ -18,8 +18,7 @@ from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time
 from sim.control.context import SimulationContext
 from sim.control.server import control_socket
-from sim.far_ends.wire_assignment import WireAssignment
-from sim.far_ends.wires import open_wires
+from sim.far_ends.wires import Wire, open_wires
 from sim.faults.fault_file import FaultFile
 from sim.firmware.bench import FirmwareBench
 from sim.firmware.programs import running
@@ -46,7 +45,7 @@ class Simulation:
     """
 
     rig: Rig
-    wires: Mapping[str, WireAssignment]
+    wires: Mapping[str, Wire]
     faults: FaultFile = field(default_factory=lambda: FaultFile(()))
     fingers: Mapping[str, Position] = field(default_factory=dict)
     imperfections: Imperfections = field(default_factory=Imperfections)
@@ -142,8 +141,7 @@ async def _open_devices(
         )
         for number, name in enumerate(context.bench.amplifiers, start=1)
     ]
-    wires = {name: choice.wire for name, choice in simulation.wires.items()}
-    context.urls = await stack.enter_async_context(open_wires(wires, devices))
+    context.urls = await stack.enter_async_context(open_wires(simulation.wires, devices))
     context.devices = {device.name: device for device in devices}
 
 

@@ -7,7 +7,7 @@ import time
 from drivers.errors import LinkError
 from sim.soft_amp.counters import Counters
 from sim.soft_amp.library import library
-from sim.soft_amp.settings import MAX_CHANNELS, Settings
+from sim.soft_amp.settings import MAX_CHANNELS, Law, Settings
 
 _POLL = 0.001  # s
 _HANDOVER = 2.0  # s
@@ -69,7 +69,7 @@ class Engine:
         sound = _SoundSettings(
             rate,
             settings.channels,
-            settings.law,
+            list(Law).index(settings.law),
             settings.protocol,
             settings.limit,
             settings.max_gaps,

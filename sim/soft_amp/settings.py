@@ -3,7 +3,7 @@
 import json
 import math
 from dataclasses import asdict, dataclass
-from enum import IntEnum
+from enum import IntEnum, StrEnum
 
 from model.errors import InputError
 
@@ -13,11 +13,11 @@ MAX_CHANNELS = 32
 CHANNELS_OF_AMPLIFIER = 16
 
 
-class Law(IntEnum):
-    """How a sample follows from the wanted one; the values are those of `enum law`."""
+class Law(StrEnum):
+    """How a sample follows from the wanted one; in the order of `enum law`."""
 
-    LINEAR = 0
-    SQUARE = 1
+    LINEAR = "linear"
+    SQUARE = "square"
 
 
 class Protocol(IntEnum):

@@ -3,7 +3,7 @@
 import pytest
 
 from model.errors import InputError
-from sim.far_ends.wire_assignment import WireAssignment, assign_wires
+from sim.far_ends.wire_assignment import assign_wires
 from sim.far_ends.wires import Wire
 
 DEFAULTS = Wire("serial")
@@ -20,9 +20,7 @@ URLS = {
 def test_assign_wires_follows_the_urls() -> None:
     """Kind, port and address are those of the URL; equal lines are shared."""
     assigned = assign_wires(URLS, common=None, options=[], defaults=DEFAULTS)
-    assert [
-        (choice.wire.kind, choice.wire.port, choice.address) for choice in assigned.values()
-    ] == [
+    assert [(wire.kind, wire.port, wire.address) for wire in assigned.values()] == [
         ("serial", 0, 3),
         ("serial", 0, 4),
         ("modbus-tcp", 5020, 9),
@@ -30,8 +28,8 @@ def test_assign_wires_follows_the_urls() -> None:
         ("socketcand", 29536, 5),
         ("slcan", 0, 7),
     ]
-    assert assigned["a"].wire == assigned["b"].wire
-    assert assigned["a"].wire.shared
+    assert assigned["a"] == assigned["b"]
+    assert assigned["a"].shared
 
 
 def test_assign_wires_prefers_own_option_to_common_to_url() -> None:
@@ -41,9 +39,9 @@ def test_assign_wires_prefers_own_option_to_common_to_url() -> None:
         URLS, common=modbus, options=["c=slcan", "a=socketcand:7"], defaults=DEFAULTS
     )
     assert list(assigned) == list(URLS)
-    assert assigned["a"] == WireAssignment(Wire("socketcand", port=7))
-    assert assigned["b"] == WireAssignment(modbus)
-    assert assigned["c"] == WireAssignment(Wire("slcan"))
+    assert assigned["a"] == Wire("socketcand", port=7)
+    assert assigned["b"] == modbus
+    assert assigned["c"] == Wire("slcan")
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ from drivers.opening import Lines
 from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.control.context import SimulationContext
-from sim.far_ends.wire_assignment import WireAssignment
 from sim.far_ends.wires import Wire
 from sim.plant.accelerometer import Accelerometer
 from sim.process.simulation import Simulation, run_simulation
@@ -31,7 +30,7 @@ async def test_simulation_serves_amplifiers_on_two_wires(tmp_path: Path) -> None
     rig = load_rig(write_rig(tmp_path / "rig.yaml", *TWO_AMPLIFIERS))
     simulation = Simulation(
         rig,
-        {"main": WireAssignment(Wire("serial")), "side": WireAssignment(Wire("modbus-tcp"), 7)},
+        {"main": Wire("serial"), "side": Wire("modbus-tcp", address=7)},
         fingers={"1": (0.1, 0.1)},
         sensors=[Accelerometer("P1", 0.1, 0.1)],
         control=tmp_path / "control",

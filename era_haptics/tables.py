@@ -30,7 +30,7 @@ def table(
 ) -> LocalizationTable:
     """Load the rig's localization table from the user's cache, or build it in a second or two.
 
-    drive_mode: its default, `switched`, `graded`, `signed` or `phased`; frequencies (f,) [Hz]:
+    drive_mode: its default, `switched` or `phased`; frequencies (f,) [Hz]:
     ascending, within the rig's limits, by default 40 to 500 in steps of 10 within these; grid:
     target cells. The table of `era table build`; `load_table` and `save_table` are for files.
     Raises InputError.

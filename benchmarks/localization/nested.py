@@ -42,9 +42,8 @@ def main() -> None:
         for mode in DRIVE_MODES:
             steps = np.concatenate([np.diff(each[mode]) for each in found])
             print(f"{name}, {mode}: higher level {_counted(steps)}")
-            for smaller in DRIVE_MODES[mode].restricted:
-                excess = np.concatenate([each[smaller] - each[mode] for each in found])
-                print(f"{name}, {mode}: {smaller} {_counted(excess)}")
+        excess = np.concatenate([each["switched"] - each["phased"] for each in found])
+        print(f"{name}, phased: switched {_counted(excess)}")
 
 
 def _fingers(sets: int) -> Iterator[FloatArray]:

@@ -25,7 +25,7 @@ def modes_figure() -> Figure:
     table = paper_table()
     x, y = (np.linspace(0, side, SIDE) for side in (table.plate.length, table.plate.width))
     points = lattice(x, y)
-    figure = Figure(figsize=(13, 3.4), layout="constrained")
+    figure = Figure(figsize=(6.8, 2.7), layout="constrained")
     panels = figure.subplots(1, len(DRIVE_MODES))
     for axes, drive_mode in zip(panels, DRIVE_MODES, strict=True):
         question = question_of(PLACES, drive_mode=drive_mode)

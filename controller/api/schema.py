@@ -112,7 +112,7 @@ class TableSummary(Message):
     """The localization table in use."""
 
     fingerprint: str = Field(description="of the plate and ERAs that it was built for")
-    mode: str = Field(description="switched, graded, signed or phased")
+    mode: str = Field(description="switched or phased")
     frequencies_hz: list[float]
     cells_x: Count
     cells_y: Count

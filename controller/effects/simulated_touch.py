@@ -64,8 +64,8 @@ class TouchSimulator:
         self._table = table
         self._levels = EffectLevels(table)
         self._capabilities = PlaybackCapabilities(
-            drive_mode=[*DRIVE_MODES][-1],
-            playable=tuple(DRIVE_MODES),
+            drive_mode=DRIVE_MODES[-1],
+            playable=DRIVE_MODES,
             frequencies=(float(table.frequencies[0]), float(table.frequencies[-1])),
             max_amplitudes={era.name: era.stroke for era in table.eras},
             envelope_support=RAMPS_ONLY,

@@ -141,7 +141,7 @@ class Controller:
         """The drive mode of questions to the table; the best possible one until `open`."""
         if self._decider_if_open is not None:
             return self._decider_if_open.capabilities.drive_mode
-        return self._drive_mode or [*DRIVE_MODES][-1]
+        return self._drive_mode or DRIVE_MODES[-1]
 
     @property
     def rejected_touches(self) -> Mapping[str, int]:

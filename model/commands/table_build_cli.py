@@ -27,7 +27,7 @@ def build(
         ),
     ] = None,
     drive_mode: Annotated[
-        str, typer.Option("--mode", help="Default drive mode: switched, graded, signed or phased.")
+        str, typer.Option("--mode", help="Default drive mode: switched or phased.")
     ] = "switched",
     grid: Annotated[
         str, typer.Option(metavar="NXxNY", help="Target cells along x and y.")

@@ -39,7 +39,7 @@ def query(
     ] = False,
     drive_mode: Annotated[
         str | None,
-        typer.Option("--mode", help="switched, graded, signed or phased; default: the table's."),
+        typer.Option("--mode", help="switched or phased; default: the table's."),
     ] = None,
     level: Annotated[
         float, typer.Option(metavar="DB_SL", help="Level at the target, dB SL.")

@@ -10,7 +10,7 @@ the minimax of expected powers is not the best percentile). A mean is at most th
 or two iterations.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -22,12 +22,6 @@ from model.arrays import Complex64Array, Float32Array, IntArray
 from model.choice import best_along, best_first
 from model.drive_modes.forms import Forms
 
-Solve = Callable[[Complex64Array, Complex64Array, Complex64Array | None], Complex64Array]
-"""Weights (n, eras) for R (n, eras, eras) and c (n, eras), within what a mode allows.
-
-The third argument is the solution for the same R and a similar c, if there is one.
-"""
-
 MAX_CANDIDATES = 12
 """Frequencies at which Lawson's iterations are done."""
 
@@ -37,9 +31,6 @@ LAWSON_STEPS = 3
 PRUNE_MARGIN = 0.84
 """A frequency whose bound is below this times the best score is pruned: 1.5 dB, since the
 percentile decides among the best."""
-
-FIRST_BOUNDED = 6
-"""Frequencies of the highest bounds at which a restricted mode is solved first."""
 
 LIMITED_STEPS = 30
 """Iterations towards weights that reach the level within full stroke; ten lose up to 1.4 dB where
@@ -60,17 +51,14 @@ _TINY, _LEAST = 1e-7, np.float32(1e-30)
 
 @dataclass(frozen=True)
 class Coherent:
-    """Method of a drive mode for its weights.
+    """Search for weights of all ERAs.
 
-    solve: see `Solve`; phases: number of starting phases of the first target, and of every further
-    one; iterations: number from each start that align the phases with those reached; bound: the
-    solution without the mode's restrictions, None for a mode that has none.
+    phases: number of starting phases of the first target, and of every further one; iterations:
+    number from each start that align the phases with those reached.
     """
 
-    solve: Solve
     phases: tuple[int, int]
     iterations: int
-    bound: Solve | None = None
 
     def search(self, forms: Forms, min_score: float) -> "CoherentResult":
         """Find the best weights at each frequency that can have the best score of all.
@@ -78,20 +66,7 @@ class Coherent:
         min_score: best score so far; frequencies that cannot come near it are pruned.
         """
         found = _BestCandidates(forms, min_score)
-        every = np.arange(forms.frequency_count)
-        if self.bound is None or len(forms.targets) > 1:
-            self._search_at(forms, found, every)
-        else:
-            _, bound = _optimise_target_phases(
-                _mean(forms), forms.targets, self.bound, starts=_starts(1, (1, 1)), iterations=1
-            )
-            found.bound[:] = bound
-            order = best_first(bound)
-            self._search_at(forms, found, np.sort(order[:FIRST_BOUNDED]))
-            rest = np.sort(order[FIRST_BOUNDED:])
-            rest = rest[bound[rest] > PRUNE_MARGIN * found.score]
-            if len(rest):
-                self._search_at(forms, found, rest)
+        self._search_at(forms, found, np.arange(forms.frequency_count))
         if found.is_level_limited:
             self._limit_weights(forms, found)
             self._relax_level(forms, found)
@@ -192,7 +167,7 @@ class Coherent:
         targets = forms.targets
         starts = _starts(len(targets), self.phases)
         iterations = self.iterations if len(starts) > 1 else 1
-        return _optimise_target_phases(R, targets, self.solve, starts=starts, iterations=iterations)
+        return _optimise_target_phases(R, targets, starts=starts, iterations=iterations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,7 +246,7 @@ def _saturated(weights: Complex64Array, gain: float) -> Complex64Array:
 def _moved(shares: Float32Array, expected: Float32Array) -> Float32Array:
     """Shares of the quiet fingertips (f, q) after a step of Lawson's, by their expected powers.
 
-    As they were at frequencies where no ERA is driven, as those of `graded` that only push away.
+    As they were at frequencies where no ERA is driven.
     """
     moved = shares * np.sqrt(np.maximum(expected, 0))
     total = np.add.reduce(moved, axis=-1, keepdims=True)
@@ -307,10 +282,14 @@ def _starts(targets: int, phases: tuple[int, int]) -> Complex64Array:
     return np.array(list(product(*circles)), dtype=np.complex64)
 
 
+def _solve(R: Complex64Array, c: Complex64Array) -> Complex64Array:
+    """Weights R^-1 c: the largest |c^H w| for their w^H R w."""
+    return np.asarray(np.linalg.solve(R, c[..., None])[..., 0])
+
+
 def _optimise_target_phases(
     R: Complex64Array,
     targets: Complex64Array,
-    solve: Solve,
     *,
     starts: Complex64Array,
     iterations: int,
@@ -324,7 +303,7 @@ def _optimise_target_phases(
     conjugate = targets.conj()
     if len(starts) == 1 and iterations == 1:
         c = conjugate[0] if len(targets) == 1 else conjugate.sum(axis=0)
-        w = solve(R, c, None)
+        w = _solve(R, c)
         # At the solution w^H R w = |c^H w|.
         value = np.sqrt(np.abs(np.vecdot(c, w)))
     else:
@@ -332,11 +311,9 @@ def _optimise_target_phases(
         target_factors = np.repeat(starts[:, :, None], n, axis=2)
         forms = np.broadcast_to(R, (s, *R.shape)).reshape(-1, eras, eras)
         tried, magnitudes = [], []
-        solved = None
         for _ in range(iterations):
             c = np.add.reduce(target_factors[..., None] * conjugate, axis=1)
-            solved = solve(forms, c.reshape(-1, eras), solved)
-            w = solved.reshape(s, n, eras)
+            w = _solve(forms, c.reshape(-1, eras)).reshape(s, n, eras)
             reached = np.vecdot(conjugate, w[:, None])  # (s, t, n)
             magnitude = np.maximum(np.abs(reached), 1e-20)
             tried.append(w)

@@ -6,9 +6,6 @@ adds a force where the drive acts anyway: without errors the best contrast does 
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from model.arrays import Complex64Array
 from model.compiled.kernels import kernels
 from model.drive_modes import phased_kernel
 from model.drive_modes.coherent import Coherent, CoherentResult
@@ -34,11 +31,4 @@ class Phased(Coherent):
         return phased_kernel.search_all(by, forms)
 
 
-def solve_phased(
-    R: Complex64Array, c: Complex64Array, _: Complex64Array | None = None
-) -> Complex64Array:
-    """Weights R^-1 c: the largest |c^H w| for their w^H R w, of any mode."""
-    return np.asarray(np.linalg.solve(R, c[..., None])[..., 0])
-
-
-PHASED = Phased(solve_phased, phases=(1, 5), iterations=8)
+PHASED = Phased(phases=(1, 5), iterations=8)

@@ -15,10 +15,11 @@ import numpy as np
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.choice import best_first, best_of
 from model.counting import counted
-from model.drive_modes import ALTERNATIVES, DRIVE_MODES, find_drives, max_sensation
+from model.drive_modes import ALTERNATIVES, UNRESTRICTED, find_drives, max_sensation
 from model.drive_modes.coherent import CoherentResult
 from model.drive_modes.exact_search import search_exactly, sensation_found
 from model.drive_modes.forms import Forms, Weights
+from model.drive_modes.phased import PHASED
 from model.drive_modes.tones import excitation_of
 from model.ensemble.measures import Felt, percentile, percentile_of_sorted
 from model.errors import InputError
@@ -184,8 +185,7 @@ def _by_point(
     Where nulls are narrow, with few fingers and small errors, these do better. For several targets
     at the frequencies of the drives found, since their search takes long.
     """
-    coherent = DRIVE_MODES[drive_mode].coherent
-    if coherent is None or coherent.bound is not None:  # restricted weights gain next to nothing
+    if drive_mode != UNRESTRICTED:
         return []
     if not 1 <= len(question.quiet) <= MAX_FINGERS_BY_POINT:
         return []
@@ -195,7 +195,7 @@ def _by_point(
     if len(at) == 0:
         return []
     by_point = candidates.fingers.by_point(forms.at(at), candidates.playable[at])
-    found = _drives_of(coherent.search(by_point, 0.0), at)
+    found = _drives_of(PHASED.search(by_point, 0.0), at)
     return [found[each] for each in best_first([score for score, _ in found])[:ALTERNATIVES]]
 
 
@@ -210,12 +210,11 @@ def _during_effect(
 
     On the plate with the fingers on it, whose ringing takes too long to solve at every frequency.
     """
-    coherent = DRIVE_MODES[drive_mode].coherent
-    if coherent is None or candidates.over_effect is None:
+    if drive_mode != UNRESTRICTED or candidates.over_effect is None:
         return []
     at = _rows_of([drive for _, drive in drives])
     responses = candidates.over_effect.responses(candidates.playable[at])
-    return _drives_of(coherent.search_all(candidates.fingers.forms_during(responses)), at)
+    return _drives_of(PHASED.search_all(candidates.fingers.forms_during(responses)), at)
 
 
 def _rows_of(drives: Sequence[Weights]) -> IntArray:
@@ -323,13 +322,9 @@ def _judged_over_effect(
 
 
 def _level_error(question: Question, drive_mode: str, reachable: float) -> UnreachableLevel:
-    # The search is not exhaustive for phases of several targets or of weights above zero, nor for
-    # frequencies of more than two ERAs.
-    is_single = len(question.targets) == 1
+    # Not exhaustive for phases of several targets, nor for frequencies of more than two ERAs.
     is_exhaustive = (
-        question.eras_at_most <= 2
-        if drive_mode == "switched"
-        else is_single and drive_mode != "graded"
+        question.eras_at_most <= 2 if drive_mode == "switched" else len(question.targets) == 1
     )
     # Rounded down, so that the level named can be reached.
     level = math.floor(10 * float(decibels(reachable))) / 10

@@ -44,7 +44,7 @@ class Question:
     level_db_sl: float = STRONG_DB_SL
     softer_db: tuple[float, ...] = ()
     drive_mode: str | None = None
-    playable: tuple[str, ...] = tuple(DRIVE_MODES)
+    playable: tuple[str, ...] = DRIVE_MODES
     frequencies: tuple[float, float] = (0.0, math.inf)
     eras_at_most: int = 2
     search_time: float = 10.0

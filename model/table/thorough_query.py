@@ -35,7 +35,7 @@ def query_thoroughly(table: LocalizationTable, question: Question) -> Pattern:
     drive_mode = question.drive_mode_on(table.drive_mode, era_count=len(table.eras))
     level = question.level_db_sl
     best: Pattern | None = None
-    for mode in (*reversed(DRIVE_MODES[drive_mode].restricted), drive_mode):
+    for mode in DRIVE_MODES[: 1 + DRIVE_MODES.index(drive_mode)]:
         for pattern in _louder(table, replace(question, drive_mode=mode)):
             robust = pattern.robust_level_db_sl
             if robust is None or robust < level - _ROUNDING:

@@ -20,7 +20,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.save_table: {"table": None, "path": "t.npz"},
     era.table: {"rig": RIG, "drive_mode": "switched", "frequencies": [60], "grid": era.Grid(4, 3)},
     era.query: {
-        "table": None, "target": TARGET, "quiet": (), "level_db_sl": 20.0, "drive_mode": "signed",
+        "table": None, "target": TARGET, "quiet": (), "level_db_sl": 20.0, "drive_mode": "phased",
         "loads": (1.5,),
     },
     era.answer: {

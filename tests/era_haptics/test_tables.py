@@ -21,7 +21,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> era.LocalizationTable:
     rig = era.load_rig(str(era.example_rig_path()), mesh="12x9")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        return era.table(rig, drive_mode="signed", frequencies=[60, 110, 250], grid=era.Grid(4, 3))
+        return era.table(rig, drive_mode="phased", frequencies=[60, 110, 250], grid=era.Grid(4, 3))
 
 
 @pytest.mark.parametrize("envelopes", [False, True])
@@ -50,7 +50,7 @@ def test_query_equals_the_command(
 
 def test_table_has_the_requested_mode_frequencies_and_grid(table: era.LocalizationTable) -> None:
     """Mode, frequencies and cells."""
-    assert table.drive_mode == "signed"
+    assert table.drive_mode == "phased"
     np.testing.assert_array_equal(table.frequencies, [60.0, 110.0, 250.0])
     assert table.grid == era.Grid(4, 3)
 

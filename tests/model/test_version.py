@@ -19,8 +19,6 @@ def test_numerics_version_changes_when_figures_change():
     assert found.keys() == record["figures"].keys()
     for name, values in record["figures"].items():
         tolerance = {"atol": 2e-3} if name.endswith("_db") else {"rtol": 2e-6}
-        if name == "query_graded_quiet_db":  # its search ends elsewhere by kernel of OpenBLAS
-            tolerance = {"atol": 0.01}
         np.testing.assert_allclose(found[name], values, err_msg=f"{name}: {REMEDY}", **tolerance)
 
 

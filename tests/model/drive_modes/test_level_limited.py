@@ -1,18 +1,11 @@
 """Weights that reach the level within full stroke, against a general constrained optimiser."""
 
-from contextlib import suppress
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 from model.drive_modes import find_drives
 from model.drive_modes.forms import Forms
-from model.rig.uncertainty import Uncertainty
-from model.table.pattern_choice import UnreachableLevel
-from model.table.question import Question
-from paper_table import contact_sets, smooth_table
 
 
 def _forms(seed: int, short: float) -> Forms:
@@ -68,13 +61,3 @@ def test_level_beyond_the_best_weights_costs_no_more_than_it_must(seed: int, sho
     assert np.abs(drive.values).max() <= 1 + 1e-6
     assert abs(forms.targets[0, 0] @ drive.values) >= 0.999 * forms.wanted
     assert 20 * np.log10(_optimum(forms) / score) < 0.5
-
-
-@pytest.mark.parametrize("mode", ["graded", "signed"])
-def test_a_frequency_at_which_no_weights_push_is_left_out(mode: str) -> None:
-    """Where positive weights reach no target at all, near the highest levels of a known rig."""
-    table = replace(smooth_table(), uncertainty=Uncertainty.none())
-    for places in contact_sets(5, fingers=3, seed=52):
-        question = Question((places[0],), tuple(places[1:]), level_db_sl=60.0, drive_mode=mode)
-        with suppress(UnreachableLevel):
-            assert table.query(question).level_db_sl >= 59.9

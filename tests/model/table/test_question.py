@@ -56,10 +56,10 @@ def test_question_refuses_what_no_table_can_answer(arguments):
         Question(((0.1, math.inf),)),
         Question((TARGET,), ((math.nan, 0.1),)),
         Question((TARGET,), drive_mode="phased", playable=("switched",)),
-        Question((TARGET,), playable=("graded",)),
+        Question((TARGET,), playable=("phased",)),
         Question((TARGET,), frequencies=(600.0, 800.0)),
         Question((TARGET,), eras_at_most=9),
-        Question((TARGET,), eras_at_most=3, drive_mode="graded"),
+        Question((TARGET,), eras_at_most=3, drive_mode="phased"),
     ],
 )
 def test_query_refuses_what_table_or_amplifiers_lack(question):
@@ -73,7 +73,6 @@ def test_query_refuses_what_table_or_amplifiers_lack(question):
     [
         (Question((TARGET,), QUIET, drive_mode="phased"), True),
         (Question((TARGET, (0.2, 0.1)), drive_mode="phased"), False),
-        (Question((TARGET,), QUIET, drive_mode="graded"), False),
         (Question((TARGET, (0.2, 0.1))), True),
         (Question((TARGET,), QUIET, eras_at_most=4), False),
     ],
@@ -104,7 +103,7 @@ def test_query_says_that_a_search_was_incomplete_when_it_ran_out_of_time():
 
 def test_query_uses_frequencies_that_the_amplifiers_play():
     """With amplifiers from 150 to 250 Hz no tone lies outside, in any mode."""
-    for mode in ("switched", "graded", "signed", "phased"):
+    for mode in ("switched", "phased"):
         pattern = smooth_table().query(
             Question((TARGET,), QUIET, drive_mode=mode, frequencies=(150.0, 250.0))
         )
@@ -164,7 +163,7 @@ def test_query_reaches_the_level_at_both_targets(softer):
 @pytest.mark.parametrize(
     ("targets", "mode"),
     [
-        *(((TARGET,), mode) for mode in ("switched", "graded", "signed", "phased")),
+        *(((TARGET,), mode) for mode in ("switched", "phased")),
         ((TARGET, QUIET[0]), "phased"),
     ],
 )

@@ -34,7 +34,7 @@ def test_sums_of_sources_add_up_the_tones_of_each_pattern():
         np.testing.assert_allclose(row, slow)
 
 
-@pytest.mark.parametrize("mode", ["switched", "graded", "signed", "phased"])
+@pytest.mark.parametrize("mode", ["switched", "phased"])
 def test_query_predicts_what_the_direct_solver_finds(mode):
     """Level, contrast and the loudest quiet level, by the sparse direct solve with fingers on."""
     rig, table = smooth_rig(), smooth_table()

@@ -156,5 +156,5 @@ def test_build_states_the_discretisation_error_of_the_worst_era():
 
 def test_build_refuses_an_unknown_drive_mode(problem):
     """The error lists those there are."""
-    with pytest.raises(InputError, match="switched, graded, signed, phased"):
+    with pytest.raises(InputError, match="switched, phased"):
         build_in_parts(problem, drive_mode="loud")

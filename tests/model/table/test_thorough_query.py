@@ -13,7 +13,7 @@ from model.table.table import LocalizationTable
 from model.table.thorough_query import LEVEL_STEP, query_thoroughly
 from paper_table import contact_sets, smooth_table
 
-NESTED = ("switched", "graded", "signed", "phased")
+NESTED = ("switched", "phased")
 TOLERANCE = 0.1  # dB
 
 

@@ -123,7 +123,7 @@ class Bench:
         self._shapes_at = lru_cache(_MAX_SHAPES)(
             lambda points: self._plant.reduced.at(np.frombuffer(points).reshape(-1, 2))
         )
-        # Voicess that moved a base, with the time of their end [s].
+        # Voices that moved a base, with the time of their end [s].
         self._played: deque[tuple[Voices, float]] = deque()
 
     @property

@@ -1,9 +1,7 @@
-"""Recordings: readings of sensors over time, and what a file format for them has."""
+"""Recordings: readings of sensors over time."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -24,17 +22,6 @@ class Recording:
     sample_rate: float
     start: float
     samples: FloatArray
-
-    def __post_init__(self) -> None:
-        """Check shapes and sampling rate."""
-        shape = (len(self.samples), len(self.names))
-        if np.shape(self.samples) != shape or np.shape(self.points) != (len(self.names), 2):
-            raise InputError(
-                f"samples and points must match the {len(self.names)} sensors, got shapes "
-                f"{np.shape(self.samples)} and {np.shape(self.points)}"
-            )
-        if not (math.isfinite(self.sample_rate) and self.sample_rate > 0):
-            raise InputError(f"sampling rate must be positive, got {self.sample_rate} Hz")
 
     @property
     def times(self) -> FloatArray:
@@ -67,25 +54,3 @@ class Recording:
                 "longer"
             )
         return fit_tones(self.times, self.samples, frequencies, with_offset=True)
-
-
-@dataclass(frozen=True)
-class Format:
-    """A file format.
-
-    read: raises InputError with file and line; start: the first bytes of a file; max_values: limit
-    that bounds memory; cannot_hold: why recordings of these names at this sampling rate [Hz] do not
-    fit, None where they do; sidecars: the files beside one.
-    """
-
-    write: Callable[[Path, Recording], None]
-    read: Callable[[Path], Recording]
-    start: bytes
-    max_values: int
-    cannot_hold: Callable[[Sequence[str], float], str | None] = lambda names, sample_rate: None
-    sidecars: Callable[[Path], tuple[Path, ...]] = lambda path: ()
-
-
-def rounded(value: float, digits: int) -> float:
-    """A value that was written with so many significant digits."""
-    return float(f"{value:.{digits}g}")

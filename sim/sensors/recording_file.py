@@ -1,8 +1,4 @@
-"""Read and write recordings; the suffix selects the format.
-
-Files are replaced atomically. A new format is a module in `sim.sensors.formats` and a line in
-`_FORMATS`.
-"""
+"""Write recordings; the suffix selects the format. Files are replaced atomically."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,12 +7,8 @@ import numpy as np
 
 from model.errors import InputError
 from model.files.replacing import begins_with
-from sim.sensors.formats.csv_file import CSV
-from sim.sensors.formats.uff_file import UFF
-from sim.sensors.formats.wav_file import WAV
-from sim.sensors.recording import Format, Recording
-
-_FORMATS = {".csv": CSV, ".wav": WAV, ".uff": UFF, ".unv": UFF}
+from sim.sensors.formats import FORMATS, Format
+from sim.sensors.recording import Recording
 
 
 def write_recording(path: Path, recording: Recording) -> None:
@@ -61,12 +53,7 @@ def max_values(path: Path) -> int:
     return _format_of(path).max_values
 
 
-def read_recording(path: Path) -> Recording:
-    """Read what `write_recording` writes; InputError, with file and line, for anything else."""
-    return _format_of(path).read(path)
-
-
 def _format_of(path: Path) -> Format:
-    if path.suffix.lower() not in _FORMATS:
-        raise InputError(f"{path}: suffix must be one of {', '.join(_FORMATS)}")
-    return _FORMATS[path.suffix.lower()]
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"{path}: suffix must be one of {', '.join(FORMATS)}")
+    return FORMATS[path.suffix.lower()]

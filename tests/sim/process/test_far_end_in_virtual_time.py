@@ -9,8 +9,8 @@ import pytest
 from drivers.contents import Tone
 from far_end_process import far_end_process
 from playing import SESSION, playing
+from recordings import read_recording
 from rig_files import write_rig
-from sim.sensors.recording_file import read_recording
 
 
 async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path) -> None:

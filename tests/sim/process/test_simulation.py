@@ -15,13 +15,13 @@ from drivers.errors import CommandRefused
 from drivers.host.group import Group
 from drivers.opening import Lines
 from model.rig.file import load_rig
+from recordings import read_recording
 from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.control.context import SimulationContext
 from sim.far_ends.wires import Wire
 from sim.plant.accelerometer import Accelerometer
 from sim.process.simulation import Simulation, run_simulation
 from sim.process.view import PlateView, draw
-from sim.sensors.recording_file import read_recording
 from words_bench import LIMITS, layer
 
 

@@ -10,10 +10,10 @@ from drivers.contents import Tone
 from full_disk import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig
+from recordings import read_recording
 from sim.bench.bench import Bench
 from sim.plant.accelerometer import Accelerometer
 from sim.sensors.recorder import Recorder
-from sim.sensors.recording_file import read_recording
 
 HALF_STROKE = Tone(0, 110.0, 0.5)
 

@@ -1,1 +1,0 @@
-"""Recordings as files, a kind of file each."""

@@ -19,11 +19,11 @@ from drivers.by_hand.reaching import (
 from drivers.by_hand.rows import capability_rows, fault_rows, in_units, status_rows
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
-from drivers.host.amplifier import STOP_RAMP, WATCHDOG, Amplifier
+from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.comparison import name_of
 from drivers.host.jobs import Priority
 from drivers.host.sensors import check_tones, measure_tones, read_measured, read_sensors
-from drivers.host.timing import check_watchdog
+from drivers.host.timing import STOP_RAMP, check_watchdog
 from drivers.protocol.records import bits_of
 from drivers.protocol.table import COMMAND, FAULTS, LATCHED, QUANTITIES, STATES, has_feature
 from drivers.urls import with_address

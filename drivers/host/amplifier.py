@@ -1,7 +1,6 @@
 """One amplifier of protocol 3, whatever its wire: who it is, and its requests."""
 
 import asyncio
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,19 +9,18 @@ from drivers import clock
 from drivers.contents import Layer, is_silence
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout, Preempted
 from drivers.host.budget import COMMIT_DELAY
-from drivers.host.comparison import MAX_CONTRADICTIONS, achieved_problem, name_of
+from drivers.host.comparison import MAX_CONTRADICTIONS, achieved_problem, is_stopping, name_of
 from drivers.host.dialogue import Dialogue, Staged
 from drivers.host.identification import check_capabilities, check_identity
 from drivers.host.jobs import Priority
 from drivers.host.joint_start import JointStart
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
-from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT
+from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT, STOP_RAMP
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import (
     FAULTS,
-    LATCHED,
     QUANTITIES,
     STATES,
 )
@@ -30,7 +28,6 @@ from drivers.protocol.tokens import is_newer_token
 from registry.limits import GuardLimits
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
-STOP_RAMP = 0.005  # s; the shortest without a step
 DISARM_RAMP = 0.05  # s; long enough to avoid a click
 OPEN_TIMEOUT = 0.5  # s; for boards that restart when their port is opened
 CONFIRM_TIMEOUT = 0.3  # s; three replies of the slowest wire
@@ -321,23 +318,11 @@ class Amplifier(Dialogue):
             cause = cause or f"silence was not reported within {timeout:g} s"
         return Stopped(False, self.feeding.may_play_until, self.line.loss or cause)
 
-    def wire_ramp(self, ramp: float) -> int:
-        """Return the nearest ramp that the amplifier has: silence is never refused for it."""
-        highest = self.capabilities.get("ramp_max", _RAMP.maximum)
-        if math.isnan(ramp):
-            return _RAMP.to_wire(STOP_RAMP)
-        return min(_RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high)), int(highest))
-
     async def _request(
         self, name: str, values: Values, priority: Priority, *, timeout: float = REPLY_TIMEOUT
     ) -> Values:
         """Send a request and return the values of its reply."""
         return await self.line.submit(self, priority, name, values, timeout=timeout)
-
-    def is_silent(self, status: Values) -> bool:
-        """Whether a status has the levels of all channels, and all are zero."""
-        known = self.capabilities.get("channels")
-        return known == len(status["levels"]) and not any(status["levels"])
 
     async def _listen_for_another_host(self, status: Values) -> None:
         """Wait for a watchdog that rises unasked; raises LinkError."""
@@ -350,10 +335,3 @@ class Amplifier(Dialogue):
             if status["watchdog_left"] > left:
                 raise self._driven_by_another()
             left = status["watchdog_left"]
-
-
-def is_stopping(status: Values, before: int | None) -> bool:
-    """Whether a status shows that a stop was carried out since a latch was the newest."""
-    if before is None or status["state"] not in LATCHED:
-        return False
-    return status["latch"] > 0 and is_newer_token(status["latch"], before)

@@ -9,7 +9,8 @@ from drivers.host.feeding import Feeding
 from drivers.host.ledger import Ledger
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import QUANTITIES, STATUS_FLAGS, has_feature
+from drivers.protocol.table import LATCHED, QUANTITIES, STATUS_FLAGS, has_feature
+from drivers.protocol.tokens import is_newer_token
 
 MAX_CONTRADICTIONS = 2
 """Contradictions in a row that are a fault; a single one may be a moment between two sets."""
@@ -97,3 +98,10 @@ def achieved_problem(sent: LayerSet, achieved: LayerSet, can: Values) -> str | N
 def name_of(names: Mapping[str, int], number: int) -> str:
     """Return the name of a number of the table, or the number."""
     return next((name for name, each in names.items() if each == number), str(number))
+
+
+def is_stopping(status: Values, before: int | None) -> bool:
+    """Whether a status shows that a stop was carried out since a latch was the newest."""
+    if before is None or status["state"] not in LATCHED:
+        return False
+    return status["latch"] > 0 and is_newer_token(status["latch"], before)

@@ -10,7 +10,7 @@ from drivers.host.comparison import MAX_CONTRADICTIONS, name_of, problem_of
 from drivers.host.feeding import Feeding
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
-from drivers.host.timing import FAST, SET_WORDS, TAKEN_WORDS
+from drivers.host.timing import FAST, SET_WORDS, STOP_RAMP, TAKEN_WORDS
 from drivers.host.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
@@ -81,6 +81,18 @@ class Dialogue:
         if self._ledger is None:
             raise CommandError(f"amplifier {self.name} must be opened first")
         return self._ledger
+
+    def wire_ramp(self, ramp: float) -> int:
+        """Return the nearest ramp that the amplifier has: silence is never refused for it."""
+        highest = self.capabilities.get("ramp_max", _RAMP.maximum)
+        if math.isnan(ramp):
+            return _RAMP.to_wire(STOP_RAMP)
+        return min(_RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high)), int(highest))
+
+    def is_silent(self, status: Values) -> bool:
+        """Whether a status has the levels of all channels, and all are zero."""
+        known = self.capabilities.get("channels")
+        return known == len(status["levels"]) and not any(status["levels"])
 
     def exchange_time(self, name: str) -> float:
         """Return how long the longest request of a name and its reply take on the wire [s]."""
@@ -162,7 +174,7 @@ class Dialogue:
         Raises for what plays or feeds, while it must not go out: LinkError while degraded or beside
         another host, CommandRefused once a status has shown that it is not armed any more.
         """
-        takes = self.exchange_time(name)
+        takes = self._times[name] if name in self._times else self.exchange_time(name)
         if name == "Set" and takes > FAST:  # much shorter, nearly always
             words = SET_WORDS + len(values["stream"])
             takes = self.line.wire.exchange_time(words, TAKEN_WORDS)

@@ -11,6 +11,8 @@ FAST = REPLY_TIMEOUT - REACTION
 """Longest exchange [s] whose reply is here by then."""
 ATTEMPTS = 3
 """Of a request; one less where the wire is slow."""
+STOP_RAMP = 0.005
+"""Shortest ramp without a step [s]."""
 HEARTBEAT = 0.05
 """Interval of heartbeats [s]."""
 MAX_LOSS_DETECTION_TIME = 3 * HEARTBEAT

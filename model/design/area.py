@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,53 +37,7 @@ PolygonSection = Annotated[list[PointSection], Field(min_length=3, max_length=64
 
 
 @dataclass(frozen=True)
-class Edge:
-    """The edge of a plate of a length and a width [m]."""
-
-    length: float
-    width: float
-    text: ClassVar[str] = EDGE
-
-    def candidates(self, spacing: float) -> FloatArray:
-        """Corners, and places between them."""
-        counts = [max(1, round(side / spacing)) for side in (self.length, self.width)] * 2
-        ends = np.cumsum([0.0, self.length, self.width, self.length, self.width])
-        at = [
-            np.linspace(start, end, count, endpoint=False)
-            for start, end, count in zip(ends[:-1], ends[1:], counts, strict=True)
-        ]
-        return self._at(np.concatenate(at))
-
-    def contains(self, points: FloatArray) -> NDArray[np.bool_]:
-        """Whether points are on the edge."""
-        gaps = np.minimum(np.abs(points), np.abs([self.length, self.width] - points))
-        return np.asarray((gaps <= _ON_EDGE).any(axis=1))
-
-    def moved(self, place: FloatArray, step: float) -> FloatArray:
-        """A step to and fro along the edge, around its corners."""
-        return self._at(self._along(place) + np.array([-step, step]))
-
-    def _at(self, along: FloatArray) -> FloatArray:
-        """Places (n, 2) a distance (n,) along the edge from the origin, x first."""
-        length, width = self.length, self.width
-        s = np.mod(along, 2 * (length + width))
-        x = np.clip(np.minimum(s, 2 * length + width - s), 0, length)
-        y = np.clip(np.minimum(s - length, 2 * (length + width) - s), 0, width)
-        return np.column_stack([x, y])
-
-    def _along(self, place: FloatArray) -> float:
-        x, y = place.tolist()
-        if y <= _ON_EDGE:
-            return float(x)
-        if x >= self.length - _ON_EDGE:
-            return float(self.length + y)
-        if y >= self.width - _ON_EDGE:
-            return float(2 * self.length + self.width - x)
-        return float(2 * (self.length + self.width) - y)
-
-
-@dataclass(frozen=True)
-class Within:
+class Area:
     """A part of a plate of a length and a width [m], where a function of points (n, 2) is true.
 
     text: what identifies it: its name, or the content of its file.
@@ -111,21 +65,20 @@ class Within:
         return places[is_other & self.contains(places)]
 
 
-def area_of(where: str, plate: Plate) -> Edge | Within:
+def area_of(where: str, plate: Plate) -> Area:
     """The area of a name, a picture or a file of polygons.
 
     Raises InputError for a picture that cannot be read or has other proportions than the plate, and
     for a file that is none.
     """
     length, width = plate.length, plate.width
-    if where == EDGE:
-        return Edge(length, width)
-    if where == ANYWHERE:
-        return Within(where, length, width, everywhere)
+    if where in (EDGE, ANYWHERE):
+        contains = everywhere if where == ANYWHERE else partial(_on_edge, length, width)
+        return Area(where, length, width, contains)
     path = Path(where)
     if path.suffix.lower() in PICTURES:
         contains = partial(_is_white, _white(path, plate), length, width)
-        return Within(path.read_bytes().hex(), length, width, contains)
+        return Area(path.read_bytes().hex(), length, width, contains)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(
             f"--where must be {EDGE}, {ANYWHERE}, a picture ({', '.join(PICTURES)}) or a .yaml "
@@ -134,7 +87,7 @@ def area_of(where: str, plate: Plate) -> Edge | Within:
     document = read_document(path, if_empty="it must have polygons, each a name with its corners")
     polygons = Validation(document, _PolygonsSection).finish().polygons
     corners = [np.array(polygon, dtype=float) for polygon in polygons.values()]
-    return Within(document.text, length, width, partial(_in_any, corners))
+    return Area(document.text, length, width, partial(_in_any, corners))
 
 
 def everywhere(points: FloatArray) -> NDArray[np.bool_]:
@@ -142,19 +95,20 @@ def everywhere(points: FloatArray) -> NDArray[np.bool_]:
     return np.ones(len(points), dtype=bool)
 
 
-def candidates_of(area: Edge | Within, plate: Plate, *, count: int) -> FloatArray:
-    """About a count of candidate places, (c, 2) [m].
+def candidates_of(area: Area, *, count: int) -> tuple[FloatArray, float]:
+    """About a count of candidate places, (c, 2) [m], and how far apart they are [m].
 
     Raises InputError for an area without any.
     """
-    spacing = 2 * (plate.length + plate.width) / count
-    if not isinstance(area, Edge):
-        spacing = math.sqrt(plate.length * plate.width / count)
+    size = area.length * area.width
+    spacing = math.sqrt(size / count)
+    if area.text == EDGE:
+        spacing = 2 * (area.length + area.width) / count
     for _ in range(6):  # of a small area the raster is finer
         places = area.candidates(spacing)
         if len(places) >= count / 2:
-            return places
-        if plate.length * plate.width / spacing**2 > _MAX_CANDIDATES * 4:
+            return places, spacing
+        if size / spacing**2 > _MAX_CANDIDATES * 4:
             break
         spacing *= 0.7
     if len(places) == 0:
@@ -162,7 +116,7 @@ def candidates_of(area: Edge | Within, plate: Plate, *, count: int) -> FloatArra
             "--where must leave room for ERAs on the plate, got none; check that it is in metres, "
             "from the plate's corner, and white where ERAs may stand"
         )
-    return places
+    return places, spacing
 
 
 def in_polygon(polygon: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
@@ -177,6 +131,12 @@ def in_polygon(polygon: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
     share = np.clip(share, 0, 1)
     gap = np.hypot(x - x0 - share * side[0], y - y0 - share * side[1])
     return np.asarray(inside | (gap.min(axis=1) <= _ON_EDGE))
+
+
+def _on_edge(length: float, width: float, points: FloatArray) -> NDArray[np.bool_]:
+    """Whether points (n, 2) are on the edge of a plate."""
+    gaps = np.minimum(np.abs(points), np.abs([length, width] - points))
+    return np.asarray((gaps <= _ON_EDGE).any(axis=1))
 
 
 def _in_any(polygons: Sequence[FloatArray], points: FloatArray) -> NDArray[np.bool_]:

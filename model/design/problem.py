@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from model.arrays import FloatArray, IntArray
-from model.design.area import Edge, Within, candidates_of
+from model.design.area import EDGE, Area, candidates_of
 from model.design.contacts import ContactRule
 from model.design.support import DEFAULT_LOWEST, MIN_SUPPORTING, shortfall
 from model.errors import InputError
@@ -41,7 +41,7 @@ class DesignProblem:
 
     rig: Rig
     count: int
-    area: Edge | Within
+    area: Area
     contacts: ContactRule
     kept: tuple[str, ...] = ()
     apart: float = DEFAULT_APART
@@ -131,11 +131,19 @@ class DesignProblem:
         """Contact sets that no search has seen, (fingers, 2) [m] each, target first."""
         return self.contacts.sets(JUDGED_SETS, seed=self.seed + _JUDGED_SEED)
 
-    @cached_property
+    @property
     def candidates(self) -> FloatArray:
         """Places [m] from which a search begins, (c, 2); raises InputError where there are none."""
-        is_edge = isinstance(self.area, Edge)
-        return candidates_of(self.area, self.rig.plate, count=CANDIDATES[is_edge])
+        return self._raster[0]
+
+    @property
+    def spacing(self) -> float:
+        """Distance [m] of candidates."""
+        return self._raster[1]
+
+    @cached_property
+    def _raster(self) -> tuple[FloatArray, float]:
+        return candidates_of(self.area, count=CANDIDATES[self.area.text == EDGE])
 
     def open_candidates(self, positions: FloatArray) -> IntArray:
         """Numbers of candidates far enough from positions (n, 2) [m].
@@ -166,10 +174,3 @@ class DesignProblem:
             place = self.candidates[rng.choice(self.open_candidates(found))]
             found = np.vstack([found, place])
         return found
-
-
-def spacing_of(places: FloatArray) -> float:
-    """Median distance [m] of places (c, 2) to their nearest neighbour, at most 0.1 m."""
-    gaps = np.linalg.norm(places[:, None] - places, axis=-1)
-    np.fill_diagonal(gaps, np.inf)
-    return float(np.median(np.minimum(gaps.min(axis=1), 0.1)))

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import FloatArray, IntArray
-from model.choice import best_by, best_of
+from model.choice import best_by
 from model.design import problem as design_problem
-from model.design.area import Within, everywhere
-from model.design.problem import DesignProblem, spacing_of
+from model.design.area import ANYWHERE, area_of
+from model.design.problem import DesignProblem
 from model.design.score import Mounts, Places, Scorer
 from model.design.support import MIN_SUPPORTING
+from model.errors import InputError
 
 MAX_SWEEPS = 4
 """Exchanges of every ERA."""
@@ -95,15 +96,13 @@ class LayoutSearch:
 
     def one_more(self, positions: FloatArray) -> Found | None:
         """Add the best candidate to positions (n, 2) [m], then move all; None without room."""
-        every = np.vstack([positions, self.problem.candidates])
-        gaps = np.linalg.norm(every[:, None] - positions, axis=-1).min(axis=1)
-        open_ = np.flatnonzero(gaps >= self.problem.apart)
-        if not len(open_):
+        try:
+            open_ = self.problem.open_candidates(positions)
+        except InputError:
             return None
-        places = self._scorer.places(every)
-        own = np.arange(len(positions))
-        best = open_[best_of([self._value_at(places, [*own, each]) for each in open_.tolist()])]
-        return self._refined(np.vstack([positions, every[best]]))
+        tried = [np.vstack([positions, self.problem.candidates[each]]) for each in open_]
+        best = best_by(self.scored(tried), lambda found: found.score_db)
+        return self._refined(best.positions)
 
     def refine(self, layout: Sequence[int]) -> Found:
         """Move the places of a layout freely by ever smaller steps."""
@@ -111,6 +110,8 @@ class LayoutSearch:
 
     def scored(self, layouts: Sequence[FloatArray]) -> list[Found]:
         """The score of each of some layouts (n, 2) [m], as it is."""
+        if not layouts:
+            return []
         every = np.unique(np.vstack(layouts), axis=0)
         is_known = (every[:, None] == self._places.at).all(axis=-1).any(axis=1).all()
         places = self._places if is_known else self._scorer.places(every)
@@ -120,13 +121,12 @@ class LayoutSearch:
 
     def sensitivities(self, positions: FloatArray, *, step: float) -> FloatArray:
         """The most that the score [dB] changes by a step [m] of each ERA, per metre, (n,)."""
-        moves = [self._steps(place, step) for place in positions]
-        places = self._scorer.places(np.vstack([positions, *moves]))
-        layout = np.arange(len(positions))
-        own, changes = self._score_at(places, layout), np.zeros(len(positions))
-        for number, row in _rows(moves):
-            tried = np.where(layout == number, row, layout)
-            changes[number] = max(changes[number], abs(self._score_at(places, tried) - own) / step)
+        (own,) = self.scored([positions])
+        changes = np.zeros(len(positions))
+        for number, place in enumerate(positions):
+            found = self.scored(_replaced(positions, number, self._steps(place, step)))
+            supported = [abs(each.score_db - own.score_db) for each in found if each.is_supported]
+            changes[number] = max(supported, default=0.0) / step
         return changes
 
     def value(self, layout: tuple[int, ...]) -> float:
@@ -137,32 +137,20 @@ class LayoutSearch:
         return self._known[key]
 
     def _refined(self, positions: FloatArray) -> Found:
-        (found,) = self.scored([positions])
-        value = found.score_db
-        step = spacing_of(self.problem.candidates) / 2
+        (best,) = self.scored([positions])
+        step = self.problem.spacing / 2
         while step >= FINEST_STEP / 2:
-            positions, moved = self._moved(positions, step)
-            if moved <= value + _GAIN:
+            before = best.score_db
+            for number in range(self._k, len(positions)):
+                moves = self.problem.area.moved(best.positions[number], step)
+                tried = _replaced(best.positions, number, moves)
+                found = self.scored([each for each in tried if self.problem.are_apart(each)])
+                for each in found:
+                    if each.score_db > best.score_db + _GAIN:
+                        best = each
+            if best.score_db <= before + _GAIN:
                 step /= 2
-            value = max(value, moved)
-        return Found(positions, value)
-
-    def _moved(self, positions: FloatArray, step: float) -> tuple[FloatArray, float]:
-        """Positions after at most one step of each ERA that is not kept, and their value."""
-        moves = [
-            self.problem.area.moved(place, step) if number >= self._k else np.empty((0, 2))
-            for number, place in enumerate(positions)
-        ]
-        places = self._scorer.places(np.vstack([positions, *moves]))
-        layout = np.arange(len(positions))
-        value = self._value_at(places, layout)
-        for number, row in _rows(moves):
-            tried = np.where(np.arange(len(layout)) == number, row, layout)
-            if self.problem.are_apart(places.at[tried]):
-                worth = self._value_at(places, tried)
-                if worth > value + _GAIN:
-                    value, layout = worth, tried
-        return places.at[layout], value
+        return best
 
     def _steps(self, place: FloatArray, step: float) -> FloatArray:
         """Steps of a place within the area, or of one outside it anywhere on the plate."""
@@ -171,7 +159,7 @@ class LayoutSearch:
             found = area.moved(place, step)
             if len(found):
                 return found
-        return Within("anywhere", plate.length, plate.width, everywhere).moved(place, step)
+        return area_of(ANYWHERE, plate).moved(place, step)
 
     def _value_at(self, places: Places, chosen: Iterable[int]) -> float:
         numbers = np.asarray(chosen)
@@ -198,10 +186,7 @@ class LayoutSearch:
         return [int((places.at == at).all(axis=1).argmax()) for at in positions]
 
 
-def _rows(moves: Sequence[FloatArray]) -> Iterator[tuple[int, int]]:
-    """Number of an ERA and row of each of its moves, below all ERAs."""
-    row = len(moves)
-    for number, options in enumerate(moves):
-        for _ in options:
-            yield number, row
-            row += 1
+def _replaced(positions: FloatArray, number: int, places: FloatArray) -> list[FloatArray]:
+    """Positions (n, 2) with that of one ERA at each of some places (m, 2)."""
+    at = np.arange(len(positions))[:, None] == number
+    return [np.where(at, place, positions) for place in places]

@@ -20,7 +20,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import pytest  # noqa: E402
-from hypothesis import settings  # noqa: E402
+from hypothesis import HealthCheck, settings  # noqa: E402
 
 import preloaded  # noqa: E402
 from drivers import garbage_collection  # noqa: E402
@@ -70,7 +70,10 @@ SLOWEST = (
 """Run in this order before all others: one that started last would leave the other cores idle."""
 
 
-settings.register_profile("short", max_examples=40)  # of each property; a hundred without it
+# Forty examples of each property, a hundred without it, however long a busy machine takes.
+settings.register_profile(
+    "short", max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("short")
 
 

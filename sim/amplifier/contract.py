@@ -10,7 +10,7 @@ where the sum of layers is limited.
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from drivers.playback import Voice, playback_of
@@ -27,6 +27,15 @@ from drivers.protocol.table import (
 )
 from drivers.protocol.tokens import token_after
 from sim.amplifier.capabilities import capabilities
+from sim.amplifier.readings import (
+    HIGH_VOLTAGE,
+    LIMITED,
+    FaultRecord,
+    achieved,
+    exceeds_full,
+    fault_list,
+    measured,
+)
 from sim.amplifier.set_intake import SetIntake, derated
 from sim.amplifier.state_table import TRANSITIONS
 from sim.amplifier.summary import AmplifierSummary
@@ -34,17 +43,13 @@ from sim.amplifier.thermal_model import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD
 
 SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
 _FAULTS_KEPT = 16
-_HIGH_VOLTAGE = 1800.0  # V
-_CAPACITANCE = 1e-9  # F; of an actuator
 _DISCHARGE = 0.02  # s; time constant of the supply once it is off
 _DERATING_RAMP = 0.02  # s; no click
-_FRACTIONS = 16  # of a fade at which its sum with others is looked at
 _ENABLED = "OPERATION_ENABLED"
 _ENDING = ("SWITCHED_ON", "FAULT_REACTION_ACTIVE")
 _LATCHED = ("QUICK_STOP_ACTIVE", "FAULT")
 _SENSING = ("GetSensors", "Measure", "GetReading")
 _Q = QUANTITIES
-_LIMITED = 1 + _Q["level"].step
 
 
 class SensorPort(Protocol):
@@ -80,7 +85,7 @@ class Amplifier:
         self.session = 0
         self.latch = 0
         self.listeners: list[Callable[[Values, float], None]] = []
-        self._faults: deque[tuple[str, int | None, float]] = deque(maxlen=_FAULTS_KEPT)
+        self._faults: deque[FaultRecord] = deque(maxlen=_FAULTS_KEPT)
         self._heat = ThermalState(since=-math.inf)
         self._is_interlock_open = False
         self.committed_at = -math.inf  # s; see `token`
@@ -165,9 +170,7 @@ class Amplifier:
         left = self._last_fed + self._watchdog - now if self.state == _ENABLED else 0.0
         decayed = math.exp(min(0.0, (self._silent_from - now) / _DISCHARGE))
         # A sum that lasts is limited again and again.
-        self._is_limited |= any(
-            self.playback.level(each, now) > _LIMITED for each in self._channels
-        )
+        self._is_limited |= any(self.playback.level(each, now) > LIMITED for each in self._channels)
         flags = {
             "high_voltage": is_on,
             "interlock_open": self._is_interlock_open,
@@ -181,7 +184,7 @@ class Amplifier:
             "flags": sum(1 << STATUS_FLAGS[each] for each, is_set in flags.items() if is_set),
             **{"latch": self.latch, "watchdog_left": _Q["watchdog_left"].to_wire(max(left, 0.0))},
             "temperature": _Q["temperature"].to_wire(self._heat.at(now)),
-            "voltage": round(_HIGH_VOLTAGE if is_on else _HIGH_VOLTAGE * decayed),
+            "voltage": round(HIGH_VOLTAGE if is_on else HIGH_VOLTAGE * decayed),
             **{"token": self._intake.committed, "channels": len(levels), "layers": layers},
             "levels": [_Q["level"].to_wire(level) for level in levels],
             "tokens": [tokens.get(layer, 0) for layer in range(layers)],
@@ -239,7 +242,7 @@ class Amplifier:
             case "GetCaps":
                 return self.capabilities
             case "GetFaults":
-                return self._fault_list(now)
+                return fault_list(self._faults, now)
             case "Arm":
                 self._arm(values["session"], values["watchdog"], now)
             case "Disarm" | "Stop":
@@ -263,9 +266,13 @@ class Amplifier:
                 if layers is not None:
                     self._play(layers, values["token"], now)
             case "GetAchieved":
-                return self._achieved_of(values["layer"])
+                layer, count = values["layer"], self.capabilities["layers"]
+                if layer >= count:
+                    raise Refusal(f"layer must be 0 to {count - 1}, got {layer}")
+                return achieved(self.playback, layer)
             case "GetMeasured":
-                return {"count": len(self._channels), "channels": list(self._measured(now))}
+                channels = list(measured(self.playback, now))
+                return {"count": len(channels), "channels": channels}
             case "SetAddress":
                 if values["serial_number"] != self.identity["serial_number"]:
                     raise Refusal("serial number must be this amplifier's")
@@ -278,17 +285,6 @@ class Amplifier:
     @property
     def _channels(self) -> range:
         return range(self.playback.channels)
-
-    def _fault_list(self, now: float) -> Values:
-        listed = [
-            {
-                "fault": FAULTS[fault],
-                "channel": NO_CHANNEL if channel is None else channel,
-                "age": _Q["age"].to_wire(now - at),
-            }
-            for fault, channel, at in self._faults
-        ]
-        return {"count": len(listed), "faults": listed}
 
     def _is_foreign(self, session: int, name: str) -> bool:
         """Whether a session is not the one that is held, or to arm, has ended."""
@@ -340,46 +336,10 @@ class Amplifier:
         if all(layer.renew for layer in layers):
             return
         self.token, self.committed_at = token, now
-        self._is_limited |= any(self._exceeds_full(channel, now) for channel in self._channels)
+        self._is_limited |= any(
+            exceeds_full(self.playback, channel, now) for channel in self._channels
+        )
         self._changed(now)
-
-    def _achieved_of(self, layer: int) -> Values:
-        if layer >= self.capabilities["layers"]:
-            raise Refusal(f"layer must be 0 to {self.capabilities['layers'] - 1}, got {layer}")
-        playing = self.playback.playing(layer)
-        commands = [
-            {
-                **{"channel": each.channel, "frequency": each.frequency},
-                **{"level": each.level, "phase": each.phase},
-            }
-            for each in playing.commands
-        ]
-        return {
-            **{"token": self.playback.tokens.get(layer, 0), "layer": layer},
-            **{"count": len(commands), "commands": commands},
-            **{"ramp": playing.ramp, "valid_for": playing.valid_for},
-        }
-
-    def _measured(self, now: float) -> Iterator[Values]:
-        """Yield what a capacitor of a typical actuator draws at the present levels."""
-        for channel in self._channels:
-            level = min(self.playback.level(channel, now), 1.0)
-            # Force goes with the voltage squared, at half the frequency.
-            voltage = _HIGH_VOLTAGE * math.sqrt(level / 2)
-            frequencies = [voice.frequency for voice in self.playback.voices_of(channel)]
-            omega = math.pi * max(frequencies, default=0.0)
-            yield {
-                "channel_voltage": _Q["channel_voltage"].to_wire(voltage),
-                "channel_current": _Q["channel_current"].to_wire(omega * _CAPACITANCE * voltage),
-            }
-
-    def _exceeds_full(self, channel: int, now: float) -> bool:
-        """Whether a channel's sum exceeds full level by a step or more from now on."""
-        times = {now}
-        for voice in self.playback.voices_of(channel):
-            length = voice.transition.end - now
-            times.update(now + length * part / _FRACTIONS for part in range(1, _FRACTIONS + 1))
-        return any(self.playback.level(channel, at) > _LIMITED for at in times if at >= now)
 
     def _silence(self, moment: float, *, ramp: float) -> None:
         """Silence every channel within the ramp [s], and discard what is staged."""

@@ -1,0 +1,70 @@
+"""What a simulated amplifier reports of what its channels play, and of its faults."""
+
+import math
+from collections.abc import Iterable, Iterator
+
+from drivers.playback import Playback
+from drivers.protocol.records import Values
+from drivers.protocol.table import FAULTS, NO_CHANNEL, QUANTITIES
+
+HIGH_VOLTAGE = 1800.0  # V
+_CAPACITANCE = 1e-9  # F; of an actuator
+_FRACTIONS = 16  # of a fade at which its sum with others is looked at
+_Q = QUANTITIES
+LIMITED = 1 + _Q["level"].step
+
+FaultRecord = tuple[str, int | None, float]
+"""Name, channel if there is one, and time [s] of a fault."""
+
+
+def fault_list(faults: Iterable[FaultRecord], now: float) -> Values:
+    """Return the values of GetFaults at a time [s]."""
+    listed = [
+        {
+            "fault": FAULTS[fault],
+            "channel": NO_CHANNEL if channel is None else channel,
+            "age": _Q["age"].to_wire(now - at),
+        }
+        for fault, channel, at in faults
+    ]
+    return {"count": len(listed), "faults": listed}
+
+
+def achieved(playback: Playback, layer: int) -> Values:
+    """Return the values of GetAchieved: what a layer plays."""
+    playing = playback.playing(layer)
+    commands = [
+        {
+            **{"channel": each.channel, "frequency": each.frequency},
+            **{"level": each.level, "phase": each.phase},
+        }
+        for each in playing.commands
+    ]
+    return {
+        **{"token": playback.tokens.get(layer, 0), "layer": layer},
+        **{"count": len(commands), "commands": commands},
+        **{"ramp": playing.ramp, "valid_for": playing.valid_for},
+    }
+
+
+def measured(playback: Playback, now: float) -> Iterator[Values]:
+    """Yield what a capacitor of a typical actuator draws at the level of each channel."""
+    for channel in range(playback.channels):
+        level = min(playback.level(channel, now), 1.0)
+        # Force goes with the voltage squared, at half the frequency.
+        voltage = HIGH_VOLTAGE * math.sqrt(level / 2)
+        frequencies = [voice.frequency for voice in playback.voices_of(channel)]
+        omega = math.pi * max(frequencies, default=0.0)
+        yield {
+            "channel_voltage": _Q["channel_voltage"].to_wire(voltage),
+            "channel_current": _Q["channel_current"].to_wire(omega * _CAPACITANCE * voltage),
+        }
+
+
+def exceeds_full(playback: Playback, channel: int, now: float) -> bool:
+    """Whether a channel's sum exceeds full level by a step or more from now on."""
+    times = {now}
+    for voice in playback.voices_of(channel):
+        length = voice.transition.end - now
+        times.update(now + length * part / _FRACTIONS for part in range(1, _FRACTIONS + 1))
+    return any(playback.level(channel, at) > LIMITED for at in times if at >= now)

@@ -11,8 +11,7 @@ from drivers.errors import LinkError
 from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.errors import InputError
 from sim.measure_cli import measure
-from sim.port_option import port_option
-from sim.soft_amp_cli import soft_amp
+from sim.soft_amp_cli import port_option, soft_amp
 from sim.witness_cli import witness
 
 if TYPE_CHECKING:

@@ -36,7 +36,9 @@ class MemoryPort:
         if not self._first.is_plugged:
             raise LinkError(f"amplifier {self._first.name} is unplugged")
         self._on_data, self._on_loss = on_data, on_loss
-        self._end = SerialAmplifiers({each.address: each for each in devices}, self._reply)
+        self._end = SerialAmplifiers(
+            {each.address: each for each in devices}, lambda data: self._wire.outward.send(data)
+        )
         self._wire = TwoWayLine(
             to_amplifier=self._end.receive,
             to_host=self._deliver,
@@ -70,9 +72,6 @@ class MemoryPort:
     async def wait_closed(self) -> None:
         """End what runs for it."""
         await self._running.aclose()
-
-    def _reply(self, data: bytes) -> None:
-        self._wire.outward.send(data)
 
     def _deliver(self, data: bytes) -> None:
         # Never while the host still writes the request.

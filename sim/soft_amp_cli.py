@@ -3,19 +3,25 @@
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from drivers.errors import LinkError
 from model.errors import InputError
-from sim.port_option import port_option
 from sim.soft_amp.settings import Law, Protocol, Settings
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from sim.soft_amp.place import Place
+
+
+def port_option(served: str) -> Any:
+    """The option for a loopback port; served: what is served there."""
+    return typer.Option(
+        metavar="PORT", help=f"Serve {served} on this loopback port; 0: any.", min=0, max=65535
+    )
 
 
 def soft_amp(

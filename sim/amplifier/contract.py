@@ -114,12 +114,9 @@ class Amplifier:
         self.is_derated = False
 
     @property
-    def outputs(self) -> tuple[tuple[Voice, ...], ...]:
-        """The voices of each channel from now on, without further events.
-
-        Those of a channel are the same object until they change.
-        """
-        return tuple(self.playback.all_voices)
+    def outputs(self) -> Sequence[tuple[Voice, ...]]:
+        """The voices of each channel from now on, without further events."""
+        return self.playback.all_voices
 
     @property
     def next_event(self) -> float:

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from operator import itemgetter
 from types import MappingProxyType
 from typing import Protocol, TypeAlias
 
@@ -105,19 +106,12 @@ class Bench:
         ]
         for amplifier, sensing in zip(self.amplifiers.values(), self._sensing, strict=True):
             amplifier.attach(sensing)
-        # By amplifier: its ERAs and their channels, the outputs of its channels, and the changes of
-        # outputs that move the bases of ERAs, each with its time [s], after the amplifier's delay.
-        self._wired: dict[str, list[tuple[int, int]]] = {name: [] for name in rig.amplifiers}
-        for index, era in enumerate(rig.eras):
-            channel = rig.wiring[era.name]
-            self._wired[channel.amplifier].append((index, channel.number))
-        self._commanded: dict[str, tuple[Voices, ...]] = {
-            name: amplifier.outputs for name, amplifier in self.amplifiers.items()
-        }
-        self._delayed: dict[str, deque[tuple[float, int, Voices]]] = {
-            name: deque() for name in rig.amplifiers
-        }
-        self._applied_outputs: list[Voices] = [()] * len(rig.eras)  # by ERA
+        # By ERA: what its channel plays, and what moves its base, later by the amplifier's delay;
+        # between them the changes that are on their way, by their time [s].
+        self._wired = [rig.wiring[era.name] for era in rig.eras]
+        self._commanded: list[Voices] = [()] * len(rig.eras)
+        self._delayed: list[tuple[float, int, Voices]] = []
+        self._applied_outputs: list[Voices] = [()] * len(rig.eras)
         self._errors = [imperfections.errors_of(era.name, rig) for era in rig.eras]
         self._noise = [draw_noise(seed=imperfections.seed, number=n) for n in range(len(rig.eras))]
         self._shapes_at = lru_cache(_MAX_SHAPES)(
@@ -275,7 +269,7 @@ class Bench:
         amplifiers = self.amplifiers.values()
         while True:
             events = [amplifier.next_event for amplifier in amplifiers]
-            changes = [waiting[0][0] for waiting in self._delayed.values() if waiting]
+            changes = [moment for moment, _, _ in self._delayed[:1]]
             moment = min([to_time, *events, *changes])
             self._time = max(self._time, moment)
             for amplifier, event in zip(amplifiers, events, strict=True):
@@ -355,20 +349,18 @@ class Bench:
 
     def _update_plant(self) -> None:
         """Pass changed outputs of the channels on to the plant, after their delay."""
-        for name, amplifier in self.amplifiers.items():
-            outputs, commanded = amplifier.outputs, self._commanded[name]
-            waiting = self._delayed[name]
-            if outputs is not commanded and outputs != commanded:
-                self._commanded[name] = outputs
-                delay = self.imperfections.delay(name)
-                for index, number in self._wired[name]:
-                    if outputs[number] is not commanded[number]:
-                        playing = outputs[number]
-                        playing = delayed(playing, delay) if delay else playing
-                        waiting.append((self._time + delay, index, playing))
-            while waiting and waiting[0][0] <= self._time:
-                _, index, playing = waiting.popleft()
-                self._apply(index, playing)
+        for index, wired in enumerate(self._wired):
+            playing = self.amplifiers[wired.amplifier].outputs[wired.number]
+            commanded = self._commanded[index]
+            if playing is not commanded and playing != commanded:
+                self._commanded[index] = playing
+                delay = self.imperfections.delay(wired.amplifier)
+                late = delayed(playing, delay) if delay else playing
+                self._delayed.append((self._time + delay, index, late))
+        self._delayed.sort(key=itemgetter(0))
+        while self._delayed and self._delayed[0][0] <= self._time:
+            _, index, playing = self._delayed.pop(0)
+            self._apply(index, playing)
         while self._played and self._played[0][1] < self._time - KEPT:
             self._played.popleft()
 

@@ -5,7 +5,6 @@ is then no longer orthogonal, and nothing else shows it where the loop-back has 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,35 +19,16 @@ _ALIKE = 0.999
 _SURE = 5.0  # standard errors
 
 
-@dataclass(frozen=True)
-class Drift:
-    """Of an input's clock relative to that of the outputs: relative, and its standard error.
-
-    is_steady: whether a drift is all that makes periods differ; a lost block does otherwise.
-    """
-
-    relative: float
-    error: float
-    is_steady: bool
-
-    @property
-    def is_certain(self) -> bool:
-        """Whether there are two clocks."""
-        size = abs(self.relative)
-        return TOLERANCE < size < _MAX_DRIFT and size > _SURE * self.error and self.is_steady
-
-
-def drift(multisine: Multisine, runs: Sequence[FloatArray]) -> Drift:
-    """Estimate the drift of one input from whole periods of each run, (periods x samples,).
+def certain_drift(multisine: Multisine, runs: Sequence[FloatArray]) -> float:
+    """Drift of an input's clock relative to the outputs', from whole periods of each run, (n,).
 
     Least squares of the phase 2 pi f t drift between the first and the last period, t apart,
-    weighted by the power of each line.
+    weighted by the power of each line. 0 where that is within its error, or not all that makes
+    periods differ, as a lost block does.
     """
     n = multisine.samples
-    spectra = np.array(
-        [[np.fft.rfft(each[:n]), np.fft.rfft(each[-n:])] for each in runs], dtype=complex
-    )
-    first, last = spectra[:, 0, multisine.lines], spectra[:, 1, multisine.lines]
+    first = np.array([multisine.found(each[:n]) for each in runs])
+    last = np.array([multisine.found(each[-n:]) for each in runs])
     apart = PERIOD * (len(runs[0]) / n - 1)
     turned = last * first.conj()
     weights = np.abs(turned)
@@ -59,4 +39,6 @@ def drift(multisine: Multisine, runs: Sequence[FloatArray]) -> Drift:
     rest = phases - slopes * relative
     error = np.sqrt(float((weights**2 * slopes**2 * rest**2).sum())) / moment
     alike = np.abs((turned * np.exp(-1j * slopes * relative)).sum()) / max(weights.sum(), 1e-300)
-    return Drift(relative, float(error), bool(alike > _ALIKE))
+    size = abs(relative)
+    is_certain = TOLERANCE < size < _MAX_DRIFT and size > _SURE * error and alike > _ALIKE
+    return relative if is_certain else 0.0

@@ -44,7 +44,6 @@ from witness_config import witness_config
 
 LEVEL_DB_SL = 30.0
 LEVEL_LIMIT = 1.0  # of the example's rig, written by hand
-TOUCH_WAIT = 0.030  # s; the daemon's own
 SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcand": 500_000}
 """Default speeds of the wires that have one [bit/s]."""
 

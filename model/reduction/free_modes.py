@@ -1,10 +1,6 @@
 """Modes of a free plate, and the response of its truncated modes to forces at points."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
-
-import numpy as np
 
 from model.arrays import FloatArray
 
@@ -13,9 +9,6 @@ RESIDUAL_ORDER = 4
 
 A field has this many terms, a receptance between points twice as many, from inner products.
 """
-
-CacheKey: TypeAlias = tuple[tuple[int, ...], bytes]
-"""Shape and content of points or footprints, of which either alone may be those of others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,17 +24,3 @@ class PointSolutions:
     shapes: FloatArray
     residuals: FloatArray
     truncated_terms: FloatArray
-
-
-def unknowns_of(
-    modes: Sequence[FloatArray], residuals: Sequence[FloatArray]
-) -> tuple[FloatArray, ...]:
-    """Join modes (n, r) by class, all after each other, and residual vectors (k, terms, n)."""
-    ends = np.cumsum([own.shape[1] for own in modes])
-    found = []
-    for own, end, residual in zip(modes, ends, residuals, strict=True):
-        padded = np.zeros((len(own), ends[-1] + residual.shape[0] * residual.shape[1]))
-        padded[:, end - own.shape[1] : end] = own
-        padded[:, ends[-1] :] = residual.transpose(2, 1, 0).reshape(len(own), -1)
-        found.append(padded)
-    return tuple(found)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import FloatArray
-from model.reduction.free_modes import RESIDUAL_ORDER, CacheKey, PointSolutions, unknowns_of
+from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
 from model.spectral.functions import CLASSES, deflections_by_class
 from model.spectral.local_compliance import (
     Unresolved,
@@ -62,7 +62,8 @@ class SpectralModes:
         self.largest_truncated = float(u.max())
         # u / u_c of each truncated mode to the powers 1, 2, ...
         self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
-        self._known: dict[CacheKey, _Observed] = {}
+        # By shape and content, of which either alone may be those of others.
+        self._known: dict[tuple[tuple[int, ...], bytes], _Observed] = {}
         self._is_softer = False
 
     def softer(self) -> "SpectralModes":
@@ -91,25 +92,22 @@ class SpectralModes:
     def basis(self, attached: PointSolutions, points: FloatArray) -> FloatArray:
         """Deflection at points of modes and residual vectors, (p, r + RESIDUAL_ORDER n)."""
         at, count = self._observe(points), len(attached.points)
-        residuals = attached.residuals
-        shape = RESIDUAL_ORDER * count, residuals.shape[2]
-        extra = residuals.transpose(1, 0, 2).reshape(shape) @ at.truncated.T
+        extra = np.concatenate(attached.residuals.swapaxes(0, 1)) @ at.truncated.T
         extra[:count] += self._local(self._observe(attached.points), at)
         return np.hstack([at.shapes, extra.T])
 
     def unknowns(self, attached: PointSolutions) -> tuple[FloatArray, ...]:
         """The columns of `basis` by symmetry class, without the local compliance."""
-        together = attached.residuals
-        ends = np.cumsum([len(part.truncated) for part in self._classes])[:-1]
-        truncated = np.split(together, ends, axis=2)
-        counts = [len(part.eigenvalues) for part in self._classes]
-        pairs = list(zip(self._classes, counts, strict=True))
-        modes = [part.shapes[:, :count] for part, count in pairs]
-        residuals = [
-            own @ part.shapes[:, count:].T
-            for own, (part, count) in zip(truncated, pairs, strict=True)
-        ]
-        return unknowns_of(modes, residuals)
+        count, mode, rest, found = len(self.eigenvalues), 0, 0, []
+        residuals = np.concatenate(attached.residuals.swapaxes(0, 1))  # term by term
+        for part in self._classes:
+            modes, rests = len(part.eigenvalues), len(part.truncated)
+            own = np.zeros((len(part.shapes), count + len(residuals)))
+            own[:, mode : mode + modes] = part.shapes[:, :modes]
+            own[:, count:] = part.shapes[:, modes:] @ residuals[:, rest : rest + rests].T
+            found.append(own)
+            mode, rest = mode + modes, rest + rests
+        return tuple(found)
 
     def _local(self, own: _Observed, other: _Observed) -> FloatArray:
         """Compliance in waves that the polynomials do not resolve, in units of u_c."""

@@ -10,9 +10,8 @@ typedef struct {
     const float *minus_omega2, *error;      /* (f); (f, n) */
     const float *stiffness, *drives, *strokes, *by_damping; /* (f, b + k); (f, n) */
     const float *changes;                                   /* (f, n + k), of ERAs and fingers */
-    /* Found: (f, a, a); (f, a, n); (f, a, n); (f, 2 + deviating, k p, n) */
-    float *inverse, *forces, *motion, *rows;
-    float *reach, *moved, *power; /* (f, k p, n + k); (f, n + k, n); (f, k, n, n) */
+    /* Found: (f, a, a); (f, a, n); (f, a, n); (f, k p, n); (f, k, n, n) */
+    float *inverse, *forces, *motion, *fields, *power;
 } contacts;
 
 /* Values of work space. */
@@ -121,9 +120,7 @@ void contact_forms(const contacts *on, int first, int count, value *work) {
             for (size_t e = 0; e < n; e++)
                 moved[s * n + e] = times(changes[s], u[(s < n ? s : b + s - n) * n + e]);
     }
-    store(on->rows + 2 * first * (2 + others) * at * n, h, (2 + others) * at * n, count);
-    store(on->moved + 2 * first * j * n, moved, j * n, count);
-    store_real(on->reach + first * at * j, reach, at * j, count);
+    store(on->fields + 2 * first * at * n, h, at * n, count);
 
     /* Forms of the mean over each fingertip, of the rows at its points and of what is uncertain. */
     for (size_t finger = 0; finger < k; finger++) {

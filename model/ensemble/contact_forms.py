@@ -40,8 +40,6 @@ class LoadedContacts:
     - shapes: (a, r); attachments: of dynamic stiffness (f, a) Z
     - inverse: (f, a, a) K; forces: (f, a, n) F; motion: (f, a, n) r
     - fields: (f, k, p, n) h [m/s²] at each finger's points; power: (f, k, n, n) R
-    - rows: (f, rows, k p, n) h and its changes dh; reach: (f, k p, j) |t|² of each uncertain
-      spring and load; moved: (f, j, n) their s r; error_power: (f, n) of discretisation
     """
 
     shapes: Float32Array
@@ -51,11 +49,6 @@ class LoadedContacts:
     motion: Complex64Array
     fields: Complex64Array
     power: Complex64Array
-    rows: Complex64Array
-    reach: Float32Array
-    moved: Complex64Array
-    error_power: Float32Array
-    gain_variance: float
 
 
 def load_contacts(
@@ -71,7 +64,7 @@ def load_contacts(
     sum 1; error_power (f, n): mean square of the discretisation error of each ERA's field; loads
     (k,): of each finger relative to the rig's fingertip, empty for 1.
     """
-    k, p, r = points.shape
+    k, _, r = points.shape
     by, attachments = kernels(), plate.with_fingers(k, loads)
     shapes = np.concatenate([plate.shapes, points[:, 0]])
     found = (
@@ -95,15 +88,7 @@ def load_contacts(
             changes=attachments.changes,
         )
     )
-    fields = found.rows[:, 0].reshape(-1, k, p, plate.era_count)
-    return LoadedContacts(
-        shapes=shapes,
-        attachments=attachments,
-        fields=fields,
-        error_power=error_power,
-        gain_variance=plate.gain_variance,
-        **vars(found),
-    )
+    return LoadedContacts(shapes=shapes, attachments=attachments, **vars(found))
 
 
 def _forms_by_numpy(
@@ -154,7 +139,7 @@ def _forms_by_numpy(
     power += (shares @ outer).view(np.complex64).reshape(f, k, n, n)
     size = (mean @ power_of(h).reshape(f, k, p, n))[:, :, 0]
     _add_diagonal(power, plate.gain_variance * size + error_power[:, None])
-    return FoundForms(inverse, forces, motion, rows, reach, moved, power)
+    return FoundForms(inverse, forces, motion, h.reshape(f, k, p, n), power)
 
 
 def _others(plate: AttachedPlate) -> Complex64Array:

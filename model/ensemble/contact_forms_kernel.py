@@ -15,7 +15,7 @@ _GIVEN = (
     *("shapes", "points", "weights", "receptance", "others", "minus_omega2", "error"),
     *("stiffness", "drives", "strokes", "by_damping", "changes"),
 )
-_FOUND = ("inverse", "forces", "motion", "rows", "reach", "moved", "power")
+_FOUND = ("inverse", "forces", "motion", "fields", "power")
 
 
 class _Contacts(ctypes.Structure):
@@ -33,9 +33,7 @@ class FoundForms:
     inverse: Complex64Array
     forces: Complex64Array
     motion: Complex64Array
-    rows: Complex64Array
-    reach: Float32Array
-    moved: Complex64Array
+    fields: Complex64Array
     power: Complex64Array
 
 
@@ -56,9 +54,7 @@ def contact_forms(
         inverse=np.empty((f, a, a), dtype=np.complex64),
         forces=np.empty((f, a, n), dtype=np.complex64),
         motion=np.empty((f, a, n), dtype=np.complex64),
-        rows=np.empty((f, 2 + d, kp, n), dtype=np.complex64),
-        reach=np.empty((f, kp, n + k), dtype=np.float32),
-        moved=np.empty((f, n + k, n), dtype=np.complex64),
+        fields=np.empty((f, k, kp // k, n), dtype=np.complex64),
         power=np.empty((f, k, n, n), dtype=np.complex64),
     )
     on = _Contacts(

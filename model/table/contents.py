@@ -29,8 +29,8 @@ MIN_CANDIDATES, ROWS_BY_POINT = 4, 16
 """Candidates of a content by the mean over fingertips and as many by their points; frequencies that
 are searched by point."""
 
-MAX_COMBINATIONS = 200
-"""Combinations of candidates that are continued with those of the next content."""
+MAX_COMBINATIONS, PRUNING_STEP = 200, 4
+"""Combinations of candidates that are kept for the next content and the choice, by some draws."""
 
 _TINY = 1e-30
 _NEARLY_HIGHEST = 0.99
@@ -282,8 +282,9 @@ def _best_combination(
             if may_exchange:
                 allowed &= (candidates.bands[last] != candidates.bands[before]).all(axis=1)
             combinations = combinations[allowed]
-            if len(combinations) > MAX_COMBINATIONS and number + 1 < len(streams):
-                worst = _worst(combinations, streams, quiet, own, loudest)
+            if len(combinations) > MAX_COMBINATIONS:
+                some = own[:, ::PRUNING_STEP], loudest[:, :, ::PRUNING_STEP]
+                worst = _worst(combinations, streams, quiet, *some)
                 combinations = combinations[best_first(worst)[:MAX_COMBINATIONS]]
         if len(combinations):
             worst = _worst(combinations, streams, quiet, own, loudest)

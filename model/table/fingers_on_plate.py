@@ -282,7 +282,7 @@ class DriveResponses:
             plates,
             centres,
             np.ones(centres.shape[:2], dtype=np.float32),
-            self.contacts.error_power.take(tones.frequencies.repeat(bases), axis=0),
+            np.zeros((m * bases, self.plate.era_count), dtype=np.float32),  # of forms, not needed
             self.loads,
         )
         factors = draws.factors[:columns, 1:].reshape(columns, bases, -1).swapaxes(0, 1)

@@ -15,9 +15,9 @@ from drivers.codec.can_bus.segments import (
     segments,
     unpack_frames,
 )
-from drivers.conformance.client import Answer, Client, Heard, When, altered, expect_reply
-from drivers.conformance.findings import Violation, expect_equal
-from drivers.protocol.records import Refusal, Values
+from drivers.conformance.client import Answer, Client, Heard, When, altered, expect_reply, read_as
+from drivers.conformance.findings import expect_equal
+from drivers.protocol.records import Values
 from drivers.protocol.serial_payload import HELLO
 from drivers.protocol.table import IDENTITY, NAK
 from drivers.statistics import WireCounters
@@ -76,10 +76,7 @@ class CanClient(Client):
         """Set the node operational and read the identity."""
         await self.command("start")
         answer = await self.exchange(HELLO, ())
-        try:
-            return IDENTITY.unpack(answer.words, is_strict=False)
-        except Refusal as error:
-            raise Violation("identity", expected="versions and four texts", seen=error) from None
+        return read_as("identity", IDENTITY.unpack, answer.words, is_strict=False)
 
     async def exchange(self, number: int, words: Sequence[int]) -> Answer:
         """Send a message and await its reply."""

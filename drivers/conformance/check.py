@@ -4,12 +4,11 @@ from collections.abc import Callable, Iterable, Sequence
 from inspect import isawaitable
 
 from drivers import clock
-from drivers.conformance.client import Client
+from drivers.conformance.client import Client, read_as
 from drivers.conformance.findings import Late, Optional, Violation
 from drivers.conformance.report import Check, CheckResult, Result, Steps
 from drivers.conformance.subject import MAX_ATTEMPTS, Subject
 from drivers.errors import LinkError
-from drivers.protocol.records import Refusal
 from drivers.protocol.table import MESSAGES
 
 
@@ -37,10 +36,7 @@ async def identified(client: Client, level: float) -> Subject:
     answer = await client.exchange(message.number, ())
     if answer.code:
         raise Violation("GetCaps", expected="carried out", seen=answer.code)
-    try:
-        can = message.reply.unpack(answer.words, is_strict=False)
-    except Refusal as error:
-        raise Violation("reply to GetCaps", expected="as in the table", seen=error) from None
+    can = read_as("reply to GetCaps", message.reply.unpack, answer.words, is_strict=False)
     return Subject(client, identity, can, level)
 
 

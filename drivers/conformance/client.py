@@ -8,7 +8,7 @@ import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 from drivers import clock
 from drivers.conformance.findings import Violation, expect, expect_equal
@@ -18,6 +18,7 @@ from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REFUSALS
 
 REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
 QUIET = 0.03  # s; in which something that must not be replied to would be
+_T = TypeVar("_T")
 _CODES = {number: name for name, number in REFUSALS.items()}
 
 
@@ -37,12 +38,16 @@ class When(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """A message of the amplifier: number of its request (0: an event), type, words."""
+    """A message of the amplifier: number of its request (0: an event), type, words.
+
+    frame: that it came in, as its wire has it.
+    """
 
     at: float
     number: int
     type: int
     words: tuple[int, ...]
+    frame: Any = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,10 +164,7 @@ class Client(ABC):
 
     def refusal(self, sent: float, came: float, number: int, words: Sequence[int]) -> Answer:
         """Make the answer of a Nak; Violation where it names another request."""
-        try:
-            values = NAK_RECORD.unpack(words, is_strict=True)
-        except Refusal as error:
-            raise Violation("Nak", expected="three words", seen=str(error)) from None
+        values = read_as("Nak", NAK_RECORD.unpack, words, is_strict=True)
         expect_equal(values["request"], number, "request that a Nak names")
         channel = None if values["channel"] == NO_CHANNEL else values["channel"]
         code = _CODES.get(values["code"], f"code {values['code']}")
@@ -174,6 +176,14 @@ def altered(data: bytes, at: int) -> bytes:
     changed = bytearray(data)
     changed[at] ^= 0x10
     return bytes(changed)
+
+
+def read_as(what: str, read: Callable[..., _T], *arguments: object, **options: object) -> _T:
+    """Return what is read; Violation where it cannot be read."""
+    try:
+        return read(*arguments, **options)
+    except Refusal as error:
+        raise Violation(what, expected="as in the table", seen=error) from None
 
 
 def expect_reply(found: Heard | None, number: int) -> Heard:

@@ -12,7 +12,14 @@ from drivers.conformance.findings import expect, expect_equal, expect_one_of, ex
 from drivers.playback import Playback, playback_of
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import FAULTS, MESSAGES, QUANTITIES, STATES, STATUS_FLAGS
+from drivers.protocol.table import (
+    FAULTS,
+    MESSAGES,
+    QUANTITIES,
+    STAGED_LIFE,
+    STATES,
+    STATUS_FLAGS,
+)
 from drivers.protocol.tokens import token_after
 
 SLACK = 0.002  # s; of times in milliseconds
@@ -46,7 +53,7 @@ class Expected:
         self.sets: dict[int, tuple[LayerSet, ...]] = {}
         self.is_exact = False
         self.watchdog = 0.0
-        self.fed = self.began = self.silent = when
+        self.fed = self.began = self.silent = self._first = when
         self.cause = "rest"
         self.tolerance = max(2 * can["level_step"] / _FULL, _TOLERANCE)
         self._has_floor = True  # or levels may be lower: of a fault, whose fade may be shorter
@@ -88,8 +95,8 @@ class Expected:
         if token == self.token:
             expect_equal((shown["token"], shown["played"]), (token, 1), "token, played of a repeat")
             return
-        if token != self._incoming:
-            self._incoming, self._received = token, set()
+        if token != self._incoming or when.earliest > self._first.latest + STAGED_LIFE:
+            self._incoming, self._received, self._first = token, set(), when
         self._received.add(values["index"])
         missing = [each for each in range(values["parts"]) if each not in self._received]
         seen = tuple(shown[each] for each in ("token", "staged", "played", "missing"))
@@ -99,17 +106,13 @@ class Expected:
         if not missing and is_now:
             self.commit(token, when)
 
-    def forget_parts(self) -> None:
-        """Note that what was staged, or not complete, has been discarded."""
-        self._incoming = 0
-
     def commit(self, token: int, when: When) -> None:
         """Note that a set was played within an interval, unless it is the one that plays."""
         if token == self.token:
             return
         layers = self.sets[token]
         self.token, self.cause = token, f"set {token} of layers {[one.layer for one in layers]}"
-        self.forget_parts()
+        self._incoming = 0
         self._has_floor = True
         self._start(when)
         for playback, moment in zip(self._playbacks, self._moments, strict=True):
@@ -117,7 +120,7 @@ class Expected:
 
     def _fall_silent(self, state: str, when: When, ramp: float, *, has_floor: bool = True) -> None:
         self.state, self._has_floor = state, has_floor
-        self.forget_parts()
+        self._incoming = 0
         self._start(when)
         ends = []
         for playback, moment in zip(self._playbacks, self._moments, strict=True):

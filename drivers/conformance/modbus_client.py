@@ -3,7 +3,6 @@
 import asyncio
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 from drivers import clock
 from drivers.codec.modbus.crc import crc16
@@ -16,7 +15,7 @@ from drivers.conformance.client import (
     altered,
     expect_reply,
 )
-from drivers.conformance.findings import Violation, expect, expect_equal
+from drivers.conformance.findings import expect, expect_equal
 from drivers.protocol.records import Values
 from drivers.protocol.table import MAX_WORDS, MESSAGES
 
@@ -29,14 +28,6 @@ EXCEPTION = 0x80
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol, length, unit
 _LEAST = 5  # bytes of a frame
 _EXCEPTIONS = {1: "UNKNOWN_TYPE", 2: "UNKNOWN_TYPE", 3: "BAD_LENGTH"}
-
-
-@dataclass(frozen=True, slots=True)
-class Response(Heard):
-    """A response: its unit and PDU."""
-
-    unit: int
-    pdu: bytes
 
 
 class ModbusClient(Client):
@@ -63,7 +54,7 @@ class ModbusClient(Client):
             else:
                 transaction, _, _, unit = _HEADER.unpack_from(frame)
                 pdu = frame[_HEADER.size :]
-            self.take(Response(clock.now(), transaction, pdu[0], (), unit, pdu))
+            self.take(Heard(clock.now(), transaction, pdu[0], (), (unit, pdu)))
 
     def _size(self) -> int:
         """Return how long the frame is that the buffer begins with, at least."""
@@ -83,25 +74,27 @@ class ModbusClient(Client):
         body = bytes([unit]) + pdu
         return body + crc16(body)
 
-    async def transact(self, pdu: bytes) -> tuple[Response, float]:
-        """Send a PDU and await its response; returns it and when it was sent [s]."""
+    async def transact(self, pdu: bytes) -> tuple[bytes, When]:
+        """Send a PDU and await its response; returns that and when it was carried out."""
         data, sent = self.adu(pdu), clock.now()
         self._buffer = b""
         number = 0 if self.is_rtu else self.number
         self.port.write(data)
-        found = expect_reply(await self.next(lambda each: each.number == number), pdu[0])
-        assert isinstance(found, Response)  # noqa: S101
-        expect_equal(found.unit, self.address, "unit of a response")
-        is_own = found.pdu[0] & ~EXCEPTION == pdu[0]
-        expect(is_own, "function of a response", expected=pdu[0], seen=found.pdu[0])
-        if pdu[0] == WRITE and not found.pdu[0] & EXCEPTION:
-            expect_equal(found.pdu, pdu[:5], "response to a write")
-        return found, sent
+        heard = expect_reply(await self.next(lambda each: each.number == number), pdu[0])
+        unit, response = heard.frame
+        seen = unit, response[0] & ~EXCEPTION
+        expect_equal(seen, (self.address, pdu[0]), "unit, function of a response")
+        if response[0] == WRITE:
+            expect_equal(response, pdu[:5], "response to a write")
+        return response, When(sent, heard.at)
 
     async def read(self, first: int, count: int, *, function: int = READ) -> tuple[int, ...]:
         """Read registers; Violation for an exception."""
         response, _ = await self.transact(struct.pack(">BHH", function, first, count))
-        return registers_of(response.pdu, count, first)
+        what = f"head of the response to a read of {count} registers from {first}"
+        head = bytes([function, 2 * count])
+        expect_equal((response[:2], len(response)), (head, 2 + 2 * count), what)
+        return struct.unpack(f">{count}H", response[2:])
 
     async def hello(self) -> Values:
         """Read the identity."""
@@ -119,22 +112,20 @@ class ModbusClient(Client):
         """Write a message, then read its reply; one that shows the present is read alone."""
         tag, when = None, None
         if number not in PRESENT or words:
-            pdu = self.write_of(number, words)
             tag = self.number % 0xFFFF + 1  # that of the frame, see `write_of`
-            response, sent = await self.transact(pdu)
-            when = sent, response.at
-            if response.pdu[0] & EXCEPTION:
-                code = _EXCEPTIONS.get(response.pdu[1], f"exception {response.pdu[1]}")
-                return Answer(code, None, (), When(*when))
+            response, when = await self.transact(self.write_of(number, words))
+            if response[0] & EXCEPTION:
+                code = _EXCEPTIONS.get(response[1], f"exception {response[1]}")
+                return Answer(code, None, (), when)
         sent = clock.now()
         count = HEAD + min(self.reply_words.get(number, MAX_WORDS), MAX_WORDS)
         shown, result, *reply = await self.read(BOX * number + REPLY, count)
+        when = when or When(sent, clock.now())
         if tag is not None:
             expect_equal(shown, tag, f"tag of the reply to message {number}")
-        when = when or (sent, clock.now())
         if result:
             return self.refusal(*when, number, (number, *divmod(result, 256)))
-        return Answer("", None, tuple(reply), When(*when))
+        return Answer("", None, tuple(reply), when)
 
     def write_of(self, number: int, words: Sequence[int], *, tag: int | None = None) -> bytes:
         """Return the PDU that writes a message, tagged with the number of its frame."""
@@ -168,12 +159,3 @@ def write_pdu(first: int, registers: Sequence[int]) -> bytes:
     count = len(registers)
     head = struct.pack(">BHHB", WRITE, first, count, 2 * count % 256)
     return head + struct.pack(f">{count}H", *registers)
-
-
-def registers_of(pdu: bytes, count: int, first: int) -> tuple[int, ...]:
-    """Return the registers in a response; Violation for an exception or another length."""
-    if pdu[0] & EXCEPTION:
-        what = f"response to a read of {count} registers from {first}"
-        raise Violation(what, expected="the registers", seen=f"exception {pdu[1]}")
-    expect_equal((len(pdu), pdu[1]), (2 + 2 * count, 2 * count), "length of a response")
-    return struct.unpack(f">{count}H", pdu[2:])

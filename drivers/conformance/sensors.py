@@ -4,11 +4,10 @@ import asyncio
 import math
 
 from drivers.conformance.check import driving, reading
-from drivers.conformance.client import Answer
+from drivers.conformance.client import Answer, read_as
 from drivers.conformance.expected import SLACK
 from drivers.conformance.findings import (
     Optional,
-    Violation,
     expect,
     expect_equal,
     expect_one_of,
@@ -17,7 +16,7 @@ from drivers.conformance.findings import (
 from drivers.conformance.material import layer
 from drivers.conformance.rows import send
 from drivers.conformance.subject import Subject
-from drivers.protocol.records import Record, Refusal, Values
+from drivers.protocol.records import Record, Values
 from drivers.protocol.table import NO_CHANNEL, QUANTITIES, READING_STATES, sensor_reading
 
 _PLACE = "protocol.md#sensors"
@@ -118,10 +117,7 @@ async def _complete(subject: Subject, began: Answer, state: str = "COMPLETE") ->
         shown, at = await subject.request("GetReading", first=len(found)), 0
         expect(shown["count"] > 0, "sensors of a reading", expected=count, seen=len(found))
         for _ in range(shown["count"]):
-            try:
-                row, at = record.read(shown["sensors"], at)
-            except Refusal as error:
-                raise Violation("sensors of a reading", expected="whole", seen=error) from None
+            row, at = read_as("sensors of a reading", record.read, shown["sensors"], at)
             found.append(row)
     return found
 

@@ -7,9 +7,17 @@ from cobs import cobs
 
 from drivers import clock
 from drivers.codec.serial_line.frame import NEUTRAL, REPLY, Frame, FrameReader, encode_frame
-from drivers.conformance.client import Answer, Client, Heard, When, altered, expect_reply
-from drivers.conformance.findings import Violation, expect_equal
-from drivers.protocol.records import Refusal, Values
+from drivers.conformance.client import (
+    Answer,
+    Client,
+    Heard,
+    When,
+    altered,
+    expect_reply,
+    read_as,
+)
+from drivers.conformance.findings import expect_equal
+from drivers.protocol.records import Values
 from drivers.protocol.serial_payload import HELLO, pack_words, unpack_identity, unpack_words
 from drivers.protocol.table import EVENT, MAX_WORDS, NAK, VERSION
 
@@ -27,20 +35,17 @@ class SerialClient(Client):
         self.sequence = 0
         self.invalid = 0
         self._reader = FrameReader(on_invalid=self._count)
-        self._frames: dict[tuple[int, int], Frame] = {}
 
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""
         for frame in self._reader.feed(data):
-            try:
-                is_identity = frame.kind == HELLO | REPLY
-                words = () if is_identity else unpack_words(frame.payload)
-            except Refusal:
+            is_text = frame.kind == HELLO | REPLY
+            if len(frame.payload) % 2 and not is_text:
                 self.invalid += 1
                 continue
-            self._frames[frame.kind, frame.sequence] = frame
-            is_event = frame.kind == EVENT
-            self.take(Heard(clock.now(), frame.sequence, frame.kind, words), is_event=is_event)
+            words = () if is_text else unpack_words(frame.payload)
+            heard = Heard(clock.now(), frame.sequence, frame.kind, words, frame)
+            self.take(heard, is_event=frame.kind == EVENT)
 
     async def hello(self) -> Values:
         """Read the identity."""
@@ -48,15 +53,10 @@ class SerialClient(Client):
 
     async def identity(self, payload: bytes, version: int) -> Values:
         """Read the identity by a Hello of any length and version."""
-        self.sequence = (self.sequence + 1) % _SEQUENCES
-        request = Frame(HELLO, self.address, self.sequence, payload, version)
-        _, frame = await self._replied(request)
-        expect_equal(frame.kind, HELLO | REPLY, "type of the reply to Hello")
-        expect_equal(frame.version, NEUTRAL, "version of the reply to Hello")
-        try:
-            return unpack_identity(frame.payload)
-        except Refusal as error:
-            raise Violation("identity", expected="versions and four texts", seen=error) from None
+        frame = (await self._replied(HELLO, payload, version)).frame
+        seen = frame.kind, frame.version
+        expect_equal(seen, (HELLO | REPLY, NEUTRAL), "type, version of the reply to Hello")
+        return read_as("identity", unpack_identity, frame.payload)
 
     async def exchange(self, number: int, words: Sequence[int]) -> Answer:
         """Send a message and await its reply."""
@@ -64,30 +64,24 @@ class SerialClient(Client):
 
     async def exchange_payload(self, number: int, payload: bytes, version: int) -> Answer:
         """Send a payload under a version and await its reply."""
-        self.sequence = (self.sequence + 1) % _SEQUENCES
         sent = clock.now()
-        heard, frame = await self._replied(
-            Frame(number, self.address, self.sequence, payload, version)
-        )
-        if frame.kind == NAK | REPLY:
+        heard = await self._replied(number, payload, version)
+        answer = Answer("", None, heard.words, When(sent, heard.at))
+        if heard.type == NAK | REPLY:
             answer = self.refusal(sent, heard.at, number, heard.words)
-            neutral = answer.code == "UNSUPPORTED_VERSION"
-            expect_equal(frame.version, NEUTRAL if neutral else VERSION, "version of a Nak")
-            return answer
-        expect_equal(frame.kind, number | REPLY, f"type of the reply to message {number}")
-        expect_equal(frame.version, VERSION, f"version of the reply to message {number}")
-        return Answer("", None, heard.words, When(sent, heard.at))
+        is_refused, is_neutral = bool(answer.code), answer.code == "UNSUPPORTED_VERSION"
+        required = (NAK if is_refused else number) | REPLY, NEUTRAL if is_neutral else VERSION
+        seen = heard.type, heard.frame.version
+        expect_equal(seen, required, f"type, version of the reply to message {number}")
+        return answer
 
-    async def _replied(self, request: Frame) -> tuple[Heard, Frame]:
-        self.port.write(encode_frame(request))
-        heard = expect_reply(
-            await self.next(lambda each: each.number == request.sequence and each.type != EVENT),
-            request.type,
-        )
-        frame = self._frames[heard.type, heard.number]
-        self._frames.clear()
-        expect_equal(frame.address, self.address, "address of a reply")
-        return heard, frame
+    async def _replied(self, number: int, payload: bytes, version: int) -> Heard:
+        self.port.write(self.frame(number, payload, version=version))
+        sequence = self.sequence
+        found = await self.next(lambda each: each.number == sequence and each.type != EVENT)
+        heard = expect_reply(found, number)
+        expect_equal(heard.frame.address, self.address, "address of a reply")
+        return heard
 
     def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
         """Return the frame of a request."""
@@ -107,16 +101,20 @@ class SerialClient(Client):
         content = cobs.decode(good[1:-1])
         long = content[:-_CRC_SIZE] + bytes(2 * MAX_WORDS + 2 - 2 * len(words))
         reply = bytes([content[0] | REPLY]) + content[1:-_CRC_SIZE]
-        for at in (-4, -3, -2, -1, _SEQUENCE_AT):
-            yield f"a wrong byte {at}", _framed(altered(content, at))
-        yield "its last byte missing", good[:-2] + b"\0"
-        yield "its first byte missing", b"\0" + good[2:]
-        yield "a broken stuffing", b"\0\xff" + good[2:]
-        yield "no CRC", _framed(content[:-_CRC_SIZE])
-        yield "more than 240 bytes of payload", _framed(_checked(long))
-        yield "the bit of a reply", _framed(_checked(reply))
         other = self.address % self.addresses + 1
-        yield "another address", self.request(number, words, to=other)
+        bits = (
+            (f"a wrong byte {at}", altered(content, at)) for at in (-4, -3, -2, -1, _SEQUENCE_AT)
+        )
+        yield from ((what, _framed(each)) for what, each in bits)
+        yield from {
+            "its last byte missing": good[:-2] + b"\0",
+            "its first byte missing": b"\0" + good[2:],
+            "a broken stuffing": b"\0\xff" + good[2:],
+            "no CRC": _framed(content[:-_CRC_SIZE]),
+            "more than 240 bytes of payload": _framed(_checked(long)),
+            "the bit of a reply": _framed(_checked(reply)),
+            "another address": self.request(number, words, to=other),
+        }.items()
 
     def _count(self, piece: bytes) -> None:
         self.invalid += 1

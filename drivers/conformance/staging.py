@@ -94,7 +94,6 @@ def sets_expire(subject: Subject) -> Rows:
         0.6 * STAGED_LIFE,
         *others,
         0.5 * STAGED_LIFE,
-        subject.forget_parts,
         first,
     ]
 

@@ -8,19 +8,18 @@ from functools import partial
 from typing import Any
 
 from drivers import clock
-from drivers.conformance.client import Answer, Client
+from drivers.conformance.client import Answer, Client, read_as
 from drivers.conformance.expected import ENABLED, NAMES, OFF, Expected
 from drivers.conformance.findings import (
     Late,
     Optional,
-    Violation,
     expect,
     expect_equal,
     expect_one_of,
 )
 from drivers.conformance.material import Material, layer
 from drivers.conformance.rows import Rows, Send, play, send
-from drivers.protocol.records import Refusal, Values
+from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, pack_layers, parts
 from drivers.protocol.table import MESSAGES, STATES
 
@@ -122,10 +121,8 @@ class Subject(Material):
 
     def _carried_out(self, name: str, values: Values, answer: Answer) -> Answer:
         """Read the reply to a request, and compare it with what must be shown."""
-        try:
-            shown = MESSAGES[name].reply.unpack(answer.words, is_strict=False)
-        except Refusal as error:
-            raise Violation(f"reply to {name}", expected="as in the table", seen=error) from None
+        unpack = MESSAGES[name].reply.unpack
+        shown = read_as(f"reply to {name}", unpack, answer.words, is_strict=False)
         if "levels" in shown:
             seen, required = (
                 (shown["channels"], shown["layers"]),
@@ -220,10 +217,6 @@ class Subject(Material):
     async def play(self, *layers: LayerSet) -> Answer:
         """Play a set at once."""
         return await self.send(play(*layers))
-
-    async def forget_parts(self) -> None:
-        """From now on what was staged, or not complete, is no more."""
-        self.shown.forget_parts()
 
     # In time
 

@@ -26,8 +26,8 @@ SLACK = 0.002  # s; of times in milliseconds
 DRIFT = 1e-3  # of a time; of the amplifier's clock
 NAMES = {number: name for name, number in STATES.items()}
 OFF, ENABLED, STOPPED = "SWITCH_ON_DISABLED", "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
-_FALLING = {"SWITCHED_ON": OFF, "FAULT_REACTION_ACTIVE": "FAULT"}
-"""States that last until all is silent, with those that follow."""
+_FALLING = {"SWITCHED_ON": ("SWITCHED_ON", OFF), "FAULT": ("FAULT_REACTION_ACTIVE", "FAULT")}
+"""What is shown until all is silent, and then."""
 _TRIP, FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until a trip, of a fault, until a state shows
 _LASTING = 3.0  # s; what ends after it is not awaited
 _LATE = 0.002  # s; by which a set may begin later
@@ -154,11 +154,12 @@ class Expected:
     def _expect_state(self, state: str, shown: Values, when: When) -> None:
         if self.state == ENABLED:
             self._expect_watchdog(state, when)
-        falling = {after: before for before, after in _FALLING.items()}
-        known = {_FALLING.get(self.state, self.state)}
+        known = [self.state]
         is_silent = when.earliest > self.silent.latest + _SETTLING + SLACK
-        if (before := falling.get(max(known))) and self.state != OFF and not is_silent:
-            known = {before, *known} if when.latest > self.silent.earliest - SLACK else {before}
+        if self.state in _FALLING:
+            may_be_silent = when.latest > self.silent.earliest - SLACK
+            falling, after = _FALLING[self.state]
+            known = [falling] * (not is_silent) + [after] * may_be_silent
         what = f"state {when.earliest - self.began.latest:.3f} s after {self.cause}"
         expect_one_of(state, known, what)
         if self.state == "SWITCHED_ON":

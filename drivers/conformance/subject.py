@@ -29,7 +29,7 @@ MAX_ATTEMPTS = 10
 """Of a check, or a case of one, for which this machine was late."""
 _SAMPLES, _EACH = 12, 0.02  # of a transition; s for which one must be in time
 _NARROW = 0.006  # s; of the uncertainty of a sample, beyond two exchanges
-_SETTLED = 1.2  # s; the longest ramp, and what a state may take
+_SETTLED = 3.2  # s; the longest watchdog and ramp, and what a state may take
 _MAX_WATCHDOG_USE = 0.8
 _DONE = "carried out"
 _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
@@ -124,11 +124,8 @@ class Subject(Material):
         unpack = MESSAGES[name].reply.unpack
         shown = read_as(f"reply to {name}", unpack, answer.words, is_strict=False)
         if "levels" in shown:
-            seen, required = (
-                (shown["channels"], shown["layers"]),
-                (len(self.channels), len(self.layers)),
-            )
-            expect_equal(seen, required, "number of levels and tokens in Status")
+            for each in ("channels", "layers"):
+                expect_equal(shown[each], self.can[each], f"number of {each} in Status")
         if self.expected is not None:
             if name == "Set":
                 self.expected.taken(values, shown, answer.when)
@@ -188,14 +185,9 @@ class Subject(Material):
 
     async def rest(self) -> None:
         """Bring it to silence, disarmed, nothing latched."""
-        self.expected, due = None, clock.now() + _SETTLED
-        stopped = await self.request("Stop", ramp=0)
-        while any(stopped["levels"]) or stopped["state"] in _MOVING:
-            seen = f"{NAMES.get(stopped['state'])}, levels {stopped['levels']}"
-            what = "silence after a Stop with ramp 0"
-            expect(clock.now() < due, what, expected=f"within {_SETTLED:g} s", seen=seen)
-            await asyncio.sleep(_POLL)
-            stopped = await self.request("GetStatus")
+        self.expected = None
+        await self.request("Stop", ramp=0)
+        stopped = await self.settle()
         await self.request("Clear", latch=stopped["latch"])
         status = await self.request("GetStatus")
         expect_equal(NAMES.get(status["state"]), OFF, "state after Clear")
@@ -239,16 +231,16 @@ class Subject(Material):
         if clock.now() > end + _OVERSLEPT:
             raise Late("a pause took too long")
 
-    async def settle(self, pause: float = _POLL) -> Answer:
+    async def settle(self) -> Answer:
         """Read statuses until it is silent and in a state that lasts."""
-        due = clock.now() + self.shown.watchdog + _SETTLED
+        due = clock.now() + _SETTLED
         while True:
             reply = await self.status()
             if not any(reply["levels"]) and reply["state"] not in (*_MOVING, STATES[ENABLED]):
                 return reply
             seen = f"{NAMES.get(reply['state'])}, levels {reply['levels']}"
-            expect(clock.now() < due, "silence", expected="in time", seen=seen)
-            await asyncio.sleep(pause)
+            expect(clock.now() < due, "silence", expected=f"within {_SETTLED:g} s", seen=seen)
+            await asyncio.sleep(_POLL)
 
     async def follow(self, duration: float | None = None) -> None:
         """Read statuses for a time [s] from the last change on, None until all is settled.
@@ -268,7 +260,6 @@ class Subject(Material):
             await asyncio.sleep(pause * is_narrow)
         if seen < max(min(_SAMPLES / 3, time / _EACH, time / (4 * self.exchange_time)), 2):
             raise Late(f"only {seen} statuses were in time")
-        await self.status()
 
     async def in_time(self, case: Callable[[], Awaitable[object]]) -> None:
         """Try a case, each time from rest, until this machine was in time."""

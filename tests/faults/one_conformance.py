@@ -9,12 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.conformance import CHECKS, LEVEL, CheckResult, Result, of_kind
-from drivers.conformance.check import run_checks
-from firmware_line import FirmwarePort
+from drivers.conformance import CHECKS, Result, of_kind
+from firmware_judged import firmware_results
 from firmware_programs import build_firmware
-from judged_line import CLIENTS, KINDS, judged, plain
-from virtual_loop import run_virtual
+from judged_line import KINDS, judged, plain
 
 _CASES = [(kind, check.name) for kind in KINDS for _, check in of_kind(kind)]
 _OF_ANY_WIRE = [check.name for check in CHECKS if not check.kinds]
@@ -56,23 +54,6 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("name", _OF_ANY_WIRE)
 def test_firmware(name: str, firmware: Path) -> None:
     """It finds none on the firmware, whose playback is its own."""
-
-    async def result() -> CheckResult:
-        port = FirmwarePort("serial", firmware)
-        client = CLIENTS["serial"](1)
-        client.port, port.take = port, client.received
-        chosen = [each for each in of_kind("serial") if each[1].name == name]
-        (found,) = await run_checks(chosen, client, level=LEVEL)
-        return found
-
-    found = run_virtual(result())
+    (found,) = firmware_results("serial", firmware, [name])
     violation = found.reason * (found.result is Result.FAILED)
     assert not violation, violation
-
-
-def test_run_ends_soon() -> None:
-    """The whole run passes, within a minute of the amplifier's time."""
-    results = judged("serial")
-    failed = [f"{each.check.name}: {each.reason}" for each in results if each.result == "failed"]
-    assert not failed, failed[0]
-    assert sum(each.seconds for each in results) < 60

@@ -21,6 +21,7 @@ from drivers.protocol.table import (
     STATUS_FLAGS,
 )
 from drivers.protocol.tokens import token_after
+from drivers.transition import Transition
 
 SLACK = 0.002  # s; of times in milliseconds
 DRIFT = 1e-3  # of a time; of the amplifier's clock
@@ -34,7 +35,7 @@ _LATE = 0.002  # s; by which a set may begin later
 _SHARES = ((0, 0), (0, 1), (1, 0), (0.5, 0.5))
 """Of the interval of a commit, for the sets of even and odd number of each playback."""
 _POINTS, _POINT = 600, 2e-5  # at which an interval is looked at; s apart
-_PER_LINE, _PER_COSINE = 400, 100  # points of a step of an envelope, of a ramp
+_PER_TURN, _PER_FADE = 1000, 100  # points of a step that may pass 0, of a rise or fade
 _TOLERANCE = 0.002  # of full level
 _FULL = QUANTITIES["level"].per_unit
 
@@ -237,7 +238,7 @@ def _moments_of(playback: Playback, first: float, last: float) -> Sequence[float
     if playback.is_settled(first) and playback.next_due > last:
         return (first,)
     apart = [
-        each.transition.step / (_PER_LINE if each.transition.knots else _PER_COSINE)
+        each.transition.step / (_PER_TURN if _may_turn(each.transition) else _PER_FADE)
         for voices in playback.all_voices
         for each in voices
         if each.transition.end > first
@@ -245,6 +246,11 @@ def _moments_of(playback: Playback, first: float, last: float) -> Sequence[float
     width = max(min(apart, default=math.inf), _POINT)
     count = min(math.ceil((last - first) / width) + 3, _POINTS)
     return [first + (last - first) * at / (count - 1) for at in range(count)]
+
+
+def _may_turn(transition: Transition) -> bool:
+    """Whether its amplitude may be least on its way, not at an end."""
+    return bool(transition.knots or (transition.first and transition.last))
 
 
 def _levels(

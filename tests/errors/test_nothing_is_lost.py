@@ -87,7 +87,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return {
         name: path.read_bytes()
         for name, path in found.items()
-        if not re.match(r"\.cache/|out\.npz\.parts/|study/chunks/", name)
+        if not re.match(r"\.cache/|out\.npz\.parts/|design/(chunks|answers)-", name)
     }
 
 

@@ -216,7 +216,7 @@ class Amplifier(Dialogue):
         problem = achieved_problem(one, achieved, self.capabilities)
         if problem is None:
             self._misachieved = 0
-            self.ledger.achieved(achieved, values["token"])
+            self.ledger.playback.correct(achieved, values["token"])
             return achieved
         self._misachieved += 1
         if self._misachieved >= MAX_CONTRADICTIONS:

@@ -231,10 +231,6 @@ class Ledger:
             for one in layers
         )
 
-    def achieved(self, one: LayerSet, token: int) -> None:
-        """Note what the amplifier says it plays of a layer of the set with this token."""
-        self.playback.correct(one, token)
-
 
 def _fade(one: LayerSet) -> float:
     """Return how long a layer takes to end [s]: along its ramp or its longest ending."""

@@ -112,7 +112,10 @@ async def test_voltage_and_current_of_each_channel(kind: str) -> None:
             {"channel_voltage": 0, "channel_current": 0},
         ],
     }
-    far._measured = lambda now: iter(values["channels"])  # type: ignore[method-assign]
+    handle = far.handle
+    far.handle = lambda name, given, now: (  # type: ignore[method-assign]
+        values if name == "GetMeasured" else handle(name, given, now)
+    )
     await host.open()
     assert await read_measured(host) == [(1234.5, 250e-6), (0.0, 0.0)]
     far.capabilities = {**far.capabilities, "features": 0}

@@ -135,9 +135,9 @@ def test_what_was_achieved_counts_from_then_on() -> None:
     ledger = Ledger(WIDE, CAN)
     play(ledger, 1, 0.0, Layer(0, (tone(level=0.5),)))
     (sent,) = ledger.admit([Layer(0, (tone(level=0.45),))], 0.5)
-    ledger.achieved(sent, 2)  # of another set: without effect
+    ledger.playback.correct(sent, 2)  # of another set: without effect
     refusal(ledger, Layer(1, (tone(level=0.54, frequency=200),)))
-    ledger.achieved(sent, 1)
+    ledger.playback.correct(sent, 1)
     refusal(ledger, Layer(1, (tone(level=0.56, frequency=200),)))
     assert ledger.admit([Layer(1, (tone(level=0.54, frequency=200),))], 1.0)
 

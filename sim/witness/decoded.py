@@ -1,7 +1,7 @@
-"""Decoded messages, the same for every kind of wire."""
+"""Messages as they are decoded and sent, the same for every kind of wire."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
@@ -13,6 +13,7 @@ from drivers.protocol.table import (
     EVENT_RECORD,
     FAULTS,
     IDENTITY,
+    LATCHED,
     MESSAGES,
     NAK,
     NAK_RECORD,
@@ -22,6 +23,7 @@ from drivers.protocol.table import (
 from sim.witness.capture import Direction
 
 HELLO = "Hello"
+ENABLED = STATES["OPERATION_ENABLED"]
 A_READ = "a read"
 """Name of a read that is no message, and changes nothing."""
 STATUS_RECORD = MESSAGES["GetStatus"].reply
@@ -148,3 +150,38 @@ def sent_by_amplifier(
     if number not in NAMES:
         return damaged(f"a reply of unknown type {number}")
     return reply_of(REPLIES[NAMES[number]], words, address, (address, sequence, number))
+
+
+@dataclass(eq=False, slots=True)
+class Sent:
+    """A request as it was sent, in this order; begun [s]: when its first byte passed.
+
+    since: from which on its amplifier has to respond, infinite while it is the host's turn; begin,
+    end: between which it is carried out, None for until its reply [s].
+    """
+
+    number: int
+    request: Request
+    begun: float
+    since: float
+    begin: float
+    end: float | None = None
+    is_overdue: bool = False
+
+
+_CARRIED_OUT: dict[str, Callable[[Values, Values], bool]] = {
+    "Arm": lambda values, status: status["state"] == ENABLED,
+    "Disarm": lambda values, status: status["state"] != ENABLED,
+    "Set": lambda values, status: values["now"] and status["token"] == values["token"],
+    "Commit": lambda values, status: status["token"] == values["token"],
+    "Silence": lambda values, status: not any(status["tokens"]),
+    "Stop": lambda values, status: status["state"] in LATCHED,
+    "Clear": lambda values, status: True,
+}
+CHANGING = frozenset(_CARRIED_OUT)
+"""Requests that change what the amplifier does."""
+
+
+def is_carried_out(request: Request, status: Values) -> bool:
+    """Whether a later status shows that a request was carried out."""
+    return bool(_CARRIED_OUT[request.name](request.values, status))

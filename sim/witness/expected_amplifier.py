@@ -11,7 +11,16 @@ from collections.abc import Mapping, Sequence
 from drivers.protocol.records import Values
 from drivers.protocol.table import LATCHED, QUANTITIES, REACTION, STAGED_LIFE
 from drivers.protocol.tokens import is_newer_token
-from sim.witness.decoded import FEEDING, REPLIES, STATUS_RECORD, Request
+from sim.witness.decoded import (
+    CHANGING,
+    ENABLED,
+    FEEDING,
+    REPLIES,
+    STATUS_RECORD,
+    Request,
+    Sent,
+    is_carried_out,
+)
 from sim.witness.expected_outputs import Interval
 from sim.witness.expected_state import (
     DISABLED,
@@ -23,7 +32,6 @@ from sim.witness.expected_state import (
     SWITCHED_ON,
     ExpectedState,
 )
-from sim.witness.sent import CHANGING, ENABLED, Sent, is_carried_out
 from sim.witness.set_replies import achieved_problem
 from sim.witness.violation import ReportViolation
 

@@ -5,8 +5,8 @@ import math
 from drivers.protocol.records import Values
 from drivers.protocol.table import FAULTS, LATCHED, QUANTITIES, STATES, STATUS_FLAGS
 from drivers.protocol.tokens import is_newer_token
+from sim.witness.decoded import ENABLED, Sent
 from sim.witness.expected_outputs import ExpectedOutputs, Interval
-from sim.witness.sent import ENABLED, Sent
 from sim.witness.set_replies import SetReplies
 from sim.witness.violation import ReportViolation
 

@@ -12,8 +12,7 @@ from drivers.protocol.table import LATCHED, QUANTITIES
 from sim.witness.amplifier_session import AmplifierSession, is_vibrating
 from sim.witness.config import TimeLimits
 from sim.witness.deadlines import Deadlines, Delays
-from sim.witness.decoded import A_READ, FEEDING, HELLO, Request
-from sim.witness.sent import Sent
+from sim.witness.decoded import A_READ, FEEDING, HELLO, Request, Sent
 from sim.witness.set_rules import ExpectedSets, check_expected, check_set
 
 _IN_FLIGHT = 0.001  # s; from the host's write until a frame is seen

@@ -11,6 +11,7 @@ from sim.witness.config import TimeLimits
 from sim.witness.deadlines import Delays
 from sim.witness.decoded import (
     BROADCAST,
+    CHANGING,
     FEEDING,
     HELLO,
     Decoder,
@@ -18,10 +19,10 @@ from sim.witness.decoded import (
     Notice,
     Reply,
     Request,
+    Sent,
 )
 from sim.witness.host_rules import HostRules
 from sim.witness.modbus_decoder import ModbusDecoder
-from sim.witness.sent import CHANGING, Sent
 from sim.witness.serial_decoder import SerialDecoder
 from sim.witness.set_rules import check_sums
 from sim.witness.violation import Report

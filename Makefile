@@ -21,7 +21,7 @@ demo: .venv/installed
 firmware:
 	$(MAKE) -C firmware
 
-# The tests of the firmware, mutated frames under sanitizers, and its sizes; a million frames:
+# The tests of the firmware, damaged frames under sanitizers, and its sizes; 200 000 frames a line:
 # make firmware-test FIRMWARE=--long
 firmware-test: .venv/installed-test
 	.ci/install gcc-arm-none-eabi:arm-none-eabi-gcc libnewlib-arm-none-eabi:

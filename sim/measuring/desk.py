@@ -111,12 +111,12 @@ class Desk:
                     f"{getattr(limits, key):g}; check whether the ERAs bear it, and widen it"
                 )
 
-    def check_frequencies(self, frequencies: FloatArray) -> None:
-        """Raise InputError for frequencies [Hz] beyond the rig's limits."""
+    def check_frequencies(self, frequencies: FloatArray, *, what: str) -> None:
+        """Raise InputError for frequencies [Hz] beyond the rig's limits; what: has them."""
         limits = self.rig.limits
         low, high = limits.frequency_min, limits.frequency_max
         if frequencies.min() < low or frequencies.max() > high:
             raise InputError(
-                f"--frequencies must be within the rig's limits.frequency of {low:g} to {high:g} "
+                f"{what} must be within the rig's limits.frequency of {low:g} to {high:g} "
                 f"Hz, got {frequencies.min():g} to {frequencies.max():g} Hz"
             )

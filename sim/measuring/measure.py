@@ -64,7 +64,7 @@ def open_desk(
     desk.check(level)
     if frequencies is None:
         frequencies = default_frequencies(rig.limits.frequency_min, rig.limits.frequency_max)
-    desk.check_frequencies(frequencies)
+    desk.check_frequencies(frequencies, what="--frequencies")
     card = open_card(device, outputs=desk.output, inputs=desk.input, limit=level)
     try:
         yield desk, card, Multisine(frequencies, len(desk.eras) + 1, card.rate, level, seed)

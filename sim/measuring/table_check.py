@@ -10,7 +10,6 @@ from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.contents import Tone
 from drivers.errors import DriverError, LinkError
 from model.arrays import FloatArray
-from model.errors import InputError
 from model.rig.rig import Rig
 from model.table.pattern import Pattern
 from model.table.promise_at_sensors import (
@@ -68,12 +67,13 @@ def check_table(
             table, places, count=settings.samples, level=level, seed=settings.seed
         ):
             excitation = promise.pattern.excitation
-            _check_frequencies(excitation, rig)
+            frequencies = np.unique([tone.frequency for tone in excitation.values()])
+            # A table may have been built of more; an amplifier's ledger refuses them, too.
+            desk.check_frequencies(frequencies, what="frequencies of the table")
             heard = record(promise)
             chosen = [by_name[name] for name in promise.sensors]
             check_levels(heard, chosen)
             # All tones are fitted together, since their frequencies need not fit into the window.
-            frequencies = np.unique([tone.frequency for tone in excitation.values()])
             samples = heard[:, [sensor.input - 1 for sensor in chosen]]
             tones = fit_tones(np.arange(len(samples)) / rate, samples, frequencies.tolist())
             amplitudes = np.abs(tones / [sensor.sensitivity for sensor in chosen])
@@ -123,20 +123,6 @@ def _by_amplifier(
     if card.gaps:
         raise LinkError("blocks of sound were lost while a pattern played; verify again")
     return heard[-round(_WINDOW * card.rate) :].astype(float)
-
-
-def _check_frequencies(excitation: Excitation, rig: Rig) -> None:
-    """Raise InputError for tones outside of the rig's limits: a table may have been built of more.
-
-    An amplifier's ledger refuses them, too.
-    """
-    low, high = rig.limits.frequency_min, rig.limits.frequency_max
-    for name, tone in excitation.items():
-        if not low <= tone.frequency <= high:
-            raise InputError(
-                f"frequencies must be within the rig's limits.frequency of {low:g} to {high:g} Hz, "
-                f"got {tone.frequency:g} Hz of ERA {name} in the table; build it again"
-            )
 
 
 def _by_card(card: SoundCard, desk: Desk, pattern: Pattern, level: float) -> FloatArray:

@@ -13,6 +13,7 @@ from pathlib import Path
 from model.errors import InputError
 from model.files.uff import read_bytes
 from model.structure.plate import Plate
+from sim.plant.fingers import check_on_plate
 
 COLUMNS = ("sensor", "x_m", "y_m", "input", "mv_per_m_s2")
 OPTIONAL = {"gain": 1.0, "full_scale_v": 1.0}
@@ -82,11 +83,7 @@ def _sensor(
     if not name or any(name == other.name for other in before):
         raise InputError(f"{place}: sensor must be a name that no other has, got {name!r}")
     x, y, channel = number("x_m"), number("y_m"), number("input")
-    if not plate.contains(x, y):
-        raise InputError(
-            f"{place}: sensor {name} must be on the plate, from (0, 0) to ({plate.length:g}, "
-            f"{plate.width:g}) m, got ({x:g}, {y:g}) m"
-        )
+    check_on_plate(f"{place}: sensor {name}", (x, y), plate)
     if channel != int(channel) or channel < 1 or any(channel == other.input for other in before):
         raise InputError(
             f"{place}: input must be a number from 1 that no other sensor has, got {channel:g}"

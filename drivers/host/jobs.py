@@ -62,21 +62,20 @@ class Job:
     result: "asyncio.Future[Values]"
     start: JointStart | None = None
     is_held: bool = False
-    number: int = 0
     not_before: float = 0.0
     sent_at: float = 0.0
     due: float = 0.0
     looks: int = 0
     had_no_reply: bool = False
 
-    def rank(self, now: float) -> tuple[int, bool, int]:
+    def rank(self, now: float) -> tuple[int, bool]:
         """Place in the queue at a time [s]; one that is held for other lines goes before sets."""
         rank: int = self.priority
         if rank != Priority.READING:
             rank = min(rank, Priority.ARM)
             if rank > Priority.HEARTBEAT and (self.is_held or now - self.queued_at > MAX_WAIT):
                 rank = Priority.HEARTBEAT
-        return rank, not self.is_held, self.number
+        return rank, not self.is_held
 
     def is_superseded_by(self, priority: Priority, member: "Dialogue | None") -> bool:
         """Whether a request for an amplifier, None for all, makes it obsolete."""
@@ -88,14 +87,8 @@ class JobQueue:
 
     def __init__(self) -> None:
         self.jobs: list[Job] = []
-        """In the order in which they were queued."""
-        self._number = 0
-
-    def add(self, job: Job) -> None:
-        """Queue a job, behind those of its priority."""
-        self._number += 1
-        job.number = self._number
-        self.jobs.append(job)
+        """In the order in which they were queued, as those of one rank are sent."""
+        self.add = self.jobs.append
 
     def remove(self, job: Job) -> None:
         """Take a job out, if it waits."""

@@ -24,7 +24,7 @@ from drivers.protocol.table import (
 )
 from sim.amplifier.contract import Amplifier
 from sim.bench.reading import Measurement, ToneReader
-from sim.plant.accelerometer import Accelerometer, positions
+from sim.plant.accelerometer import Accelerometer
 
 if TYPE_CHECKING:
     from sim.bench.bench import Bench
@@ -121,19 +121,15 @@ class Sensing:
         if apart * measurement.window < 1 - _ROUNDING:
             raise Refusal(f"frequencies must be {1 / measurement.window:g} Hz apart, got {apart:g}")
         self.forget()
-        sensors = self.sensors
-        points = positions(sensors)
         token = self._amplifier.token
         self.reader = ToneReader(
+            self._bench,
             measurement,
-            sensors,
-            shapes=lambda: self._bench.shapes_at(points),
+            self.sensors,
             start=now,
             origin=self._amplifier.committed_at if token else None,
             token=token,
-            sample_rate=self._bench.sample_rate,
             rng=self._rng,
-            on_end=self._bench.forget_reader,
         )
         self._bench.probes.append(self.reader)
 

@@ -49,15 +49,14 @@ def natural_modes(
                 f"{support}: finite elements of it are not solved"
             )
         chosen = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
-    if not isinstance(chosen, Mesh):
-        raise TypeError(f"mesh must be a Mesh or SpectralMesh, got {type(chosen).__name__}")
-    matrices = assemble(rig.plate, chosen)
+    elements = chosen
+    matrices = assemble(rig.plate, elements)
     solved = modes(matrices, count, support=support, eras=rig.eras, loads=rig.masses)
 
     def shapes_at(points: FloatArray) -> FloatArray:
-        return np.asarray(chosen.interpolation(points) @ solved.mode_shapes)
+        return np.asarray(elements.interpolation(points) @ solved.mode_shapes)
 
-    return NaturalModes(solved.natural_frequencies, shapes_at, chosen)
+    return NaturalModes(solved.natural_frequencies, shapes_at, elements)
 
 
 def _on_polynomials(rig: Rig, count: int, *, support: str, mesh: SpectralMesh) -> NaturalModes:

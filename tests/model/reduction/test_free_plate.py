@@ -133,6 +133,16 @@ def test_acceleration_refuses_values_out_of_range(frequency, x, mesh, message):
         free.acceleration((replace(eras[0], x=x),), frequencies, free.mesh.nodes)
 
 
+def test_truncated_sums_of_a_soft_plate_are_the_same_both_ways():
+    """Reciprocity, and no sum below zero: its kept modes move a million times as far."""
+    plate = Plate(1.2, 0.8, 0.004, ALUMINIUM)
+    modes = solve_free_plate(plate, Mesh(4, 4, plate.length, plate.width)).modes
+    points = np.random.default_rng(5).uniform(0, [plate.length, plate.width], (9, 2))
+    for sums in modes.truncated_terms(points, points):
+        assert sums == pytest.approx(sums.T, abs=1e-9 * np.abs(sums).max())
+        assert np.linalg.eigvalsh(sums)[0] > -1e-9 * np.abs(sums).max()
+
+
 def test_solve_free_plate_refuses_the_mesh_of_another_plate():
     """The error names both sizes, as that of `assemble`."""
     mesh = Mesh(12, 9, LENGTH, WIDTH)

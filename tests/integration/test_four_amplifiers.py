@@ -104,7 +104,7 @@ async def four_amplifiers(wires: Mapping[str, Wire]) -> AsyncIterator[FourAmplif
     loop = asyncio.get_running_loop()
     live_in_memory()
     rig = load_rig(Path(model.__file__).parents[1] / "examples" / "table.yaml")
-    rig = replace(rig, mesh=Mesh(4, 4, rig.plate.length, rig.plate.width))
+    rig = replace(rig, mesh=Mesh(8, 8, rig.plate.length, rig.plate.width))
     bench = Bench(rig, now=loop.time())
     devices = {
         name: AmplifierDevice(bench, name, address=number)

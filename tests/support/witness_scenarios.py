@@ -13,6 +13,8 @@ async def day(chain: Chain) -> None:
     await chain.touch(1, 2, rest=0.12)
     await chain.touch(1, rest=0.05)
     await chain.touch(rest=0.1)
+    await chain.touch(1, rest=0.1)
+    await chain.touch(rest=0.1)
     await chain.touch(3, rest=0.1)
     await chain.operate("stop", rest=0.1)
     await chain.touch()

@@ -49,7 +49,7 @@ class Line:
         )
         for delay, data in arriving:
             size = max(int(_PIECE / self._byte_time), 1) if self._byte_time else max(len(data), 1)
-            for at in range(0, len(data), size):
+            for at in range(0, max(len(data), 1), size):  # no bytes: the end of a connection
                 piece = data[at : at + size]
                 self._free_from = max(now, self._free_from) + len(piece) * self._byte_time
                 due = self._free_from + delay

@@ -54,13 +54,13 @@ class Lines:
         """
         address = address_of(url)
         async with self._changing.setdefault(address.line, asyncio.Lock()):
-            opened = self._opened.get(address.line)
+            before, opened = self._opened, self._opened.get(address.line)
             if opened is not None and opened.line.loss is not None:
                 del self._opened[address.line]
                 await opened.close()
                 opened = None
             if opened is None:
-                before, opened = self._opened, await _open(address)
+                opened = await _open(address)
                 if self._opened is not before:
                     await opened.close()
                     raise LinkError(f"{address.line} was closed while it was being opened")

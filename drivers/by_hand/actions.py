@@ -226,8 +226,9 @@ async def drive(
             await keep_alive(amplifier, duration, watchdog / 5)
         finally:
             # An amplifier that cannot be reached is stopped by its watchdog.
-            with contextlib.suppress(DriverError):
-                await amplifier.disarm(_RAMP)
+            if amplifier.may_be_armed:  # another host's is left alone
+                with contextlib.suppress(DriverError):
+                    await amplifier.disarm(_RAMP)
         after = await amplifier.read_status()
     played = [{"channel": row["channel"], **in_units(COMMAND, row)} for row in achieved["commands"]]
     return {"url": url, "achieved": played, "duration_s": duration, **status_rows(after)}

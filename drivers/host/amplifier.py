@@ -30,12 +30,14 @@ from registry.limits import GuardLimits
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
 DISARM_RAMP = 0.05  # s; long enough to avoid a click
 OPEN_TIMEOUT = 0.5  # s; for boards that restart when their port is opened
+_ARM_WITHIN = 3.0  # s; from the request to arm until it is sent, on the slowest wire
 CONFIRM_TIMEOUT = 0.3  # s; three replies of the slowest wire
 LISTENING = 0.3  # s; to an amplifier that is found armed
 SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENABLED = STATES["OPERATION_ENABLED"]
+_ENERGISED = (STATES["SWITCHED_ON"], _ENABLED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +125,7 @@ class Amplifier(Dialogue):
 
         It is identified anew: it may have lost its supply, and come back with other limits.
         """
-        before = self.silences
+        before, began = self.silences, clock.now()
         await self.identify(timeout=REPLY_TIMEOUT)  # before the watchdogs of others that are armed
         wire = _WATCHDOG.to_wire(watchdog)
         low, high = (self.capabilities[f"watchdog_{end}"] for end in ("min", "max"))
@@ -136,9 +138,17 @@ class Amplifier(Dialogue):
         def make() -> Values:
             if self.silences != before:
                 raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
+            if clock.now() - began > _ARM_WITHIN:  # this machine slept: nobody waits for it now
+                raise LinkTimeout(f"amplifier {self.name}: identified too late; arm again")
             return values
 
-        status = await self.line.submit(self, Priority.ARM, "Arm", values, make=make)
+        was_armed = self.may_be_armed
+        try:
+            status = await self.line.submit(self, Priority.ARM, "Arm", values, make=make)
+        except CommandRefused as error:
+            if not (isinstance(error, Preempted) or error.may_play):
+                self.may_be_armed = was_armed
+            raise
         self.session, self.feeding.watchdog = session, watchdog
         self._contradictions = self._misachieved = 0
         self.ledger.forget()
@@ -235,11 +245,12 @@ class Amplifier(Dialogue):
         """
         status = await self._request("Disarm", {"ramp": self.wire_ramp(ramp)}, Priority.SILENCE)
         end = clock.now() + ramp + CONFIRM_TIMEOUT
-        while status["state"] == _ENABLED or not self.is_silent(status):
+        while status["state"] in _ENERGISED or not self.is_silent(status):
             if clock.now() > end or status["state"] == _ENABLED:
                 raise CommandRefused(f"amplifier {self.name} is not silent after a disarm")
             await asyncio.sleep(_INTERVAL)
             status = await self.read_status(Priority.SILENCE)
+        self.may_be_armed = False
 
     async def ping(self) -> Values:
         """Feed the watchdog; returns the status. Raises CommandRefused if it is not armed."""
@@ -287,7 +298,7 @@ class Amplifier(Dialogue):
         values = {"ramp": self.wire_ramp(ramp)}
         members = len(self.line.members)
         # On a line that others share each has three exchanges: a stop and two statuses.
-        timeout += ATTEMPTS * members * self.exchange_time("GetStatus")
+        timeout += ramp + ATTEMPTS * members * self.exchange_time("GetStatus")
         waiting = timeout * (members + 1)  # on a line that others keep busy
         try:
             async with asyncio.timeout(waiting) as limit:

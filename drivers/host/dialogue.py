@@ -46,6 +46,8 @@ class Dialogue:
         self.line, self.address, self.name = line, address, name
         self.capabilities: Values = {}
         self.session = 0
+        self.may_be_armed = False
+        """Whether an Arm of this host may have been carried out since it was disarmed."""
         self.latch: int | None = None
         """Newest latch that a status has shown since it was identified."""
         self.status: Values | None = None
@@ -117,6 +119,10 @@ class Dialogue:
                 self.feeding.unheard(_RAMP.from_wire(values["ramp"]), now)
             else:
                 self.feeding.sent(now)
+        elif name in ("Stop", "Disarm"):
+            self.feeding.fades(_RAMP.from_wire(values["ramp"]))
+        if name == "Arm":
+            self.may_be_armed = True
         admitted = self._admitted
         if name in _SILENCING or name == "Arm":
             self._admitted = None

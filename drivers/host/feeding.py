@@ -14,9 +14,9 @@ class Feeding:
     """What may have fed and what surely did, and the watchdog [s]; delay [s]: of the line.
 
     may: when the last request that may have fed went out. plays: the last such that does not also
-    silence it: how long the amplifier may play follows from it. fade [s]: longest ramp of a silence
-    without reply since. since, confirmed_at: when the last request that surely did went out, and
-    its reply came.
+    silence it: how long the amplifier may play follows from it. fade [s]: longest ramp since, of a
+    silence without reply, a stop or a disarm. since, confirmed_at: when the last request that
+    surely did went out, and its reply came.
     """
 
     delay: float = 0.0
@@ -44,6 +44,10 @@ class Feeding:
         as long as there is no reply, it does not put off when the amplifier must be silent.
         """
         self.may = now
+        self.fades(ramp)
+
+    def fades(self, ramp: float) -> None:
+        """Note that what plays may fade along a ramp [s] from when its watchdog has not passed."""
         self.fade = max(self.fade, ramp)
 
     def confirmed(self, sent_at: float, now: float) -> None:

@@ -67,7 +67,6 @@ class Group(Members):
         self._closing = asyncio.Lock()  # a second close waits for the first
         self._sets = JointSets(self, draw(_TOKEN.minimum, _TOKEN.maximum))
         self._stops = self._cleared = 0  # stops so far, and at the last clear
-        self._may_be_armed = False  # since the amplifiers were opened
         self._limit: asyncio.Timeout | None = None  # of an exchange in progress
 
     @property
@@ -90,7 +89,6 @@ class Group(Members):
         for amplifier in self.amplifiers.values():
             check_watchdog(self._watchdog, amplifier.exchange_time("Set"))
         self.state = GroupState.DISARMED
-        self._may_be_armed = False
         self._cleared = stops
 
     async def arm(self) -> None:
@@ -126,7 +124,6 @@ class Group(Members):
                 self.check_none_since(before)
             for amplifier in amplifiers:
                 amplifier.check_other_host()  # before a disarm of what failed ends its vibration
-            self._may_be_armed = True
             session = self._draw(_SESSION.minimum, _SESSION.maximum)
             arming = asyncio.gather(
                 *[each.arm(session, self._watchdog) for each in amplifiers], return_exceptions=True
@@ -148,15 +145,13 @@ class Group(Members):
             self.state = GroupState.ARMED
 
     async def _disarm_armed(self, arming: "asyncio.Future[list[Any]]") -> None:
-        """Disarm what may have been armed by this; one that has refused may be another host's."""
-        results = zip(self.amplifiers.values(), await arming, strict=True)
+        """Disarm what may have been armed by this; any other may be another host's."""
+        await arming
         disarmed = await asyncio.gather(
             *[
                 retried(each, partial(each.disarm, STOP_RAMP))
-                for each, result in results
-                if not isinstance(result, CommandRefused)
-                or isinstance(result, Preempted)
-                or result.may_play
+                for each in self.amplifiers.values()
+                if each.may_be_armed
             ],
             return_exceptions=True,
         )
@@ -303,12 +298,15 @@ class Group(Members):
         self._leave_armed()
         self.state = GroupState.CLOSED
         async with self._closing:
-            members = [each for each in self.amplifiers.values() if is_armed or not is_lost(each)]
-            if not self._may_be_armed:
+            members = [
+                each
+                for each in self.amplifiers.values()
+                if each.may_be_armed and (is_armed or not is_lost(each))
+            ]
+            if not members:
                 return
             try:
                 await self.silenced(self._disarm(members, ramp))
-                self._may_be_armed = False
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
 

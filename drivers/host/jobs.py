@@ -114,7 +114,6 @@ class JobQueue:
         """Whether one that waits makes a job obsolete."""
         return any(job.is_superseded_by(other.priority, other.member) for other in self.jobs)
 
-    @property
-    def next_due(self) -> float:
-        """When the first of those that pause is due [s]; 0 if none pauses."""
-        return min((job.not_before for job in self.jobs if job.not_before), default=0.0)
+    def next_due(self, now: float) -> float:
+        """When [s] the first of those that pause is due, after the present time; 0 if none is."""
+        return min((job.not_before for job in self.jobs if job.not_before > now), default=0.0)

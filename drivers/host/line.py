@@ -287,7 +287,7 @@ class Line:
         """Have the timer look again by the next time that matters; it is never cancelled."""
         if self._current is not None:
             due = self._current.due
-        elif not self._queue.jobs or (due := self._queue.next_due) <= 0.0:
+        elif not self._queue.jobs or (due := self._queue.next_due(self._loop.time())) <= 0.0:
             return
         if self._timer is None or self._timer.when() > due:
             if self._timer is not None:
@@ -317,7 +317,9 @@ class Line:
         self.pump()
 
     def _not_answered(self, job: Job) -> None:
-        if self._must_yield(job):
+        now = self._loop.time()
+        was_cut = job.priority is Priority.READING and now - job.sent_at < job.timeout
+        if was_cut or self._must_yield(job):
             job.attempts += 1
             self._repeat(job)
             return

@@ -107,5 +107,5 @@ class DevicePort(ABC):
                 while not self.closing.is_set():
                     if data := self.read_waiting():
                         post(self.received, data)
-            except self.failures as error:
+            except Exception as error:  # whatever it is, nothing more is read
                 post(self.lose, error)

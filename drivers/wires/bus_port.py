@@ -59,8 +59,8 @@ class BusPort(DevicePort):
     """A bus of python-can, read by the event loop where it is watched, or by a thread.
 
     on_data: called with packed frames. Implements `Port`. Of frames that the adapter has not taken
-    yet newer ones replace the older, whose request was given up; broadcasts stay, which have no
-    reply to wait for.
+    yet newer ones replace the older, whose request was given up; broadcasts, which have no
+    reply to wait for, stay for as long as a request would.
     """
 
     kind = "CAN bus"
@@ -75,7 +75,7 @@ class BusPort(DevicePort):
         on_loss: Callable[[str], None],
     ) -> None:
         self._bus = bus
-        self._unsent: list[CanFrame] = []
+        self._unsent: list[tuple[CanFrame, float]] = []  # until when [s] a broadcast may be sent
         self._given_up_at = 0.0
         self._is_full = False
         self._timer: asyncio.TimerHandle | None = None
@@ -88,9 +88,9 @@ class BusPort(DevicePort):
 
     def write(self, data: bytes) -> None:
         """Send frames, as soon as the adapter takes them; raises LinkError."""
-        kept = [frame for frame in self._unsent if frame.id == REQUEST]
-        self._unsent = [*kept, *unpack_frames(data)]
-        self._given_up_at = self.loop.time() + _FULL_TIMEOUT
+        kept = [each for each in self._unsent if each[0].id == REQUEST]
+        self._given_up_at = until = self.loop.time() + _FULL_TIMEOUT
+        self._unsent = [*kept, *[(frame, until) for frame in unpack_frames(data)]]
         self._send()
 
     def read_watched(self) -> bytes:
@@ -123,9 +123,11 @@ class BusPort(DevicePort):
 
     def _send(self) -> None:
         """Send frames until the adapter takes no more, then again after a pause."""
+        now = self.loop.time()
+        self._unsent = [each for each in self._unsent if each[0].id != REQUEST or now <= each[1]]
         try:
             while self._unsent:
-                self._is_full = not self._take(self._unsent[0])
+                self._is_full = not self._take(self._unsent[0][0])
                 if self._is_full:
                     break
                 del self._unsent[0]

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from drivers.codec.can_bus.adapter_text import SLCAN, SLCAN_RATES
+from drivers.errors import LinkError
 from drivers.hardware import Port
 from drivers.host.wire import NETWORK_DELAY
 from drivers.ports.opening import open_port
@@ -37,5 +38,10 @@ class SlcanAddress(CanAddress):
         port = TextPort(SLCAN, on_data, cut_off=b"\r", goodbye=_CLOSE)
         port.below = await open_port(self.place, port.received, on_loss)
         # Closed first, where an earlier host has left it open.
-        port.below.write(_CLOSE + b"S%d\rO\r" % SLCAN_RATES.index(self.bitrate))
+        try:
+            port.below.write(_CLOSE + b"S%d\rO\r" % SLCAN_RATES.index(self.bitrate))
+        except LinkError:
+            port.close()
+            await port.wait_closed()
+            raise
         return port

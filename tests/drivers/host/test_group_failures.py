@@ -7,9 +7,11 @@ from functools import partial
 import pytest
 
 from armed_group import grouped, layer, losing, tone, with_group
+from drivers.contents import Shape
 from drivers.errors import CommandRefused, DriverError
 from drivers.host.group import Group
 from drivers.host.joint_start import JointStart
+from drivers.host.sensors import read_measured
 from drivers.protocol.records import Refusal, Values
 from sim.amplifier.contract import Amplifier as FarEnd
 from virtual_loop import in_virtual_time
@@ -163,6 +165,77 @@ async def test_arming_anew_stops_what_cannot_be_disarmed(
     with pytest.raises(DriverError):
         await group.arm()
     assert ends[0].levels("a") == [0.0, 0.0]
+
+
+@grouped(("a",), wire="serial")
+async def test_ramp_of_a_disarm_may_play_on_after_the_watchdog(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """One of 1 s is heard once, no reply comes: it is not lost while it fades."""
+    (end,) = ends
+    await group.apply({"a": [layer(0, tone())]})
+    end.outward = lambda name, data: []
+    disarming = asyncio.ensure_future(group.disarm(1.0))
+    for _ in range(100):
+        await asyncio.sleep(0.001)
+        if end.far["a"].state != "OPERATION_ENABLED":
+            break
+    end.inward = lambda name, data: []
+    while end.levels("a")[0]:
+        assert not group.lost_by
+        await asyncio.sleep(0.005)
+    with pytest.raises(DriverError):
+        await disarming
+
+
+@pytest.mark.parametrize("wire", ["serial", "can", "tcp"])
+@grouped(("a", "b"))
+async def test_failed_arming_leaves_another_hosts_amplifier_alone(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """It answers at the address of one of ours, under another serial number."""
+    await group.disarm()
+    (end,) = ends
+    far = end.far["b"]
+    far.identity = {**far.identity, "serial_number": "OTHER"}
+    far.handle("Arm", {"session": 4242, "watchdog": 1000}, end.loop.time())
+    with pytest.raises(DriverError):
+        await group.arm()
+    await group.close()
+    assert far.state == "OPERATION_ENABLED"
+    assert end.far["a"].state != "OPERATION_ENABLED"
+
+
+@grouped(("a",), wire="serial")
+async def test_nothing_is_armed_by_a_machine_that_slept(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """It wakes half a minute after it began to arm: whoever asked for it may have gone."""
+    await group.disarm()
+    (end,) = ends
+    end.far["a"].session = 1
+    arming = asyncio.ensure_future(group.arm())
+    await asyncio.sleep(0.001)
+    end.loop.now += 30.0
+    with pytest.raises(DriverError):
+        await arming
+    assert end.far["a"].state != "OPERATION_ENABLED"
+
+
+@pytest.mark.parametrize("wire", ["serial", "can", "tcp"])
+@grouped(("a",))
+async def test_reading_that_gives_way_to_a_set_is_no_silence(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """Its reply takes 8 ms, the set has several parts: all are played, then it is read."""
+    (end,) = ends
+    end.outward = lambda name, data: [(0.008 if name == "GetMeasured" else 0.0002, data)]
+    reading = asyncio.ensure_future(read_measured(group.amplifiers["a"]))
+    await asyncio.sleep(0.001)
+    onset = Shape(0.002, (0.01,) * 12)
+    await group.apply({"a": [layer(number, tone(level=0.05, onset=onset)) for number in range(4)]})
+    assert not group.degraded
+    await reading
 
 
 @in_virtual_time

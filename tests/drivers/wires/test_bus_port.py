@@ -101,6 +101,24 @@ async def test_frames_of_a_stuck_queue_are_dropped() -> None:
         assert not losses
 
 
+async def test_broadcast_waits_no_longer_while_others_are_written(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A commit amid requests that are repeated every 20 ms: gone after the 30 ms of a reply."""
+    async with opened() as (port, adapter, _):
+        now = port.loop.time()
+        monkeypatch.setattr(port.loop, "time", lambda: now)
+        adapter.room = 0
+        port.write(pack_frames(COMMIT))
+        for _ in range(2):
+            now += 0.02
+            port.write(pack_frames(STOP))
+        adapter.room = 30
+        port.write(pack_frames(STOP))
+        monkeypatch.undo()
+        assert adapter.taken == [b"stop"]
+
+
 async def test_bus_off_is_a_loss_and_other_error_frames_are_none() -> None:
     """Error class 0x40 of linux/can/error.h; told once."""
     async with opened() as (port, adapter, losses):

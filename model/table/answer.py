@@ -25,6 +25,7 @@ from model.table.contents import (
     Stream,
     choose_contents,
     contrasts,
+    felt_amplitudes,
     loudest_power,
     own_amplitudes,
     promise,
@@ -236,7 +237,9 @@ class _Answering:
             others = np.arange(len(streams)) != number
             for finger in stream.targets:
                 felt = _as_decibels(ratios[finger]) if finger in ratios else (None, None, None)
-                level = _as_decibels(own_amplitudes(power[number], weights, (finger,)))
+                level = _as_decibels(
+                    felt_amplitudes(power, weights, chosen.rows, number, (finger,))
+                )
                 heard = loudest_power(power[others], chosen.rows[others], finger)
                 is_shared = finger != stream.targets[0]
                 layers[finger] = Layer(
@@ -283,7 +286,8 @@ class _Answering:
     def _choose(self, streams: Sequence[Stream], quiet: Sequence[int]) -> Chosen:
         """The tones of all contents; of one for one finger as `LocalizationTable.query`."""
         table, (first, *others) = self.table, streams
-        if others or len(first.targets) > 1 or len(first.rows) > 1:
+        is_plain = len(first.targets) == len(first.rows) == 1
+        if others or (quiet and not is_plain):  # alone it is weighed against the rest of the plate
             return choose_contents(
                 self._on_plate,
                 streams,
@@ -292,9 +296,10 @@ class _Answering:
                 apart_hz=self.apart_hz,
             )
         every = [self._every[finger] for finger in (*first.targets, *quiet)]
+        count = len(first.targets)
         question = Question(
-            (every[0].at,),
-            tuple(each.at for each in every[1:]),
+            tuple(each.at for each in every[:count]),
+            tuple(each.at for each in every[count:]),
             level_db_sl=first.level_db_sl,
             drive_mode=UNRESTRICTED,
             frequencies=self.requests[first.targets[0]].band_hz,

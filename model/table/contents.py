@@ -32,7 +32,7 @@ are searched by point."""
 MAX_COMBINATIONS, PRUNING_STEP = 200, 4
 """Combinations of candidates that are kept for the next content and the choice, by some draws."""
 
-_TINY = 1e-30
+_TINY = 1e-20
 _NEARLY_HIGHEST = 0.99
 
 
@@ -125,6 +125,24 @@ def own_amplitudes(
     return np.asarray(np.minimum.reduce(means))
 
 
+def felt_amplitudes(
+    power: Float32Array,
+    weights: Float32Array,
+    rows: IntArray,
+    number: int,
+    targets: Sequence[int],
+) -> Float32Array:
+    """The least that a content's fingertips feel of it, (d,), of power (K, k, p, d).
+
+    Tones of other contents at its frequency, by rows (K,), may cancel part of it.
+    """
+    amplitude = np.sqrt(power[number])
+    for other in np.flatnonzero(rows == rows[number]).tolist():
+        if other != number:
+            amplitude = amplitude - np.sqrt(power[other])
+    return own_amplitudes(np.maximum(amplitude, 0) ** 2, weights, targets)
+
+
 def loudest_power(power: Float32Array, rows: IntArray, finger: int) -> Float32Array:
     """Power (d,) of contents at the loudest point of a finger, of power (j, k, p, d).
 
@@ -151,14 +169,14 @@ def contrasts(
 
     power (K, k, p, d): of the contents at their gains; rows (K,): of their frequencies.
     """
-    own = [own_amplitudes(power[j], weights, each.targets) for j, each in enumerate(streams)]
+    own = [felt_amplitudes(power, weights, rows, j, each.targets) for j, each in enumerate(streams)]
     every = np.arange(len(streams))
     found: dict[int, Float32Array] = {}
     for j, stream in enumerate(streams):
         others = every != j
         if others.any():
             for finger in stream.targets:
-                level = own_amplitudes(power[j], weights, (finger,))
+                level = felt_amplitudes(power, weights, rows, j, (finger,))
                 others_power = loudest_power(power[others], rows[others], finger)
                 found[finger] = _ratio(level, others_power)
     for finger in quiet:

@@ -199,13 +199,14 @@ def answer_as_json(
             {
                 "at_m": list(layer.request.at),
                 "frequency_hz": next(iter(tones.values())).frequency if tones else None,
-                "drive": table.drive_of(tones),
+                # A shared content is played once, where it was asked for first.
+                "drive": {} if layer.verdict == "shared" else table.drive_of(tones),
                 "level_db_sl": layer.level_db_sl if tones else None,
                 "promised_level_db_sl": layer.promised_level_db_sl if tones else None,
-                "felt_contrast_db": layer.felt_contrast_db,
-                "median_felt_contrast_db": layer.median_felt_contrast_db,
-                "robust_felt_contrast_db": layer.promised_contrast_db,
-                "foreign_level_db_sl": layer.foreign_level_db_sl,
+                "felt_contrast_db": _finite(layer.felt_contrast_db),
+                "median_felt_contrast_db": _finite(layer.median_felt_contrast_db),
+                "robust_felt_contrast_db": _finite(layer.promised_contrast_db),
+                "foreign_level_db_sl": _finite(layer.foreign_level_db_sl),
                 "verdict": layer.verdict,
             }
         )
@@ -221,11 +222,16 @@ def answer_as_json(
     return {
         "layers": layers,
         "quiet": quiet,
-        "robust_worst_db": found.promised_worst_db,
+        "robust_worst_db": _finite(found.promised_worst_db),
         "stroke_factor": found.stroke_factor,
         "applied": list(found.applied),
         "solve_time_s": elapsed,
     }
+
+
+def _finite(value: float | None) -> float | None:
+    """A level or contrast as JSON has it: none of what is not felt at all."""
+    return value if value is not None and math.isfinite(value) else None
 
 
 def prepared_timing(table: LocalizationTable) -> Timing:

@@ -10,9 +10,10 @@ from model.cli import app
 from model.errors import InputError
 from model.finger.perception import detection_threshold
 from model.table.answer import answer
-from model.table.contents import loudest_power
+from model.table.contents import felt_amplitudes, loudest_power
 from model.table.exact_plates import Plates, draw_plates, powers_on
 from model.table.file import save_table
+from model.table.query import answer_as_json
 from model.table.question import Question
 from model.table.request import Finger, Request
 from paper_table import contact_sets, smooth_table
@@ -151,6 +152,32 @@ def test_contents_of_one_frequency_may_meet_in_phase():
     """At a finger, amplitudes of one frequency add, powers of two: 3, 4 and 12 make 7² + 12²."""
     power = np.array([3.0, 12.0, 4.0])[:, None, None, None] ** 2
     assert loudest_power(power, np.array([5, 2, 5]), 0) == pytest.approx(193)
+
+
+def test_a_tone_of_the_same_frequency_may_cancel_part_of_ones_own():
+    """At two points of amplitude 5 and 2, beside 3 of another content: 2 and 0, 1 in the mean."""
+    power = np.array([[5.0, 2.0], [3.0, 3.0], [4.0, 4.0]])[:, None, :, None] ** 2
+    weights = np.full((1, 2), 0.5, dtype=np.float32)
+    assert felt_amplitudes(power, weights, np.array([7, 7, 8]), 0, (0,)) == pytest.approx(1.0)
+    assert felt_amplitudes(power, weights, np.array([7, 6, 8]), 0, (0,)) == pytest.approx(3.5)
+
+
+def test_two_fingers_that_share_and_no_other_are_served():
+    """So near that no contents of their own reach 6 dB: there is nobody to be quiet at."""
+    requests = [Request(at, may_share=True) for at in ((0.16, 0.06), (0.19, 0.06))]
+    found = answer(smooth_table(), requests)
+    assert "shares" in found.applied[-1]
+    for layer in found.layers:
+        assert layer.promised_level_db_sl > 19.9
+        assert layer.promised_contrast_db is None
+
+
+def test_what_is_not_felt_is_null_in_json():
+    """A higher priority takes the whole stroke: JSON has no infinity."""
+    requests = [Request(NEAR, level_db_sl=80.0, priority=1), Request(FAR, level_db_sl=12.0)]
+    found = answer_as_json(smooth_table(), requests)
+    assert found["layers"][1]["verdict"] == "held back"
+    json.dumps(found, allow_nan=False)
 
 
 def test_levels_share_the_stroke_by_one_factor_and_by_priority():

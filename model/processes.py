@@ -4,6 +4,7 @@ import logging
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -135,10 +136,19 @@ def _interrupts_blocked() -> Iterator[None]:
 
 
 def _start_worker(solve: Callable[[Any, Any], Any], shared: Any) -> None:
-    """Keep what all tasks need; ignore Ctrl-C, which the parent process handles."""
+    """Keep what all tasks need; ignore Ctrl-C, which the parent process handles; end with it."""
     global _in_worker
     _in_worker = solve, shared
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent has; a pool's worker waits for tasks for ever else."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _run(task: Any) -> Any:

@@ -35,10 +35,6 @@ intersphinx_mapping: dict[str, tuple[str, str | None]] = {}
 
 
 _ARRAY_TYPE = re.compile(r"~numpy\.ndarray\[.*?~numpy\.dtype\[[^]]*\]\]")
-_MESSAGES = {
-    name: re.compile(rf"~drivers\.protocol\.messages\.{first} \|.*?\.{last}\b")
-    for name, first, last in (("Request", "Hello", "LoadEnvelope"), ("Reply", "Identity", "Nak"))
-}
 _LONG_ARRAY = re.compile(r"array\(\[([^,]+),.+?, *([^,]+)\]\)")
 
 
@@ -59,10 +55,7 @@ def _shorten(
 
 def _named(text: str) -> str:
     """Types that are long by the names they go by."""
-    text = _ARRAY_TYPE.sub("ndarray", text)
-    for name, pattern in _MESSAGES.items():
-        text = pattern.sub(name, text)
-    return text
+    return _ARRAY_TYPE.sub("ndarray", text)
 
 
 def setup(app: Sphinx) -> None:

@@ -12,8 +12,7 @@ from collections.abc import Callable
 from controller.api.connection import Connection
 
 MAX_CONNECTIONS = 32  # for all methods
-RESERVE = 8  # further ones, for RESERVE_METHODS alone
-RESERVE_METHODS = frozenset({"hello", "status", "stop", "disarm"})
+RESERVE = 8  # further ones, for the methods in reserve alone
 IDLE_TIMEOUT = 1.0  # s; without a request, after which a client may be evicted
 SILENT_TIMEOUT = 0.1  # s; the same for one that has sent nothing yet
 

@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from controller.api.channel import Channel
@@ -25,25 +24,18 @@ from controller.api.client_protocol import (
     as_position,
     make_params,
     read_result,
-    touch_params,
+    touches_at,
 )
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import (
-    ArmParams,
+    METHODS,
     ArmResult,
-    DisarmParams,
     EffectsResult,
-    HelloParams,
     HelloResult,
-    PlayParams,
     PlayResult,
-    RenewParams,
     RenewResult,
-    RequestedBy,
     StatusResult,
     StopResult,
-    SubscribeParams,
-    UnsubscribeParams,
 )
 from controller.api.schema import Empty, Message, Topic
 from controller.api.socket_path import find_socket
@@ -54,7 +46,6 @@ _MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.05, 0.5  # s
 _REPEATED_FOR = 0.3  # s; requests whose connection is lost, as by a daemon with many clients
 _MIN_PAUSE, _MAX_PAUSE = 0.001, 0.02  # s
 _RENEWAL_INTERVAL = 0.25  # s; within it a lost lease is noticed, however long it was
-_NOT_REPEATED = ("arm", "play", "clear")  # a request that was lost may have been carried out
 
 _T = TypeVar("_T")
 _ResultT = TypeVar("_ResultT", bound=Message)
@@ -103,12 +94,7 @@ class AsyncClient:
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.close()
 
     async def close(self) -> None:
@@ -123,26 +109,25 @@ class AsyncClient:
 
     async def hello(self, client: str) -> HelloResult:
         """Introduce this client by another name; return what the daemon drives."""
-        params = make_params(HelloParams, client=client)
+        result = await self._call(HelloResult, "hello", client=client)
         self._name = client
-        return await self.call("hello", params, HelloResult)
+        return result
 
     async def status(self) -> StatusResult:
         """Return the state of the daemon, the amplifiers and the plate."""
-        return await self.call("status", Empty(), StatusResult)
+        return await self._call(StatusResult, "status")
 
     async def arm(self, owner: str, *, lease_s: float = DEFAULT_LEASE) -> ArmResult:
         """Switch high voltage on until the lease expires; `armed` renews it by itself."""
-        params = make_params(ArmParams, owner=owner, lease_s=lease_s)
-        return await self.call("arm", params, ArmResult)
+        return await self._call(ArmResult, "arm", owner=owner, lease_s=lease_s)
 
     async def renew(self, lease: str) -> RenewResult:
         """Extend the lease by its full length from now."""
-        return await self.call("renew", make_params(RenewParams, lease=lease), RenewResult)
+        return await self._call(RenewResult, "renew", lease=lease)
 
     async def disarm(self) -> None:
         """Ramp to silence and switch high voltage off."""
-        await self.call("disarm", DisarmParams(lease=None), Empty)
+        await self._call(Empty, "disarm")
         self._release()
 
     async def stop(self) -> StopResult:
@@ -151,45 +136,45 @@ class AsyncClient:
         Raises NotSilent unless every amplifier is confirmed silent.
         """
         self._release()
-        return await self.call("stop", RequestedBy(), StopResult)
+        return await self._call(StopResult, "stop")
 
     async def clear(self) -> None:
         """Acknowledge a stop, or a fault whose cause is gone."""
-        await self.call("clear", RequestedBy(), Empty)
+        await self._call(Empty, "clear")
 
     async def forget(self) -> None:
         """Discard what was learned of the plate; answers are those of the table as built."""
-        await self.call("forget", RequestedBy(), Empty)
+        await self._call(Empty, "forget")
 
     async def touch(
         self, positions: Sequence[tuple[float, float]], *, source: str = "python"
     ) -> None:
         """Report all fingers of a source, at x, y [m]; valid for 150 ms, so repeat it."""
-        await self.call("touch", touch_params(positions, source), Empty)
+        await self._call(Empty, "touch", source=source, touches=touches_at(positions))
 
     async def effects(self) -> EffectsResult:
         """List the effects."""
-        return await self.call("effects", Empty(), EffectsResult)
+        return await self._call(EffectsResult, "effects")
 
     async def play(
         self, effect: str, position: tuple[float, float], *, level_db_sl: float | None = None
     ) -> PlayResult:
         """Play an effect at the finger nearest to x, y [m]; say whether it is held back."""
         x, y = as_position(position)
-        params = make_params(PlayParams, effect=effect, x_m=x, y_m=y, level_db_sl=level_db_sl)
-        return await self.call("play", params, PlayResult)
+        return await self._call(
+            PlayResult, "play", effect=effect, x_m=x, y_m=y, level_db_sl=level_db_sl
+        )
 
     async def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
         """Receive notifications of topics; see `events`."""
-        params = make_params(SubscribeParams, topics=list(topics), rate_hz=rate_hz)
-        await self.call("subscribe", params, Empty)
+        await self._call(Empty, "subscribe", topics=list(topics), rate_hz=rate_hz)
         for topic in topics:
             self._rates.pop(topic, None)
             self._rates[topic] = rate_hz
 
     async def unsubscribe(self, *topics: Topic) -> None:
         """Receive no more notifications of topics."""
-        await self.call("unsubscribe", make_params(UnsubscribeParams, topics=list(topics)), Empty)
+        await self._call(Empty, "unsubscribe", topics=list(topics))
         for topic in topics:
             self._rates.pop(topic, None)
 
@@ -261,23 +246,24 @@ class AsyncClient:
 
     async def call(self, method: str, params: Message, result: type[_ResultT]) -> _ResultT:
         """Call any method and return its result."""
-        return read_result(await self.request(method, params), result)
-
-    async def request(self, method: str, params: Message) -> Any:
-        """Call any method and return its result as parsed JSON."""
         if self._lease_lost is not None and method not in ("stop", "disarm"):
             raise self._lease_lost.with_traceback(None)
-        return await self._within_timeout(self._send(method, params))
+        found = await self._within_timeout(self._send(method, params))
+        return read_result(found, result)
+
+    async def _call(self, result: type[_ResultT], method: str, **values: object) -> _ResultT:
+        """Call a method with these parameters."""
+        return await self.call(method, make_params(method, **values), result)
 
     async def _send(self, method: str, params: Message) -> Any:
         """Send a request, again over new connections if that is harmless."""
-        if method in _NOT_REPEATED:
-            channel = await self._repeated(self._connected)
-            return await channel.request(method, params)
 
         async def attempt() -> Any:
             return await (await self._connected()).request(method, params)
 
+        if method in METHODS and not METHODS[method].is_repeated:
+            channel = await self._repeated(self._connected)
+            return await channel.request(method, params)
         return await self._repeated(attempt)
 
     async def _repeated(self, attempt: Callable[[], Awaitable[_T]]) -> _T:
@@ -313,7 +299,7 @@ class AsyncClient:
                 try:
                     for rate in dict.fromkeys(self._rates.values()):
                         topics = [topic for topic, each in self._rates.items() if each == rate]
-                        params = SubscribeParams(topics=topics, rate_hz=rate)
+                        params = make_params("subscribe", topics=topics, rate_hz=rate)
                         await channel.request("subscribe", params)
                 except BaseException:
                     channel.close()
@@ -346,13 +332,12 @@ class AsyncClient:
             self._renewing = None
 
     async def _disarm(self, lease: str) -> None:
-        params = DisarmParams(lease=lease)
-        await self._within_timeout(self._send("disarm", params))
+        await self._within_timeout(self._send("disarm", make_params("disarm", lease=lease)))
 
     async def _keep_renewing(self, lease: ArmResult) -> None:
         """Renew a lease until it is lost, over a new connection if need be."""
         loop = asyncio.get_running_loop()
-        params = RenewParams(lease=lease.lease)
+        params = make_params("renew", lease=lease.lease)
         expires_at = loop.time() + lease.lease_s
         pause = _RENEWAL_INTERVAL
         reason: RpcError | Unreachable | None = None

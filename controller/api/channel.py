@@ -2,20 +2,19 @@
 
 import asyncio
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Self, cast
 
 from controller.api.client_protocol import (
     Notification,
-    Response,
     Unreachable,
     check_version,
     make_params,
     read_line,
+    result_of,
 )
 from controller.api.jsonrpc import request_line
-from controller.api.methods import HelloParams
 from controller.api.peer import check_peer
 from controller.api.schema import Message
 
@@ -55,7 +54,7 @@ class Channel(asyncio.Protocol):
         on_lost: Callable[[], object],
     ) -> Self:
         """Connect, check the peer, and introduce this client; raises RpcError and Unreachable."""
-        params = make_params(HelloParams, client=name)
+        params = make_params("hello", client=name)
         channel = cls(path, on_event=on_event, on_lost=on_lost)
         try:
             await channel._connect()
@@ -87,7 +86,7 @@ class Channel(asyncio.Protocol):
         response = self._pending[id] = asyncio.get_running_loop().create_future()
         try:
             self._transport.write(request_line(id, method, params))
-            return (await response).result()
+            return result_of(await response)
         finally:
             del self._pending[id]
 
@@ -120,10 +119,10 @@ class Channel(asyncio.Protocol):
         closed = ConnectionResetError("closed by the daemon")
         self._lose(Unreachable.at(self.path, error if isinstance(error, OSError) else closed))
 
-    def _resolve(self, response: Response) -> None:
+    def _resolve(self, response: Mapping[str, Any]) -> None:
         """Resolve the request that a response is for; without an id, all of them."""
         for id, pending in self._pending.items():
-            if response.id in (id, None) and not pending.done():
+            if response["id"] in (id, None) and not pending.done():
                 pending.set_result(response)
 
     def _lose(self, error: Unreachable) -> None:

@@ -7,13 +7,13 @@ with Client.connect() as era:
 """
 
 import asyncio
+import functools
 import threading
 import weakref
-from collections.abc import Coroutine, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 from controller.api.async_client import AsyncClient
 from controller.api.client_protocol import (
@@ -23,19 +23,22 @@ from controller.api.client_protocol import (
     Unreachable,
 )
 from controller.api.jsonrpc import RpcError
-from controller.api.methods import (
-    ArmResult,
-    EffectsResult,
-    HelloResult,
-    PlayResult,
-    RenewResult,
-    StatusResult,
-    StopResult,
-)
-from controller.api.schema import Message, Topic
+from controller.api.methods import ArmResult
 
 _T = TypeVar("_T")
-_ResultT = TypeVar("_ResultT", bound=Message)
+_P = ParamSpec("_P")
+
+
+def _blocking(
+    method: Callable[Concatenate[AsyncClient, _P], Coroutine[Any, Any, _T]],
+) -> Callable[Concatenate["Client", _P], _T]:
+    """The same method of the blocking client."""
+
+    @functools.wraps(method)
+    def call(self: "Client", /, *args: _P.args, **options: _P.kwargs) -> _T:
+        return self._run(method(self._client, *args, **options))
+
+    return call
 
 
 class Client:
@@ -70,12 +73,7 @@ class Client:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -84,62 +82,19 @@ class Client:
             self._loop.run(self._client.close())
             self._loop.close()
 
-    def hello(self, client: str) -> HelloResult:
-        """Introduce this client by another name; return what the daemon drives."""
-        return self._run(self._client.hello(client))
-
-    def status(self) -> StatusResult:
-        """Return the state of the daemon, the amplifiers and the plate."""
-        return self._run(self._client.status())
-
-    def arm(self, owner: str, *, lease_s: float = DEFAULT_LEASE) -> ArmResult:
-        """Switch high voltage on until the lease expires; `armed` renews it by itself."""
-        return self._run(self._client.arm(owner, lease_s=lease_s))
-
-    def renew(self, lease: str) -> RenewResult:
-        """Extend the lease by its full length from now."""
-        return self._run(self._client.renew(lease))
-
-    def disarm(self) -> None:
-        """Ramp to silence and switch high voltage off."""
-        self._run(self._client.disarm())
-
-    def stop(self) -> StopResult:
-        """Quick stop, latched until `clear`.
-
-        Raises NotSilent unless every amplifier is confirmed silent.
-        """
-        return self._run(self._client.stop())
-
-    def clear(self) -> None:
-        """Acknowledge a stop, or a fault whose cause is gone."""
-        self._run(self._client.clear())
-
-    def forget(self) -> None:
-        """Discard what was learned of the plate; answers are those of the table as built."""
-        self._run(self._client.forget())
-
-    def touch(self, positions: Sequence[tuple[float, float]], *, source: str = "python") -> None:
-        """Report all fingers of a source, at x, y [m]; valid for 150 ms, so repeat it."""
-        self._run(self._client.touch(positions, source=source))
-
-    def effects(self) -> EffectsResult:
-        """List the effects."""
-        return self._run(self._client.effects())
-
-    def play(
-        self, effect: str, position: tuple[float, float], *, level_db_sl: float | None = None
-    ) -> PlayResult:
-        """Play an effect at the finger nearest to x, y [m]; say whether it is held back."""
-        return self._run(self._client.play(effect, position, level_db_sl=level_db_sl))
-
-    def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
-        """Receive notifications of topics; see `events`."""
-        self._run(self._client.subscribe(*topics, rate_hz=rate_hz))
-
-    def unsubscribe(self, *topics: Topic) -> None:
-        """Receive no more notifications of topics."""
-        self._run(self._client.unsubscribe(*topics))
+    hello = _blocking(AsyncClient.hello)
+    status = _blocking(AsyncClient.status)
+    arm = _blocking(AsyncClient.arm)
+    renew = _blocking(AsyncClient.renew)
+    disarm = _blocking(AsyncClient.disarm)
+    stop = _blocking(AsyncClient.stop)
+    clear = _blocking(AsyncClient.clear)
+    forget = _blocking(AsyncClient.forget)
+    touch = _blocking(AsyncClient.touch)
+    effects = _blocking(AsyncClient.effects)
+    play = _blocking(AsyncClient.play)
+    subscribe = _blocking(AsyncClient.subscribe)
+    unsubscribe = _blocking(AsyncClient.unsubscribe)
 
     @contextmanager
     def armed(self, owner: str, *, lease_s: float = DEFAULT_LEASE) -> Iterator[ArmResult]:
@@ -161,9 +116,7 @@ class Client:
         while (event := self._run(self._client.next_event(timeout=timeout))) is not None:
             yield event
 
-    def call(self, method: str, params: Message, result: type[_ResultT]) -> _ResultT:
-        """Call any method and return its result."""
-        return self._run(self._client.call(method, params, result))
+    call = _blocking(AsyncClient.call)
 
     def _run(self, work: Coroutine[Any, Any, _T]) -> _T:
         if not self._loop.is_open:
@@ -205,11 +158,7 @@ class _LoopThread:
 
 def _run_until(loop: asyncio.AbstractEventLoop, finished: asyncio.Event) -> None:
     with asyncio.Runner(loop_factory=lambda: loop) as runner:
-        runner.run(_wait(finished))
-
-
-async def _wait(finished: asyncio.Event) -> None:
-    await finished.wait()
+        runner.run(finished.wait())
 
 
 def _end(

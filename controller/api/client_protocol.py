@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 from pydantic import ValidationError
 
 from controller.api.jsonrpc import ErrorCode, RpcError, read_error
-from controller.api.methods import TouchParams
+from controller.api.methods import METHODS
 from controller.api.schema import API_VERSION, Message, TouchPoint
 from drivers.errors import LinkError
 from model.arguments import shown
@@ -70,56 +70,48 @@ class Notification:
     line: bytes = b""
 
 
-@dataclass(frozen=True)
-class Response:
-    """The response to the request of an id; id None: to a request that could not be read."""
-
-    id: int | None
-    content: Mapping[str, Any]
-
-    def result(self) -> Any:
-        """The result; raises the RpcError that the response holds instead."""
-        try:
-            if "error" not in self.content:
-                return self.content["result"]
-            error = read_error(self.content["error"])
-        except (AttributeError, KeyError, TypeError, ValueError) as problem:
-            raise _not_understood() from problem
-        raise error
-
-
-def read_line(line: bytes) -> Response | Notification:
-    """Read a line of a daemon; raises Unreachable for what is not a daemon's."""
+def read_line(line: bytes) -> Mapping[str, Any] | Notification:
+    """Read a line of a daemon, a response or an event; raises Unreachable for what is neither."""
     try:
-        content = json.loads(line)
+        content: dict[str, Any] = json.loads(line)
         if content.get("method") != "event":
-            return Response(content["id"], content)
+            content["id"]  # None: of a request that could not be read
+            return content
         params = content["params"]
         return Notification(params["topic"], params["time_s"], params["lost"], params["data"], line)
     except (ValueError, AttributeError, KeyError, TypeError) as error:
         raise _not_understood() from error
 
 
-def make_params(model: type[_MessageT], **values: object) -> _MessageT:
+def result_of(response: Mapping[str, Any]) -> Any:
+    """The result of a response; raises the RpcError that it holds instead."""
+    try:
+        if "error" not in response:
+            return response["result"]
+        error = read_error(response["error"])
+    except (AttributeError, KeyError, TypeError, ValueError) as problem:
+        raise _not_understood() from problem
+    raise error
+
+
+def make_params(method: str, **values: object) -> Message:
     """The parameters of a method; raises InputError with the key and the value that is wrong."""
     try:
-        return model(**values)
+        return METHODS[method].params(**values)
     except ValidationError as error:
-        method = model.__name__.removesuffix("Params").lower()
         key, problem = first_problem(error)
         value = error.errors()[0]["input"]
         raise InputError(f"{method}: {key} {problem}, got {shown(value)}") from None
 
 
-def touch_params(positions: Iterable[tuple[float, float]], source: str) -> TouchParams:
-    """A touch frame with fingers at x, y [m]; raises InputError."""
+def touches_at(positions: Iterable[tuple[float, float]]) -> list[TouchPoint]:
+    """Fingers at x, y [m] of a touch frame; raises InputError."""
     if not isinstance(positions, Iterable):
         raise InputError(
             f"touch: positions must be a list of x, y in metres, got {shown(positions)}"
         )
     points = [as_position(position) for position in positions]
-    touches = [TouchPoint(id=id, x_m=x, y_m=y) for id, (x, y) in enumerate(points, start=1)]
-    return make_params(TouchParams, source=source, touches=touches)
+    return [TouchPoint(id=id, x_m=x, y_m=y) for id, (x, y) in enumerate(points, start=1)]
 
 
 def as_position(position: object) -> tuple[float, float]:

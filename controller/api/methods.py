@@ -186,39 +186,78 @@ class UnsubscribeParams(Message):
 
 
 class Method(NamedTuple):
-    """Parameters, result and summary of a method."""
+    """A method of the API, and how its requests are treated.
+
+    is_limited: whether they count in a client's rate; in_reserve: whether they are served to
+    clients in reserve; needs_reply: whether they are carried out only for a client that gets the
+    reply; is_repeated: whether clients send them again if the connection is lost, after which they
+    may have been carried out; over_http: whether they need no lasting connection.
+    """
 
     params: type[Message]
     result: type[Message]
     summary: str
+    is_limited: bool = True
+    in_reserve: bool = False
+    needs_reply: bool = False
+    is_repeated: bool = True
+    over_http: bool = True
 
 
 METHODS: dict[str, Method] = {
     "hello": Method(
-        HelloParams, HelloResult, "introduce the client; returns what the daemon drives"
+        HelloParams,
+        HelloResult,
+        "introduce the client; returns what the daemon drives",
+        in_reserve=True,
     ),
-    "status": Method(Empty, StatusResult, "state of the daemon, the amplifiers and the plate"),
+    "status": Method(
+        Empty, StatusResult, "state of the daemon, the amplifiers and the plate", in_reserve=True
+    ),
     "arm": Method(
-        ArmParams, ArmResult, "switch high voltage on; touches are felt until the lease expires"
+        ArmParams,
+        ArmResult,
+        "switch high voltage on; touches are felt until the lease expires",
+        needs_reply=True,
+        is_repeated=False,
     ),
     "renew": Method(RenewParams, RenewResult, "extend the lease"),
     "disarm": Method(
-        DisarmParams, Empty, "ramp to silence and switch high voltage off; any client may"
+        DisarmParams,
+        Empty,
+        "ramp to silence and switch high voltage off; any client may",
+        in_reserve=True,
     ),
     "stop": Method(
         RequestedBy,
         StopResult,
         "quick stop, latched until clear; any client may, at any time; error 1006 unless every "
         "amplifier is confirmed silent",
+        is_limited=False,
+        in_reserve=True,
     ),
-    "clear": Method(RequestedBy, Empty, "acknowledge a stop, or a fault whose cause is gone"),
+    "clear": Method(
+        RequestedBy,
+        Empty,
+        "acknowledge a stop, or a fault whose cause is gone",
+        is_repeated=False,  # it would acknowledge a stop that came meanwhile
+    ),
     "forget": Method(
         RequestedBy, Empty, "discard what was learned of the plate; answers are those of the table"
     ),
-    "touch": Method(TouchParams, Empty, "report all fingers of a touch source of this client"),
+    "touch": Method(
+        TouchParams,
+        Empty,
+        "report all fingers of a touch source of this client",
+        is_limited=False,  # the newest frame counts, so they never queue up
+    ),
     "effects": Method(Empty, EffectsResult, "list the effects"),
-    "play": Method(PlayParams, PlayResult, "play an effect at a finger; only while armed"),
-    "subscribe": Method(SubscribeParams, Empty, "receive notifications of topics"),
-    "unsubscribe": Method(UnsubscribeParams, Empty, "receive no more notifications of topics"),
+    "play": Method(
+        PlayParams, PlayResult, "play an effect at a finger; only while armed", is_repeated=False
+    ),
+    "subscribe": Method(SubscribeParams, Empty, "receive notifications of topics", over_http=False),
+    "unsubscribe": Method(
+        UnsubscribeParams, Empty, "receive no more notifications of topics", over_http=False
+    ),
 }
-"""Every method of the API, by name."""
+"""Every method of the API, by name: the one place where a method is registered."""

@@ -9,12 +9,11 @@ import logging
 import socket
 import time
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 from controller.api.acceptor import Acceptor
-from controller.api.admission import RESERVE_METHODS, Admission
-from controller.api.coalesced_calls import CoalescedCalls
+from controller.api.admission import Admission
 from controller.api.connection import STOP, Connection
 from controller.api.jsonrpc import (
     ErrorCode,
@@ -28,7 +27,7 @@ from controller.api.jsonrpc import (
     unknown_method,
 )
 from controller.api.methods import METHODS, TouchParams
-from controller.api.schema import Message
+from controller.api.schema import Empty, Message
 from controller.api.turns import Turns
 from controller.api.waiting_touches import supersedes
 from drivers import clock
@@ -36,11 +35,9 @@ from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
 
 MAX_PENDING = 8  # requests of one client that take long; stop is not counted
+_RESERVE_METHODS = sorted(name for name, method in METHODS.items() if method.in_reserve)
 
 Handler: TypeAlias = Callable[[Connection, Any], Message | Awaitable[Message]]
-
-_UNLIMITED = frozenset({"stop", "touch"})
-"""Methods that the request rate does not limit: a stop is always served, touches never queue up."""
 
 _BUSY = RpcError(ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
 
@@ -72,6 +69,19 @@ class _Call:
         )
 
 
+def _read_call(line: bytes) -> _Call:
+    try:
+        request = read_request(line)
+        if request.method not in METHODS:
+            raise unknown_method(request.method, METHODS)
+        params = read_params(METHODS[request.method].params, request)
+    except InvalidRequest as error:
+        return _Call(error.id, True, error=error)
+    except RpcError as error:
+        return _Call(request.id, request.expects_response, error=error)
+    return _Call(request.id, request.expects_response, request.method, params)
+
+
 class ApiServer:
     """Serves the methods of the API.
 
@@ -98,7 +108,6 @@ class ApiServer:
         self._admission = Admission(
             holds_lease=holds_lease, is_subscribed=is_subscribed, clock=clock
         )
-        self._stops: dict[Connection, CoalescedCalls[Message]] = {}
         self._turns = Turns(
             self._serve_line, is_busy=is_busy, clock=clock, processor_time=processor_time
         )
@@ -130,25 +139,22 @@ class ApiServer:
 
     def _disconnected(self, connection: Connection) -> None:
         self._admission.admitted.discard(connection)
-        self._stops.pop(connection, None)
         self._on_disconnect(connection)
 
     def _serve_line(self, connection: Connection) -> None:
-        """Serve the next line of a client."""
-        call = self._next(connection)
-        if isinstance(call, _Call) and isinstance(call.params, TouchParams):
+        """Serve the next line of a client, unless it is a touch frame that the one after replaces.
+
+        That one is then read, and ahead.
+        """
+        call: _Call | None = connection.ahead or self._read(connection)
+        connection.ahead, connection.is_stop_ahead = None, False
+        if call is not None and isinstance(call.params, TouchParams):
             connection.ahead = ahead = self._read(connection)
             connection.is_stop_ahead = ahead is not None and ahead.method == "stop"
             if call.is_superseded_by(ahead):
-                call = None
+                return
         if call is not None:
             self._serve(connection, call)
-
-    def _next(self, connection: Connection) -> _Call | None:
-        """The next call of a client, or None."""
-        ahead: _Call | None = connection.ahead
-        connection.ahead, connection.is_stop_ahead = None, False
-        return ahead or self._read(connection)
 
     def _read(self, connection: Connection) -> _Call | None:
         """Read the next line, within the client's rate; refused requests count."""
@@ -160,45 +166,23 @@ class ApiServer:
             return None
         if line is None:
             return None
-        call = self._parse(connection, line)
-        if is_urgent and STOP in line and (call is None or call.method != "stop"):
+        call = _read_call(line)
+        if is_urgent and STOP in line and call.method != "stop":
             connection.note_false_alarm()
-        return call
-
-    def _parse(self, connection: Connection, line: bytes) -> _Call | None:
-        try:
-            request = read_request(line)
-        except InvalidRequest as error:
-            return self._refused(connection, _Call(error.id, True, error=error))
-        head = request.id, request.expects_response, request.method
-        try:
-            if request.method not in METHODS:
-                raise unknown_method(request.method, METHODS)
-            params = read_params(METHODS[request.method].params, request)
-        except RpcError as error:
-            return self._refused(connection, _Call(*head, error=error))
-        if request.method not in _UNLIMITED and not connection.take_request():
-            return _Call(*head, error=_BUSY)
-        return _Call(*head, params)
-
-    def _refused(self, connection: Connection, call: _Call) -> _Call | None:
-        """Count a refused request; close the connection of a client with too many."""
-        if connection.take_request():
+        is_limited = call.error is not None or METHODS[call.method].is_limited
+        if not is_limited or connection.take_request():
             return call
-        connection.refuse(_BUSY)
-        return None
+        if call.error is not None:
+            connection.refuse(_BUSY)
+            return None
+        return replace(call, params=None, error=_BUSY)
 
     def _serve(self, connection: Connection, call: _Call) -> None:
         """Serve one call, or start to."""
-        if call.error is not None:
-            self._respond_error(connection, call, call.error)
-            return
-        if call.method == "arm" and not call.expects_response:
-            return  # without a response no client has the lease to renew or end
         try:
             result = self._call(connection, call)
         except Exception as error:
-            self._respond_error(connection, call, error)
+            self._respond(connection, call, error)
             return
         if isinstance(result, Message):
             self._respond(connection, call, result)
@@ -214,38 +198,22 @@ class ApiServer:
         connection.close_if_finished()
 
     def _call(self, connection: Connection, call: _Call) -> Message | Awaitable[Message]:
-        if call.method not in RESERVE_METHODS and not self._admission.promote(connection):
+        if call.error is not None:
+            raise call.error
+        method, handle = METHODS[call.method], self._handlers[call.method]
+        if method.needs_reply and not call.expects_response:
+            return Empty()
+        if not method.in_reserve and not self._admission.promote(connection):
             raise RpcError(
                 ErrorCode.BUSY,
-                f"too many clients; only {', '.join(sorted(RESERVE_METHODS))} are served here",
+                f"too many clients; only {', '.join(_RESERVE_METHODS)} are served here",
                 remedy="try again later",
             )
-        if call.method == "stop":
-            return self._coalesced_stop(connection, call.params)
-        if len(connection.pending) >= MAX_PENDING:
+        if call.method != "stop" and len(connection.pending) >= MAX_PENDING:
             raise RpcError(ErrorCode.BUSY, "too many pending requests", remedy="await responses")
-        if call.method == "arm":
-            return self._arm(connection, call.params)
-        return self._handlers[call.method](connection, call.params)
-
-    async def _arm(self, connection: Connection, params: Message | None) -> Message:
-        """Arm for a client that has not left with the same bytes."""
-        for _ in range(2):  # iterations in which its end is received
-            await asyncio.sleep(0)
-        if connection.has_left:
-            raise RpcError(ErrorCode.LEASE, "the client has left", remedy="stay to renew the lease")
-        result = self._handlers["arm"](connection, params)
-        return result if isinstance(result, Message) else await result
-
-    def _coalesced_stop(self, connection: Connection, params: Message | None) -> Awaitable[Message]:
-        """Stop; a client's stops during one of its own share the next."""
-
-        async def stop() -> Message:
-            result = self._handlers["stop"](connection, params)
-            return result if isinstance(result, Message) else await result
-
-        calls = self._stops.setdefault(connection, CoalescedCalls())
-        return asyncio.shield(calls.request(stop))
+        if method.needs_reply:
+            return _for_one_who_stays(connection, lambda: handle(connection, call.params))
+        return handle(connection, call.params)
 
     async def _finish(
         self, connection: Connection, call: _Call, result: Awaitable[Message]
@@ -253,15 +221,27 @@ class ApiServer:
         try:
             self._respond(connection, call, await result)
         except Exception as error:
-            self._respond_error(connection, call, error)
+            self._respond(connection, call, error)
 
-    def _respond(self, connection: Connection, call: _Call, result: Message) -> None:
-        if call.expects_response:
-            connection.respond(result_line(call.id, result.model_dump_json()))
+    def _respond(self, connection: Connection, call: _Call, outcome: Message | Exception) -> None:
+        if not call.expects_response:
+            return
+        if isinstance(outcome, Message):
+            connection.respond(result_line(call.id, outcome.model_dump_json()))
+        else:
+            connection.respond(error_line(call.id, _rpc_error(outcome)))
 
-    def _respond_error(self, connection: Connection, call: _Call, error: Exception) -> None:
-        if call.expects_response:
-            connection.respond(error_line(call.id, _rpc_error(error)))
+
+async def _for_one_who_stays(
+    connection: Connection, handle: Callable[[], Message | Awaitable[Message]]
+) -> Message:
+    """Handle a request of a client that has not left with the same bytes."""
+    for _ in range(2):  # iterations in which its end is received
+        await asyncio.sleep(0)
+    if connection.has_left:
+        raise RpcError(ErrorCode.LEASE, "the client has left", remedy="stay to renew the lease")
+    result = handle()
+    return result if isinstance(result, Message) else await result
 
 
 def _rpc_error(error: Exception) -> RpcError:

@@ -8,9 +8,7 @@ from controller.api.jsonrpc import ERROR_MEANINGS, ErrorCode, ErrorData
 from controller.api.methods import METHODS, Method
 from controller.api.schema import API_VERSION, Message
 
-HTTP_METHODS = {
-    name: method for name, method in METHODS.items() if name not in ("subscribe", "unsubscribe")
-}
+HTTP_METHODS = {name: method for name, method in METHODS.items() if method.over_http}
 """Methods available over HTTP: notifications need a WebSocket."""
 
 HTTP_STATUS = {

@@ -10,6 +10,7 @@ import sys
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import era_haptics
 from page_part import insert
@@ -22,10 +23,29 @@ def signatures() -> str:
     """All functions and classes by name, as Python, with the first sentence of each docstring."""
     found = [getattr(era_haptics, name) for name in era_haptics.__all__]
     kept = [thing for thing in found if not _is_exception(thing)]
-    trees = [ast.parse(textwrap.dedent(inspect.getsource(thing))).body[0] for thing in kept]
+    trees = [_tree(thing) for thing in kept]
     trees.sort(key=lambda tree: isinstance(tree, ast.FunctionDef))
     parts = ["\n".join(_entry(tree)) for tree in trees]
     return "```python\n" + "\n\n".join(parts) + "\n```"
+
+
+def _tree(thing: Any) -> ast.stmt:
+    """The source of a function, or of a class with that of the coroutines that it wraps."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(thing))).body[0]
+    if isinstance(tree, ast.ClassDef):
+        tree.body = [_unwrapped(thing, member) for member in tree.body]
+    return tree
+
+
+def _unwrapped(kind: type, member: ast.stmt) -> ast.stmt:
+    """A member of a class; as a plain function, if it is one that wraps a coroutine function."""
+    if not isinstance(member, ast.Assign):
+        return member
+    wrapper = getattr(kind, ast.unparse(member.targets[0]))
+    if not hasattr(wrapper, "__wrapped__"):
+        return member
+    tree = _tree(wrapper.__wrapped__)
+    return ast.FunctionDef(**{name: getattr(tree, name) for name in tree._fields})
 
 
 def _is_exception(thing: object) -> bool:

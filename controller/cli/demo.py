@@ -82,10 +82,10 @@ def demo(
         raise InputError("--dashboard takes its touches from the page; omit --touches and --json")
     drawn = seed_of_plate(exact=exact, seed=seed)
     recorded = read_capture(touches or example_touches_path())
-    rig_file = rig_file or example_rig_path()
+    own_rig, rig_file = rig_file, rig_file or example_rig_path()
     rig = load_rig(rig_file)
     started = time.perf_counter()
-    table, table_file = cached_table(rig)
+    table, _ = cached_table(rig)
     if dashboard:
         from controller.cli.daemon import DASHBOARD
         from controller.demo.live import run_live
@@ -126,8 +126,10 @@ def demo(
         print(_NO_BUS)
     for file in files:
         print(f"wrote {file}")
-    if table_file is not None:
-        print(next_line("era", "table", "show", table_file))
+    if own_rig is None:
+        print(next_line("era", "config", "init", "my_rig.yaml"))
+    else:
+        print(next_line("era", "table", "build", own_rig, "-o", "table.npz"))
 
 
 _NO_BUS = (

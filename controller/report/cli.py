@@ -37,6 +37,9 @@ def report(
     from controller.report.collect import collect
     from controller.report.zip_file import write_zip
 
+    for path in configs or ():
+        if not path.exists():
+            raise InputError(f"{path}: no such file; check its name and folder")
     collected = collect(configs or [], socket=socket, home=Path.home())
     write_zip(output, collected)
     for name, text in collected.files.items():

@@ -79,6 +79,8 @@ def query(
     from model.table.query import prepared_timing, query_as_json
     from model.table.question import Question
 
+    if swap_bands and not own:
+        raise InputError("--swap-bands must be given with --own; in a batch by bands_may_swap")
     if batch is not None:
         if target or quiet or own:
             raise InputError("--target, --own and --quiet must be left out with --batch")
@@ -216,7 +218,9 @@ def _band(text: str) -> tuple[float, float]:
     try:
         return float(low), float(high or low)
     except ValueError:
-        raise InputError(f"band of --own must be LOW-HIGH in Hz, got {text!r}") from None
+        raise InputError(
+            f"band of --own must be LOW-HIGH in Hz, such as 40-120, got {text!r}"
+        ) from None
 
 
 def _place(finger: dict[str, Any]) -> str:

@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from model.arguments import expect_at_least
 from model.arrays import Float32Array, FloatArray, IntArray
 from model.choice import best_by, best_of
 from model.drive_modes import UNRESTRICTED
@@ -66,6 +67,7 @@ def answer(
     are lowered by one factor where the ERAs' stroke does not allow all; higher priorities first.
     Raises InputError for requests that contradict each other, and a band without frequencies.
     """
+    expect_at_least(apart_hz, 0.0, what="apart_hz")
     check_requests(requests, fingers, table.plate)
     return _Answering(table, tuple(requests), tuple(fingers), apart_hz, bands_may_swap).answer(
         min_contrast_db
@@ -116,8 +118,10 @@ class _Answering:
         while _worst_of(tried[-1]) < min_contrast_db and len(tried[-1][0].contents) > 1:
             plan = self._with_less(*tried[-1])
             tried.append((plan, self._measure(plan)))
+        below: tuple[str, ...] = ()
         if _worst_of(tried[-1]) < min_contrast_db:
             tried.append(best_by(tried, _worst_of))
+            below = (f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served",)
         plan, found = tried[-1]
         for number, contrast in plan.held:
             heard_there = found.quiet.get(number)
@@ -133,7 +137,7 @@ class _Answering:
             tuple(found.quiet[number] for number in quiet),
             found.worst_db,
             found.stroke_factor,
-            plan.applied + found.applied,
+            plan.applied + below + found.applied,
         )
 
     @cached_property
@@ -204,8 +208,10 @@ class _Answering:
         rows = np.flatnonzero((frequencies >= low) & (frequencies <= high))
         if len(rows) == 0:
             raise InputError(
-                f"band of {_at(request)} must hold a frequency of the table, "
-                f"{frequencies[0]:g} to {frequencies[-1]:g} Hz, got {low:g} to {high:g} Hz"
+                f"band of {_at(request)} must be LOW-HIGH in Hz and hold a frequency of the table, "
+                f"{frequencies[0]:g} to {frequencies[-1]:g} Hz, of which "
+                f"{frequencies[np.abs(frequencies - low).argmin()]:g} Hz is the nearest, got "
+                f"{low:g}-{high:g}"
             )
         return rows
 

@@ -56,6 +56,11 @@ class _Line(BaseModel):
     loads: list[float] = []
 
 
+_OF_TARGETS = {"target", "targets", "mode", "eras_at_most", "envelopes"}
+_OF_OWN = {"bands_may_swap", "apart_hz"}
+"""Keys of a line that only one of both kinds of questions has."""
+
+
 def question_from_json(line: str, defaults: Mapping[str, Any] = MappingProxyType({})) -> Question:
     """Parse the question of one line, `{"target": [x, y], "quiet": [[x, y], ...], "mode": ...}`.
 
@@ -69,9 +74,6 @@ def question_from_json(line: str, defaults: Mapping[str, Any] = MappingProxyType
 def _parsed(line: str, defaults: Mapping[str, Any]) -> _Line:
     try:
         asked = _Line.model_validate_json(line)
-        return asked.model_copy(
-            update={k: v for k, v in defaults.items() if k not in asked.model_fields_set}
-        )
     except ValidationError as error:
         key, rule = first_problem(error)
         raise InputError(
@@ -80,6 +82,11 @@ def _parsed(line: str, defaults: Mapping[str, Any]) -> _Line:
             else 'line must be a JSON object such as {"target": [0.08, 0.06], "quiet": '
             f"[[0.22, 0.16]]}}; {rule}"
         ) from None
+    given = asked.model_fields_set
+    if others := given & (_OF_TARGETS if asked.own else _OF_OWN):
+        without = "without" if asked.own else "with"
+        raise InputError(f"{', '.join(sorted(others))} must be given {without} own")
+    return asked.model_copy(update={k: v for k, v in defaults.items() if k not in given})
 
 
 def _question(asked: _Line) -> Question:
@@ -156,8 +163,6 @@ def query_as_json(
 
 def _answer_of_line(table: LocalizationTable, asked: _Line) -> dict[str, Any]:
     """Answer the requests of a line; its loads are those of the quiet fingers."""
-    if asked.target or asked.targets:
-        raise InputError("own must be given without target and targets")
     requests = []
     for each in asked.own:
         given = each.model_dump(exclude_none=True)

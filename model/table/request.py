@@ -3,7 +3,11 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 
+import numpy as np
+
+from model.arguments import expect_number, shown
 from model.config.points import in_metres
 from model.errors import InputError
 from model.finger import MAX_CONTACTS
@@ -43,6 +47,10 @@ class Request:
 
     def __post_init__(self) -> None:
         """Check everything that does not depend on the table."""
+        _check_pair(self.at, what="place of a finger", such_as="(0.08, 0.06), x and y in metres")
+        _check_pair(self.band_hz, what="band", such_as="(40, 120), lowest and highest in Hz")
+        expect_number(self.level_db_sl, what="level", unit="dB SL")
+        expect_number(self.load, what="load", unit="times the rig's fingertip")
         low, high = self.band_hz
         if not 0 <= low <= high:  # False for NaN
             raise InputError(
@@ -64,6 +72,18 @@ class Finger:
 
     at: Point
     load: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the types."""
+        _check_pair(self.at, what="place of a finger", such_as="(0.08, 0.06), x and y in metres")
+        expect_number(self.load, what="load", unit="times the rig's fingertip")
+
+
+def _check_pair(given: object, *, what: str, such_as: str) -> None:
+    """Raise InputError for anything but two numbers."""
+    pair = given if isinstance(given, Sequence | np.ndarray) else ()
+    if len(pair) != 2 or not all(isinstance(each, Real) for each in pair):
+        raise InputError(f"{what} must be two numbers such as {such_as}, got {shown(given)}")
 
 
 @dataclass(frozen=True)

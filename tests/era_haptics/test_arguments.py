@@ -45,10 +45,22 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.commands_for: {"rig": RIG, "drive": DRIVE},
     era.Drive: {"frequency": 110.0, "level": 1.0, "phase_deg": 0.0},
     era.Grid: {"nx": 4, "ny": 3},
+    era.Request: {
+        "at": TARGET, "band_hz": (40.0, 90.0), "level_db_sl": 20.0, "priority": 0, "load": 1.0,
+    },
+    era.Finger: {"at": TARGET, "load": 1.0},
 }  # fmt: skip
 """Valid arguments by function; None: a small table."""
 
-TAKES_ANYTHING = {"bands_may_swap", "title", "envelopes", "measures", "all_scales"}
+TAKES_ANYTHING = {
+    "bands_may_swap",
+    "may_share",
+    "is_protected",
+    "title",
+    "envelopes",
+    "measures",
+    "all_scales",
+}
 
 
 STRAYS = (object(), "here", 3.5, [object()])

@@ -180,6 +180,13 @@ def test_what_is_not_felt_is_null_in_json():
     json.dumps(found, allow_nan=False)
 
 
+def test_what_is_served_below_the_least_contrast_is_said():
+    """At a level that leaves a quiet finger more than 6 dB nothing is changed but said."""
+    found = answer(smooth_table(), [Request(NEAR)], [Finger(QUIET)], min_contrast_db=99)
+    assert found.promised_worst_db < 99
+    assert ["99" in each for each in found.applied] == [True]
+
+
 def test_levels_share_the_stroke_by_one_factor_and_by_priority():
     """No ERA beyond its stroke; equals lose as much, a higher priority loses nothing."""
     table = smooth_table()
@@ -316,6 +323,9 @@ def test_a_batch_holds_lines_with_contents(table_file, tmp_path):
         {"own": [own], "target": [0.09, 0.07]},
         {"own": [own], "quiet": [[0.05, 0.19]], "loads": [1, 1]},
         {"own": [own | {"loud": 1}]},
+        {"own": [own], "mode": "phased"},
+        {"target": [0.09, 0.07], "apart_hz": 10},
+        {"own": [own], "apart_hz": -1},
     ]
     batch = tmp_path / "b.jsonl"
     batch.write_text("\n".join(map(json.dumps, lines)))
@@ -326,11 +336,18 @@ def test_a_batch_holds_lines_with_contents(table_file, tmp_path):
         [14, 13], abs=1e-3
     )
     assert second["mode"] == "phased"
-    assert [each["line"] for each in errors] == [3, 4, 5]
+    assert [each["line"] for each in errors] == [3, 4, 5, 6, 7, 8]
 
 
 @pytest.mark.parametrize(
-    "options", ["--own 0.1,0.1@x", "--own 0.1,0.1 --target 0.2,0.1", "--own 0.1,0.1 --mode phased"]
+    "options",
+    [
+        "--own 0.1,0.1@x",
+        "--own 0.1,0.1@145",
+        "--own 0.1,0.1 --target 0.2,0.1",
+        "--own 0.1,0.1 --mode phased",
+        "--target 0.1,0.1 --swap-bands",
+    ],
 )
 def test_the_command_refuses_what_it_cannot_answer(table_file, options):
     """A band that is none, and options of the other form."""

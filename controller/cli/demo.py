@@ -71,7 +71,13 @@ def demo(
     import asyncio
     import time
 
-    from controller.demo.run import WIRES, example_touches_path, run_demo, write_picture
+    from controller.demo.run import (
+        WIRES,
+        example_touches_path,
+        run_demo,
+        run_live,
+        write_picture,
+    )
     from controller.sources.capture import read_capture
     from model.rig.file import example_rig_path, load_rig
     from model.table.table_cache import cached_table
@@ -82,13 +88,12 @@ def demo(
         raise InputError("--dashboard takes its touches from the page; omit --touches and --json")
     drawn = seed_of_plate(exact=exact, seed=seed)
     recorded = read_capture(touches or example_touches_path())
-    own_rig, rig_file = rig_file, rig_file or example_rig_path()
+    own_rig, rig_file = rig_file, (rig_file or example_rig_path()).absolute()
     rig = load_rig(rig_file)
     started = time.perf_counter()
     table, _ = cached_table(rig)
     if dashboard:
         from controller.cli.daemon import DASHBOARD
-        from controller.demo.live import run_live
 
         print("Open the URL below, press Arm, and touch the plate; Ctrl-C ends it.", flush=True)
         asyncio.run(run_live(rig_file, table, wire=wire, dashboard=DASHBOARD, seed=drawn))

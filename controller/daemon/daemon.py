@@ -26,8 +26,9 @@ from controller.daemon.socket_lock import SocketLock
 from controller.daemon.states import ENERGISED, DaemonState, StateMachine
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches, TouchInputs
-from controller.learning.learning import Learning, observed
+from controller.learning.learning import Learning
 from controller.loop.loop import Controller
+from controller.loop.observer import Observer
 from controller.sources.touch import TouchFrame
 from drivers import clock
 from drivers.errors import DriverError
@@ -49,9 +50,9 @@ _logger = logging.getLogger(__name__)
 class Daemon:
     """A daemon; create it within the event loop that runs it.
 
-    dashboard: HOST:PORT at which the gateway serves the page, or None. lines: makes the lines to
-    its amplifiers. watchdog [s]: of these, a longer one for simulated amplifiers on a machine that
-    is busy.
+    dashboard: HOST:PORT at which the gateway serves the page, or None. observer: of the control
+    loop. lines: makes the lines to its amplifiers. watchdog [s]: of these, a longer one for
+    simulated amplifiers on a machine that is busy.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class Daemon:
         log: LogThread,
         manager: ServiceManager,
         dashboard: str | None,
+        observer: Observer = Observer(),  # noqa: B008  frozen
         lines: Callable[[], Lines] = Lines,
         watchdog: float = WATCHDOG,
     ) -> None:
@@ -111,9 +113,7 @@ class Daemon:
             urls=config.urls,
             serial_numbers=config.section.serial_numbers,
             connected=self._connected,
-            observer=self._supervisor.observe(
-                observed(self._publisher.observer(), lambda: self._learning)
-            ),
+            observer=self._supervisor.observe(self._publisher.observer()),
             intent_source=self._layout,
             timing=timing,
             drive_mode=config.section.mode,
@@ -129,6 +129,8 @@ class Daemon:
                 changed=self._publisher.plate_changed,
                 estimated=self._publisher.learning_latencies.add,
             )
+            self._controller.observers.append(self._learning.observer)
+        self._controller.observers.append(observer)
         self._touches = ApiTouches(config.rig.plate, self._deliver)
         self._inputs = TouchInputs(self._deliver, failed=self._input_failed)
         self._api = ApiService(
@@ -184,6 +186,11 @@ class Daemon:
             await self._close(running)
         if not running.cancelled():
             running.result()
+
+    @property
+    def started(self) -> asyncio.Event:
+        """Set once it serves, and its amplifiers are open or searched for."""
+        return self._supervisor.started
 
     @property
     def learning(self) -> Learning | None:

@@ -1,4 +1,4 @@
-"""Observes the control loop and the simulated plate, and makes a row of every touch."""
+"""Observes the daemon and the simulated plate, and makes a row of every touch."""
 
 import asyncio
 import math
@@ -16,7 +16,6 @@ from controller.demo.touch_row import (
     steady_contrast_db,
 )
 from controller.loop.observer import Applied, Observer, Silenced
-from controller.loop.selection import Prediction
 from controller.sources.contacts import Change, Contact, ContactKey
 from drivers import clock
 from drivers.errors import LinkError
@@ -55,11 +54,11 @@ class _Touch:
 class _Playing:
     """A pattern from its commit to the next command [s], with its measurements.
 
-    touches: its targets; steady, onset: vibration by finger over its end and its first 100 ms.
+    steady, onset: vibration by finger over its end and its first 100 ms.
     """
 
     applied: Applied
-    touches: list[_Touch]
+    touch: _Touch
     until: float = math.inf
     steady: asyncio.Task[dict[str, FingerVibration]] | None = None
     onset: asyncio.Task[dict[str, FingerVibration]] | None = None
@@ -70,15 +69,17 @@ class _Playing:
 
 
 class TouchRecorder:
-    """Collects a row per touch: pass `observer` to the controller and await `finish` at the end.
+    """Collects a row per touch: pass `observer` to the daemon and await `finish` at the end.
 
     Times of rows count from `start`. on_row is called with each row once the touch was lifted and
-    its pattern measured.
+    its pattern measured. failure: the error of a plate that does not reply.
     """
 
     def __init__(self, plate: SimulatedPlate, *, on_row: Callable[[TouchRow], None]) -> None:
         self.rows: list[TouchRow] = []
-        self._errors: list[str] = []
+        self.failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._fault: str | None = None
+        self._is_armed = asyncio.Event()
         self._plate = plate
         self._on_row = on_row
         self._start = clock.now()
@@ -98,32 +99,39 @@ class TouchRecorder:
             contacts_changed=self._contacts_changed,
             pattern_applied=self._pattern_applied,
             silenced=self._silenced,
-            refused=self._failed,
-            link_lost=self._failed,
-            source_failed=self._failed,
         )
 
     async def all_lifted(self) -> None:
         """Wait until no finger is on the plate."""
         await self._lifted.wait()
 
-    def start(self) -> None:
-        """Set the start of the recording to now."""
+    async def start(self) -> None:
+        """Wait until the plate is armed, and set the start of the recording to then."""
+        await self._is_armed.wait()
         self._start = clock.now()
 
-    def recovered(self) -> None:
-        """Note that the amplifiers are armed again: errors so far do not abort the demonstration.
+    def armed(self) -> None:
+        """Note that the plate is armed, again after a fault."""
+        self._fault = None
+        self._is_armed.set()
 
-        The touches that they have spoiled say so.
-        """
-        self._errors.clear()
+    def failed(self, cause: str) -> None:
+        """Note that the plate is armed no longer; rows of touches that this spoils say so."""
+        self._fault = cause.partition("; ")[0]  # without its remedy
+        since = -math.inf if self._playing is None else self._playing.applied.time
+        self._end_pattern(clock.now())
+        for touch in self._touches.values():
+            if touch.contact.since > since:
+                touch.reason = self._fault
 
     async def finish(self) -> None:
-        """Wait for the rows of all lifted touches; raises LinkError with the first error."""
+        """Wait for the rows of all lifted touches; raises LinkError after a fault that lasts."""
         while self._tasks:
             await asyncio.wait(self._tasks)
-        if self._errors:
-            raise LinkError(f"demonstration aborted: {self._errors[0]}")
+        if self.failure.done():
+            self.failure.result()
+        if self._fault is not None:
+            raise LinkError(f"demonstration aborted: {self._fault}")
         self.rows.sort(key=lambda row: row.time_s)
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
@@ -131,28 +139,33 @@ class TouchRecorder:
         if change.down or change.up:
             self._changed_at = clock.now()
         for contact in change.down:
+            self._lift(contact.key)  # one that was down when the link was lost
             others = {_id(other): (other.x, other.y) for other in contacts if other != contact}
-            touch = self._touches[contact.key] = _Touch(contact, others)
-            if self._errors:
-                touch.reason = _cause(self._errors[0])
+            self._touches[contact.key] = _Touch(contact, others, reason=self._fault)
         if contacts:
             self._lifted.clear()
         else:
             self._lifted.set()
         for contact in change.up:
-            touch = self._touches.pop(contact.key)
-            touch.until = clock.now()
-            if self._playing is None or touch not in self._playing.touches:
-                self._run(self._add_row(touch))
+            self._lift(contact.key)
+
+    def _lift(self, key: ContactKey) -> None:
+        touch = self._touches.pop(key, None)
+        if touch is None:
+            return
+        touch.until = clock.now()
+        if self._playing is None or touch is not self._playing.touch:
+            self._run(self._add_row(touch))
 
     def _pattern_applied(self, applied: Applied) -> None:
         self._end_pattern(applied.time)
-        found = (self._touches.get(felt.contact.key) for felt in applied.targets)
-        self._playing = _Playing(applied, [touch for touch in found if touch is not None])
-        for touch in self._playing.touches:
-            touch.patterns.append(self._playing)
-        for touch in self._touches.values():
-            touch.reason = touch.reason or _NOT_THE_TARGET
+        for each in self._touches.values():
+            each.reason = each.reason or _NOT_THE_TARGET
+        touch = self._touches.get(_target(applied).key)
+        if touch is None:  # lifted meanwhile
+            return
+        self._playing = _Playing(applied, touch)
+        touch.patterns.append(self._playing)
         if applied.from_rest and applied.quiet:
             self._playing.onset = self._run(self._measure_onset(self._playing))
 
@@ -161,14 +174,6 @@ class TouchRecorder:
         for contact in silenced.targets:
             if touch := self._touches.get(contact.key):
                 touch.reason = silenced.reason
-
-    def _failed(self, error: str) -> None:
-        since = -math.inf if self._playing is None else self._playing.applied.time
-        self._end_pattern(clock.now())
-        self._errors.append(error)
-        for touch in self._touches.values():
-            if touch.contact.since > since:
-                touch.reason = _cause(self._errors[0])
 
     def _end_pattern(self, now: float) -> None:
         """Close the playing pattern and measure its end."""
@@ -182,9 +187,8 @@ class TouchRecorder:
         since, until = max(settled, end - STEADY_WINDOW) + MARGIN, end - MARGIN
         if since < until:
             ended.steady = self._run(self._plate.vibration(since, until))
-        for touch in ended.touches:
-            if touch.until < math.inf:
-                self._run(self._add_row(touch))
+        if ended.touch.until < math.inf:
+            self._run(self._add_row(ended.touch))
 
     async def _measure_onset(self, playing: _Playing) -> dict[str, FingerVibration]:
         """Vibration over the first 100 ms of a pattern; empty if it ended earlier."""
@@ -231,40 +235,38 @@ class TouchRecorder:
 
     def _task_done(self, task: asyncio.Task[Any]) -> None:
         self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            self._errors.append(str(error))
+        error = None if task.cancelled() else task.exception()
+        if error is not None and not self.failure.done():
+            self.failure.set_exception(error)
 
 
 async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
     """The row with the longest pattern of a touch; latency and onset are of its first one."""
     main_part = max(touch.patterns, key=lambda playing: playing.duration)
     first, applied = touch.patterns[0], main_part.applied
-    predicted = _prediction(touch, main_part)
+    predicted, pattern = applied.targets[0], applied.pattern
     vibration = await main_part.steady if main_part.steady else {}
-    target, quiet = _fingers(vibration, predicted.contact, applied)
-    onset = await first.onset if first.onset else {}
-    onset_target, onset_quiet = _fingers(onset, touch.contact, first.applied)
-    contacts = [each.contact for each in applied.targets if each is not predicted]
+    target, quiet = _fingers(vibration, applied)
+    onset_target, onset_quiet = _fingers(await first.onset if first.onset else {}, first.applied)
     return replace(
         row,
         reason=None,
-        target_id=_id(predicted.contact),
-        targets_m=[(each.x, each.y) for each in (predicted.contact, *contacts)],
+        targets_m=[(predicted.contact.x, predicted.contact.y)],
         quiet={_id(other): (other.x, other.y) for other in applied.quiet},
         drive={
             era: {"frequency_hz": each.frequency, "level": each.level, "phase_deg": each.phase}
             for era, each in applied.drive.items()
         },
-        mode=applied.pattern.drive_mode,
+        mode=pattern.drive_mode,
         shaped_onset=bool(first.applied.pattern.onset),
         latency_ms=1000 * first.applied.latency,
         played_s=main_part.duration,
         steady=main_part.duration >= STEADY_DURATION,
-        predicted_felt_contrast_db=applied.pattern.felt_contrast_db,
-        robust_felt_contrast_db=applied.pattern.robust_felt_contrast_db,
+        predicted_felt_contrast_db=pattern.felt_contrast_db,
+        robust_felt_contrast_db=pattern.robust_felt_contrast_db,
         measured_felt_contrast_db=felt_contrast_db(target, quiet) if target else None,
         predicted_contrast_db=predicted.contrast_db,
-        robust_contrast_db=applied.pattern.robust_contrast_db,
+        robust_contrast_db=pattern.robust_contrast_db,
         measured_contrast_db=steady_contrast_db(target, quiet) if target else None,
         predicted_transient_contrast_db=first.applied.transient_contrast_db,
         measured_transient_contrast_db=(
@@ -272,31 +274,25 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
         ),
         predicted_level_db_sl=predicted.level_db_sl,
         measured_level_db_sl=target.level_db_sl if target else None,
-        pattern=applied.pattern,
+        pattern=pattern,
         levels_db_sl={id: finger.level_db_sl for id, finger in vibration.items()},
     )
 
 
 def _fingers(
-    vibration: Mapping[str, FingerVibration], contact: Contact, applied: Applied
+    vibration: Mapping[str, FingerVibration], applied: Applied
 ) -> tuple[FingerVibration | None, list[FingerVibration]]:
-    """Vibration of a target and of the quiet fingers; no target unless all were measured."""
-    target = vibration.get(_id(contact))
+    """Vibration of the target and of the quiet fingers; no target unless all were measured."""
+    target = vibration.get(_id(_target(applied)))
     quiet = [vibration[_id(each)] for each in applied.quiet if _id(each) in vibration]
-    is_complete = (
-        target is not None and len(target.frequencies) and len(quiet) == len(applied.quiet)
-    )
-    return (target, quiet) if is_complete else (None, [])
+    if target is None or not len(target.frequencies) or len(quiet) < len(applied.quiet):
+        return None, []
+    return target, quiet
 
 
-def _prediction(touch: _Touch, playing: _Playing) -> Prediction:
-    """Prediction for a touch under a pattern that played for it."""
-    return next(felt for felt in playing.applied.targets if felt.contact.key == touch.contact.key)
-
-
-def _cause(error: str) -> str:
-    """What an error states, without its remedy."""
-    return error.partition("; ")[0]
+def _target(applied: Applied) -> Contact:
+    """The finger that feels a pattern: without a layout one at a time does."""
+    return applied.targets[0].contact
 
 
 def _id(contact: Contact) -> str:

@@ -1,26 +1,33 @@
-"""Runs the demonstration: far end, controller, recorded touches, rows, picture."""
+"""Runs the demonstration: a daemon over simulated amplifiers, recorded touches, rows, picture."""
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Sequence
+import json
+import socket
+import tempfile
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from controller.demo.far_end import SIM_OPTIONS, WATCHDOG, simulated_plate
+from controller.api.async_client import AsyncClient
+from controller.api.jsonrpc import RpcError
+from controller.api.schema import MAX_LEASE
+from controller.daemon.config import DaemonConfig, load_daemon_config
+from controller.daemon.daemon import Daemon
+from controller.daemon.log import LogThread, start_log
+from controller.daemon.service_manager import ServiceManager
+from controller.daemon.socket_lock import SocketLock
+from controller.daemon.states import DaemonState
+from controller.demo.far_end import SIM_OPTIONS, WATCHDOG, SimulatedPlate, simulated_plate
 from controller.demo.picture import choose_rows, touches_figure
 from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import TouchRow
-from controller.loop.loop import Controller
-from controller.loop.observer import Observer
+from controller.gateway.installed import require_gateway
 from controller.sources.capture import RecordedDatagram, replay_capture
-from controller.sources.tuio import TuioSource
-from drivers.errors import CommandRefused
-from drivers.garbage_collection import no_long_collections
-from drivers.opening import Lines
+from drivers import clock
+from drivers.errors import LinkError
 from model.figures import save_figure
-from model.rig.file import load_rig
 from model.table.table import LocalizationTable
-from model.table.timing import Timing
 
 WIRES = (*SIM_OPTIONS, "sim")
 
@@ -29,6 +36,14 @@ CONTACT_TIMEOUT = 2.0
 
 DECAY = 0.1
 """Time [s] for the plate to ring down after the last touch."""
+
+RECOVERY = 30.0
+"""Time [s] within which the daemon must be armed, also anew after a fault."""
+
+_HOST = "127.0.0.1"
+_ARMED = DaemonState.OPERATION_ENABLED
+_TIMEOUT = 60.0  # s; of a request to the daemon, on a machine that is busy
+_PAUSE = 0.05  # s; between attempts to arm
 
 
 def example_touches_path() -> Path:
@@ -47,94 +62,146 @@ async def run_demo(
     on_row: Callable[[TouchRow], None],
     seed: int | None = 0,
 ) -> list[TouchRow]:
-    """Play recorded touches into a controller, over a wire, onto a simulated plate.
+    """Play recorded touches to a daemon, over a wire, onto a simulated plate.
 
-    wire: one of WIRES; touches: of a TUIO capture; on_row: called with each row when complete;
-    seed: of the plate within the rig's uncertainty, None for the rig's own. Return all rows in
-    order of time. Raises LinkError if the far end is lost.
+    rig_file: an absolute path; wire: one of WIRES; touches: of a TUIO capture; on_row: called with
+    each row when complete; seed: of the plate within the rig's uncertainty, None for the rig's own.
+    Return all rows in order of time. Raises LinkError if the far end is lost.
     """
-    rig = load_rig(rig_file)
-    async with simulated_plate(
-        rig_file, rig.amplifiers, wire=wire, seed=seed, threshold=rig.threshold
-    ) as plate:
-        tuio = TuioSource(f"tuio:127.0.0.1:0?timeout={CONTACT_TIMEOUT:g}")
-        await tuio.open()
+    port = _free_port()
+    url = f"tuio:{_HOST}:{port}?timeout={CONTACT_TIMEOUT:g}"
+    more = {"socket": "era.sock", "touch": [{"name": "recorded", "url": url}]}
+    async with _on_simulated_plate(rig_file, more, wire=wire, seed=seed) as (config, lock, plate):
         recorder = TouchRecorder(plate, on_row=on_row)
-        refused = asyncio.Event()
-        controller = Controller(
-            rig,
+        daemon = Daemon(
+            config,
             table,
-            lines=Lines,
-            urls=plate.urls,
-            sources=[tuio],
-            observer=noting_refusals(recorder.observer, refused),
-            timing=Timing(table),
+            log=LogThread(None),  # nothing is logged: rows and causes tell it
+            manager=ServiceManager({}),
+            dashboard=None,
+            observer=recorder.observer,
             watchdog=WATCHDOG,
         )
-        await controller.open()
+        serving = asyncio.create_task(daemon.run(lock))
+        arming = asyncio.create_task(_keep_armed(daemon, config.socket, recorder))
+        playing = asyncio.create_task(_play(touches, port, recorder))
+        tasks = (serving, arming, playing, recorder.failure)
         try:
-            with no_long_collections():
-                await controller.arm()
-                running = asyncio.create_task(controller.run())
-                arming = asyncio.create_task(
-                    keep_armed(controller, refused, recovered=recorder.recovered)
-                )
-                playing = asyncio.create_task(_play(touches, tuio, recorder))
-                tasks = (running, arming, playing)
-                try:
-                    await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-                    for task in tasks:
-                        if task.done():
-                            task.result()
-                finally:
-                    for task in tasks:
-                        task.cancel()
-                    await asyncio.gather(*tasks, return_exceptions=True)
-            await recorder.finish()
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in tasks:
+                if task.done():
+                    task.result()
+            if not playing.done():  # a signal has ended the daemon
+                raise KeyboardInterrupt
         finally:
-            await controller.close()
+            arming.cancel()
+            playing.cancel()
+            daemon.shut_down("the demonstration is over")
+            await asyncio.gather(serving, arming, playing, return_exceptions=True)
     return recorder.rows
 
 
-def noting_refusals(observer: Observer, refused: asyncio.Event) -> Observer:
-    """An observer that also sets an event when an amplifier refuses something."""
-
-    def note(reason: str) -> None:
-        refused.set()
-        observer.refused(reason)
-
-    return replace(observer, refused=note)
-
-
-async def keep_armed(
-    controller: Controller, refused: asyncio.Event, *, recovered: Callable[[], None]
+async def run_live(
+    rig_file: Path,
+    table: LocalizationTable,
+    *,
+    wire: str,
+    dashboard: str,
+    seed: int | None = 0,
 ) -> None:
-    """Arm simulated amplifiers again whose watchdogs have expired while the machine stalled.
+    """Serve the dashboard of a rig over a wire until Ctrl-C; starts disarmed.
 
-    refused: set when one refuses something; recovered: called when they are armed again.
+    rig_file, wire, seed: as for `run_demo`; dashboard: HOST:PORT of the loopback. The daemon uses
+    the default socket, so that `era status` and others reach it. Raises InputError if one runs
+    already or the gateway is not installed, and LinkError.
     """
+    require_gateway()
+    log = start_log(None, level="warning")
+    try:
+        async with _on_simulated_plate(rig_file, {}, wire=wire, seed=seed) as (config, lock, _):
+            daemon = Daemon(
+                config,
+                table,
+                log=log,
+                manager=ServiceManager(),
+                dashboard=dashboard,
+                watchdog=WATCHDOG,
+            )
+            await daemon.run(lock)
+    finally:
+        log.close()
+
+
+@contextlib.asynccontextmanager
+async def _on_simulated_plate(
+    rig_file: Path, more: Mapping[str, object], *, wire: str, seed: int | None
+) -> AsyncIterator[tuple[DaemonConfig, SocketLock, SimulatedPlate]]:
+    """Configuration and socket of a daemon of a rig, and the plate that it drives.
+
+    more: keys of the daemon's file besides the rig.
+    """
+    async with contextlib.AsyncExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="era-")))
+        file = folder / "daemon.yaml"
+        file.write_text(json.dumps({"rig": str(rig_file), **more}), encoding="utf-8")
+        config = load_daemon_config(file)
+        lock = SocketLock(config.socket)
+        stack.callback(lock.release)
+        rig = config.rig
+        plate = await stack.enter_async_context(
+            simulated_plate(rig_file, rig.amplifiers, wire=wire, seed=seed, threshold=rig.threshold)
+        )
+        yield replace(config, urls=plate.urls), lock, plate
+
+
+def _free_port() -> int:
+    """A UDP port that is free now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((_HOST, 0))
+        return int(probe.getsockname()[1])
+
+
+async def _keep_armed(daemon: Daemon, path: Path, recorder: TouchRecorder) -> None:
+    """Arm a daemon at a socket, and again after every fault, as of a machine that stalled.
+
+    Raises LinkError if that takes too long.
+    """
+    await daemon.started.wait()
+    async with await AsyncClient.connect(path, name="era demo", timeout=_TIMEOUT) as era:
+        await era.subscribe("state")
+        while True:
+            lease = await _armed(era)
+            recorder.armed()
+            while (status := await era.status()).state == _ARMED:
+                await era.next_event(timeout=MAX_LEASE / 4)
+                with contextlib.suppress(RpcError):  # the lease ends with the state
+                    await era.renew(lease)
+            recorder.failed(status.cause)
+
+
+async def _armed(era: AsyncClient) -> str:
+    """Clear what is latched and arm; return the lease. Raises LinkError after `RECOVERY`."""
+    end = clock.now() + RECOVERY
     while True:
-        await refused.wait()
-        refused.clear()
-        try:
-            await controller.arm()  # changes nothing where all still are
-        except CommandRefused:
-            await controller.clear()
-            await controller.arm()
-            recovered()
+        status = await era.status()
+        if clock.now() > end:
+            raise LinkError(f"demonstration aborted: {status.cause}")
+        with contextlib.suppress(RpcError):  # the state has changed meanwhile
+            if status.state in (DaemonState.FAULT, DaemonState.QUICK_STOP_ACTIVE):
+                await era.clear()
+            if status.state == DaemonState.READY_TO_SWITCH_ON:
+                return (await era.arm("the demonstration", lease_s=MAX_LEASE)).lease
+        await asyncio.sleep(_PAUSE)
 
 
-async def _play(
-    touches: Sequence[RecordedDatagram], tuio: TuioSource, recorder: TouchRecorder
-) -> None:
-    """Play the touches and wait until the last one counts as lifted and the plate is at rest."""
-    recorder.start()
-    await replay_capture(touches, tuio.host, tuio.port)
+async def _play(touches: Sequence[RecordedDatagram], port: int, recorder: TouchRecorder) -> None:
+    """Play the touches; wait until the last one is lifted, or counts as such, and has its row."""
+    await recorder.start()
+    await replay_capture(touches, _HOST, port)
     await asyncio.sleep(DECAY)  # the last datagrams arrive
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(CONTACT_TIMEOUT):
-            await recorder.all_lifted()
+    await recorder.all_lifted()
     await asyncio.sleep(DECAY)
+    await recorder.finish()
 
 
 def write_picture(table: LocalizationTable, rows: list[TouchRow], folder: Path) -> list[Path]:

@@ -25,7 +25,7 @@ from controller.learning.learning_status import LearningState, LearningStatus
 from controller.learning.messages import Answers, Estimate, Note, Ready, Refreshed, Start
 from controller.learning.settled_readings import SettledReadings
 from controller.loop.loop import Controller
-from controller.loop.observer import Applied, Observer, Silenced
+from controller.loop.observer import Applied, Observer
 from controller.sources.contacts import Change, Contact
 from drivers import clock
 from drivers.errors import CommandError, DriverError
@@ -89,13 +89,20 @@ class Learning:
         """Process number of the estimator, if one runs."""
         return None if self._estimator is None else self._estimator.pid
 
-    def contacts_changed(self, contacts: tuple[Contact, ...]) -> None:
-        """Follow the contacts on the plate."""
+    @property
+    def observer(self) -> Observer:
+        """The callbacks for the control loop."""
+        return Observer(
+            contacts_changed=self._contacts_changed,
+            pattern_applied=self._pattern_applied,
+            silenced=lambda silenced: self.ended(),
+        )
+
+    def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         if self._readings is not None:
             self._readings.contacts_changed(contacts)
 
-    def pattern_applied(self, applied: Applied) -> None:
-        """Follow a pattern that plays."""
+    def _pattern_applied(self, applied: Applied) -> None:
         if self._readings is not None:
             self._readings.pattern_applied(applied)
 
@@ -354,29 +361,3 @@ class Learning:
         for task in ending:
             task.cancel()
         await asyncio.gather(*ending, return_exceptions=True)
-
-
-def observed(observer: Observer, learning: Callable[[], Learning | None]) -> Observer:
-    """An observer of the control loop that is called first, and then the learning, if any."""
-
-    def contacts_changed(contacts: tuple[Contact, ...], change: Change) -> None:
-        observer.contacts_changed(contacts, change)
-        if (learns := learning()) is not None:
-            learns.contacts_changed(contacts)
-
-    def pattern_applied(applied: Applied) -> None:
-        observer.pattern_applied(applied)
-        if (learns := learning()) is not None:
-            learns.pattern_applied(applied)
-
-    def silenced(silenced: Silenced) -> None:
-        observer.silenced(silenced)
-        if (learns := learning()) is not None:
-            learns.ended()
-
-    return replace(
-        observer,
-        contacts_changed=contacts_changed,
-        pattern_applied=pattern_applied,
-        silenced=silenced,
-    )

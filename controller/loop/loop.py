@@ -3,8 +3,7 @@
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import ParamSpec
+from collections.abc import Callable, Mapping
 
 from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
 from controller.loop.decision import RELEASE_RAMP, Decider, Decision
@@ -13,7 +12,7 @@ from controller.loop.observer import Observer, applied_by, silenced_by
 from controller.loop.plate_set import PlateSet
 from controller.sources.contacts import Change
 from controller.sources.reject_counter import RejectCounter
-from controller.sources.touch import TouchFrame, TouchSource
+from controller.sources.touch import TouchFrame
 from drivers import clock
 from drivers.errors import (
     CommandError,
@@ -33,7 +32,6 @@ from model.errors import InputError
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
-from registry.plugins import failure_text
 
 CLOSING_RAMP = 0.050  # s; not urgent, so longer than a release
 
@@ -41,11 +39,10 @@ CLOSING_RAMP = 0.050  # s; not urgent, so longer than a release
 IDLE_INTERVAL = 0.5
 
 _logger = logging.getLogger(__name__)
-_P = ParamSpec("_P")
 
 
 class Controller:
-    """Drives the amplifiers of a rig from touch sources: open, arm, run, close.
+    """Drives the amplifiers of a rig by touch frames: open, arm, run, close.
 
     table: for this rig; lines: makes the lines to its amplifiers, anew for each opening; urls and
     expected serial numbers by amplifier name. Starts disarmed: contacts are followed but nothing is
@@ -55,6 +52,7 @@ class Controller:
     intent_source: by default the newest contact buzzes where it is. timing: shapes the patterns of
     the table, ramps only without it. drive_mode: None for the best that the amplifiers can play.
     connected: called with all amplifiers when their lines are open. watchdog [s]: of armed ones.
+    observers: called in order.
     """
 
     def __init__(
@@ -65,8 +63,7 @@ class Controller:
         lines: Callable[[], Lines],
         urls: Mapping[str, str] | None = None,
         serial_numbers: Mapping[str, str] | None = None,
-        sources: Sequence[TouchSource] = (),
-        observer: Observer | None = None,
+        observer: Observer = Observer(),  # noqa: B008  frozen
         intent_source: IntentSource | None = None,
         timing: Timing | None = None,
         drive_mode: str | None = None,
@@ -89,8 +86,7 @@ class Controller:
         self._group = Group({}, watchdog=watchdog)
         self._missing: frozenset[str] = frozenset()
         self._known: dict[str, Amplifier] = {}
-        self._sources = sources
-        self._observer = observer or Observer()
+        self.observers = [observer]
         self._intent_source = intent_source or BuzzNewestContact()
         self._timing = timing
         self._drive_mode = drive_mode
@@ -246,22 +242,17 @@ class Controller:
     async def run(self) -> None:
         """Run the loop until `close` or cancellation; raises LinkError when an amplifier is lost.
 
-        All others are stopped first. A source that fails or ends does not end the loop.
-        While disarmed the loop sends nothing: a lost link then shows in the next request, which
-        raises, and in `group_state`; the daemon's supervisor checks both.
+        All others are stopped first. While disarmed the loop sends nothing: a lost link then shows
+        in the next request, which raises, and in `group_state`, as the daemon's supervisor checks.
         """
-        listening = [asyncio.create_task(self._listen(source)) for source in self._sources]
         try:
             while self.group_state is not GroupState.CLOSED:
                 await self.step()
-                self._report(self._observer.cycle_completed)
+                self._report(lambda each: each.cycle_completed())
                 await self._wait_for_event()
         finally:
             if self._expiry is not None:
                 self._expiry.cancel()
-            for task in listening:
-                task.cancel()
-            await asyncio.gather(*listening, return_exceptions=True)
 
     async def step(self) -> None:
         """Run the loop once: decide, send what changed, then the heartbeat if it is due."""
@@ -279,10 +270,12 @@ class Controller:
         except (Preempted, LinkDegraded):
             pass  # what plays is unknown, and decided anew
         except LinkError as error:
-            self._report(self._observer.link_lost, str(error))
+            lost = str(error)
+            self._report(lambda each: each.link_lost(lost))
             raise
         except DriverError as error:
-            self._report(self._observer.refused, str(error))
+            reason = str(error)
+            self._report(lambda each: each.refused(reason))
         finally:
             self._report_change(expired)
             if not self._wake.is_set():
@@ -354,7 +347,7 @@ class Controller:
             ended = self._decider.ended(now)
             if ended is not None:
                 silenced = silenced_by(ended, sent_at=None, now=now)
-                self._report(self._observer.silenced, silenced)
+                self._report(lambda each: each.silenced(silenced))
         elif decision.pattern is not None and self._group.degraded:
             self._decider.forget()  # decided again once all amplifiers reply
         else:
@@ -387,12 +380,13 @@ class Controller:
                 sent_at=sent_at,
                 timing=self._timing,
             )
-            self._report(self._observer.pattern_applied, applied)
+            self._report(lambda each: each.pattern_applied(applied))
             return
-        if decision.refusal is not None:
-            self._report(self._observer.refused, decision.refusal)
+        refusal = decision.refusal
+        if refusal is not None:
+            self._report(lambda each: each.refused(refusal))
         silenced = silenced_by(decision, sent_at=sent_at, now=clock.now())
-        self._report(self._observer.silenced, silenced)
+        self._report(lambda each: each.silenced(silenced))
 
     async def _renew(self, now: float) -> None:
         """Prolong the playback if due; raises DriverError."""
@@ -434,14 +428,6 @@ class Controller:
             if not is_known:
                 self._decider.forget()
 
-    async def _listen(self, source: TouchSource) -> None:
-        """Run a source; report one that fails, and leave its contacts to time out."""
-        try:
-            await source.run(self.deliver)
-        except Exception as error:
-            _logger.exception("touch source: failed")
-            self._report(self._observer.source_failed, failure_text(error))
-
     async def _wait_for_event(self) -> None:
         """Wait for a change, a heartbeat, the timeout of a source or the expiry of an intent."""
         if self._wake.is_set():
@@ -461,11 +447,12 @@ class Controller:
 
     def _report_change(self, change: Change) -> None:
         if change:
-            self._report(self._observer.contacts_changed, self._decider.contacts, change)
+            self._report(lambda each: each.contacts_changed(self._decider.contacts, change))
 
-    def _report(self, callback: Callable[_P, None], *args: _P.args, **kwargs: _P.kwargs) -> None:
-        """Call an observer; its exceptions are only logged."""
-        try:
-            callback(*args, **kwargs)
-        except Exception:
-            _logger.exception("loop: observer failed")
+    def _report(self, event: Callable[[Observer], None]) -> None:
+        """Report an event to all observers; their exceptions are only logged."""
+        for observer in self.observers:
+            try:
+                event(observer)
+            except Exception:
+                _logger.exception("loop: observer failed")

@@ -118,6 +118,5 @@ class Observer:
     silenced: Callable[[Silenced], None] = _ignore
     refused: Callable[[str], None] = _ignore
     link_lost: Callable[[str], None] = _ignore
-    source_failed: Callable[[str], None] = _ignore
     cycle_completed: Callable[[], None] = _ignore
     """Called after each cycle of the loop, at least once a second."""

@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer, Silenced
-from controller.sources.touch import Touch, TouchFrame, TouchSource
+from controller.sources.touch import Touch, TouchFrame
 from drivers.contents import Tone as Played
 from drivers.errors import LinkError
 from drivers.host.amplifier import Amplifier as Host
@@ -296,7 +296,6 @@ class Reports:
     silenced: list[Silenced] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
-    failed: list[str] = field(default_factory=list)
     contacts: list[int] = field(default_factory=list)
 
     def observer(self) -> Observer:
@@ -307,7 +306,6 @@ class Reports:
             silenced=self.silenced.append,
             refused=self.refused.append,
             link_lost=self.lost.append,
-            source_failed=self.failed.append,
         )
 
 
@@ -372,7 +370,6 @@ class Bench:
 
 def make_bench(
     *amplifiers: str,
-    sources: Sequence[TouchSource] = (),
     observer: Observer | None = None,
     channels: int = 2,
     far_ends: list[Any] | None = None,
@@ -395,7 +392,6 @@ def make_bench(
         rig,
         table,
         lines=lambda: BenchLines(by_name),
-        sources=sources,
         observer=observer or reports.observer(),
         **options,
     )

@@ -2,7 +2,7 @@
 
 import asyncio
 
-from controller.demo.live import run_live
+from controller.demo.run import run_live
 from model.rig.file import example_rig_path
 from small_table import small_table
 

@@ -5,9 +5,7 @@ from pathlib import Path
 import pytest
 
 from controller.demo import far_end
-from controller.demo.far_end import SimulatedPlate, simulated_plate
-from controller.demo.recorder import TouchRecorder
-from controller.plate_control import PlateControl
+from controller.demo.far_end import simulated_plate
 from drivers.errors import LinkError
 from model.rig.file import example_rig_path
 
@@ -42,13 +40,3 @@ async def test_far_end_reports_exit_status_when_rig_is_invalid(
         async with simulated_plate(rig, ["main"], wire="serial"):
             pass
     assert f"{rig}:1: plate: " in capfd.readouterr().err
-
-
-async def test_recorder_reports_first_error_at_the_end(tmp_path: Path) -> None:
-    """Of several errors the first is raised, since it usually causes the others."""
-    plate = SimulatedPlate(PlateControl(tmp_path / "missing", remedy="start it again"), {})
-    recorder = TouchRecorder(plate, on_row=lambda row: None)
-    recorder.observer.refused("no pattern was found")
-    recorder._run(plate.place_fingers({"1": (0.1, 0.1)}))
-    with pytest.raises(LinkError, match=r"no pattern was found$"):
-        await recorder.finish()

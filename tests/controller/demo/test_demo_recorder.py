@@ -1,15 +1,18 @@
-"""Why a touch of the demonstration was not played, as its row says it."""
+"""Rows of touches that were not played, and a plate that is armed again."""
 
+import asyncio
 from pathlib import Path
 
 import pytest
 
+from controller.demo import run
 from controller.demo.far_end import SimulatedPlate
 from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import TouchRow
 from controller.loop.observer import Silenced
 from controller.plate_control import PlateControl
 from controller.sources.contacts import Change, Contact, ContactKey
+from daemon_bench import ENABLED, ready_daemon, until, until_state
 from drivers import clock
 from drivers.errors import LinkError
 
@@ -27,40 +30,36 @@ def recorder_of(rows: list[TouchRow], folder: Path) -> TouchRecorder:
     return TouchRecorder(plate, on_row=rows.append)
 
 
-async def test_rows_of_an_aborted_demonstration_name_the_fault(tmp_path: Path) -> None:
-    """The touch that was down at the fault and the one that came later; not what was silenced."""
+async def test_rows_after_a_fault_name_it_until_the_plate_is_armed_again(tmp_path: Path) -> None:
+    """The touch that was down at the fault and the one that came later; no other one."""
     rows: list[TouchRow] = []
     recorder = recorder_of(rows, tmp_path)
     observer = recorder.observer
-    near, down, later = contact(1), contact(2), contact(3)
+    near, down, later, last = (contact(number) for number in range(4))
     observer.contacts_changed((near,), Change(down=(near,)))
     observer.silenced(Silenced((near,), (near,), "too close to an edge", None, clock.now()))
     observer.contacts_changed((), Change(up=(near,)))
     observer.contacts_changed((down,), Change(down=(down,)))
-    observer.refused(f"{FAULT}; once the cause is gone, clear and arm again")
+    recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
     observer.contacts_changed((), Change(up=(down,)))
     observer.contacts_changed((later,), Change(down=(later,)))
     observer.contacts_changed((), Change(up=(later,)))
-    with pytest.raises(LinkError, match=FAULT):
-        await recorder.finish()
-    assert [row.reason for row in rows] == ["too close to an edge", FAULT, FAULT]
-
-
-async def test_demonstration_that_is_armed_again_has_all_rows(tmp_path: Path) -> None:
-    """Touches before and after the fault; what was down at the fault names it."""
-    rows: list[TouchRow] = []
-    recorder = recorder_of(rows, tmp_path)
-    observer = recorder.observer
-    down, later = contact(1), contact(2)
-    observer.contacts_changed((down,), Change(down=(down,)))
-    observer.refused(f"{FAULT}; once the cause is gone, clear and arm again")
-    recorder.recovered()
-    observer.contacts_changed((), Change(up=(down,)))
-    observer.contacts_changed((later,), Change(down=(later,)))
-    observer.contacts_changed((), Change(up=(later,)))
+    recorder.armed()
+    observer.contacts_changed((last,), Change(down=(last,)))
+    observer.contacts_changed((), Change(up=(last,)))
     with pytest.raises(LinkError, match="missing"):  # the plate of this test, not the fault
         await recorder.finish()
-    assert [row.reason == FAULT for row in rows] == [True, False]
+    reasons = [row.reason for row in rows]
+    assert reasons[:3] == ["too close to an edge", FAULT, FAULT]
+    assert reasons[3] != FAULT
+
+
+async def test_recorder_raises_a_fault_that_lasts(tmp_path: Path) -> None:
+    """At the end: the demonstration is aborted, for the cause of the fault."""
+    recorder = recorder_of([], tmp_path)
+    recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
+    with pytest.raises(LinkError, match=f"aborted: {FAULT}$"):
+        await recorder.finish()
 
 
 async def test_row_of_a_finger_alone_names_no_other_finger(tmp_path: Path) -> None:
@@ -74,3 +73,21 @@ async def test_row_of_a_finger_alone_names_no_other_finger(tmp_path: Path) -> No
         await recorder.finish()
     assert rows[0].reason is not None
     assert "finger" not in rows[0].reason
+
+
+async def test_plate_is_armed_again_after_a_stop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after a fault of amplifiers that stalled: cleared, armed, and the recorder hears of it."""
+    monkeypatch.setattr(run, "RECOVERY", 5.0)
+    async with ready_daemon(tmp_path) as (bench, era):
+        recorder = recorder_of([], tmp_path)
+        arming = asyncio.create_task(run._keep_armed(bench.daemon, bench.socket, recorder))
+        await recorder.start()
+        await until_state(era, ENABLED)
+        await era.stop()
+        await until(lambda: recorder._fault is not None)
+        await until(lambda: recorder._fault is None or arming.done())
+        assert not arming.done()
+        arming.cancel()
+        await asyncio.gather(arming, return_exceptions=True)

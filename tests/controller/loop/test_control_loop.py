@@ -3,14 +3,13 @@
 import asyncio
 import logging
 import math
-from collections.abc import Callable
 from itertools import count, pairwise
 
 import pytest
 
 from controller.loop.intent import NO_CONTACTS
 from controller.loop.observer import Observer
-from controller.sources.touch import Touch, TouchFrame, TouchSource
+from controller.sources.touch import Touch, TouchFrame
 from controller_bench import FINGER, OTHER, Bench, armed, running
 from drivers.contents import Tone as Played
 from drivers.host.group import GroupState
@@ -566,29 +565,3 @@ async def test_controller_survives_a_failing_observer(caplog: pytest.LogCaptureF
         assert bench.silences() == [True, False, True]
         assert len(bench.far_end.requests("Ping")) > 3
     assert "no disk space for this row" in caplog.text
-
-
-class FailingSource(TouchSource):
-    """A touch source that fails after 10 ms with a finger down."""
-
-    async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-        """Deliver one frame, then fail."""
-        deliver(TouchFrame("weak", now(), (Touch(1, 0.5, 0.5),)))
-        await asyncio.sleep(0.01)
-        raise OSError("the panel was unplugged")
-
-
-@in_virtual_time
-async def test_controller_survives_a_failing_source(caplog: pytest.LogCaptureFixture) -> None:
-    """The failure is reported; its finger times out after 150 ms; other sources continue."""
-    async with running(sources=[FailingSource()]) as bench:
-        start = bench.far_end.sets()[-1].time
-        await asyncio.sleep(0.2)
-        assert bench.far_end.sets()[-1].time == pytest.approx(start + 0.150, abs=1e-6)
-        assert bench.reports.failed == ["OSError: the panel was unplugged"]
-        assert bench.far_end.sets()[-1].is_silent
-        assert len(bench.reports.applied) == 1
-        bench.touch(FINGER)
-        await asyncio.sleep(0.01)
-        assert len(bench.reports.applied) == 2
-    assert "the panel was unplugged" in caplog.text

@@ -46,7 +46,6 @@ class Connection(asyncio.BufferedProtocol):
         self.process = process
         self.name = "unnamed client"
         self.received_at = clock()  # s; when the last bytes arrived
-        self.has_been_read = False  # whether any bytes were
         self.has_spoken = False  # whether it has sent a complete line
         self.is_reserve = False  # whether it is in reserve
         self.excess = 0  # requests beyond the rate since its last pause
@@ -54,8 +53,8 @@ class Connection(asyncio.BufferedProtocol):
         self.reading_time = 0.0  # s; processor time of reading, not yet subtracted from a budget
         self.is_at_end = False  # whether it has closed its side
         self.pending: set[asyncio.Task[None]] = set()
+        self.is_touching = False  # whether its last touch frame has fingers
         self.ahead: Any = None
-        self.is_stop_ahead = False
         self._on_connect = on_connect
         self._on_lines = on_lines
         self._on_disconnect = on_disconnect
@@ -85,7 +84,7 @@ class Connection(asyncio.BufferedProtocol):
     def is_unread(self) -> bool:
         """Whether its first bytes have arrived and were not read."""
         connected = self._transport.get_extra_info("socket") if self._transport else None
-        if self.has_been_read or connected is None:
+        if self.has_spoken or self._input or connected is None:
             return False
         poll = select.poll()
         poll.register(connected, select.POLLIN)
@@ -103,7 +102,7 @@ class Connection(asyncio.BufferedProtocol):
     @property
     def is_urgent(self) -> bool:
         """Whether a stop is ahead, or its input may hold one."""
-        return self.is_stop_ahead or (
+        return getattr(self.ahead, "method", None) == "stop" or (
             self._stop_at >= 0 and self._clock() >= self._distrusted_until
         )
 
@@ -131,7 +130,6 @@ class Connection(asyncio.BufferedProtocol):
     def data_received(self, data: bytes | memoryview) -> None:
         """Keep it, undivided; pause reading while much waits to be served."""
         self.received_at = self._clock()
-        self.has_been_read = True
         before = len(self._input)
         self._input += data
         self._stop_at = max(self._stop_at, self._input.rfind(STOP, max(0, before - len(STOP) + 1)))

@@ -1,9 +1,4 @@
-"""Subscriptions to topics, and how often each topic is sent.
-
-`state`, `log`, `link` and `layout` are sent at every change. Of `contacts`, `pattern` and `silence`
-the newest is sent, at most 60 times per second. `amplifiers` and `latency` are sent at the rate
-that each client subscribed with.
-"""
+"""Subscriptions to topics; `TOPICS` says how often each topic is sent."""
 
 import asyncio
 import logging
@@ -12,10 +7,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from controller.api.connection import Connection
 from controller.api.jsonrpc import event_line
 from controller.api.schema import MAX_RATE, Message, Topic
+from controller.api.topics import TOPICS
 
 DEFAULT_RATE = 10.0  # Hz
-_COALESCED: frozenset[Topic] = frozenset({"contacts", "pattern", "silence"})
-_PERIODIC: frozenset[Topic] = frozenset({"amplifiers", "latency"})
 
 _logger = logging.getLogger(__name__)
 
@@ -31,8 +25,7 @@ class Hub:
     ) -> None:
         self._current = current
         self._clock = clock
-        self._topics: dict[Connection, set[Topic]] = {}
-        self._timers: dict[Connection, asyncio.TimerHandle] = {}
+        self._topics: dict[Connection, dict[Topic, asyncio.TimerHandle | None]] = {}
         self._newest: dict[Topic, Callable[[], Message | None]] = {}
         self._flush: asyncio.TimerHandle | None = None
         self._flushed_at = -1.0
@@ -41,28 +34,29 @@ class Hub:
     def subscribe(
         self, connection: Connection, topics: Iterable[Topic], *, rate: float | None = None
     ) -> None:
-        """Add topics, and send their current data; rate [Hz]: of the periodic ones."""
-        topics = set(topics)
-        self._topics.setdefault(connection, set()).update(topics)
-        for topic in sorted(topics & self._current.keys()):
-            self._send([connection], topic, self._current[topic])
-        if topics & _PERIODIC:
-            self._cancel_timer(connection)
-            self._start_timer(connection, 1 / (rate or DEFAULT_RATE))
+        """Add topics, and send their current data; rate [Hz]: of those that are periodic."""
+        new = sorted(set(topics))
+        self.unsubscribe(connection, new)
+        self._topics.setdefault(connection, {}).update(dict.fromkeys(new))
+        for topic in new:
+            if topic in self._current:
+                self._send([connection], topic, self._current[topic])
+            if TOPICS[topic].sent == "periodically":
+                self._start_timer(connection, topic, 1 / (rate or DEFAULT_RATE))
 
     def unsubscribe(self, connection: Connection, topics: Iterable[Topic]) -> None:
         """Remove topics."""
-        remaining = self._topics.get(connection, set())
-        remaining.difference_update(topics)
-        if not remaining & _PERIODIC:
-            self._cancel_timer(connection)
-        if not remaining:
+        subscribed = self._topics.get(connection, {})
+        for topic in topics:
+            timer = subscribed.pop(topic, None)
+            if timer is not None:
+                timer.cancel()
+        if not subscribed:
             self._topics.pop(connection, None)
 
     def forget(self, connection: Connection) -> None:
         """Remove a client that has disconnected."""
-        self._cancel_timer(connection)
-        self._topics.pop(connection, None)
+        self.unsubscribe(connection, [*self._topics.get(connection, ())])
 
     def is_subscribed(self, connection: Connection) -> bool:
         """Whether a client has subscribed to any topic."""
@@ -73,7 +67,7 @@ class Hub:
 
         Nothing is sent if it returns None, for outdated data.
         """
-        if topic not in _COALESCED:
+        if TOPICS[topic].sent != "newest":
             self._send(self._subscribers(topic), topic, make_data)
             return
         if not self._topics:
@@ -124,18 +118,12 @@ class Hub:
         for connection in subscribers:
             connection.notify(lambda lost: event_line(topic, time=now, lost=lost, data=data))
 
-    def _start_timer(self, connection: Connection, period: float) -> None:
-        """Send the periodic topics every period [s]."""
+    def _start_timer(self, connection: Connection, topic: Topic, period: float) -> None:
+        """Send a topic every period [s]."""
 
         def send() -> None:
-            for topic in sorted(self._topics.get(connection, set()) & _PERIODIC):
-                self._send([connection], topic, self._current[topic])
-            self._timers[connection] = loop.call_later(period, send)
+            self._send([connection], topic, self._current[topic])
+            self._start_timer(connection, topic, period)
 
         loop = asyncio.get_running_loop()
-        self._timers[connection] = loop.call_later(period, send)
-
-    def _cancel_timer(self, connection: Connection) -> None:
-        timer = self._timers.pop(connection, None)
-        if timer is not None:
-            timer.cancel()
+        self._topics[connection][topic] = loop.call_later(period, send)

@@ -12,8 +12,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
-from controller.api.acceptor import Acceptor
-from controller.api.admission import Admission
+from controller.api.admission import Acceptor, Admission
 from controller.api.connection import STOP, Connection
 from controller.api.jsonrpc import (
     ErrorCode,
@@ -109,7 +108,11 @@ class ApiServer:
             holds_lease=holds_lease, is_subscribed=is_subscribed, clock=clock
         )
         self._turns = Turns(
-            self._serve_line, is_busy=is_busy, clock=clock, processor_time=processor_time
+            self._serve_line,
+            is_first=lambda client: client.is_touching or holds_lease(client),
+            is_busy=is_busy,
+            clock=clock,
+            processor_time=processor_time,
         )
         self._acceptor: Acceptor | None = None
 
@@ -147,11 +150,11 @@ class ApiServer:
         That one is then read, and ahead.
         """
         call: _Call | None = connection.ahead or self._read(connection)
-        connection.ahead, connection.is_stop_ahead = None, False
+        connection.ahead = None
         if call is not None and isinstance(call.params, TouchParams):
-            connection.ahead = ahead = self._read(connection)
-            connection.is_stop_ahead = ahead is not None and ahead.method == "stop"
-            if call.is_superseded_by(ahead):
+            connection.is_touching = bool(call.params.touches)
+            connection.ahead = self._read(connection)
+            if call.is_superseded_by(connection.ahead):
                 return
         if call is not None:
             self._serve(connection, call)

@@ -109,19 +109,26 @@ class LayoutEvent(Message):
 
 
 class TopicData(NamedTuple):
-    """Data and summary of a topic."""
+    """A topic: its data, its summary, and when it is sent.
+
+    At every change; or the newest of several changes, at most 60 times per second; or at the rate
+    that a client has subscribed with.
+    """
 
     data: type[Message]
     summary: str
+    sent: Literal["always", "newest", "periodically"] = "always"
 
 
 TOPICS: dict[Topic, TopicData] = {
     "state": TopicData(StateEvent, "every change of state, with its cause"),
-    "contacts": TopicData(ContactsEvent, "fingers touched, moved or lifted"),
-    "pattern": TopicData(PatternEvent, "what plays now, as the amplifiers confirmed it"),
-    "silence": TopicData(SilenceEvent, "nothing plays now, and why"),
-    "amplifiers": TopicData(AmplifiersEvent, "status of the amplifiers, at rate_hz"),
-    "latency": TopicData(LatencyEvent, "latency from touch to command, at rate_hz"),
+    "contacts": TopicData(ContactsEvent, "fingers touched, moved or lifted", "newest"),
+    "pattern": TopicData(PatternEvent, "what plays now, as the amplifiers confirmed it", "newest"),
+    "silence": TopicData(SilenceEvent, "nothing plays now, and why", "newest"),
+    "amplifiers": TopicData(
+        AmplifiersEvent, "status of the amplifiers, at rate_hz", "periodically"
+    ),
+    "latency": TopicData(LatencyEvent, "latency from touch to command, at rate_hz", "periodically"),
     "log": TopicData(LogEvent, "log records from level info, without those of `state` and `link`"),
     "link": TopicData(LinkEvent, "links to amplifiers that were degraded, lost or reopened"),
     "layout": TopicData(LayoutEvent, "the surface layout was replaced"),

@@ -1,8 +1,8 @@
 """When clients of the API are served: in short turns, with what the control loop leaves.
 
-All clients together get a share of the event loop's processor time, saved up for bursts. A turn is
-short, and waits while a touch is on its way to the wire. A client whose input may hold a stop is
-served at once, within neither limit.
+A share of the event loop's processor time, saved up for bursts, is for clients that touch or hold
+the lease, another one for all other clients. A turn is short, and waits while a touch is on its way
+to the wire. A client whose input may hold a stop is served at once, within neither limit.
 """
 
 import asyncio
@@ -10,12 +10,13 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 
 from controller.api.connection import Connection
-from controller.api.rate_limit import TimeBudget
+from controller.api.rate_limit import RateLimiter
 
-MAX_TURN = 0.0001  # s, and one request; how long a touch waits for clients
-SHARE = 0.25  # of the event loop's time, for all clients together
+MAX_TURN = 0.0001  # s, and one request; how long a touch waits for clients of either share
+SHARE = 0.25  # of the event loop's time, for those that touch, and for the others together
 BURST = 0.02  # s of processor time, saved up
 MAX_DEFERRAL = 0.003  # s; of a turn by touches, which may follow each other without a gap
 _RECHECK = 0.0005  # s; of a turn that is deferred
@@ -26,89 +27,46 @@ PAUSE = 0.001  # s
 class Turns:
     """Serves waiting clients in turn, a line of each.
 
-    serve: serves one line of a client; is_busy: whether a touch is on its way to the wire;
-    clock [s]; processor_time: of this thread [s].
+    serve: serves one line of a client; is_first: whether a client touches or holds the lease;
+    is_busy: whether a touch is on its way to the wire; clock [s]; processor_time: of this thread
+    [s].
     """
 
     def __init__(
         self,
         serve: Callable[[Connection], None],
         *,
+        is_first: Callable[[Connection], bool],
         is_busy: Callable[[], bool],
         clock: Callable[[], float],
         processor_time: Callable[[], float],
     ) -> None:
         self._serve = serve
-        self._is_busy = is_busy
-        self._clock = clock
+        self._is_first = is_first
         self._processor_time = processor_time
-        self._waiting: deque[Connection] = deque()
-        self._urgent: deque[Connection] = deque()
-        self._is_turn_scheduled = self._is_urgent_turn_scheduled = False
-        self._deferred_since: float | None = None
-        self._budget = TimeBudget(SHARE, BURST, clock=clock)
+        share = partial(RateLimiter, SHARE, burst=BURST, clock=clock)
+        self._first = _Lane(self._take, share(), is_busy=is_busy, clock=clock)
+        self._others = _Lane(self._take, share(), is_busy=is_busy, clock=clock)
+        self._urgent = _Lane(self._take, self._others.budget, is_busy=None, clock=clock)
 
     def add(self, connection: Connection) -> None:
         """Serve a client that has lines."""
         if connection.is_urgent:
-            with contextlib.suppress(ValueError):
-                self._waiting.remove(connection)
-            if connection not in self._urgent:
-                self._urgent.append(connection)
-            self._schedule_urgent_turn()
-        elif not connection.is_paused and connection not in self._waiting:
-            self._waiting.append(connection)
-            self._schedule_turn()
+            for lane in (self._first, self._others):
+                with contextlib.suppress(ValueError):
+                    lane.waiting.remove(connection)
+            self._urgent.add(connection)
+        elif not connection.is_paused and not any(
+            connection in lane.waiting for lane in (self._first, self._others)
+        ):
+            (self._first if self._is_first(connection) else self._others).add(connection)
 
-    def _schedule_urgent_turn(self) -> None:
-        if self._urgent and not self._is_urgent_turn_scheduled:
-            self._is_urgent_turn_scheduled = True
-            asyncio.get_running_loop().call_soon(self._take_urgent_turn)
-
-    def _take_urgent_turn(self) -> None:
-        self._is_urgent_turn_scheduled = False
-        self._take(self._urgent)
-        self._schedule_urgent_turn()
-
-    def _schedule_turn(self, delay: float = 0.0) -> None:
-        """Schedule a turn unless one is: after a delay [s], or in the next iteration but one.
-
-        Data that arrived meanwhile and what it wakes, such as the control loop for a touch, run
-        first.
-        """
-        if not self._waiting or self._is_turn_scheduled:
-            return
-        self._is_turn_scheduled = True
-        loop = asyncio.get_running_loop()
-        if delay > 0:
-            loop.call_later(delay, self._take_turn)
-        else:
-            loop.call_soon(loop.call_soon, self._take_turn)
-
-    def _take_turn(self) -> None:
-        self._is_turn_scheduled = False
-        delay = self._delay()
-        if delay <= 0:
-            self._deferred_since = None
-            self._take(self._waiting)
-        self._schedule_turn(delay)
-
-    def _delay(self) -> float:
-        """Return the time [s] by which the turn that is due has to wait, 0 for none."""
-        if self._is_busy():
-            now = self._clock()
-            if self._deferred_since is None:
-                self._deferred_since = now
-            if now - self._deferred_since < MAX_DEFERRAL:
-                return _RECHECK
-        return self._budget.pause()
-
-    def _take(self, connections: deque[Connection]) -> None:
+    def _take(self, lane: "_Lane") -> None:
         """Serve a line of each connection, round and round, until the turn's time is up."""
         began_at, end = self._processor_time(), time.perf_counter() + MAX_TURN
         reading_time = 0.0
-        while connections:
-            connection = connections.popleft()
+        while lane.waiting:
+            connection = lane.waiting.popleft()
             self._serve(connection)
             reading_time += connection.reading_time
             connection.reading_time = 0.0
@@ -119,7 +77,7 @@ class Turns:
             connection.close_if_finished()
             if time.perf_counter() >= end:
                 break
-        self._budget.spend(self._processor_time() - began_at + reading_time)
+        lane.budget.spend(self._processor_time() - began_at + reading_time)
 
     def _pause(self, connection: Connection) -> None:
         """Serve a client that exceeds its rate a little at a time, so that it delays no one."""
@@ -131,3 +89,69 @@ class Turns:
         connection.excess = 0
         if connection.has_lines:
             self.add(connection)
+
+
+class _Lane:
+    """Clients that wait, and when their next turn is.
+
+    take: takes a turn; budget: of processor time; is_busy: None if turns wait for nothing.
+    """
+
+    def __init__(
+        self,
+        take: "Callable[[_Lane], None]",
+        budget: RateLimiter,
+        *,
+        is_busy: Callable[[], bool] | None,
+        clock: Callable[[], float],
+    ) -> None:
+        self.waiting: deque[Connection] = deque()
+        self.budget = budget
+        self._take = take
+        self._is_busy = is_busy
+        self._clock = clock
+        self._is_turn_scheduled = False
+        self._deferred_since: float | None = None
+
+    def add(self, connection: Connection) -> None:
+        """Let a client wait for its turn, unless it does."""
+        if connection not in self.waiting:
+            self.waiting.append(connection)
+        self._schedule()
+
+    def _schedule(self, delay: float = 0.0) -> None:
+        """Schedule a turn unless one is: after a delay [s], or in the next iteration but one.
+
+        Data that arrived meanwhile and what it wakes, such as the control loop for a touch, run
+        first; not before turns that wait for nothing.
+        """
+        if not self.waiting or self._is_turn_scheduled:
+            return
+        self._is_turn_scheduled = True
+        loop = asyncio.get_running_loop()
+        if self._is_busy is None:
+            loop.call_soon(self._take_turn)
+        elif delay > 0:
+            loop.call_later(delay, self._take_turn)
+        else:
+            loop.call_soon(loop.call_soon, self._take_turn)
+
+    def _take_turn(self) -> None:
+        self._is_turn_scheduled = False
+        delay = self._delay()
+        if delay <= 0:
+            self._deferred_since = None
+            self._take(self)
+        self._schedule(delay)
+
+    def _delay(self) -> float:
+        """Return the time [s] by which the turn that is due has to wait, 0 for none."""
+        if self._is_busy is None:
+            return 0.0
+        if self._is_busy():
+            now = self._clock()
+            if self._deferred_since is None:
+                self._deferred_since = now
+            if now - self._deferred_since < MAX_DEFERRAL:
+                return _RECHECK
+        return self.budget.pause()

@@ -17,6 +17,7 @@ from model.errors import InputError
 from model.structure.plate import Plate
 
 _MIN_PAUSE, _MAX_PAUSE = 1.0, 30.0  # s; before a failed source is restarted
+_CLOSE_TIMEOUT = 0.2  # s
 MAX_SOURCES_PER_CLIENT = 64  # with fingers down; a gateway forwards those of many browsers
 _SOURCE_TIMEOUT = 1.0  # s; without a frame, after which a source no longer counts
 
@@ -47,10 +48,11 @@ class TouchInputs:
         ]
 
     async def close(self) -> None:
-        """Stop all sources."""
+        """Stop all sources, without waiting for one of a plug-in that does not end."""
         for task in self._running:
             task.cancel()
-        await asyncio.gather(*self._running, return_exceptions=True)
+        if self._running:
+            await asyncio.wait(self._running, timeout=_CLOSE_TIMEOUT)
 
     async def _run(self, touch_input: TouchInput) -> None:
         def deliver(frame: TouchFrame) -> None:

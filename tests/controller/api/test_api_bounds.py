@@ -13,8 +13,7 @@ from typing import cast
 
 import pytest
 
-from controller.api.acceptor import Acceptor
-from controller.api.admission import MAX_CONNECTIONS, Admission
+from controller.api.admission import MAX_CONNECTIONS, Acceptor, Admission
 from controller.api.connection import MAX_REQUEST_RATE, MAX_UNREAD_BYTES, Connection
 from controller.api.hub import Hub
 from controller.api.methods import METHODS
@@ -225,7 +224,7 @@ def test_client_in_reserve_survives_processes_that_connect_again_and_again(
         for number in range(count):
             now += 0.0005
             one, _ = connect(lambda now=now: now, process=number % processes)
-            one.has_been_read = one.has_spoken = True
+            one.has_spoken = True
             admission.admit(one)
 
     newcomers(2000)

@@ -307,7 +307,7 @@ async def test_stop_is_served_among_silent_and_asking_clients(
     They are those of another process.
     """
     process = 1
-    monkeypatch.setattr("controller.api.acceptor.credentials_of", lambda _: (process, 0))
+    monkeypatch.setattr("controller.api.admission.credentials_of", lambda _: (process, 0))
     asking = [await served.connect() for _ in range(32)]
     for wire in asking:
         wire.call("effects")

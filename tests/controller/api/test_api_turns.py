@@ -15,12 +15,13 @@ from wire_of_memory import Wire
 
 REQUEST = b'{"jsonrpc":"2.0","method":"renew","params":{"lease":"a"}}\n'
 TOUCH = b'{"jsonrpc":"2.0","method":"touch","params":{"source":"a","touches":[]},"id":1}\n'
+TOUCH_DOWN = TOUCH.replace(b"[]", b'[{"id":1,"x_m":0.1,"y_m":0.1}]')
 LOOKALIKE = b'{"jsonrpc":"2.0","method":"renew","params":{"lease":"stop"}}\n'
 STOP = b'{"jsonrpc":"2.0","method":"stop"}\n'
 
 
 class Served:
-    """A server of one client, whose methods take a processor time [s] each; is_busy: of touches."""
+    """A server whose methods take a processor time [s] each; is_busy: of touches."""
 
     def __init__(self, *, costs: float = 0.0) -> None:
         self.is_busy = False
@@ -31,27 +32,34 @@ class Served:
         def handler(name: str) -> Callable[[Connection, Message], Message]:
             def handle(client: Connection, params: Message) -> Message:
                 self._processor_time += costs
-                self.times.setdefault(name, []).append(self._loop.time() - self.began_at)
+                self.times.setdefault(name, []).append(self.now)
                 return METHODS[name].result.model_construct()
 
             return handle
 
-        server = ApiServer(
+        self._server = ApiServer(
             {name: handler(name) for name in METHODS},
             on_disconnect=lambda client: None,
-            holds_lease=lambda client: True,
+            holds_lease=lambda client: False,
             is_subscribed=lambda client: False,
             is_busy=lambda: self.is_busy,
             clock=self._loop.time,
             processor_time=lambda: self._processor_time,
         )
         self.began_at = self._loop.time()
-        self._client = server._make_connection(1)
-        self._client.connection_made(Wire())
+        self._clients: dict[int, Connection] = {}
 
-    def receive(self, data: bytes) -> None:
-        """Receive bytes of the client."""
-        self._client.data_received(data)
+    @property
+    def now(self) -> float:
+        """Time since it began [s]."""
+        return self._loop.time() - self.began_at
+
+    def receive(self, data: bytes, *, client: int = 1) -> None:
+        """Receive bytes of a client."""
+        if client not in self._clients:
+            self._clients[client] = self._server._make_connection(client)
+            self._clients[client].connection_made(Wire())
+        self._clients[client].data_received(data)
 
 
 @in_virtual_time
@@ -66,6 +74,21 @@ async def test_clients_take_a_burst_then_a_quarter_of_the_time(
     times = served.times["touch"]
     assert sum(time == 0 for time in times) == pytest.approx(20, abs=1)
     assert len(times) == pytest.approx(20 + 250, abs=3)
+
+
+@in_virtual_time
+async def test_client_that_touches_waits_for_no_other_client() -> None:
+    """Beside 30 that ask without end, whose requests of 1 ms each take all of their own share."""
+    served = Served(costs=0.001)
+    served.receive(TOUCH_DOWN, client=0)
+    for client in range(1, 31):
+        served.receive(REQUEST * 100, client=client)
+    for number in range(1, 6):
+        await asyncio.sleep(0.1 * number - served.now)
+        served.receive(TOUCH_DOWN, client=0)
+    await asyncio.sleep(0.05)
+    assert len(served.times["renew"]) < 250
+    assert served.times["touch"] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.5], abs=0.002)
 
 
 @in_virtual_time

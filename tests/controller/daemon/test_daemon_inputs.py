@@ -1,6 +1,7 @@
 """Touch inputs of a daemon: names of their frames, failures, and clients that leave."""
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -136,6 +137,27 @@ async def test_inputs_run_beside_each_other(
     assert failed == [("right", "unplugged")]
     await inputs.close()
     assert (panels["a:"].ended, panels["c:"].ended) == (["x\x1b[2J"], ["z"])
+
+
+async def test_closing_waits_for_no_source_that_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plug-in that swallows its cancellation holds neither a reload nor the exit."""
+    release, started = asyncio.Event(), asyncio.Event()
+
+    class Stubborn(TouchSource):
+        async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
+            started.set()
+            while not release.is_set():
+                with contextlib.suppress(asyncio.CancelledError):
+                    await release.wait()
+
+    monkeypatch.setattr("controller.daemon.config.open_source", lambda url: Stubborn())
+    monkeypatch.setattr("controller.daemon.touch_inputs._CLOSE_TIMEOUT", 0.0)
+    inputs = TouchInputs(lambda frame: None, failed=lambda name, error: None)
+    inputs.start([TouchInput("left", "a:", TouchCalibration())])
+    await started.wait()
+    async with asyncio.timeout(20):
+        await inputs.close()
+    release.set()
 
 
 async def test_failed_input_is_restarted_after_growing_pauses(

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.latency.touches import FLOODING, HELD, Work, places
+from controller.effects.layout import SurfaceLayout
+from controller.effects.player import EffectPlayer
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.intent import BuzzNewestContact
 from controller.loop.routing import phasor_of, route
 from controller.loop.selection import MOVE_TOLERANCE, Selector
 from controller.sources.contacts import Contact, ContactKey
@@ -195,7 +196,7 @@ class Expected:
                 Contact(ContactKey("bench", number), x, y, since=float(number))
                 for number, (x, y) in enumerate([*self._others, place])
             ]
-            intent = BuzzNewestContact().intent(contacts, 0.0)
+            intent = EffectPlayer(SurfaceLayout()).intent(contacts, 0.0)
             pattern = Selector(self._table).select(contacts, intent, self._capabilities).pattern
             layers: Mapping[str, Layer] = {}
             if pattern is not None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
 from controller.loop.decision import RELEASE_RAMP, Decider, Decision
-from controller.loop.intent import BuzzNewestContact, IntentSource
+from controller.loop.intent import IntentSource
 from controller.loop.observer import Observer, applied_by, silenced_by
 from controller.loop.plate_set import PlateSet
 from controller.sources.contacts import Change
@@ -49,8 +49,8 @@ class Controller:
     sent. The loop sends the heartbeat itself after it has run, so that the watchdogs of the
     amplifiers trip when it hangs.
 
-    intent_source: by default the newest contact buzzes where it is. timing: shapes the patterns of
-    the table, ramps only without it. drive_mode: None for the best that the amplifiers can play.
+    intent_source: what contacts shall feel. timing: shapes the patterns of the table, ramps only
+    without it. drive_mode: None for the best that the amplifiers can play.
     connected: called with all amplifiers when their lines are open. watchdog [s]: of armed ones.
     observers: called in order.
     """
@@ -61,10 +61,10 @@ class Controller:
         table: LocalizationTable,
         *,
         lines: Callable[[], Lines],
+        intent_source: IntentSource,
         urls: Mapping[str, str] | None = None,
         serial_numbers: Mapping[str, str] | None = None,
         observer: Observer = Observer(),  # noqa: B008  frozen
-        intent_source: IntentSource | None = None,
         timing: Timing | None = None,
         drive_mode: str | None = None,
         connected: Callable[[Mapping[str, Amplifier]], None] = lambda amplifiers: None,
@@ -87,7 +87,7 @@ class Controller:
         self._missing: frozenset[str] = frozenset()
         self._known: dict[str, Amplifier] = {}
         self.observers = [observer]
-        self._intent_source = intent_source or BuzzNewestContact()
+        self._intent_source = intent_source
         self._timing = timing
         self._drive_mode = drive_mode
         self._rejects = RejectCounter(_logger)

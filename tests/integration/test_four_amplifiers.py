@@ -26,6 +26,7 @@ from model.fem.mesh import Mesh
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.vibration.excitation import Tone
+from newest_contact import BuzzNewestContact
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.wires import Wire, open_wires
@@ -116,7 +117,9 @@ async def four_amplifiers(wires: Mapping[str, Wire]) -> AsyncIterator[FourAmplif
         for number, era in enumerate(rig.eras)
     }
     async with open_wires(wires, [*devices.values()]) as urls:
-        controller = Controller(rig, table, lines=Lines, urls=urls)
+        controller = Controller(
+            rig, table, lines=Lines, intent_source=BuzzNewestContact(), urls=urls
+        )
         await controller.open()
         running = asyncio.create_task(controller.run())
         await controller.arm()

@@ -11,6 +11,7 @@ from drivers.opening import Lines
 from long_form import shortly
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
+from newest_contact import BuzzNewestContact
 from rig_on_wire import far_side
 from virtual_loop import in_virtual_time
 from wires import WIRES
@@ -29,7 +30,9 @@ async def test_motion_and_output_are_not_taken_for_each_other(
     rigs = {False: coarse_rig, True: replace(coarse_rig, outputs=frozenset(coarse_rig.amplifiers))}
     rig = rigs[of_rig]
     async with far_side(WIRES[wire], rigs[of_amplifier]) as far:
-        controller = Controller(rig, OneTable(rig.plate), lines=Lines, urls=far.urls)
+        controller = Controller(
+            rig, OneTable(rig.plate), lines=Lines, intent_source=BuzzNewestContact(), urls=far.urls
+        )
         player = TonePlayer(rig, Lines, far.urls)
         if of_amplifier is of_rig:
             await controller.open()

@@ -31,6 +31,7 @@ from model.structure.plate import Plate
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
+from newest_contact import BuzzNewestContact
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
@@ -393,7 +394,7 @@ def make_bench(
         table,
         lines=lambda: BenchLines(by_name),
         observer=observer or reports.observer(),
-        **options,
+        **{"intent_source": BuzzNewestContact(), **options},
     )
     return Bench(controller, rig, far_ends, table, reports)
 

@@ -26,6 +26,7 @@ from drivers.protocol.records import Values
 from memory_machine import live_in_memory
 from model.rig.rig import Channel, Rig
 from model.table.table import LocalizationTable
+from newest_contact import BuzzNewestContact
 from paper_plate import make_paper_rig
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
@@ -411,6 +412,7 @@ class _Run:
             self.rig,
             _table(),
             lines=Lines,
+            intent_source=BuzzNewestContact(),
             urls=self.urls,
             connected=self._connected,
             observer=Observer(

@@ -30,6 +30,7 @@ from model.structure.plate import Plate
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone
+from newest_contact import BuzzNewestContact
 from registry.limits import GuardLimits
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
@@ -305,7 +306,9 @@ async def _play(
             witness.opened(link, loop.time())
         witness.contacts(loop.time(), ())
         table = OneTable(rig.plate)
-        controller = Controller(rig, table, lines=Lines, urls=urls)
+        controller = Controller(
+            rig, table, lines=Lines, intent_source=BuzzNewestContact(), urls=urls
+        )
         chain = Chain(loop, machine, bench, witness, table, controller, links)
         async with _sensed(chain):
             await chain._try(controller.open())

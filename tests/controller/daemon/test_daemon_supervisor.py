@@ -22,6 +22,7 @@ from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import FAULTS, STATES
 from drivers.protocol.tokens import token_after
+from newest_contact import BuzzNewestContact
 from virtual_loop import in_virtual_time
 
 ENABLED = DaemonState.OPERATION_ENABLED
@@ -103,6 +104,7 @@ async def watched(*, refuses: bool = False) -> AsyncIterator[Watched]:
         bench.rig,
         bench.table,
         lines=lambda: BenchLines({"main": bench.far_end}),
+        intent_source=BuzzNewestContact(),
         connected=supervisor.connected,
         observer=supervisor.observe(
             Observer(refused=lambda reason: daemon.refusals.append(reason))

@@ -21,6 +21,7 @@ from controller.loop.loop import Controller
 from controller.loop.observer import Observer
 from controller_bench import BenchLines, FarEnd, make_bench
 from drivers.errors import DriverError
+from newest_contact import BuzzNewestContact
 from virtual_loop import in_virtual_time
 
 READY, ENABLED = DaemonState.READY_TO_SWITCH_ON, DaemonState.OPERATION_ENABLED
@@ -101,6 +102,7 @@ async def scene() -> AsyncIterator[Scene]:
         bench.rig,
         bench.table,
         lines=lambda: BenchLines({"main": bench.far_end}),
+        intent_source=BuzzNewestContact(),
         connected=supervisor.connected,
         observer=supervisor.observe(observer),
     )

@@ -24,6 +24,7 @@ from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import FAULTS, STATES
 from model.errors import InputError
 from model.vibration.excitation import Tone
+from newest_contact import BuzzNewestContact
 from virtual_loop import in_virtual_time
 
 
@@ -462,7 +463,13 @@ async def test_controller_refuses_amplifiers_that_do_not_fit_the_rig() -> None:
     """Other names, or fewer channels; nothing stays open."""
     bench = make_bench(channels=1)
     with pytest.raises(InputError, match=r"main.*other"):
-        Controller(bench.rig, bench.table, lines=lambda: BenchLines({}), urls={"other": "fake://"})
+        Controller(
+            bench.rig,
+            bench.table,
+            lines=lambda: BenchLines({}),
+            intent_source=BuzzNewestContact(),
+            urls={"other": "fake://"},
+        )
     with pytest.raises(InputError, match=r"ERA NE .*main, got 1; .*rig file"):
         await bench.controller.open()
     assert not bench.far_end.is_open

@@ -7,6 +7,7 @@ from controller_bench import BenchLines, FarEnd
 from drivers.host.group import GroupState
 from model.errors import InputError
 from model.table.timing import Timing
+from newest_contact import BuzzNewestContact
 from small_table import small_problem, small_table
 from virtual_loop import in_virtual_time
 
@@ -22,6 +23,7 @@ async def test_open_refuses_a_table_without_playable_frequencies() -> None:
         small_problem().rig,
         table,
         lines=lambda: BenchLines({"main": link}),
+        intent_source=BuzzNewestContact(),
         timing=Timing(table),
     )
     with pytest.raises(InputError, match=r"400 to 500 Hz.*60 to 250 Hz"):

@@ -40,14 +40,14 @@ class LightPress:
     pressure: float | None = None
     touch_major: float | None = None
 
-    def load(self, *, pressure: float | None, touch_major: float | None) -> float | None:
+    def load(self, *, pressure: float, touch_major: float) -> float | None:
         """Return the load of a contact with these values, not bounded; the force goes first.
 
         None without a positive value of an axis.
         """
-        if self.pressure is not None and pressure is not None and pressure > 0:
+        if self.pressure is not None and pressure > 0:
             return float((pressure / self.pressure) ** _BY_FORCE)
-        if self.touch_major is not None and touch_major is not None and touch_major > 0:
+        if self.touch_major is not None and touch_major > 0:
             return float((touch_major / self.touch_major) ** _BY_SIZE)
         return None
 

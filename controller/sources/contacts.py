@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from controller.sources.contact_load import LANDING, followed
@@ -37,8 +37,7 @@ class Contact:
     """A finger on the plate at x, y [m] from its south-west corner, down since a time [s].
 
     load: relative to the rig's fingertip, bounded and in steps (`contact_load`), 1 where nothing is
-    reported. pressure, touch_major: as in `Touch`; a contact that differs in nothing else has not
-    changed.
+    reported.
     """
 
     key: ContactKey
@@ -46,8 +45,6 @@ class Contact:
     y: float
     since: float
     load: float = 1.0
-    pressure: float | None = field(default=None, compare=False)
-    touch_major: float | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,8 +180,6 @@ class ContactTracker:
             (1 - touch.y) * self._plate.width,
             since=time if known is None else known.since,
             load=1.0 if known is None else _load(known, touch, time),
-            pressure=touch.pressure,
-            touch_major=touch.touch_major,
         )
 
     def _contact_to_evict(self, newcomer: ContactKey) -> ContactKey | None:

@@ -12,14 +12,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from controller.sources.slots import (
-    ABS_MT_DISTANCE,
     ABS_MT_POSITION_X,
     ABS_MT_POSITION_Y,
     ABS_MT_PRESSURE,
     ABS_MT_SLOT,
-    ABS_MT_TOOL_TYPE,
     ABS_MT_TOUCH_MAJOR,
-    ABS_MT_TRACKING_ID,
+    SLOT_AXES,
     Range,
     SlotState,
 )
@@ -30,10 +28,6 @@ _EVENT = struct.Struct("llHHi")  # struct input_event: time of two longs, type, 
 _AXIS = struct.Struct("6i")  # struct input_absinfo: value, minimum, maximum, fuzz, flat, resolution
 _INT = struct.Struct("i")
 _EVENTS_AT_ONCE = 64
-_SLOT_AXES = (
-    *(ABS_MT_TRACKING_ID, ABS_MT_POSITION_X, ABS_MT_POSITION_Y, ABS_MT_TOOL_TYPE),
-    *(ABS_MT_DISTANCE, ABS_MT_PRESSURE, ABS_MT_TOUCH_MAJOR),
-)  # as in SlotState
 
 
 def _request(direction: int, number: int, size: int) -> int:
@@ -87,11 +81,8 @@ class InputDevice:
             self.ranges = {
                 axis: self._range(axis) for axis in (ABS_MT_POSITION_X, ABS_MT_POSITION_Y)
             }
-            for axis in (ABS_MT_PRESSURE, ABS_MT_TOUCH_MAJOR):
-                _, low, high, _ = self._axis(axis)
-                if low < high:  # both are 0 on a panel without the axis
-                    self.ranges[axis] = (low, high)
-            self.resolutions = {axis: self._axis(axis)[3] for axis in self.ranges}
+            measured = (*self.ranges, ABS_MT_PRESSURE, ABS_MT_TOUCH_MAJOR)
+            self.resolutions = {axis: self._axis(axis)[3] for axis in measured}  # 0: no axis
             self._slot_count = self._range(ABS_MT_SLOT)[1] + 1
             if grab:
                 fcntl.ioctl(self._descriptor, GRAB, 1)
@@ -121,7 +112,7 @@ class InputDevice:
 
     def slots(self) -> dict[int, SlotState]:
         """Return the state of every slot; raises OSError if the device is unplugged."""
-        states = zip(*map(self._slot_values, _SLOT_AXES), strict=True)
+        states = zip(*map(self._slot_values, SLOT_AXES), strict=True)
         return {slot: SlotState(*state) for slot, state in enumerate(states)}
 
     def read(self) -> list[InputEvent]:

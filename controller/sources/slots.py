@@ -5,7 +5,7 @@ numbers are those of its input-event-codes.h.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 from controller.sources.contact_load import LIGHT_FORCE, LIGHT_MAJOR, LightPress
@@ -40,51 +40,34 @@ class Report:
     is_partial: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass
 class SlotState:
-    """The kernel's state of a slot; tracking_id is negative without a contact.
+    """A slot as the kernel has it: values of its axes.
 
-    Values of axes that the panel does not have are 0.
+    tracking_id: of the contact, negative without one; x, y: None until reported; tool: palms and
+    pens are no fingers; distance: above 0 while hovering. Values of axes that the panel does not
+    have are 0.
     """
 
-    tracking_id: int
-    x: int
-    y: int
+    tracking_id: int = -1
+    x: int | None = None
+    y: int | None = None
     tool: int = MT_TOOL_FINGER
     distance: int = 0
     pressure: int = 0
     touch_major: int = 0
 
 
-@dataclass
-class _Slot:
-    """The state of one slot; x and y are None until reported.
-
-    contact: id of the touch, None without a contact.
-    tool: MT_TOOL_FINGER for a finger; palms and pens are ignored. distance: above 0 while hovering,
-    ignored. pressure, touch_major: 0..1 of their ranges; values: of these axes as reported.
-    """
-
-    contact: int | None = None
-    x: float | None = None
-    y: float | None = None
-    tool: int = MT_TOOL_FINGER
-    distance: int = 0
-    pressure: float | None = None
-    touch_major: float | None = None
-    values: dict[int, int] = field(default_factory=dict)
-
-    def touch(self, light_press: LightPress) -> Touch | None:
-        """Return the touch, None unless a finger with known coordinates is on the panel."""
-        if self.contact is None or self.x is None or self.y is None:
-            return None
-        if self.tool != MT_TOOL_FINGER or self.distance > 0:
-            return None
-        load = light_press.load(
-            pressure=self.values.get(ABS_MT_PRESSURE),
-            touch_major=self.values.get(ABS_MT_TOUCH_MAJOR),
-        )
-        return Touch(self.contact, self.x, self.y, self.pressure, self.touch_major, load)
+SLOT_AXES = {
+    ABS_MT_TRACKING_ID: "tracking_id",
+    ABS_MT_POSITION_X: "x",
+    ABS_MT_POSITION_Y: "y",
+    ABS_MT_TOOL_TYPE: "tool",
+    ABS_MT_DISTANCE: "distance",
+    ABS_MT_PRESSURE: "pressure",
+    ABS_MT_TOUCH_MAJOR: "touch_major",
+}
+"""Axes of a slot and their fields in `SlotState`, in its order."""
 
 
 class SlotReader:
@@ -92,9 +75,8 @@ class SlotReader:
 
     A contact appears once both its coordinates are known. A slot keeps the coordinates of its last
     contact, since the kernel omits values that did not change. Palms, pens and what hovers are no
-    touches: a finger that becomes a palm is lifted. ranges: of the axes ABS_MT_POSITION_X and _Y,
-    and of ABS_MT_PRESSURE and ABS_MT_TOUCH_MAJOR where there are any. light_press: values of these
-    two under a finger that presses lightly.
+    touches: a finger that becomes a palm is lifted. ranges: of the axes ABS_MT_POSITION_X and _Y.
+    light_press: values of force and size under a finger that presses lightly.
     """
 
     def __init__(
@@ -105,7 +87,7 @@ class SlotReader:
     ) -> None:
         self._ranges = ranges
         self._light_press = light_press
-        self._slots: dict[int, _Slot] = {}
+        self._slots: dict[int, SlotState] = {}
         self._current = 0
         self._pending: list[tuple[Touch, ...]] = []  # intermediate states of this report
         self._changed: set[int] = set()  # slots whose contact has changed within this report
@@ -114,7 +96,7 @@ class SlotReader:
     @property
     def touches(self) -> tuple[Touch, ...]:
         """All touches, by slot."""
-        touches = (slot.touch(self._light_press) for _, slot in sorted(self._slots.items()))
+        touches = (self._touch(slot) for _, slot in sorted(self._slots.items()))
         return tuple(touch for touch in touches if touch is not None)
 
     def feed(self, kind: int, code: int, value: int) -> Report | None:
@@ -138,22 +120,7 @@ class SlotReader:
     def resynchronise(self, slots: Mapping[int, SlotState], *, current: int) -> None:
         """Replace all state by the kernel's, with the slot of the next event."""
         self._current = current
-        self._slots = {
-            number: _Slot(
-                contact=state.tracking_id if state.tracking_id >= 0 else None,
-                x=self._normalised(ABS_MT_POSITION_X, state.x),
-                y=self._normalised(ABS_MT_POSITION_Y, state.y),
-                tool=state.tool,
-                distance=state.distance,
-                pressure=self._normalised(ABS_MT_PRESSURE, state.pressure),
-                touch_major=self._normalised(ABS_MT_TOUCH_MAJOR, state.touch_major),
-                values={
-                    ABS_MT_PRESSURE: state.pressure,
-                    ABS_MT_TOUCH_MAJOR: state.touch_major,
-                },
-            )
-            for number, state in slots.items()
-        }
+        self._slots = {number: replace(state) for number, state in slots.items()}
 
     def _report(self) -> Report:
         """Complete the current report."""
@@ -165,35 +132,32 @@ class SlotReader:
 
     def _feed_axis(self, code: int, value: int) -> None:
         """Process one EV_ABS event."""
-        slot = self._slots.setdefault(self._current, _Slot())
         if code == ABS_MT_SLOT:
             if value < 0:
                 raise EventError(f"slot must not be negative, got {value}")
             self._current = value
-        elif code == ABS_MT_TRACKING_ID:
-            if self._current in self._changed and not self._dropped:
-                self._pending.append(self.touches)
-            self._changed.add(self._current)
-            slot.contact = value if value >= 0 else None
-        elif code == ABS_MT_POSITION_X:
-            slot.x = self._normalised(code, value)
-        elif code == ABS_MT_POSITION_Y:
-            slot.y = self._normalised(code, value)
-        elif code == ABS_MT_TOOL_TYPE:
-            slot.tool = value
-        elif code == ABS_MT_DISTANCE:
-            slot.distance = value
-        elif code == ABS_MT_PRESSURE:
-            slot.pressure = self._normalised(code, value)
-            slot.values[code] = value
-        elif code == ABS_MT_TOUCH_MAJOR:
-            slot.touch_major = self._normalised(code, value)
-            slot.values[code] = value
+        elif code in SLOT_AXES:
+            if code == ABS_MT_TRACKING_ID:
+                if self._current in self._changed and not self._dropped:
+                    self._pending.append(self.touches)
+                self._changed.add(self._current)
+            setattr(self._slots.setdefault(self._current, SlotState()), SLOT_AXES[code], value)
 
-    def _normalised(self, code: int, value: int) -> float | None:
-        """Return a value relative to the range of its axis, 0..1; None without a range."""
-        if code not in self._ranges:
+    def _touch(self, slot: SlotState) -> Touch | None:
+        """Return the touch in a slot, None unless a finger with known coordinates is there."""
+        if slot.tracking_id < 0 or slot.x is None or slot.y is None:
             return None
+        if slot.tool != MT_TOOL_FINGER or slot.distance > 0:
+            return None
+        return Touch(
+            slot.tracking_id,
+            self._share(ABS_MT_POSITION_X, slot.x),
+            self._share(ABS_MT_POSITION_Y, slot.y),
+            self._light_press.load(pressure=slot.pressure, touch_major=slot.touch_major),
+        )
+
+    def _share(self, code: int, value: int) -> float:
+        """Return a value relative to the range of its axis, 0..1."""
         low, high = self._ranges[code]
         return (value - low) / (high - low)
 

@@ -10,16 +10,13 @@ class Touch:
     """One finger as reported by its source.
 
     id: constant from down to up; x, y: 0..1 across the sensor from its top left corner, y downwards
-    (the convention of TUIO and most panels). Not validated: may be NaN. pressure, touch_major:
-    force and longer axis of the contact area, 0..1 of what the panel can report; load: on the plate
-    relative to the rig's fingertip, not bounded (`contact_load`); each None without.
+    (the convention of TUIO and most panels). Not validated: may be NaN. load: on the plate relative
+    to the rig's fingertip, not bounded (`contact_load`); None where nothing is reported.
     """
 
     id: int
     x: float
     y: float
-    pressure: float | None = None
-    touch_major: float | None = None
     load: float | None = None
 
 

@@ -84,19 +84,6 @@ async def test_daemon_plays_effects_by_region_and_by_name(
             assert (await era.status()).silence_reason is None
 
 
-@pytest.mark.usefixtures("resting")
-async def test_click_ends_on_wire_while_finger_rests(tmp_path: Path) -> None:
-    """The amplifier plays, then falls silent, though the contact has not changed."""
-    text = LAYOUT.replace("on_press: hum", "on_press: click")
-    (tmp_path / "layout.yaml").write_text(text, encoding="utf-8")
-    async with ready_daemon(tmp_path, "layout: layout.yaml\n") as (bench, era):
-        await era.arm("me", lease_s=60)
-        async with holding(era, ON_PAD, far=bench.far):
-            await until(lambda: not any(bench.far.summary().levels))
-            await until(lambda: bench.daemon._publisher.view.silenced)
-            assert len((await era.status()).contacts) == 1
-
-
 async def test_daemon_publishes_layouts_and_rejects_invalid_ones(tmp_path: Path) -> None:
     """Subscribers get the current one, then each replacement, as hello does from then on."""
     path = tmp_path / "layout.yaml"

@@ -8,22 +8,18 @@ import pytest
 
 from controller.loop.loop import Controller
 from controller_bench import (
-    DISARMED,
     ENABLED,
     FINGER,
     OTHER,
     STOPPED,
     BenchLines,
-    FarEnd,
     make_bench,
     running,
 )
-from drivers.errors import CommandError, CommandRefused, LinkError, Preempted
+from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.host.group import GroupState
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import FAULTS, STATES
 from model.errors import InputError
-from model.vibration.excitation import Tone
 from newest_contact import BuzzNewestContact
 from virtual_loop import in_virtual_time
 
@@ -36,13 +32,6 @@ def refusing(name: str, code: str) -> Callable[[str, Values], None]:
             raise Refusal("as told", code)
 
     return answer
-
-
-def telling(
-    far_end: FarEnd, name: str, **changed: object
-) -> Callable[[str, Values], Values | None]:
-    """An answer that reports something else in replies of a name."""
-    return lambda asked, values: {**far_end.status(), **changed} if asked == name else None
 
 
 @in_virtual_time
@@ -103,29 +92,6 @@ async def test_amplifiers_stage_before_any_commits() -> None:
         assert bench.reports.applied[-1].drive.keys() == {"SW"}
 
 
-@pytest.mark.parametrize("lie", ["Commit refused", "another token", "fault in a heartbeat"])
-@in_virtual_time
-async def test_failure_of_one_stops_all(lie: str) -> None:
-    """All are stopped and disarmed, and stay so; the failure is reported once."""
-    async with running("a", "b") as bench:
-        far_end = bench.far_ends[1]
-        far_end.answer = {
-            "Commit refused": refusing("Commit", "BAD_TOKEN"),
-            "another token": telling(far_end, "Commit", token=9999),
-            "fault in a heartbeat": telling(
-                far_end, "Ping", state=STATES["FAULT"], fault=FAULTS["ARC"]
-            ),
-        }[lie]
-        await bench.hold(FINGER, seconds=0.2)
-        assert [len(far_end.requests("Stop")) for far_end in bench.far_ends] == [1, 1]
-        assert bench.controller.group_state is GroupState.DISARMED
-        assert len(bench.reports.refused) == 1
-        assert bench.reports.applied == [] or "heartbeat" in lie
-        asked = len(bench.far_ends[0].asked)
-        await bench.hold(FINGER, OTHER, seconds=0.2)
-        assert len(bench.far_ends[0].asked) == asked
-
-
 @pytest.mark.parametrize("kind", ["Set", "Commit", "Ping"])
 @in_virtual_time
 async def test_unexpected_exception_stops_all(kind: str) -> None:
@@ -148,20 +114,6 @@ async def test_unexpected_exception_stops_all(kind: str) -> None:
 
 
 @in_virtual_time
-async def test_refusal_of_one_guard_silences_all() -> None:
-    """A set that the guard of one amplifier refuses is played by none."""
-    async with running("a", "b") as bench:
-        await bench.hold(FINGER, seconds=0.1)
-        bench.table.excitation = {"SW": Tone(110.0, 20e-6), "NE": Tone(110.0, 101e-6)}
-        await bench.hold(FINGER, OTHER, seconds=0.1)
-        for far_end in bench.far_ends:
-            assert len(far_end.requests("Commit")) == 1
-            assert far_end.sets()[-1].is_silent
-        assert bench.reports.refused[0].startswith("b: channel 1: level")
-        assert bench.controller.group_state is GroupState.ARMED
-
-
-@in_virtual_time
 async def test_stop_is_latched_until_clear() -> None:
     """Arming is refused before, even if the amplifier restarts; touches are felt after it."""
     async with running() as bench:
@@ -178,20 +130,6 @@ async def test_stop_is_latched_until_clear() -> None:
         bench.touch(FINGER)
         await asyncio.sleep(0.01)
         assert not bench.far_end.sets()[-1].is_silent
-
-
-@in_virtual_time
-async def test_stop_prevents_the_commit_of_a_staged_set() -> None:
-    """A set that was staged when the stop came is never committed, which is no error."""
-    async with running("a", "b") as bench:
-        bench.far_ends[0].delay = 0.01
-        commits = len(bench.far_ends[1].requests("Commit"))
-        bench.touch(FINGER)
-        await asyncio.sleep(0.005)
-        await bench.controller.stop()
-        await asyncio.sleep(0.1)
-        assert len(bench.far_ends[1].requests("Commit")) == commits
-        assert bench.reports.refused == []
 
 
 @pytest.mark.parametrize("silencing", ["disarm", "stop", "close"])
@@ -214,22 +152,6 @@ async def test_silencing_wins_over_arming(silencing: str) -> None:
         assert ENABLED not in bench.states()
 
 
-@in_virtual_time
-async def test_clear_is_refused_while_stopping() -> None:
-    """Nothing is sent before the stop; afterwards clearing works."""
-    bench = make_bench("a")
-    await bench.controller.open()
-    bench.far_end.delay = 0.02
-    stopping = asyncio.create_task(bench.controller.stop())
-    await asyncio.sleep(0)
-    with pytest.raises(Preempted):
-        await bench.controller.clear()
-    await stopping
-    assert bench.far_end.requests("Clear") == []
-    await bench.controller.clear()
-    assert len(bench.far_end.requests("Clear")) == 1
-
-
 @pytest.mark.parametrize("order", ["stop", "disarm"])
 @in_virtual_time
 async def test_arm_is_refused_while_silencing(order: str) -> None:
@@ -249,18 +171,6 @@ async def test_arm_is_refused_while_silencing(order: str) -> None:
     await bench.controller.arm()
     assert bench.controller.group_state is GroupState.ARMED
     await bench.controller.close()
-
-
-@in_virtual_time
-async def test_arm_disarms_all_when_one_refuses() -> None:
-    """Nothing stays armed on the others."""
-    async with running("a", "b") as bench:
-        bench.far_ends[1].answer = refusing("Arm", "WRONG_STATE")
-        await bench.controller.disarm()
-        with pytest.raises(CommandRefused):
-            await bench.controller.arm()
-        assert bench.controller.group_state is GroupState.DISARMED
-        assert bench.states() == {DISARMED}
 
 
 @in_virtual_time

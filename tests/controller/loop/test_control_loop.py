@@ -539,17 +539,6 @@ async def test_opening_again_gives_no_limit_anew() -> None:
 
 
 @in_virtual_time
-async def test_controller_rejects_a_touch_at_nan() -> None:
-    """A touch without a place on the plate sends nothing and is counted."""
-    async with running() as bench:
-        before = len(bench.far_end.sets())
-        await bench.hold((1, math.nan, 0.5), (2, 0.5, 1.2), seconds=0.1)
-        assert len(bench.far_end.sets()) == before
-        assert bench.reports.contacts == []
-        assert bench.controller.rejected_touches == {"not_finite": 2, "off_plate": 2}
-
-
-@in_virtual_time
 async def test_controller_survives_a_failing_observer(caplog: pytest.LogCaptureFixture) -> None:
     """Its exceptions are logged; pattern, silence and heartbeats are sent all the same."""
 

@@ -183,16 +183,6 @@ def test_tracker_waits_as_long_as_the_frame_states(stated: float | None, timeout
     assert tracker.next_expiry == pytest.approx(21.1)
 
 
-def test_tracker_carries_pressure_along_without_a_move() -> None:
-    """A contact has its latest pressure; a change of nothing else is no movement."""
-    tracker = ContactTracker(PLATE)
-    for pressure in (0.25, 0.5):
-        change = tracker.update(TouchFrame("a", 0.0, (Touch(1, 0.5, 0.5, pressure, 0.1),)))
-        (contact,) = tracker.contacts
-        assert (contact.pressure, contact.touch_major) == (pressure, 0.1)
-    assert not change
-
-
 def test_tracker_follows_loads_in_steps_once_a_finger_has_landed() -> None:
     """None in the first 100 ms; then only what differs by half, within 0.4 and 2.5.
 

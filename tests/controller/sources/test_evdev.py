@@ -219,26 +219,6 @@ def test_evdev_source_lifts_a_finger_that_becomes_a_palm() -> None:
     ]
 
 
-def test_evdev_source_carries_pressure_along() -> None:
-    """Pressure is relative to its axis; a panel without an axis for the size reports none."""
-    panel = PipePanel()
-    seen: list[TouchFrame] = []
-
-    async def play() -> None:
-        running = asyncio.create_task(EvdevSource("evdev:p", open_panel=opened).run(seen.append))
-        await asyncio.sleep(0)
-        os.write(panel.into, raw("id 7 x 0 y 0 pressure 51 major 9"))
-        await asyncio.sleep(0.01)
-        running.cancel()
-
-    def opened(path: str, *, grab: bool) -> PipePanel:
-        return panel
-
-    run_virtual_on_sockets(play())
-    (touch,) = seen[-1].touches
-    assert (touch.pressure, touch.touch_major) == (0.2, None)
-
-
 @pytest.mark.parametrize(
     ("options", "resolutions", "load"),
     [
@@ -360,8 +340,8 @@ def test_input_device_opens_a_panel(monkeypatch: pytest.MonkeyPatch) -> None:
     """It has the ranges of its axes, and the kernel's values of all slots."""
     kernel(monkeypatch, width=1000)
     device = InputDevice("/dev/null")
-    assert device.ranges == {0x35: (0, 1000), 0x36: (0, 1000), 0x3A: (0, 255)}
-    assert device.resolutions == {0x35: 12, 0x36: 0, 0x3A: 3}
+    assert device.ranges == {0x35: (0, 1000), 0x36: (0, 1000)}
+    assert device.resolutions == {0x35: 12, 0x36: 0, 0x3A: 3, 0x30: 0}
     assert device.slots()[2] == SlotState(
         *(0x39 + 2, 0x35 + 2, 0x36 + 2),
         tool=0x37 + 2,

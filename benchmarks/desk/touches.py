@@ -105,15 +105,16 @@ def until_ready(era: Client) -> None:
 
 
 def _hold(era: Client, places: list[Place], seconds: float) -> StatusResult:
-    """Hold fingers, and return what plays in the end."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
+    """Hold fingers for some time, and until something plays; return what does."""
+    begin = time.monotonic()
+    while True:
         era.touch(places)
+        held = time.monotonic() - begin
+        if held > seconds and (status := era.status()).drive:
+            return status
+        if held > seconds + _START:
+            raise RuntimeError(f"nothing plays for fingers at {places}: {status.silence_reason}")
         time.sleep(_REPEAT)
-    status = era.status()
-    if not status.drive:
-        raise RuntimeError(f"nothing plays for fingers at {places}: {status.silence_reason}")
-    return status
 
 
 def _contrast(samples: FloatArray, frequencies: FloatArray, rate: float) -> float:

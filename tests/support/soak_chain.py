@@ -151,6 +151,8 @@ class _Run:
         self.arm_requests = 0
         self.is_ending = False
         self.stalled_for = 0.0
+        self.turning = asyncio.Event()  # unless the control loop stalls
+        self.turning.set()
         self.is_reopening = False
         self.running: asyncio.Task[None] | None = None
         self.controller: Controller | None = None
@@ -316,6 +318,7 @@ class _Run:
             if self.plan.is_calm(action.at - 0.4, action.at):
                 self.checks.violate("could not be opened without a fault")
         elif action.what == "ready":
+            await self.turning.wait()  # as in a process, whose stall also keeps requests waiting
             if controller.group_state is not GroupState.ARMED:
                 await self._call("clear", controller.clear)
                 await self._call("arm", controller.arm)
@@ -352,8 +355,8 @@ class _Run:
         self.serving = asyncio.create_task(self._serve())
 
     def _stall(self, lasts: float) -> None:
-        """Stall the control loop for a time [s]."""
-        if self.running is not None:
+        """Stall the control loop for a time [s], unless it arms."""
+        if self.running is not None and not self.arm_requests:
             self.stalled_for = lasts
             self.running.cancel()
 
@@ -402,10 +405,14 @@ class _Run:
                 lasts, self.stalled_for = self.stalled_for, 0.0
             finally:
                 self.running = None
-            await asyncio.sleep(_ON_THE_WIRE)
-            self.witness.set_stalled(True)
-            await asyncio.sleep(lasts)
-            self.witness.set_stalled(False)
+            self.turning.clear()
+            try:
+                await asyncio.sleep(_ON_THE_WIRE)
+                self.witness.set_stalled(True)
+                await asyncio.sleep(lasts)
+            finally:
+                self.witness.set_stalled(False)
+                self.turning.set()
 
     def _make_controller(self) -> Controller:
         return Controller(

@@ -68,14 +68,10 @@ class Job:
     looks: int = 0
     had_no_reply: bool = False
 
-    def rank(self, now: float) -> tuple[int, bool]:
-        """Place in the queue at a time [s]; one that is held for other lines goes before sets."""
-        rank: int = self.priority
-        if rank != Priority.READING:
-            rank = min(rank, Priority.ARM)
-            if rank > Priority.HEARTBEAT and (self.is_held or now - self.queued_at > MAX_WAIT):
-                rank = Priority.HEARTBEAT
-        return rank, not self.is_held
+    def has_waited(self, now: float) -> bool:
+        """Whether it is as urgent as a heartbeat by now [s], for it waits for long."""
+        is_minor = Priority.HEARTBEAT < self.priority < Priority.READING
+        return is_minor and now - self.queued_at > MAX_WAIT
 
     def is_superseded_by(self, priority: Priority, member: "Dialogue | None") -> bool:
         """Whether a request for an amplifier, None for all, makes it obsolete."""
@@ -89,21 +85,39 @@ class JobQueue:
         self.jobs: list[Job] = []
         """In the order in which they were queued, as those of one rank are sent."""
         self.add = self.jobs.append
+        self._had_waited = False  # the last one that was taken
 
     def remove(self, job: Job) -> None:
         """Take a job out, if it waits."""
         if job in self.jobs:
             self.jobs.remove(job)
 
+    def take(self, job: Job, now: float) -> None:
+        """Take the one out whose turn it is."""
+        self.jobs.remove(job)
+        self._had_waited = job.has_waited(now)
+
+    def _rank(self, job: Job, now: float) -> tuple[int, int]:
+        """Place at a time [s]: a commit held for other lines goes before heartbeats and sets.
+
+        Of those that have waited for long one goes before a heartbeat that waits, not several.
+        """
+        if job.is_held and job.priority > Priority.HEARTBEAT:
+            return Priority.HEARTBEAT, 0
+        if job.has_waited(now):
+            return Priority.HEARTBEAT, 2 if self._had_waited else 1
+        is_reading = job.priority is Priority.READING
+        return job.priority if is_reading else min(job.priority, Priority.ARM), 1
+
     def next(self, now: float) -> Job | None:
         """Return the job whose turn it is; None while all pause, or a stop does."""
         if len(self.jobs) == 1:
             (first,) = self.jobs
         else:
-            first = min(self.jobs, key=lambda job: job.rank(now))
+            first = min(self.jobs, key=lambda job: self._rank(job, now))
             if first.not_before > now and not first.priority.is_stop_class:
                 ready = [job for job in self.jobs if job.not_before <= now]
-                return min(ready, key=lambda job: job.rank(now), default=None)
+                return min(ready, key=lambda job: self._rank(job, now), default=None)
         return first if first.not_before <= now else None
 
     def superseded_by(self, priority: Priority, member: "Dialogue | None") -> list[Job]:

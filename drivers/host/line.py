@@ -179,7 +179,7 @@ class Line:
                 job = self._queue.next(self._loop.time())
                 if job is None or (job.start is not None and not self._may_start(job)):
                     break
-                self._queue.remove(job)
+                self._queue.take(job, self._loop.time())
                 if not job.result.done():
                     self._start(job)
         finally:

@@ -45,6 +45,7 @@ class AmplifierSession:
     armed_at: float = -math.inf
     stop_requested_at: float | None = None
     first_stop: float | None = None  # that is not confirmed yet
+    is_disarming: bool = False  # until it has shown silence
     last_stop: float = -math.inf  # or status read
     last_feed: float | None = None
     heard_other_host: float = -math.inf

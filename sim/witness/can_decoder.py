@@ -64,7 +64,8 @@ class CanDecoder(Decoder):
             take = self._from_host if direction == "amplifier" else self._from_bus
             message = take(time, frame, sender)
             if sender.cut_short is not None:
-                seen.append((b"", damaged(f"message {sender.cut_short} without all frames")))
+                number, begun = sender.cut_short
+                seen.append((b"", damaged(f"message {number} without all frames", begun)))
                 sender.cut_short = None
             seen.append((piece, message))
         return seen
@@ -110,12 +111,12 @@ class CanDecoder(Decoder):
 class _Sender:
     """Messages of one identifier; begun: time of the first frame of the last one [s].
 
-    cut_short: number of a message that the last frame has ended before it was whole.
+    cut_short: number and begin of a message that the last frame ended before it was whole.
     """
 
     def __init__(self, *, is_numbered: bool) -> None:
         self.begun = 0.0
-        self.cut_short: int | None = None
+        self.cut_short: tuple[int | None, float] | None = None
         self._counters = WireCounters()
         self._assembler = Assembler(self._counters, is_numbered=is_numbered)
         self._number: int | None = None  # of the last frame
@@ -126,7 +127,7 @@ class _Sender:
         if len(data) != BLOCK:
             return damaged(f"a frame of {len(data)} bytes, must be {BLOCK}")
         if data[0] != self._number or (self._is_whole and data[1] == 0):
-            self.cut_short = None if self._is_whole else self._number
+            self.cut_short = None if self._is_whole else (self._number, self.begun)
             self._number, self._is_whole, self.begun = data[0], False, time
         before = self._counters.invalid_frames, self._counters.unexpected_frames
         words = self._assembler.add(data, time)

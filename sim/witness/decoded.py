@@ -75,6 +75,7 @@ class Notice:
     carried out: the amplifier has carried the request of a key out; read on: the host goes on with
     it. event: unasked, with the values of its record. boot: an amplifier has started, or a master
     has reset it. other host: its request, by name. damaged: a frame that is none, and why.
+    begun: when the first of its frames passed, None where it is one [s].
     """
 
     what: Literal["carried out", "read on", "event", "boot", "other host", "damaged"]
@@ -82,6 +83,7 @@ class Notice:
     key: Hashable = None
     values: Values = field(default_factory=dict)
     text: str = ""
+    begun: float | None = None
 
 
 class Decoder(ABC):
@@ -100,9 +102,9 @@ DecodedFrame: TypeAlias = tuple[bytes, Message | None]
 """A frame and its message; None for part of a message, or none that concerns the rules."""
 
 
-def damaged(why: str) -> Notice:
+def damaged(why: str, begun: float | None = None) -> Notice:
     """Return what is said of bytes that form no message."""
-    return Notice("damaged", text=why)
+    return Notice("damaged", text=why, begun=begun)
 
 
 def request_of(

@@ -15,7 +15,7 @@ from sim.witness.deadlines import Deadlines, Delays
 from sim.witness.decoded import A_READ, FEEDING, HELLO, Request, Sent
 from sim.witness.set_rules import ExpectedSets, check_expected, check_set
 
-_IN_FLIGHT = 0.001  # s; from the host's write until a frame is seen
+_IN_FLIGHT = 0.003  # s; from the host's write until a frame is seen, of Modbus RTU at its end
 _IN_TRANSPORT = 0.010  # s; bytes may wait before they pass, while their host counts from its write
 _REORDER_WINDOW = 0.020  # s; of two commands given within it the earlier may still be sent first
 _OTHER_HOST = 2.0  # s; for which a host that hears another one sends nothing that plays or feeds
@@ -104,8 +104,8 @@ class HostRules:
         if request.name == "Set":
             layers = session.amplifier.sets.whole(request.values["token"])
             return layers is not None and not is_vibrating(layers)
-        is_confirming = request.name == "GetStatus" and session.first_stop is not None
-        return request.name in _SILENCING or is_confirming
+        is_silencing = session.is_disarming or session.first_stop is not None
+        return request.name in _SILENCING or (request.name == "GetStatus" and is_silencing)
 
     def check_order(
         self, session: AmplifierSession, sent: Sent, pending: Collection[Sent], preempted_by: int
@@ -162,9 +162,11 @@ class HostRules:
             session.is_stopped = False
 
     def status_heard(self, session: AmplifierSession, values: Values) -> None:
-        """Note a status: whether it confirms a stop."""
-        if "levels" in values and values["state"] in LATCHED and not any(values["levels"]):
-            session.first_stop = None
+        """Note a status: whether it confirms a stop, or the end of a disarm."""
+        if "levels" in values and not any(values["levels"]):
+            session.is_disarming = False
+            if values["state"] in LATCHED:
+                session.first_stop = None
 
     # rules
 
@@ -291,7 +293,9 @@ class HostRules:
             if not session.is_stopped:
                 self._check_release(session, time, values["ramp"])
             session.silence_sent(time)
-        if name == "Stop":
+        if name == "Disarm":
+            session.is_disarming = True
+        elif name == "Stop":
             session.is_stopped, session.stop_requested_at, session.session = True, None, None
             session.first_stop = time if session.first_stop is None else session.first_stop
             self._expect_confirmation(session, time, session.first_stop)

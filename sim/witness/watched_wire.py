@@ -98,6 +98,14 @@ class WatchedWire:
         self._replied.extend(self._pending)
         self._pending.clear()
 
+    def _drop_pending(self, session: AmplifierSession) -> None:
+        """Expect no reply to what was sent to an amplifier."""
+        self._pending = {
+            key: sent
+            for key, sent in self._pending.items()
+            if self.sessions[sent.request.address] is not session
+        }
+
     def is_pending(self, session: AmplifierSession) -> bool:
         """Whether an amplifier has not replied to a request yet."""
         return any(self.sessions[one.request.address] is session for one in self._pending.values())
@@ -133,7 +141,8 @@ class WatchedWire:
         for raw, message in found:
             self._report.frame(self.name, time, direction, raw)
             if isinstance(message, Notice) and message.what == "damaged":
-                self._damaged(direction, time, message.text, begun)
+                since = begun if message.begun is None else message.begun
+                self._damaged(direction, time, message.text, since)
             elif direction == "amplifier" and message is not None:
                 self._sent(time, raw, message, begun)
             elif message is not None:
@@ -179,6 +188,8 @@ class WatchedWire:
         for session in [each for each in sessions if each is not None]:
             if not is_copy:
                 self._check_request(session, time, sent)
+            if session.is_mute and message.name == HELLO:
+                self._drop_pending(session)  # never to be replied to
             if message.key is not None and (not is_copy or message.name == HELLO):
                 self._pending[message.key] = sent
             session.is_mute &= message.name != HELLO

@@ -46,9 +46,9 @@ _ON_THE_WIRE = 0.002  # s; through driver, adapter and back
 # Bytes of a silent set for four channels and what may precede it on the line, there and back.
 _BYTES = 200
 # Bytes between two feeds of one of two amplifiers on a line, there and back: another request, a
-# status and a heartbeat of both, a silent set of both, and, as what has waited is a heartbeat's
-# equal, an operator's clear of both.
-_BYTES_BETWEEN_FEEDS = 540
+# status and a heartbeat of both, a silent set of both, and, as one of those that have waited goes
+# before each heartbeat, an operator's clear of both.
+_BYTES_BETWEEN_FEEDS = 620
 _PATTERN = 0.25  # s; from a touch to its pattern
 _NOTICED = 0.3  # s; from an unplugged wire to the controller's reaction
 _TIMERS_MAX = 2_000
@@ -320,7 +320,8 @@ class _Run:
         elif action.what == "ready":
             await self.turning.wait()  # as in a process, whose stall also keeps requests waiting
             if controller.group_state is not GroupState.ARMED:
-                await self._call("clear", controller.clear)
+                if not await self._call("clear", controller.clear):  # what nobody had seen yet
+                    await self._call("clear", controller.clear)
                 await self._call("arm", controller.arm)
             at = self.loop.time() - START
             is_calm = self.plan.is_calm(action.at - 0.1, at)
@@ -333,17 +334,19 @@ class _Run:
 
     async def _call(
         self, name: OperatorCommand, call: Callable[[], Coroutine[Any, Any, None]]
-    ) -> None:
-        """Run an operator command; a refusal is a valid outcome."""
+    ) -> bool:
+        """Run an operator command; a refusal is a valid outcome, False."""
         self.witness.operator_command(name)
         self.arm_requests += name == "arm"
         try:
             await call()
-            self.note("done", name)
         except DriverError as problem:
             self.note("refused", name, type(problem).__name__, problem)
+            return False
         finally:
             self.arm_requests -= name == "arm"
+        self.note("done", name)
+        return True
 
     async def _kill(self) -> None:
         """Kill the host's process, and start another."""

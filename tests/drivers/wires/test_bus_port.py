@@ -92,7 +92,7 @@ async def test_frames_of_a_stuck_queue_are_dropped() -> None:
     """Nobody acknowledges on the bus: what waited is not sent when it is mended much later."""
     async with opened() as (port, adapter, losses):
         adapter.room = 0
-        port.write(pack_frames(COMMIT))
+        port.write(pack_frames(COMMIT + SET))
         await until(lambda: not port._unsent)
         assert port.is_blocked
         adapter.room = 30

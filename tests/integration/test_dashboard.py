@@ -347,7 +347,7 @@ async def test_lease_is_renewed_while_the_page_is_open(fresh: Page, era: Client)
     era.subscribe("state")
     await fresh.call("Page.navigate", url="about:blank")
     await until_state(era, READY)
-    causes = {told.data["cause"] for told in era.events(timeout=0.1)}
+    causes = (told.data["cause"] for told in era.events(timeout=PATIENCE))
     assert any(re.match(r"disarmed by '(http|web:\d+) 127", cause) for cause in causes)
 
 

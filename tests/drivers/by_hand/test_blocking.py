@@ -57,9 +57,9 @@ def test_blocking_amplifier_refuses_what_exceeds_its_limits() -> None:
 def test_blocking_amplifier_measures_while_it_feeds_the_watchdog() -> None:
     """Over a window longer than the watchdog; the ERA that plays moves its own foot most."""
     with BlockingAmplifier(URL, limits=LIMITS) as amplifier:
-        amplifier.arm(0.1)
+        amplifier.arm(1.0)
         amplifier.apply([Tone(2, 110.0, 0.2)], ramp=0.0)
-        reading = amplifier.measure([110.0], 0.3)
+        reading = amplifier.measure([110.0], 1.2)
         assert amplifier.status()["state"] == "OPERATION_ENABLED"
         sensors = amplifier.sensors()
         loudest = max(range(len(sensors)), key=lambda n: reading.sensors[n].tones[0][0])

@@ -1,22 +1,16 @@
 """Tasks on processes of this machine, each with one thread for linear algebra."""
 
-import logging
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from model.errors import InputError
-
-_logger = logging.getLogger(__name__)
-
-# More failures in a row mean that memory is short.
-_MAX_POOLS = 4
 
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -36,49 +30,44 @@ def on_processes(
     """Yield numbers of tasks with their results in the order in which they are done.
 
     count: of processes, 1 for this one; solve: a function of a module; shared: its first argument,
-    sent to each process once. After a
-    process has died, unfinished tasks are solved again by new ones. Raises InputError if they keep
-    dying.
+    sent to each process once. Raises InputError if a process dies.
     """
     if count == 1:
         yield from ((number, solve(shared, task)) for number, task in tasks.items())
         return
-    pending = dict(tasks)
-    for _ in range(_MAX_POOLS):
-        try:
-            for number, result in _solve_in_pool(count, solve, shared, pending):
-                del pending[number]
-                yield number, result
-            return
-        except BrokenProcessPool:
-            _logger.warning("worker process died, restarting with %d tasks left", len(pending))
-    raise InputError(
-        f"worker processes died {_MAX_POOLS} times; perhaps they are short of memory: use fewer "
-        "--workers"
-    )
+    with process_pool(min(count, len(tasks)) or 1, solve, shared) as submit:
+        numbers = dict(zip(submit(tasks.values()), tasks, strict=True))
+        for future in as_completed(numbers):
+            yield numbers[future], future.result()
 
 
 @contextmanager
 def process_pool(
     count: int, solve: Callable[[Shared, Task], Result], shared: Shared
-) -> Iterator[Callable[[Sequence[Task]], Iterator[Result]]]:
-    """A function that solves tasks on processes, and yields the results in the order of tasks.
+) -> Iterator[Callable[[Iterable[Task]], list[Future[Result]]]]:
+    """A function that begins to solve tasks on processes.
 
     count, solve, shared: as for `on_processes`. Raises InputError if a process dies.
     """
-    pool = _started_pool(count, solve, shared)
+    for variable in _THREAD_COUNTS:
+        os.environ.setdefault(variable, "1")  # read by numpy when a new process loads it
+    pool = ProcessPoolExecutor(
+        count,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_start_worker,
+        initargs=(solve, shared),
+    )
 
-    def solve_all(tasks: Sequence[Task]) -> Iterator[Result]:
-        try:
-            with _interrupts_blocked():
-                found = [pool.submit(_run, task) for task in tasks]
-            for future in found:
-                yield future.result()
-        except BrokenProcessPool:
-            raise InputError("a worker process died; perhaps it was short of memory") from None
+    def submit(tasks: Iterable[Task]) -> list[Future[Result]]:
+        with _interrupts_blocked():
+            return [pool.submit(_run, task) for task in tasks]
 
     try:
-        yield solve_all
+        yield submit
+    except BrokenProcessPool:
+        raise InputError(
+            "a worker process died, perhaps short of memory; use fewer of them (--workers)"
+        ) from None
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
@@ -88,35 +77,6 @@ def processor_count() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _started_pool(
-    count: int, solve: Callable[[Shared, Task], Result], shared: Shared
-) -> ProcessPoolExecutor:
-    for variable in _THREAD_COUNTS:
-        os.environ.setdefault(variable, "1")  # read by numpy when a new process loads it
-    return ProcessPoolExecutor(
-        count,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_start_worker,
-        initargs=(solve, shared),
-    )
-
-
-def _solve_in_pool(
-    count: int,
-    solve: Callable[[Shared, Task], Result],
-    shared: Shared,
-    tasks: Mapping[int, Task],
-) -> Iterator[tuple[int, Result]]:
-    pool = _started_pool(min(count, len(tasks)) or 1, solve, shared)
-    try:
-        with _interrupts_blocked():
-            numbers = {pool.submit(_run, task): number for number, task in tasks.items()}
-        for future in as_completed(numbers):
-            yield numbers[future], future.result()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 @contextmanager

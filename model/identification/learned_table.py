@@ -16,7 +16,7 @@ from model.errors import InputError
 from model.identification.in_service import Known, LivePlate, Report, widest
 from model.identification.learned_file import LearnedPlate, OtherPlate, load_learned, save_learned
 from model.identification.settled import SettledPattern
-from model.rig.rig import Rig, physics_fingerprint
+from model.rig.rig import Rig
 from model.table.live_table import table_following
 from model.table.table import LocalizationTable
 
@@ -55,7 +55,7 @@ class LearnedTable:
             return cls(table, known, file=file)
         learned = load_learned(file, table=table.fingerprint)
         space = known.model.space
-        if learned.names != space.names or learned.base != physics_fingerprint(known.before):
+        if learned.names != space.names or learned.base != known.before.fingerprint:
             raise OtherPlate(
                 f"{file}: parameters must be those of this rig and its sensors; remove the file to "
                 "learn anew"
@@ -109,7 +109,7 @@ class LearnedTable:
         """Write what was learned, atomically, and whether the plate has changed since."""
         if self._file is None:
             return
-        base = physics_fingerprint(self.live.before)
+        base = self.live.before.fingerprint
         learned = LearnedPlate(
             self._table.fingerprint,
             base,

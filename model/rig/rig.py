@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from numbers import Real
-from typing import Protocol
 
 from model.errors import InputError
 from model.finger.fingertip import FINGERTIP_RADIUS
@@ -91,50 +90,25 @@ class Rig:
     @property
     def fingerprint(self) -> str:
         """Fingerprint of all that decides what is felt; see `physics_fingerprint`."""
-        return physics_fingerprint(self)
+        return physics_fingerprint(
+            self.plate, self.eras, self.masses, self.uncertainty, self.fingertip, self.threshold
+        )
 
 
-class Physics(Protocol):
-    """All that decides what is felt, as a rig and its tables have it."""
-
-    @property
-    def plate(self) -> Plate:
-        """Plate without what it carries."""
-        ...
-
-    @property
-    def eras(self) -> Sequence[Era]:
-        """ERAs in order."""
-        ...
-
-    @property
-    def masses(self) -> Sequence[PointLoad]:
-        """Masses on the plate."""
-        ...
-
-    @property
-    def uncertainty(self) -> Uncertainty:
-        """How well all of it is known."""
-        ...
-
-    @property
-    def fingertip(self) -> Fingertip | None:
-        """Load of a finger, None for none."""
-        ...
-
-    @property
-    def threshold(self) -> str:
-        """Name of the detection thresholds."""
-        ...
-
-
-def physics_fingerprint(felt: Physics) -> str:
+def physics_fingerprint(
+    plate: Plate,
+    eras: Sequence[Era],
+    masses: Sequence[PointLoad],
+    uncertainty: Uncertainty,
+    fingertip: Fingertip | None,
+    threshold: str,
+) -> str:
     """SHA-256 over all that decides what fingers feel; not mesh or wiring.
 
     Over plate, ERAs, masses, their uncertainty, and load, contact and thresholds of a finger. Rigs
     with the same fingerprint share localization tables, also with other names of materials.
     """
-    numbers = asdict(felt.plate)
+    numbers = asdict(plate)
     del numbers["material"]["name"]
     # A laminate is its layers; what it is like depends on the frequency.
     if numbers["laminate"] is not None:
@@ -149,16 +123,16 @@ def physics_fingerprint(felt: Physics) -> str:
     # ERAs without gains have the fingerprint of a rig that has no such key.
     held = [
         {key: value for key, value in asdict(era).items() if key != "gains" or value}
-        for era in felt.eras
+        for era in eras
     ]
     physics = {
         "plate": numbers,
         "eras": held,
-        "masses": sorted(list(map(float, mass.numbers.values())) for mass in felt.masses),
-        "uncertainty": asdict(felt.uncertainty),
-        "fingertip": None if felt.fingertip is None else asdict(felt.fingertip),
+        "masses": sorted(list(map(float, mass.numbers.values())) for mass in masses),
+        "uncertainty": asdict(uncertainty),
+        "fingertip": None if fingertip is None else asdict(fingertip),
         "fingertip_radius": FINGERTIP_RADIUS,
-        "threshold": felt.threshold,
+        "threshold": threshold,
     }
     return hashlib.sha256(canonical_json(physics).encode()).hexdigest()
 

@@ -44,12 +44,12 @@ def ask_on_processes(
     if count == 1:
         yield ask_here(table)
         return
-    with process_pool(count, _answers, replace(table)) as solve:
+    with process_pool(count, _answers, replace(table)) as submit:
 
         def ask(questions: Sequence[Question]) -> Iterator[Contrasts | None]:
             starts = range(0, len(questions), _CHUNK)
-            for answers in solve([questions[start : start + _CHUNK] for start in starts]):
-                yield from answers
+            for answers in submit(questions[start : start + _CHUNK] for start in starts):
+                yield from answers.result()
 
         yield ask
 

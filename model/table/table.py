@@ -126,7 +126,9 @@ class LocalizationTable:
     @property
     def fingerprint(self) -> str:
         """Fingerprint of the rig that this table is for."""
-        return physics_fingerprint(self)
+        return physics_fingerprint(
+            self.plate, self.eras, self.masses, self.uncertainty, self.fingertip, self.threshold
+        )
 
     @property
     def pattern_count(self) -> int:

@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.arrays import ComplexArray
+from model.arrays import ComplexArray, FloatArray
 
 
 class Term(NamedTuple):
@@ -28,6 +28,11 @@ class Term(NamedTuple):
 
 Motion: TypeAlias = Sequence[Term]
 """The motion of a base, the sum of its terms."""
+
+
+def rise(times: FloatArray, ramp: float) -> FloatArray:
+    """A raised cosine from 0 at time 0 to 1 from a ramp [s] on, at times [s] (n,)."""
+    return np.asarray((1 - np.cos(np.pi * np.clip(times / ramp, 0, 1))) / 2)
 
 
 def raised_cosine(

@@ -11,7 +11,7 @@ in the coordinates of `PlateInTime`; that to a hat is its second difference.
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray
 from model.transients.time_response import PlateInTime
 
 
@@ -80,8 +80,3 @@ def _linear_ramps(plate: PlateInTime, s: complex, step: float) -> tuple[ComplexA
     count = len(plate.eras)
     slopes: ComplexArray = np.array([era.stroke / step + 0j for era in plate.eras])
     return plate.particular(range(count), np.full(count, s), 0 * slopes, slopes)
-
-
-def raised_cosine(times: FloatArray, ramp: float) -> FloatArray:
-    """0 at time 0, 1 from ramp [s] on, (n,)."""
-    return np.asarray((1 - np.cos(np.pi * np.clip(times / ramp, 0, 1))) / 2)

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
+from model.transients import base_motion
 from model.transients.bounded_solution import bounded_solution
 from model.transients.envelope import KNOT_STEP
-from model.transients.hats import ending_states, hat_accelerations, raised_cosine, steady_states
+from model.transients.hats import ending_states, hat_accelerations, steady_states
 from model.transients.time_response import PlateInTime
 
 ONSET_KNOTS = 21
@@ -92,7 +93,7 @@ def onset_knots(
     target_form = _over_time(at_targets.conj().T @ at_targets, steps)
     quiet_form = _over_time(at_quiet.conj().T @ at_quiet, steps)
     times = KNOT_STEP * (np.arange(steps * _SAMPLES) + 0.5) / _SAMPLES
-    wanted = raised_cosine(times, rise)[:, None] * (target_rows @ (amplitudes @ carrier.steady))
+    wanted = base_motion.rise(times, rise)[:, None] * (target_rows @ (amplitudes @ carrier.steady))
     wanted = wanted.reshape(steps, -1).T
     match = (at_targets.conj().T @ wanted).reshape(steps, eras, steps)
     aim = np.stack([np.trace(match[:, :, knot:], axis1=0, axis2=2) for knot in range(steps)])

@@ -20,6 +20,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.structure.fingertip import Fingertip
+from model.transients.base_motion import rise
 from model.transients.time_response import PlateInTime
 
 _STEP = 0.001  # s; between the times of a response, which is demodulated
@@ -171,14 +172,9 @@ def _line(ramp: float, duration: float, after: float | None, lines: float, withi
     side = math.pi / ramp
     late = np.exp(-p * ramp)
     transform = ((1 + late) / p - p * (1 + late) / (p**2 + side**2)) / 2
-    drive = _rise(times, ramp)
+    drive = rise(times, ramp)
     if after is not None:
         transform *= 1 - np.exp(-p * duration)
-        drive -= _rise(np.asarray(times - duration), ramp)
+        drive -= rise(np.asarray(times - duration), ramp)
     inverse = np.exp(np.outer(times, p)) * (step / (2 * math.pi))
     return _Line(p.astype(complex), transform.astype(complex), inverse.astype(complex), drive)
-
-
-def _rise(times: FloatArray, ramp: float) -> FloatArray:
-    """A raised cosine from 0 to 1 over a ramp [s] at times [s]."""
-    return (1 - np.cos(math.pi * np.clip(times / ramp, 0.0, 1.0))) / 2

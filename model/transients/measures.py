@@ -1,10 +1,10 @@
 """Measures of onsets and endings: transient contrast, and the residual vibration of the plate."""
 
 import math
-from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,10 +12,10 @@ from model.arrays import ComplexArray, FloatArray
 from model.finger.contrast import contrast_db
 from model.finger.felt_band import felt_part
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.transients.base_motion import Term
+from model.transients.base_motion import BaseMotions
 from model.transients.envelope import Bases
 from model.transients.hats import mean_square, steady_states
-from model.transients.time_response import PlateInTime
+from model.transients.time_response import ForcedVibration, PlateInTime
 from model.vibration.excitation import Excitation
 
 ONSET_WINDOW = 0.100
@@ -28,6 +28,17 @@ SAMPLE_RATE = 8000.0
 """Sixteen samples to a period of 500 Hz [Hz], so that a peak is found within 2 %."""
 
 _FINE = 32  # samples; near the root of those of an onset
+
+
+class _Piece(NamedTuple):
+    """A time [s] without changes: number of its forced solution, free part z, and z at its end."""
+
+    since: float
+    until: float
+    forced: ForcedVibration
+    number: int
+    free: ComplexArray
+    last: ComplexArray
 
 
 class Transients:
@@ -80,27 +91,24 @@ class Transients:
 
         after: the excitation that had been steady before; None for rest.
         """
-        shapes = self._plate.shapes_at(points)
-        drive = _ForcedResponse(self._plate, bases)
-        z = np.zeros(len(self._plate.eigenvalues), dtype=complex)
-        for state in self._steady(after or {}).values():
-            z += state
+        plate = self._plate
+        shapes = plate.shapes_at(points)
         times = np.arange(round(duration * SAMPLE_RATE)) / SAMPLE_RATE
         acceleration = np.empty((len(times), len(shapes)))
-        free_shapes = (shapes @ self._plate.acceleration).T
-        forced_shapes = (shapes @ self._plate.displacement).T
-        for since, until in drive.pieces(duration):
-            z = z + drive.change(since)
-            first, last = (int(index) for index in np.searchsorted(times, [since, until]))
-            acceleration[first:last] = drive.forced(times[first:last], since, forced_shapes)
+        free_shapes = (shapes @ plate.acceleration).T
+        forced_shapes = (shapes @ plate.displacement).T
+        for piece in self._pieces(bases, self._steady(after or {}), duration):
+            first, last = np.searchsorted(times, [piece.since, piece.until]).tolist()
+            acceleration[first:last] = piece.forced.acceleration(
+                piece.number, times[first:last], forced_shapes
+            )
             for start in range(first, last, len(self._exponentials)):
                 stop = min(last, start + len(self._exponentials))
-                now = z * np.exp(self._plate.eigenvalues * (times[start] - since))
+                now = piece.free * np.exp(plate.eigenvalues * (times[start] - piece.since))
                 free = now[:, None] * free_shapes
                 acceleration[start:stop] += self._exponentials[: stop - start] @ np.vstack(
                     [free.imag, free.real]
                 )
-            z = z * np.exp(self._plate.eigenvalues * (until - since))
         return acceleration
 
     def residual_db(self, excitation: Excitation, ending: Bases) -> float:
@@ -111,85 +119,42 @@ class Transients:
         frequency.
         """
         end_time = max((term.end for base in ending for term in base), default=0.0)
-        frequencies = {tone.frequency for tone in excitation.values()}
-        steady = self._steady(excitation)
-        still = np.zeros(len(self._plate.eigenvalues), dtype=complex)
-        residual_states: dict[float, ComplexArray] = defaultdict(lambda: still)
-        power = 0.0
-        for number, (era, base) in enumerate(zip(self._plate.eras, ending, strict=True)):
-            alone = tuple(base if other == number else () for other in range(len(ending)))
-            drive = _ForcedResponse(self._plate, alone)
-            tone = excitation.get(era.name)
-            frequency = tone.frequency if tone else min(frequencies)
-            z = steady.get(era.name, still)
-            for since, until in drive.pieces(end_time):
-                z = (z + drive.change(since)) * np.exp(self._plate.eigenvalues * (until - since))
-            residual_states[frequency] = residual_states[frequency] + z + drive.change(end_time)
+        frequencies = sorted({tone.frequency for tone in excitation.values()})
+        played = [
+            excitation[era.name].frequency if era.name in excitation else frequencies[0]
+            for era in self._plate.eras
+        ]
+        remaining = power = 0.0
         for frequency in frequencies:
-            together = sum(
-                (steady[name] for name, tone in excitation.items() if tone.frequency == frequency),
-                start=still,
+            own = {name: tone for name, tone in excitation.items() if tone.frequency == frequency}
+            bases = tuple(
+                base if each == frequency else () for each, base in zip(played, ending, strict=True)
             )
-            omega = 2 * math.pi * frequency
-            power += omega**4 * float(np.linalg.norm(self._plate.displacement @ together)) ** 2
-        remaining = sum(
-            float((z.conj() @ self._mean_square @ z).real) for z in residual_states.values()
-        )
+            left = steady = self._steady(own)
+            for piece in self._pieces(bases, steady, end_time):
+                left = piece.last
+            remaining += float((left.conj() @ self._mean_square @ left).real)
+            size = float(np.linalg.norm(self._plate.displacement @ steady))
+            power += (2 * math.pi * frequency) ** 4 * size**2
         return 10 * math.log10(remaining / power)
 
-    def _steady(self, excitation: Excitation) -> dict[str, ComplexArray]:
-        """Steady state (2 r,) of each tone alone at time 0, the reference of phases."""
-        states = {}
+    def _pieces(self, bases: Bases, total: ComplexArray, duration: float) -> Iterator[_Piece]:
+        """From time 0 to a duration [s], from a state z (2 r,), between changes of the bases."""
+        motions = BaseMotions(bases)
+        edges = sorted({0.0, *motions.moments(0, 0.0, duration), duration})
+        forced = self._plate.driven(motions, [0] * len(edges), edges)
+        for number, (since, until) in enumerate(pairwise(edges)):
+            before, after = forced.modal([number, number], [since, until])
+            free = total - before
+            total = after + free * np.exp(self._plate.eigenvalues * (until - since))
+            yield _Piece(since, until, forced, number, free, total)
+
+    def _steady(self, excitation: Excitation) -> ComplexArray:
+        """Steady state (2 r,) at time 0, the reference of phases."""
+        state = np.zeros(len(self._plate.eigenvalues), dtype=complex)
         for number, era in enumerate(self._plate.eras):
             tone = excitation.get(era.name)
             if tone is not None:
                 unit = steady_states(self._plate, 2 * math.pi * tone.frequency)[number]
-                states[era.name] = unit * (tone.phasor / era.stroke)
-        return states
-
-
-class _ForcedResponse:
-    """Particular solutions of all terms of all bases, summed for each time and omega."""
-
-    def __init__(self, plate: PlateInTime, bases: Bases) -> None:
-        together: dict[tuple[float, float, float], list[tuple[int, Term]]] = defaultdict(list)
-        for era, base in enumerate(bases):
-            for term in base:
-                together[term.start, term.end, term.omega].append((era, term))
-        self._a0 = np.empty((len(together), len(plate.eigenvalues)), dtype=complex)
-        self._a1 = np.empty_like(self._a0)
-        keys = np.array(list(together)).reshape(-1, 3)
-        self._start, self._end, self._s = keys[:, 0], keys[:, 1], 1j * keys[:, 2]
-        for row, terms in enumerate(together.values()):
-            a0, a1 = plate.particular(
-                [era for era, _ in terms],
-                np.full(len(terms), self._s[row]),
-                [term.c0 for _, term in terms],
-                [term.c1 for _, term in terms],
-            )
-            self._a0[row], self._a1[row] = a0.sum(axis=0), a1.sum(axis=0)
-
-    def pieces(self, duration: float) -> list[tuple[float, float]]:
-        """From 0 to a duration [s], cut where terms start or end."""
-        moments = {0.0, duration, *self._start.tolist(), *self._end.tolist()}
-        inside = sorted(moment for moment in moments if 0 <= moment <= duration)
-        return list(pairwise(inside))
-
-    def change(self, time: float) -> ComplexArray:
-        """Change of the free vibration (2 r,) where terms start or end at a time [s]."""
-        sign = (self._end == time).astype(float) - (self._start == time)
-        rows = np.flatnonzero(sign)
-        tau = time - self._start[rows]
-        size = sign[rows] * np.exp(self._s[rows] * tau)
-        return np.asarray(size @ self._a0[rows] + (size * tau) @ self._a1[rows])
-
-    def forced(self, times: FloatArray, since: float, shapes: ComplexArray) -> FloatArray:
-        """Acceleration (n, p) of the terms active from a time [s] on; shapes (2 r, p)."""
-        rows = np.flatnonzero((self._start <= since) & (since < self._end))
-        s = self._s[rows, None]
-        b0, b1 = self._a0[rows] @ shapes, self._a1[rows] @ shapes
-        tau = times[:, None] - self._start[rows]
-        phase_factor = np.exp(self._s[rows] * tau)
-        return np.asarray(
-            (phase_factor @ (s**2 * b0 + 2 * s * b1) + (phase_factor * tau) @ (s**2 * b1)).imag
-        )
+                state += unit * (tone.phasor / era.stroke)
+        return state

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, Float32Array, FloatArray, IntArray
 from model.finger.contrast import contrast_ratio
+from model.transients.base_motion import rise
 from model.transients.measures import ONSET_WINDOW
 from model.transients.time_response import PlateInTime
 
@@ -91,9 +92,9 @@ def ramped_ringing(
     n, end = RINGING_TIMES + math.ceil(ringing_time(duration) / spacing), RINGING_TIMES
     times = spacing * (np.arange(n) + 0.5)
     every = np.append(times, times[end:] - duration)
-    rise = np.where(every < ramp, (1 - np.cos(np.pi / ramp * every)) / 2, 1.0)
-    envelope = rise[:n].copy()
-    envelope[end:] -= rise[n:]
+    risen = rise(every, ramp)
+    envelope = risen[:n].copy()
+    envelope[end:] -= risen[n:]
     found = []
     for omega in np.split(2 * np.pi * frequencies, range(BATCH, len(frequencies), BATCH)):
         responses, steady = ramp_responses(plate, omega, every, ramp)
@@ -110,7 +111,7 @@ def ramp_responses(
 
     And the steady one, (f, eras, r). Demodulated: without the factor exp(i omega t). Before the
     ramp is over the base moves as the sum of three exponentials, see
-    `model.transients.base_motion.fade`.
+    `model.transients.base_motion.raised_cosine`.
     """
     f, eras = len(omega), len(plate.eras)
     side = np.pi / ramp

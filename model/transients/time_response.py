@@ -52,15 +52,29 @@ class ForcedVibration:
 
     def state(self, number: int, time: float) -> FloatArray:
         """Displacement and velocity (2 r,) in a solution at a time [s]."""
-        return np.asarray((self.plate.vectors @ self._modal([number], [time])[0]).imag)
+        return np.asarray((self.plate.vectors @ self.modal([number], [time])[0]).imag)
 
     def as_free(self, numbers: Sequence[int], times: Sequence[float]) -> ComplexArray:
         """z (j, m) of free vibrations with the state in solutions (j,) at times (j,) [s]."""
-        z = self._modal(numbers, times)
+        z = self.modal(numbers, times)
         # The conjugate of an eigenvector is that of the conjugate eigenvalue.
         return np.asarray(-0.5j * (z[:, self.plate.half] - z[:, self.plate.partner].conj()))
 
-    def _modal(self, numbers: Sequence[int], times: Sequence[float]) -> ComplexArray:
+    def acceleration(self, number: int, times: FloatArray, shapes: ComplexArray) -> FloatArray:
+        """Acceleration (n, p) of a solution at times (n,) [s]; shapes (2 r, p): by z."""
+        rows = self.rows(number)
+        s, tau = 1j * self.omegas[rows], times[:, None] - self.times[number]
+        phase_factor = np.exp(s * tau)
+        constant = s[:, None] ** 2 * self.a0[rows]
+        if self.a1 is None:
+            return np.asarray((phase_factor @ (constant @ shapes)).imag)
+        growth = self.a1[rows]
+        constant += 2 * s[:, None] * growth
+        growing = (tau * phase_factor) @ (s[:, None] ** 2 * growth @ shapes)
+        return np.asarray((phase_factor @ (constant @ shapes) + growing).imag)
+
+    def modal(self, numbers: Sequence[int], times: Sequence[float]) -> ComplexArray:
+        """z (j, 2 r) in solutions (j,) at times (j,) [s]."""
         tau = np.array(times)[:, None] - self.times[self.number]
         is_of_solution = self.number == np.array(numbers)[:, None]
         phase_factor = is_of_solution * np.exp(1j * self.omegas * tau)

@@ -16,9 +16,9 @@ def die(shared: int, task: int) -> None:
     os._exit(shared + task)
 
 
-def test_on_processes_gives_up_after_repeated_deaths() -> None:
-    """After four pools, with a remedy."""
-    with pytest.raises(InputError, match=r"died 4 times.*--workers"):
+def test_a_process_that_dies_is_an_error() -> None:
+    """With a remedy."""
+    with pytest.raises(InputError, match=r"died.*--workers"):
         list(on_processes(2, die, 1, {0: 8}))
 
 

@@ -8,8 +8,7 @@ import numpy as np
 
 from benchmarks.setting import RIG
 from model.arrays import ComplexArray, FloatArray
-from model.fem.elements import element_of
-from model.fem.mesh import Mesh
+from model.fem.mesh import Mesh, element_of
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import load_rig
 from model.spectral.mesh import SpectralMesh

@@ -33,7 +33,7 @@ def main() -> None:
     from model.rig.file import load_rig
     from model.table.build import build_table
     from model.table.question import Question
-    from model.transients.envelope import ramped_pulse
+    from model.transients.base_motion import ramped_pulse
     from model.transients.measures import SAMPLE_RATE, Transients
 
     rig = load_rig(RIG)

@@ -26,7 +26,7 @@ from model.rig.file import load_rig
 from model.table.build import build_table
 from model.table.effect_level import EffectLevels
 from model.table.table import LocalizationTable
-from model.transients.envelope import ramped_pulse
+from model.transients.base_motion import ramped_pulse
 from model.transients.measures import Transients
 
 EFFECTS = ((0.020, 20.0), (0.040, 20.0), (0.120, 14.0))

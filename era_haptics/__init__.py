@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from model.calibration.calibration_result import Calibration as Calibration
     from model.errors import InputError as InputError
     from model.finger.grid import Grid as Grid
-    from model.reduction.supported_modes import SupportedModes as SupportedModes
+    from model.reduction.reduced_plate import SupportedModes as SupportedModes
     from model.rig.file import example_rig_path as example_rig_path
     from model.rig.file import load_rig as load_rig
     from model.rig.rig import Rig as Rig
@@ -76,7 +76,7 @@ _NAMES = {
     "model.calibration.calibration_result": "Calibration",
     "model.errors": "InputError",
     "model.finger.grid": "Grid",
-    "model.reduction.supported_modes": "SupportedModes",
+    "model.reduction.reduced_plate": "SupportedModes",
     "model.rig.file": "example_rig_path load_rig",
     "model.rig.rig": "Rig",
     "model.rig.uncertainty": "Uncertainty",

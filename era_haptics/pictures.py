@@ -11,7 +11,7 @@ from era_haptics.solved_plate import SolvedPlate
 from model.arguments import expect
 from model.arrays import FloatArray
 from model.figures.drawing import map_figure
-from model.figures.fingertips import draw_fingertip, draw_level_scale, draw_levels
+from model.figures.table_pictures import draw_fingertip, draw_level_scale, draw_levels
 from model.table.pattern import Pattern
 from model.table.table import LocalizationTable
 from sim.plant.fingers import Record

@@ -9,8 +9,12 @@ from era_haptics.positions import Positions, as_loads, as_points
 from model.arguments import expect_number, is_whole, shown
 from model.errors import InputError
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate
-from model.reduction.supported_modes import SupportedModes, supported_modes
+from model.reduction.reduced_plate import (
+    ReducedPlate,
+    SupportedModes,
+    reduce_free_plate,
+    supported_modes,
+)
 from model.rig.rig import Rig
 from model.structure.point_load import footprints_of
 from model.table.pattern import ONSET_RAMP, Pattern

@@ -88,7 +88,7 @@ def record_responses(
 ) -> Responses:
     """Measure a rig's plate in time: each ERA at each frequency [Hz], once it has settled.
 
-    Structural damping is the viscous equivalent of `model.reduction.modal_matrices`.
+    Structural damping is the viscous equivalent of `model.reduction.reduced_plate`.
     """
     reduced = reduce_plate(
         rig.plate,

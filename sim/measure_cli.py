@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from model.commands.next_line import next_line
-from model.commands.options import JsonOption, RigArgument
+from model.commands.options import JsonOption, RigArgument, next_line
 
 if TYPE_CHECKING:
     from sim.measuring.measure import Measured
@@ -62,7 +61,7 @@ def measure(
     is repeated. The file is for era calibrate.
     """
     from model.calibration.responses_file import write_responses_csv, write_responses_uff
-    from model.commands.progress import progress_bar
+    from model.commands.options import progress_bar
     from model.config.points import parse_frequencies
     from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig

@@ -21,8 +21,7 @@ from benchmarks.setting import RIG
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.calibration.responses_file import write_responses_csv
-from model.fem.elements import ELEMENTS
-from model.fem.mesh import Mesh
+from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import PlateMatrices, assemble, direct_acceleration
 from model.rig.file import load_rig
 from model.rig.rig import Rig

@@ -32,7 +32,7 @@ def score_entry(
     from benchmarks.contrast.data_set import VERSION, checksum
     from benchmarks.contrast.entry import read_entry
     from benchmarks.contrast.score import score, summary
-    from model.commands.progress import progress_bar
+    from model.commands.options import progress_bar
 
     name, excitations = read_entry(file)
     with progress_bar("contact sets") as progress:

@@ -22,8 +22,8 @@ from model.rig.rig import Rig
 from model.structure.point_load import footprints_of
 from model.table.build import build_table
 from model.table.question import Question
-from model.transients.envelope import Bases, ramped_ending, ramped_onset, shaped
-from model.transients.hats import steady_states
+from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped
+from model.transients.knots import steady_states
 from model.transients.measures import ENDING_WINDOW, Transients
 from model.transients.shaping import Shaper
 from model.transients.time_response import PlateInTime, plate_in_time

@@ -13,7 +13,7 @@ from model.finger.perception import STRONG_DB_SL, detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
-from model.transients.envelope import Envelopes
+from model.transients.base_motion import Envelopes
 from model.vibration.excitation import Excitation, Tone
 
 FREQUENCIES = np.linspace(40, 500, 27)

@@ -11,7 +11,7 @@ from model.finger.contrast import contrast_db
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.rig.rig import Rig
 from model.table.pattern import ONSET_RAMP
-from model.transients.envelope import Bases, ramped_ending, ramped_onset, shaped
+from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.shaping import Shaper
 from model.transients.time_response import PlateInTime

@@ -9,8 +9,7 @@ import typer
 import drivers.by_hand.cli
 from controller.cli.layout import layout_app
 from controller.cli.rig import rig_app
-from model.commands.next_line import next_line
-from model.commands.options import ExactOption, SeedOption, seed_of_plate
+from model.commands.options import ExactOption, SeedOption, next_line, seed_of_plate
 from model.counting import counted
 from model.errors import InputError
 

@@ -14,8 +14,7 @@ from controller.cli.plate_by_amplifiers import (
     require_untouched,
     rig_of_file,
 )
-from model.commands.next_line import next_line
-from model.commands.options import JsonOption
+from model.commands.options import JsonOption, next_line
 from model.errors import InputError
 
 if TYPE_CHECKING:
@@ -192,7 +191,7 @@ def _measured_by_device(
     """Measure by a sound card, with a progress bar on a terminal."""
     from contextlib import nullcontext
 
-    from model.commands.progress import progress_bar
+    from model.commands.options import progress_bar
     from model.identification.measured_plate import measure_by_device
 
     with progress_bar("runs") if is_shown else nullcontext(_ignore) as progress:

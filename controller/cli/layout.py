@@ -44,7 +44,7 @@ def check(
 
     from controller.effects.layout_check import check_layout
     from controller.effects.layout_file import load_layout
-    from model.commands.progress import progress_bar
+    from model.commands.options import progress_bar
     from model.files.replacing import check_picture_name
     from model.table.file import load_table
 

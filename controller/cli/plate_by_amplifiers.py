@@ -64,7 +64,7 @@ def measured_by_amplifiers(
     from controller.cli.amplifier_urls import urls_of
     from controller.diagnosis.plate_measurement import PlateSelfMeasurement
     from drivers.opening import Lines
-    from model.commands.progress import progress_bar
+    from model.commands.options import progress_bar
 
     at = urls_of(rig, urls)
 

@@ -9,7 +9,7 @@ from controller.daemon.config_sections import DaemonSection
 from drivers.by_hand.rig_check import check_links
 from model.config.document import Document
 from model.config.kinds import CheckedFile
-from model.rig.gain_notes import gain_notes
+from model.rig.kind import gain_notes
 
 
 class DaemonKind:

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from controller.demo.touch_row import TouchRow
 from model.choice import ranked_by
-from model.figures.fingertips import draw_fingertip, draw_level_scale, draw_levels
+from model.figures.table_pictures import draw_fingertip, draw_level_scale, draw_levels
 from model.table.table import LocalizationTable
 
 MAX_PANELS = 6

@@ -21,7 +21,7 @@ from model.structure.fingertip import fingertip_loads
 from model.table.effect_level import EffectLevels
 from model.table.pulse_gains import robust_over_effect_db
 from model.table.table import LocalizationTable
-from model.transients.envelope import Bases, ramped_pulse
+from model.transients.base_motion import Bases, ramped_pulse
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation

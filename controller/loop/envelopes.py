@@ -20,7 +20,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.protocol.table import MAX_WORDS, QUANTITIES
 from model.rig.rig import Rig
-from model.transients.envelope import KNOT_STEP, BaseEnvelope, Envelopes
+from model.transients.base_motion import KNOT_STEP, BaseEnvelope, Envelopes
 from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
 
 MAX_SET_TIME = 0.010

@@ -11,7 +11,7 @@ from model.rig.rig import Rig
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.timing import Timing
-from model.transients.envelope import KNOT_STEP
+from model.transients.base_motion import KNOT_STEP
 from model.transients.knots import ONSET_KNOTS
 
 FADE_RAMP = 0.020

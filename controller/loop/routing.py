@@ -14,7 +14,7 @@ from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
-from model.transients.envelope import Envelopes
+from model.transients.base_motion import Envelopes
 from model.vibration import excitation as physics
 
 LAYER = 0

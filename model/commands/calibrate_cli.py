@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from model.commands.next_line import next_line
-from model.commands.options import JsonOption, MeshOption, RigArgument
+from model.commands.options import JsonOption, MeshOption, RigArgument, next_line
 from model.counting import counted
 from model.errors import InputError
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from model.commands.next_line import next_line
+from model.commands.options import next_line
 from model.errors import InputError
 
 config_app = typer.Typer(help="Create and check configuration files.", no_args_is_help=True)

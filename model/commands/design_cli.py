@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from model.commands.next_line import next_line
 from model.commands.options import (
     ClusterOption,
     ContactsOption,
@@ -17,6 +16,7 @@ from model.commands.options import (
     LowestOption,
     MeshOption,
     RigArgument,
+    next_line,
 )
 from model.counting import counted
 
@@ -103,7 +103,7 @@ def design(
 
     Resume an interrupted design.
     """
-    from model.commands.progress import progress_bar
+    from model.commands.options import progress_bar
     from model.config.document import read_document
     from model.config.units import LENGTH
     from model.design.area import area_of

@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from model.commands.next_line import next_line
-from model.commands.options import FolderOption, JsonOption, MeshOption, RigArgument
+from model.commands.options import FolderOption, JsonOption, MeshOption, RigArgument, next_line
 
 figure_app = typer.Typer()
 

@@ -8,8 +8,7 @@ from typing import Annotated
 
 import typer
 
-from model.commands.next_line import next_line
-from model.commands.options import JsonOption, MeshOption, RigArgument
+from model.commands.options import JsonOption, MeshOption, RigArgument, next_line
 
 plate_app = typer.Typer(help="Compute modes and vibration maps of a plate.")
 
@@ -162,7 +161,7 @@ def convergence(
 
     Print errors of natural frequencies and of responses.
     """
-    from model.commands.progress import progress_bar
+    from model.commands.options import progress_bar
     from model.config.points import parse_frequencies
     from model.rig.file import load_rig
     from model.vibration.convergence import (

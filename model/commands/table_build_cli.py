@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from model.commands.next_line import next_line
-from model.commands.options import JsonOption, MeshOption, RigArgument
+from model.commands.options import JsonOption, MeshOption, RigArgument, next_line
 from model.counting import counted
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ def build(
 
     Resume an interrupted build.
     """
-    from model.commands.progress import progress_bar
+    from model.commands.options import progress_bar
     from model.config.points import parse_frequencies, parse_pair
     from model.drive_modes import DRIVE_MODES
     from model.errors import InputError

@@ -8,8 +8,7 @@ from typing import Annotated
 
 import typer
 
-from model.commands.next_line import next_line
-from model.commands.options import FolderOption, JsonOption, TableArgument
+from model.commands.options import FolderOption, JsonOption, TableArgument, next_line
 
 
 class Format(StrEnum):
@@ -32,7 +31,7 @@ def plot(
     as_json: JsonOption = False,
 ) -> None:
     """Draw weak cells, levels, contrast and an answer."""
-    from model.commands.progress import progress_bar
+    from model.commands.options import progress_bar
     from model.figures import save_figure
     from model.figures.table_pictures import table_figures
     from model.table.file import load_table

@@ -24,7 +24,7 @@ def verify_by_measuring(
     as_json: bool,
 ) -> None:
     """Measure promises of a table; exit with 1 where too few are kept."""
-    from model.commands.progress import progress_bar
+    from model.commands.options import progress_bar
     from model.files.replacing import check_picture
     from model.rig.file import load_rig
     from model.table.file import load_table

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from model.commands.next_line import next_line
-from model.commands.options import JsonOption, TableArgument
+from model.commands.options import JsonOption, TableArgument, next_line
 
 if TYPE_CHECKING:
     from model.table.verify import Verification
@@ -21,7 +20,7 @@ def show(
     as_json: JsonOption = False,
 ) -> None:
     """Show levels, weak cells, contrast and origin of a table."""
-    from model.commands.progress import progress_bar
+    from model.commands.options import progress_bar
     from model.table.file import load_table
     from model.table.overview import kept_overview
     from model.table.summary import summarize
@@ -119,7 +118,7 @@ def verify(
 def _verify_by_solving(
     table_file: Path, rig_file: Path, *, samples: int, seed: int, as_json: bool
 ) -> None:
-    from model.commands.progress import progress_bar
+    from model.commands.options import progress_bar
     from model.rig.file import load_rig
     from model.table.file import load_table
     from model.table.verify import verify_table

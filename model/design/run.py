@@ -17,8 +17,7 @@ from model.design.layouts import NamedLayouts
 from model.design.problem import DesignProblem
 from model.design.search import Found, LayoutSearch
 from model.errors import InputError
-from model.files.array_file import Arrays
-from model.files.kept_arrays import keep_arrays, kept_arrays
+from model.files.array_file import Arrays, keep_arrays, kept_arrays
 from model.processes import on_processes
 from model.structure.support import support_problem
 

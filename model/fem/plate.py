@@ -16,8 +16,7 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.fem.elements import DOF_PER_NODE
-from model.fem.mesh import Mesh, check_frequencies
+from model.fem.mesh import DOF_PER_NODE, Mesh, check_frequencies
 from model.structure.actuator import Era
 from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.modal_elasticity import check_of_theory, loss_factors

@@ -6,8 +6,7 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import FloatArray
-from model.fem.elements import DOF_PER_NODE
-from model.fem.mesh import Mesh
+from model.fem.mesh import DOF_PER_NODE, Mesh
 from model.fem.plate import RIGID_BODY_MODES, PlateMatrices, assemble, factorise, lowest_modes
 from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
 from model.structure.dispersion import Dispersion

@@ -1,16 +1,27 @@
-"""Rig files as a kind of configuration of `era config`."""
+"""Rig files as a kind of configuration of `era config`.
 
+The check of a rig's amplifiers by the package that knows wires.
+
+What is not known of how bases follow the outputs of amplifiers, for `era config check`.
+"""
+
+import cmath
 import math
+from collections import Counter
+from itertools import pairwise
+from pkgutil import resolve_name
 from typing import Any
+from urllib.parse import quote
 
 from model.config.document import ConfigError, Document, Problem
 from model.config.kinds import CheckedFile
-from model.fem.elements import SHEAR_CORRECTION
-from model.rig.amplifiers import check_amplifiers
+from model.fem.mesh import SHEAR_CORRECTION
 from model.rig.checks import STIFF_MOUNT
 from model.rig.file import example_rig_path, rig_of, rig_schema
-from model.rig.gain_notes import gain_notes
+from model.rig.parts import limits_of
 from model.rig.rig import Rig
+from model.rig.sections import LimitsSection
+from model.structure.actuator import Era
 from model.structure.laminate_section import slide_frequency
 from model.structure.support import support_problem
 
@@ -129,3 +140,67 @@ def _summary(rig: Rig) -> str:
     if carried := sum(mass.mass for mass in rig.masses):
         parts.append(f"carries {1e3 * carried:g} g")
     return f"good: {', '.join(parts)}"
+
+
+_MAX_ANGLE = math.radians(20.5)  # between two rows
+
+
+def gain_notes(rig: Rig) -> list[str]:
+    """One warning for each ERA behind an output whose gains are missing, or rows too far apart."""
+    behind = [era for era in rig.eras if rig.wiring[era.name].amplifier in rig.outputs]
+    low, high = rig.limits.frequency_min, rig.limits.frequency_max
+    return [text for era in behind for text in _notes(era, low, high)]
+
+
+def _notes(era: Era, low: float, high: float) -> list[str]:
+    if not era.gains:
+        return [
+            f"eras.{era.name}.gains: missing behind an output, so that its motion is a guess, a "
+            "stroke by full level at every frequency; measure the plate and calibrate the rig"
+        ]
+    played = [each for each in pairwise(era.gains) if each[0][0] < high and each[1][0] > low]
+    turns = {
+        abs(cmath.phase(cmath.rect(1, other[2] - one[2]))): (one[0], other[0])
+        for one, other in played
+    }
+    angle = max(turns, default=0.0)
+    if angle <= _MAX_ANGLE:
+        return []
+    first, last = turns[angle]
+    return [
+        f"eras.{era.name}.gains: phases differ by {math.degrees(angle):.0f} degrees between "
+        f"{first:g} and {last:g} Hz, at most 20 are interpolated well; measure between them"
+    ]
+
+
+_CHECK = "drivers.by_hand.rig_check:check_links"
+"""By name: this package does not import the one beside it.
+
+Of URLs by the amplifier's name, numbers of channels that are wired, and the rig's limits; it gives
+errors by the amplifier's name, and warnings, and opens none.
+"""
+
+
+def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[Problem], list[str]]:
+    """Problems and warnings; rig: of the document, None if it is invalid."""
+    urls = _urls(document)
+    wired = Counter(channel.amplifier for channel in rig.wiring.values()) if rig else Counter()
+    limits = rig.limits if rig else limits_of(LimitsSection())
+    wrong, warnings = resolve_name(_CHECK)(urls, channels=wired, limits=limits)
+    problems = [
+        document.problem(("amplifiers", amplifier, "url"), what)
+        for amplifier, what in wrong.items()
+    ]
+    return problems, [*warnings]
+
+
+def _urls(document: Document) -> dict[str, str]:
+    """All URLs that are text; `sim://` becomes a simulated amplifier over this rig."""
+    amplifiers = document.data.get("amplifiers")
+    urls = {}
+    for name, amplifier in amplifiers.items() if isinstance(amplifiers, dict) else ():
+        url = amplifier.get("url") if isinstance(amplifier, dict) else None
+        if isinstance(url, str):
+            here = f"sim://{quote(document.source)}?amplifier={quote(str(name))}"
+            urls[name] = here if url == "sim://" else url
+    return urls

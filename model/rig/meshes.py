@@ -6,8 +6,7 @@ from typing import Any
 
 from model.config.units import LENGTH, quantity
 from model.errors import InputError
-from model.fem.elements import element_of
-from model.fem.mesh import PAPER_ELEMENT, Mesh
+from model.fem.mesh import PAPER_ELEMENT, Mesh, element_of
 from model.spectral.mesh import MAX_DEGREE, MAX_POLYNOMIALS, POLYNOMIALS, PlateMesh, SpectralMesh
 from model.structure.plate import Plate
 

@@ -34,7 +34,7 @@ from numpy.polynomial.legendre import leggauss
 from scipy import special
 
 from model.arrays import FloatArray, IntArray
-from model.fem.elements import SHEAR_CORRECTION
+from model.fem.mesh import SHEAR_CORRECTION
 from model.structure.footprint import as_footprints, mean_over
 from model.structure.plate import Plate
 

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
-from model.files.array_file import Arrays
-from model.files.kept_arrays import keep_arrays, kept_arrays
+from model.files.array_file import Arrays, keep_arrays, kept_arrays
 from model.table.table_parts import PART_TYPES, Part
 
 _SUFFIX = ".part.npz"

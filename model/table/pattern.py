@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.finger.perception import DEFAULT_THRESHOLD, highest_measured, sensitivity_margin_db
-from model.transients.envelope import Envelopes
+from model.transients.base_motion import Envelopes
 from model.vibration.excitation import Excitation
 
 ONSET_RAMP = 0.040

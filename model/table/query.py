@@ -19,7 +19,7 @@ from model.table.request import APART_HZ, Finger, Request
 from model.table.table import LocalizationTable
 from model.table.thorough_query import query_thoroughly
 from model.table.timing import Timing
-from model.transients.envelope import Envelopes
+from model.transients.base_motion import Envelopes
 
 _Place = Annotated[list[float], Field(min_length=2, max_length=2)]
 

@@ -91,7 +91,7 @@ class LocalizationTable:
     - attachment_shapes: (eras + masses, r) [1/sqrt(kg)], its shapes at ERAs and masses
     - shapes: (points, r) [1/sqrt(kg)], its shapes on the raster
     - discretisation_error: (f,), estimated relative L2 error of the fields over the raster
-      (`model.vibration.discretisation`), maximum over the ERAs
+      (`model.vibration.convergence`), maximum over the ERAs
     """
 
     plate: Plate

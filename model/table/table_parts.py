@@ -23,7 +23,7 @@ from model.structure.support import check_supported
 from model.table.file import FORMAT_VERSION, MAX_BYTES
 from model.table.raster import Raster
 from model.version import NUMERICS_VERSION
-from model.vibration.discretisation import estimate_error, finer_mesh
+from model.vibration.convergence import estimate_error, finer_mesh
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from model.table.effect_level import EffectLevels
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
-from model.transients.envelope import Bases, ramped_ending, ramped_onset, shaped
+from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped
 from model.transients.measures import Transients
 from model.transients.shaping import Shaper
 

@@ -35,7 +35,7 @@ from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.weak_cells import are_apart
-from model.transients.envelope import ramped_onset
+from model.transients.base_motion import ramped_onset
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.direct import Responder, direct_responder

@@ -12,9 +12,8 @@ from model.arrays import ComplexArray, FloatArray
 from model.finger.contrast import contrast_db
 from model.finger.felt_band import felt_part
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.transients.base_motion import BaseMotions
-from model.transients.envelope import Bases
-from model.transients.hats import mean_square, steady_states
+from model.transients.base_motion import BaseMotions, Bases
+from model.transients.knots import mean_square, steady_states
 from model.transients.time_response import ForcedVibration, PlateInTime
 from model.vibration.excitation import Excitation
 

@@ -10,7 +10,7 @@ carrier's phase at that moment. Known quiet fingers are kept quiet during the en
 the plate takes other vibrations than the pattern's.
 
 Both are robust against errors of the ERAs (`model.transients.knots`), and no knot ever exceeds the
-stroke (`model.transients.bounded_solution`).
+stroke (`model.transients.knots`).
 """
 
 import math
@@ -22,9 +22,8 @@ from model.arrays import ComplexArray, FloatArray, IntArray
 from model.finger.contrast import is_background
 from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points, fingertip_weights
 from model.finger.grid import Grid
-from model.transients.envelope import BaseEnvelope, Envelopes
-from model.transients.hats import mean_square
-from model.transients.knots import Carrier, ending_knots, onset_knots, solve_carrier
+from model.transients.base_motion import BaseEnvelope, Envelopes
+from model.transients.knots import Carrier, ending_knots, mean_square, onset_knots, solve_carrier
 from model.transients.measures import ENDING_WINDOW
 from model.transients.time_response import PlateInTime
 from model.vibration.excitation import Excitation

@@ -4,7 +4,7 @@
 
 q are the coordinates of the reduced free plate and the displacements of the phalanges of fingers
 on it, phi the shapes at an ERA, y the motion of the ERA's base; M, C and K are those of
-`model.reduction.modal_matrices`. The first-order system is
+`model.reduction.reduced_plate`. The first-order system is
 diagonalised once for each set of attachments; the base moves in terms with closed-form
 particular solutions (`model.transients.base_motion`), so no step size enters and no error grows
 with time.
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.reduction.modal_matrices import Reduced, modal_matrices
+from model.reduction.reduced_plate import ReducedPlate, modal_matrices
 from model.structure.actuator import Era
 from model.structure.fingertip import FingertipLoad
 from model.structure.point_load import PointLoad, footprints_of
@@ -93,7 +93,7 @@ class PlateInTime:
     the vectors; participation (2 r, eras); forced (2 r, r): z' by a force on each coordinate.
     """
 
-    reduced: Reduced
+    reduced: ReducedPlate
     eras: tuple[Era, ...]
     eigenvalues: ComplexArray
     vectors: ComplexArray
@@ -244,7 +244,7 @@ class PlateInTime:
 
 
 def plate_in_time(
-    reduced: Reduced,
+    reduced: ReducedPlate,
     eras: Sequence[Era],
     *,
     loads: Sequence[PointLoad] = (),

@@ -21,7 +21,7 @@ from model.structure.actuator import Era
 from model.structure.fingertip import Fingertip
 from model.structure.point_load import PointLoad
 from model.transients.base_motion import Motion, Term
-from model.vibration.discretisation import finer_mesh
+from model.vibration.convergence import finer_mesh
 
 _MAX_LOSS_FACTOR = 0.99
 _MIN_FACTOR = 0.05  # of a normal draw about 1, which may be negative

@@ -19,7 +19,7 @@ from model.rig.rig import Rig
 from model.structure.fingertip import fingertip_loads
 from model.table.pattern import ONSET_RAMP
 from model.table.question import Question
-from model.transients.envelope import Envelopes, ramped_onset, shaped
+from model.transients.base_motion import Envelopes, ramped_onset, shaped
 from model.transients.measures import ONSET_WINDOW
 from model.vibration.excitation import Excitation
 from model.vibration.peak import base_amplitudes, peak_acceleration

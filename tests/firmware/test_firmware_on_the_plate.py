@@ -19,8 +19,7 @@ from model.structure.point_load import footprints_of
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.timing import Timing
-from model.transients.base_motion import Term
-from model.transients.envelope import BaseEnvelope, shaped
+from model.transients.base_motion import BaseEnvelope, Term, shaped
 from moved_firmware import RATE
 from paper_table import smooth_rig, smooth_table
 from sim.plant.fingers import Record

@@ -11,8 +11,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from model.arrays import FloatArray
-from model.fem.elements import DOF_PER_NODE, Element, rigidities
-from model.fem.mesh import Mesh
+from model.fem.mesh import DOF_PER_NODE, Element, Mesh, rigidities
 from model.fem.plate import assemble, lowest_modes
 from model.structure.material import Material
 from model.structure.plate import Plate

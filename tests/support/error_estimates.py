@@ -26,7 +26,7 @@ from model.spectral.mesh import SpectralMesh
 from model.structure.actuator import Era
 from model.structure.material import Material
 from model.structure.plate import Plate
-from model.vibration.discretisation import estimate_error
+from model.vibration.convergence import estimate_error
 
 MAX_RATIO = 1.4
 """Largest error, relative to its estimate."""

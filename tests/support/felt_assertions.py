@@ -26,7 +26,7 @@ from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
-from model.transients.envelope import BaseEnvelope, shaped
+from model.transients.base_motion import BaseEnvelope, shaped
 from model.vibration.direct import direct_responder
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant

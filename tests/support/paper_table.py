@@ -5,8 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from model.fem.elements import ELEMENTS
-from model.fem.mesh import Mesh
+from model.fem.mesh import ELEMENTS, Mesh
 from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable

@@ -7,8 +7,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from model.arrays import ComplexArray, FloatArray
-from model.reduction.modal_matrices import modal_matrices
-from model.reduction.reduced_plate import reduce_plate
+from model.reduction.reduced_plate import modal_matrices, reduce_plate
 from model.rig.rig import Rig
 from model.structure.point_load import footprints_of
 from model.transients.time_response import PlateInTime, plate_in_time

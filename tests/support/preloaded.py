@@ -47,7 +47,7 @@ _LOADED = (
     "controller.daemon.config_reader",
     "controller.daemon.run",
     "controller.gateway.serving",
-    "model.commands.progress",
+    "model.commands.options",
     "model.fem.plate",
     "model.design.run",
     "model.table.build",

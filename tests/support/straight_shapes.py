@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from model.table.pattern import Pattern
 from model.table.question import Question
-from model.transients.envelope import BaseEnvelope
+from model.transients.base_motion import BaseEnvelope
 
 
 class Shapes:

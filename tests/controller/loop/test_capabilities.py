@@ -18,7 +18,7 @@ from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
 from model.structure.material import Material
 from model.structure.plate import Plate
-from model.transients.envelope import BaseEnvelope
+from model.transients.base_motion import BaseEnvelope
 from registry.limits import GuardLimits
 from sim.amplifier.capabilities import capabilities
 

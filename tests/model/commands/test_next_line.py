@@ -2,7 +2,7 @@ import os
 
 import pytest
 
-from model.commands.next_line import next_line
+from model.commands.options import next_line
 
 
 @pytest.mark.parametrize(

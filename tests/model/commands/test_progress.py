@@ -2,8 +2,8 @@
 
 import pytest
 
-from model.commands import progress
-from model.commands.progress import progress_bar
+from model.commands import options
+from model.commands.options import progress_bar
 
 
 def test_log_gets_a_line_every_two_seconds(
@@ -11,7 +11,7 @@ def test_log_gets_a_line_every_two_seconds(
 ) -> None:
     """Of ten steps of half a second those at 2 and 4 s are printed, without a bar."""
     now = [0.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(options.time, "monotonic", lambda: now[0])
     with progress_bar("cells") as update:
         for done in range(1, 11):
             now[0] = 0.5 * done

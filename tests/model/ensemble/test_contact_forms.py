@@ -12,8 +12,7 @@ from model.ensemble.contact_forms import load_contacts
 from model.ensemble.draws import draw
 from model.ensemble.thickness import responses_of_thicknesses, thickness_nodes
 from model.ensemble.tone_responses import NOMINAL, Tones, tone_responses
-from model.fem.elements import ELEMENTS
-from model.fem.mesh import Mesh
+from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import assemble, direct_acceleration
 from model.finger.disc import FIVE_POINTS
 from model.finger.fingertip import FINGERTIP_RADIUS

@@ -6,7 +6,7 @@ What their matrices must keep is in `element_checks`; each of ours is held to it
 import numpy as np
 import pytest
 
-from model.fem.elements import ELEMENTS, Element, rigidities
+from model.fem.mesh import ELEMENTS, Element, rigidities
 from model.structure.plate import Plate
 from paper_plate import ALUMINIUM
 

@@ -5,7 +5,7 @@ import pytest
 
 from element_checks import CHECKS, DX, DY, PLATE, frequency_error, rate
 from model.arrays import FloatArray
-from model.fem.elements import ELEMENTS, MITC4, Q3, Element, rigidities
+from model.fem.mesh import ELEMENTS, MITC4, Q3, Element, rigidities
 
 _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
 _GAUSS = np.array([[s, t] for t in (-1, 1) for s in (-1, 1)]) / np.sqrt(3)

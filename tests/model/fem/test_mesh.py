@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.fem.elements import ELEMENTS
-from model.fem.mesh import Mesh
+from model.fem.mesh import ELEMENTS, Mesh
 from model.rig.meshes import mesh_from_dict, parse_mesh
 from model.structure.plate import Plate
 from paper_plate import ALUMINIUM, LENGTH, WIDTH

@@ -5,8 +5,7 @@ import pytest
 
 from long_form import shortly
 from model.errors import InputError
-from model.fem.elements import ELEMENTS
-from model.fem.mesh import Mesh
+from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import assemble, modes
 from model.structure.actuator import Era
 from model.structure.plate import Plate

@@ -8,8 +8,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from model.errors import InputError
-from model.fem.elements import ELEMENTS
-from model.fem.mesh import Mesh
+from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import assemble, direct_acceleration, modes
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.spectral.mesh import SpectralMesh

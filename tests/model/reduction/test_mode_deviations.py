@@ -7,8 +7,7 @@ import pytest
 
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.modal_matrices import modal_matrices
-from model.reduction.reduced_plate import reduce_plate
+from model.reduction.reduced_plate import modal_matrices, reduce_plate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.spectral.direct import direct_spectral_acceleration

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from model.fem.elements import ELEMENTS
-from model.fem.mesh import Mesh
+from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import assemble, direct_acceleration
 from model.reduction.reduced_plate import reduce_plate
 from model.structure.actuator import Era

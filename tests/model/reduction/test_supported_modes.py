@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from model.fem.mesh import Mesh
-from model.reduction.reduced_plate import reduce_plate
-from model.reduction.supported_modes import SupportedModes, supported_modes
+from model.reduction.reduced_plate import SupportedModes, reduce_plate, supported_modes
 from model.rig.rig import Rig
 from model.structure.actuator import damping_from_ratio
 from model.structure.point_load import footprints_of

@@ -8,7 +8,7 @@ import pytest
 from model.config.document import ConfigError
 from model.fem.plate import assemble, direct_acceleration
 from model.rig.file import load_rig, parse_rig
-from model.rig.gain_notes import gain_notes
+from model.rig.kind import gain_notes
 from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.question import Question

@@ -12,8 +12,7 @@ from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.fem.plate import assemble
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.reduced_plate import reduce_free_plate
-from model.reduction.supported_modes import supported_modes
+from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.file import load_rig
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import Band, SpectralPlate

@@ -9,8 +9,7 @@ from scipy import linalg
 
 from long_form import in_turn
 from model.errors import InputError
-from model.fem.elements import Q5
-from model.fem.mesh import Mesh
+from model.fem.mesh import Q5, Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.reduction.spectral_modes import spectral_modes

@@ -7,8 +7,7 @@ import pytest
 from scipy import special
 from scipy.integrate import trapezoid
 
-from model.fem.elements import element_of
-from model.fem.mesh import Mesh
+from model.fem.mesh import Mesh, element_of
 from model.reduction.free_plate import solve_free_plate
 from model.spectral.mesh import SpectralMesh
 from model.structure.actuator import Era

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.reduction.reduced_plate import reduce_plate
-from model.reduction.supported_modes import supported_modes
+from model.reduction.reduced_plate import reduce_plate, supported_modes
 from model.rig.file import example_rig_path, load_rig
 from model.structure.actuator import Era
 from model.structure.material import Material

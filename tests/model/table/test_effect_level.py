@@ -12,7 +12,7 @@ from model.finger.perception import detection_threshold
 from model.table.effect_level import DriveLimits, EffectLevels, pulse_ramp, shaped_gain_db
 from model.table.pattern import Pattern
 from model.table.question import Question
-from model.transients.envelope import ramped_onset, ramped_pulse
+from model.transients.base_motion import ramped_onset, ramped_pulse
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.vibration.excitation import Excitation, Tone
 from small_table import small_table

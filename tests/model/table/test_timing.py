@@ -13,7 +13,7 @@ from model.table.build import build_table
 from model.table.query import query_batch
 from model.table.question import Question
 from model.table.timing import Timing
-from model.transients.envelope import ramped_ending, ramped_onset, shaped
+from model.transients.base_motion import ramped_ending, ramped_onset, shaped
 from model.transients.measures import Transients
 from model.transients.time_response import plate_in_time
 from paper_plate import make_paper_rig

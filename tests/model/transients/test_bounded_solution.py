@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from model.transients.bounded_solution import bounded_solution
+from model.transients.knots import bounded_solution
 
 
 def random_form(seed: int, n: int):

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.transients.base_motion import Term
-from model.transients.envelope import BaseEnvelope, ramped_ending, ramped_onset
+from model.transients.base_motion import BaseEnvelope, Term, ramped_ending, ramped_onset
 from model.vibration.excitation import Tone
 from paper_plate import make_paper_rig
 

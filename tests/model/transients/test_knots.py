@@ -4,9 +4,8 @@ import math
 
 import numpy as np
 
-from model.transients.envelope import BaseEnvelope, shaped
-from model.transients.hats import mean_square
-from model.transients.knots import ENDING_KNOTS, solve_carrier, while_ending
+from model.transients.base_motion import BaseEnvelope, shaped
+from model.transients.knots import ENDING_KNOTS, mean_square, solve_carrier, while_ending
 from model.transients.measures import Transients
 from model.vibration.excitation import Tone
 from plate_in_time import make_plate_in_time

@@ -11,7 +11,7 @@ from model.reduction.reduced_plate import reduce_plate
 from model.structure.point_load import footprints_of
 from model.table.pattern import ONSET_RAMP
 from model.table.question import Question
-from model.transients.envelope import ramped_onset
+from model.transients.base_motion import ramped_onset
 from model.transients.measures import Transients
 from model.transients.onset import RampedOnsets
 from model.transients.time_response import plate_in_time

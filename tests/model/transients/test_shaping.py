@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.transients.envelope import Envelopes, ramped_ending, ramped_onset, shaped
-from model.transients.hats import steady_states
-from model.transients.knots import ONSET_KNOTS
+from model.transients.base_motion import Envelopes, ramped_ending, ramped_onset, shaped
+from model.transients.knots import ONSET_KNOTS, steady_states
 from model.transients.measures import Transients
 from model.transients.shaping import Shaper
 from model.vibration.excitation import Excitation, Tone

@@ -1,12 +1,12 @@
 """A plate in time whose equations of motion cannot be taken apart."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from model.arrays import FloatArray
 from model.errors import InputError
+from model.reduction.reduced_plate import ReducedPlate
 from model.structure.actuator import Era
 from model.structure.materials import material
 from model.structure.plate import Plate
@@ -16,17 +16,11 @@ ERA = Era("", 0, 0, stiffness=100.0**2, damping=2 * 100.0, bolt_mass=0.0, stroke
 """Under one kilogram it is damped critically, in numbers that are exact."""
 
 
-@dataclass(frozen=True)
-class ThreeMasses:
-    """A kilogram on each of three ERAs, and nothing between them: as few coordinates as stand."""
-
-    plate = Plate(0.3, 0.2, 0.001, material("steel"), loss_factor=0.0)
-    omega = np.zeros(3)
-    losses = np.zeros(3)
-
-    def at(self, points: FloatArray) -> FloatArray:
-        """A point each."""
-        return np.eye(3)[: len(points)]
+PLATE = Plate(0.3, 0.2, 0.001, material("steel"), loss_factor=0.0)
+THREE_MASSES = ReducedPlate(
+    PLATE, np.zeros(3), np.zeros(3), lambda points: np.eye(3)[: len(points)]
+)
+"""A kilogram on each of three ERAs, and nothing between them: as few coordinates as stand."""
 
 
 @pytest.mark.parametrize("mass", [0.0, 3.0])
@@ -39,7 +33,7 @@ def test_plate_in_time_refuses_critical_damping(mass: float) -> None:
     era = replace(ERA, bolt_mass=mass, damping=factor * ERA.damping)
     eras = [replace(era, x=x, y=y) for x, y in ((0.0, 0.0), (0.1, 0.0), (0.0, 0.1))]
     with pytest.raises(InputError, match="damped critically"):
-        plate_in_time(ThreeMasses(), eras)
+        plate_in_time(THREE_MASSES, eras)
     softer = [replace(each, damping=0.999 * era.damping) for each in eras]
-    solved = plate_in_time(ThreeMasses(), softer)
+    solved = plate_in_time(THREE_MASSES, softer)
     assert np.abs(solved.eigenvalues) == pytest.approx(100 / factor)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.transients.envelope import BaseEnvelope, ramped_ending, ramped_onset, shaped
-from model.transients.hats import hat_accelerations
+from model.transients.base_motion import BaseEnvelope, ramped_ending, ramped_onset, shaped
+from model.transients.knots import hat_accelerations
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.vibration.excitation import Tone
 from plate_in_time import make_plate_in_time, stepped_acceleration

@@ -8,7 +8,7 @@ from long_form import shortly
 from model.fem.mesh import Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.spectral.mesh import SpectralMesh
-from model.vibration.discretisation import estimate_error, finer_mesh
+from model.vibration.convergence import estimate_error, finer_mesh
 from paper_plate import LENGTH, WIDTH, make_paper_rig
 
 

@@ -9,8 +9,7 @@ from scipy.signal import lsim
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem.mesh import Mesh
-from model.reduction.modal_matrices import modal_matrices
-from model.reduction.reduced_plate import ReducedPlate, reduce_plate
+from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_plate
 from model.structure.actuator import Era
 from model.structure.material import Material
 from model.structure.plate import Plate

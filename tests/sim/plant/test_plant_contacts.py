@@ -10,8 +10,7 @@ from numpy.testing import assert_allclose
 from driven_bases import Base, faded_base, shaped_base
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
-from model.reduction.modal_matrices import modal_matrices
-from model.reduction.reduced_plate import ReducedPlate, reduce_plate
+from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_plate
 from model.rig.rig import Rig
 from model.structure.fingertip import FingertipLoad
 from model.structure.point_load import footprints_of

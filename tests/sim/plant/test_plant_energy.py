@@ -9,8 +9,7 @@ from scipy.integrate import simpson
 
 from driven_bases import BASES
 from finger_energy import held_by_fingers, power_lost_in_fingers
-from model.reduction.modal_matrices import modal_matrices
-from model.reduction.reduced_plate import reduce_plate
+from model.reduction.reduced_plate import modal_matrices, reduce_plate
 from model.rig.rig import Rig
 from model.structure.fingertip import FingertipLoad
 from model.structure.point_load import footprints_of

@@ -16,7 +16,7 @@ from model.rig.rig import Rig
 from model.structure.fingertip import Fingertip, FingertipLoad
 from model.structure.point_load import footprints_of
 from model.table.question import Question
-from model.transients.envelope import BaseEnvelope, shaped
+from model.transients.base_motion import BaseEnvelope, shaped
 from model.transients.measures import Transients
 from model.transients.time_response import plate_in_time
 from model.vibration.excitation import Tone

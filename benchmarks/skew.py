@@ -16,8 +16,8 @@ import numpy as np
 
 from benchmarks.setting import RIG, random_contacts, use_one_thread
 from model.arrays import FloatArray
-from model.finger.contrast import contrast_db
 from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import contrast_db
 from model.rig.file import load_rig
 from model.table.build import build_table
 from model.table.question import MIN_LEVEL_DB_SL, Question

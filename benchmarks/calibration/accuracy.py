@@ -19,8 +19,8 @@ from examples.make_measured import (
 )
 from model.calibration.calibrate import calibrate
 from model.calibration.calibration_result import Calibration
-from model.finger.contrast import contrast_db
 from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import contrast_db
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import build_table

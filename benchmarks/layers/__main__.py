@@ -12,12 +12,9 @@ from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.spectral.functions import CLASSES
 from model.spectral.modes import Band, SpectralPlate
-from model.structure.air_gap import AirGap
 from model.structure.equivalent import bending, equivalent_plate
-from model.structure.laminate import Laminate, Layer
 from model.structure.laminate_section import wavenumber_of
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
 from model.vibration.direct import direct_responder
 from model.vibration.natural_modes import natural_modes
 

@@ -12,8 +12,7 @@ from scipy import linalg, sparse
 from scipy.sparse.linalg import eigsh
 
 from model.arrays import FloatArray
-from model.structure.laminate import Layer
-from model.structure.material import Material
+from model.structure.plate import Layer, Material
 
 _GAUSS = [(-math.sqrt(0.6), 5 / 9), (0.0, 8 / 9), (math.sqrt(0.6), 5 / 9)]
 

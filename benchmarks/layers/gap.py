@@ -9,7 +9,7 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
 from model.arrays import ComplexArray, FloatArray
-from model.structure.air_gap import AirGap
+from model.structure.plate import AirGap
 
 
 def cell_middles(length: float, width: float, cells: tuple[int, int]) -> tuple[FloatArray, ...]:

@@ -17,7 +17,7 @@ from benchmarks.localization.cases import contact_sets, paper_table, question_of
 from benchmarks.setting import use_one_thread
 from model.arrays import FloatArray
 from model.finger import fingertip
-from model.finger.contrast import contrast_db
+from model.finger.perception import contrast_db
 
 RADII = (0.005, 0.0075, 0.010, 0.013)
 QUIET = (1, 2, 3)

@@ -1,5 +1,6 @@
 """Onsets and endings of many patterns on one rig, and how long shaping them takes."""
 
+import math
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -15,10 +16,12 @@ from benchmarks.transients.cases import (
     quantised,
     with_errors,
 )
-from model.finger.contrast import contrast_db
+from model.arrays import ComplexArray
 from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import contrast_db
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
 from model.structure.point_load import footprints_of
 from model.table.build import build_table
 from model.table.question import Question
@@ -27,8 +30,7 @@ from model.transients.knots import steady_states
 from model.transients.measures import ENDING_WINDOW, Transients
 from model.transients.shaping import Shaper
 from model.transients.time_response import PlateInTime, plate_in_time
-from model.vibration.excitation import Excitation, random_gains
-from model.vibration.peak import base_amplitudes
+from model.vibration.excitation import Excitation, base_amplitudes
 
 T = TypeVar("T")
 Columns = dict[str, list[float]]
@@ -201,3 +203,12 @@ def print_columns(title: str, columns: Columns, *, worse: float) -> None:
     for name, values in columns.items():
         unit = "" if name.endswith("largest level") else " dB"
         print(f"  {name:34s} {np.median(values):6.1f} ({np.percentile(values, worse):6.1f}){unit}")
+
+
+def random_gains(
+    rng: np.random.Generator, uncertainty: Uncertainty, *, draws: int, eras: int
+) -> ComplexArray:
+    """Draw complex gains of ERAs, normal in size and phase, (draws, eras)."""
+    gain = 1 + uncertainty.gain * rng.standard_normal((draws, eras))
+    phase = math.radians(uncertainty.phase_deg) * rng.standard_normal((draws, eras))
+    return np.asarray(gain * np.exp(1j * phase))

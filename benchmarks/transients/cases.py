@@ -7,9 +7,8 @@ import numpy as np
 
 from benchmarks.setting import random_contacts
 from model.arrays import ComplexArray
-from model.finger.contrast import contrast_db
 from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points
-from model.finger.perception import STRONG_DB_SL, detection_threshold
+from model.finger.perception import STRONG_DB_SL, contrast_db, detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty

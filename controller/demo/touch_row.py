@@ -7,10 +7,14 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from model.arrays import FloatArray
-from model.finger.contrast import contrast_db, mean_level_db_sl
-from model.finger.perception import DEFAULT_THRESHOLD, sensation_level
+from model.finger.perception import (
+    DEFAULT_THRESHOLD,
+    contrast_db,
+    mean_level_db_sl,
+    sensation_level,
+)
 from model.table.pattern import Pattern
-from model.vibration.peak import peak_acceleration
+from model.vibration.excitation import peak_acceleration
 
 Position: TypeAlias = tuple[float, float]
 

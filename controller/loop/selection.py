@@ -13,13 +13,13 @@ from controller.loop.intent import HapticIntent, Target
 from controller.loop.table_query import TableAnswer, is_short, query_table, why_held_back
 from controller.sources.contacts import Contact
 from model.errors import InputError
-from model.finger.contrast import contrast_db, mean_level_db_sl
 from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import contrast_db, mean_level_db_sl
 from model.table.effect_level import EffectLevels
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
-from model.vibration.peak import peak_acceleration
+from model.vibration.excitation import peak_acceleration
 from registry.plugins import failure_text
 
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own

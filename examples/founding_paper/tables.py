@@ -23,8 +23,8 @@ from model.rig.file import load_rig
 from model.rig.layouts import diagonal_pair
 from model.rig.rig import Rig
 from model.structure.plate import Plate
+from model.vibration.excitation import NULL_SHARE, G, find_nulls
 from model.vibration.natural_modes import natural_modes
-from model.vibration.peak import NULL_SHARE, G, find_nulls
 
 RIG = Path(__file__).parents[1] / "paper_plate.yaml"
 

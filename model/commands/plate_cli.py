@@ -94,8 +94,8 @@ def plate_map(
     from model.files.replacing import check_picture
     from model.rig.file import load_rig
     from model.structure.support import support_problem
+    from model.vibration.excitation import G
     from model.vibration.maps import plate_map as solve
-    from model.vibration.peak import G
 
     if output is not None:
         check_picture(output)

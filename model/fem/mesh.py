@@ -1,6 +1,4 @@
-"""A structured mesh of rectangles over the plate.
-
-Reissner-Mindlin rectangles: MITC4, the paper's element, and Q3 to Q5 of high order.
+"""A structured mesh over the plate of Reissner-Mindlin rectangles: MITC4, the paper's, Q3 to Q5.
 
 Every integral over a rectangle is the product of an integral along x and one along y. From the
 third order on, on Gauss-Lobatto nodes, thin plates do not lock. The four-node element would: its

@@ -18,10 +18,15 @@ from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.mesh import DOF_PER_NODE, Mesh, check_frequencies
 from model.structure.actuator import Era
-from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.modal_elasticity import check_of_theory, loss_factors
 from model.structure.plate import Plate
-from model.structure.point_load import Load, PointLoad, footprints_of
+from model.structure.point_load import (
+    Load,
+    PointLoad,
+    attached_stiffness,
+    drive_forces,
+    footprints_of,
+)
 
 RIGID_BODY_MODES = 3  # of a free plate: up and down, and two tilts
 

@@ -15,8 +15,8 @@ from model.files.replacing import check_picture_name
 from model.rig.rig import Rig
 from model.structure.actuator import Era
 from model.structure.plate import Plate
+from model.vibration.excitation import G
 from model.vibration.maps import PlateMap
-from model.vibration.peak import G
 
 COLORS = "viridis"
 ACTIVE_COLOR = "#d62728"

@@ -33,10 +33,9 @@ from model.rig.layouts import FOUR_ERA_LAYOUTS, EraLayout, alike, diagonal_pair,
 from model.rig.rig import Rig
 from model.structure.actuator import Era
 from model.structure.plate import Plate
-from model.vibration.excitation import Tone
+from model.vibration.excitation import G, Tone
 from model.vibration.maps import plate_map
 from model.vibration.natural_modes import natural_modes
-from model.vibration.peak import G
 
 SWEEP = np.arange(60.0, 321.0, 10.0)
 """The 27 frequencies [Hz] of figures 10 and 11: they hold every one the paper names."""

@@ -1,7 +1,4 @@
-"""Pictures of a table: weak cells, levels, contrast and a pattern.
-
-Sensation level over the plate, and the fingertips on it.
-"""
+"""Pictures of a table: weak cells, levels, contrast, and a pattern with its fingertips."""
 
 from collections.abc import Iterable, Iterator
 

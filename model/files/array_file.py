@@ -3,9 +3,8 @@
 Names, types and sizes must be those expected; nothing may be compressed or pickled, and no array
 may declare more than the file holds.
 
-Arrays kept in files, so that interrupted work can be resumed.
-
-Each file has a SHA-256 over its arrays and over a text that identifies them.
+Of arrays kept so that interrupted work can be resumed each file has a SHA-256 over its arrays and
+over a text that identifies them.
 """
 
 import glob

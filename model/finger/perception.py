@@ -1,14 +1,20 @@
-"""Detection thresholds at the fingertip, and levels above them in dB SL.
+"""Detection thresholds at the fingertip, levels above them in dB SL, and contrast.
 
 A set of thresholds is a file in model/data/thresholds, with its sources; its name is the file's.
 What is measured differs by tens of decibels between ways to touch (docs/concepts/people.md).
+
+Felt is the part of a vibration that skin can feel: Pacinian corpuscles answer to about 1 kHz. What
+is above it in an onset is the ringing of a fingertip's contact mass on the plate beneath it and of
+modes far beyond the drive, of which models with different numbers of modes say different things.
 """
 
 import csv
+from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.arrays import FloatArray
 from model.errors import InputError
@@ -105,3 +111,89 @@ def decibels(ratio: FloatArray | float) -> FloatArray:
     """20 log10 of an amplitude ratio, of the same shape; -inf for zero."""
     with np.errstate(divide="ignore"):
         return np.asarray(20 * np.log10(ratio))
+
+
+# The background of a lone finger begins at this distance [m], about two fingertips.
+NEAR_RADIUS = 0.05
+
+
+def is_beyond(points: FloatArray, targets: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
+    """Return which points [m] (p, 2) are farther than NEAR_RADIUS from every target [m], (p,)."""
+    apart = np.linalg.norm(points[:, None] - np.array(targets), axis=-1)
+    beyond: NDArray[np.bool_] = (apart > NEAR_RADIUS).all(axis=1)
+    return beyond
+
+
+def is_background(points: FloatArray, targets: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
+    """Return which points [m] (p, 2) are background to targets [m], (p,): those beyond, or all.
+
+    All where the plate is so small that no point is beyond.
+    """
+    beyond = is_beyond(points, targets)
+    return beyond if beyond.any() else ~beyond
+
+
+def contrast_ratio(
+    targets: Sequence[FloatArray],
+    quiet: FloatArray,
+    weights: Sequence[FloatArray] | None = None,
+) -> FloatArray:
+    """Contrast of peak amplitudes as a ratio: the weakest target to the loudest quiet point.
+
+    A target counts by the mean over its points, by weights (p,) each; None where all points count
+    alike. targets (..., p) each, quiet (..., q) -> (...).
+    """
+    each = weights or [np.full(len(target.T), 1 / len(target.T)) for target in targets]
+    means = [target @ weight for target, weight in zip(targets, each, strict=True)]
+    return np.asarray(np.minimum.reduce(means) / quiet.max(axis=-1))
+
+
+def contrast_db(
+    targets: Sequence[FloatArray],
+    quiet: FloatArray,
+    weights: Sequence[FloatArray] | None = None,
+) -> FloatArray:
+    """Return `contrast_ratio` in dB."""
+    return decibels(contrast_ratio(targets, quiet, weights))
+
+
+def mean_level_db_sl(
+    frequencies: FloatArray,
+    amplitudes: FloatArray,
+    weights: FloatArray,
+    threshold: str = DEFAULT_THRESHOLD,
+) -> float:
+    """Level [dB SL] over a fingertip: mean over its points of amplitude to threshold.
+
+    frequencies (f,) [Hz], amplitudes (f, p) [m/s²], weights (p,) of the points; threshold: name of
+    the set. Raises InputError for frequencies without data.
+    """
+    above = 10 ** (sensation_level(frequencies, amplitudes, threshold) / 20)
+    return float(decibels(above @ weights))
+
+
+_CUTOFF = 1250.0  # Hz; where half of a tone passes
+_HALF_LENGTH = 0.002  # s; of the filter: 0.5 % up to 850 Hz, 40 dB from 1.65 kHz on
+
+
+def felt_part(samples: FloatArray, sample_rate: float) -> FloatArray:
+    """The part of samples (n, p) at a rate [Hz] that is up to 1 kHz, without delay, (n, p).
+
+    Before and after the samples is silence. Sampled too slowly to hold more, they stay as they are.
+    """
+    if sample_rate <= 2 * _CUTOFF or not samples.size:
+        return samples
+    kernel = _kernel(sample_rate)
+    beyond = len(kernel) // 2
+    columns = [np.convolve(each, kernel)[beyond : beyond + len(samples)] for each in samples.T]
+    return np.array(columns).T
+
+
+@cache
+def _kernel(sample_rate: float) -> FloatArray:
+    """A windowed sinc whose sum is 1."""
+    count = round(_HALF_LENGTH * sample_rate)
+    number = np.arange(-count, count + 1)
+    window = np.hanning(len(number) + 2)[1:-1]
+    kernel = window * np.sinc(2 * _CUTOFF / sample_rate * number)
+    return np.asarray(kernel / kernel.sum())

@@ -5,7 +5,7 @@ response of the truncated modes to a force there, and its growth with omega. Wit
 converge slowly near a point force. Where an attachment comes or goes while the plate vibrates, the
 plate is reduced again and its motion is projected.
 
-Mass, damping and stiffness matrices of the plate on its ERAs, in reduced coordinates.
+On its ERAs it has the matrices of mass, damping and stiffness
 
 M = I + sum m_b phi phi^T, K = diag(omega²) + sum k_b phi phi^T, C = C_s + sum c phi phi^T; phi are
 the free plate's shapes at an ERA. Point masses add in the same way. A fingertip adds its contact
@@ -23,11 +23,9 @@ in the springs has no loss. Contacts do not change it. The two differ off resona
 the steady accelerations of the paper's plate differ by at most 0.5 % (relative L2 over the plate,
 40 to 500 Hz), in proportion to eta; deep nulls move a little, they are not filled.
 
-Modes of the plate on its ERAs: natural frequencies, damping ratios and shapes.
-
-The modes are those of the undamped plate. A damping ratio says how much of its energy such a mode
-loses, psi' C psi / (2 omega) at modal mass 1, to the plate's own losses and to the dampers of the
-ERAs; that dampers also couple the modes is left out here, not in the plate in time.
+Its modes on its ERAs are those of the undamped plate. A damping ratio says how much of its energy
+such a mode loses, psi' C psi / (2 omega) at modal mass 1, to the plate's own losses and to the
+dampers of the ERAs; that dampers also couple the modes is left out here, not in the plate in time.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,8 +1,7 @@
 """Rig files as a kind of configuration of `era config`.
 
-The check of a rig's amplifiers by the package that knows wires.
-
-What is not known of how bases follow the outputs of amplifiers, for `era config check`.
+Its amplifiers are checked by the package that knows wires. Warnings say what a rig does not know or
+leaves out.
 """
 
 import cmath

@@ -14,12 +14,9 @@ from model.rig.sections import (
 )
 from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era, damping_from_ratio
-from model.structure.air_gap import AirGap
 from model.structure.equivalent import equivalent_plate
 from model.structure.fingertip import Fingertip
-from model.structure.laminate import Laminate, Layer
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
 from model.structure.point_load import PointLoad
 from registry.limits import GuardLimits
 

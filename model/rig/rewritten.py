@@ -13,7 +13,7 @@ from model.config.document import Document
 from model.config.editing import edited_text
 from model.rig.rig import Rig
 from model.structure.actuator import Gain
-from model.structure.material import Material
+from model.structure.plate import Material
 
 _PER_LINE = 4
 

@@ -14,8 +14,7 @@ from model.rig.uncertainty import Uncertainty
 from model.spectral.mesh import PlateMesh
 from model.structure.actuator import Era
 from model.structure.fingertip import Fingertip
-from model.structure.laminate import Laminate
-from model.structure.plate import Plate
+from model.structure.plate import Laminate, Plate
 from model.structure.point_load import PointLoad
 from registry.limits import GuardLimits
 

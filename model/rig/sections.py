@@ -35,8 +35,8 @@ from model.config.units import (
 )
 from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
 from model.rig.uncertainty import Uncertainty
-from model.structure.laminate import Bond
 from model.structure.materials import material, material_names
+from model.structure.plate import Bond
 from registry.suggestions import did_you_mean
 
 

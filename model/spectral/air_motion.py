@@ -16,7 +16,7 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.spectral.stiffness import ClassFunctions
-from model.structure.air_gap import AirGap
+from model.structure.plate import AirGap
 
 # Shapes for each degree: at open edges, where the deflection is not zero, they converge slowly.
 _PER_DEGREE = 2

@@ -16,13 +16,18 @@ from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralPlate
 from model.structure.actuator import Era
-from model.structure.dynamic_stiffness import attached_stiffness, drive_forces
 from model.structure.equivalent import short_wave_plate
 from model.structure.footprint import as_footprints
-from model.structure.low_rank import coupled_forces, on_diagonal
 from model.structure.modal_elasticity import check_of_theory, loss_factors
 from model.structure.plate import Plate
-from model.structure.point_load import Load, footprints_of
+from model.structure.point_load import (
+    Load,
+    attached_stiffness,
+    coupled_forces,
+    drive_forces,
+    footprints_of,
+    on_diagonal,
+)
 
 
 def direct_spectral_acceleration(

@@ -25,7 +25,6 @@ from model.spectral.stiffness import (
     class_stiffness,
     follow,
 )
-from model.structure.laminate import Layer
 from model.structure.laminate_section import (
     interface_mass,
     opposite_motions,
@@ -33,7 +32,7 @@ from model.structure.laminate_section import (
     shear_corrections,
 )
 from model.structure.modal_elasticity import loss_factors
-from model.structure.plate import Plate
+from model.structure.plate import Layer, Plate
 
 NODES = 12
 """Frequencies of a band at which modes state their stiffness."""

@@ -21,14 +21,13 @@ from model.fem.plate import NUS, SQUARES
 from model.spectral.functions import CLASSES, EdgedFunctions, edge_decays
 from model.spectral.modes import layers_of
 from model.spectral.stiffness import ClassFunctions, class_stiffness, follow
-from model.structure.laminate import Layer
 from model.structure.laminate_section import (
     Section,
     interface_mass,
     section_of,
     shear_corrections,
 )
-from model.structure.plate import Plate
+from model.structure.plate import Layer, Plate
 
 
 def stiffness_slopes(

@@ -2,7 +2,7 @@
 
 Unknowns of a symmetry class: the deflection w, in polynomials; then the displacements along the
 plate u_x and u_y of every interface between the layers, with boundary layers. u_x has the other
-parity along x, u_y along y. Energy, with the sections of `model.structure.laminate` summed over the
+parity along x, u_y along y. Energy, with the sections of `model.structure.plate` summed over the
 interfaces:
 
     stretch (u_x,x u_x,x + u_y,y u_y,y) + 2 across u_x,x u_y,y + twist (u_x,y + u_y,x)²

@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 
-from model.structure.laminate import Bond, Laminate
 from model.structure.laminate_section import (
     Bending,
     freely_sliding,
@@ -16,8 +15,7 @@ from model.structure.laminate_section import (
     wave_rigidity,
     wavenumber_of,
 )
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Bond, Laminate, Material, Plate
 
 
 def bending(laminate: Laminate, frequency: float) -> Bending:

@@ -1,6 +1,6 @@
 """Stiffness of a laminate's section, the bounds of its rigidity, and bending waves in it.
 
-The theory of `model.structure.laminate`, per area.
+The theory of `model.structure.plate`, per area.
 """
 
 import math
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.structure.laminate import Bond, Laminate, Layer
+from model.structure.plate import Bond, Laminate, Layer
 
 _MAX_STEPS = 200  # of the iteration for a wavenumber, which takes some twenty
 

@@ -7,7 +7,7 @@ a `KnownMaterial` of that name; rig files, their schema and `era plate materials
 from dataclasses import dataclass
 
 from model.errors import InputError
-from model.structure.material import Material
+from model.structure.plate import Material
 from registry.plugins import Instance, PluginRegistry
 
 

@@ -1,12 +1,217 @@
-"""The touch plate: its material, dimensions and closed-form properties."""
+"""The touch plate: its material or layers, its dimensions, and the air behind it.
 
+A laminate, such as cover glass on adhesive on a panel, layer by layer.
+
+Every layer bends, stretches and shears by itself; displacements along the plate are continuous
+from layer to layer and linear within each (a layerwise theory of first order: Reddy, Mechanics of
+Laminated Composite Plates and Shells, 2nd ed., ch. 12), the deflection is the same through the
+thickness. Soft adhesives between stiff layers then shear as in the theories of Kerwin (J. Acoust.
+Soc. Am. 31 (1959) 952) and Mead and Markus (J. Sound Vib. 10 (1969) 163), more the shorter the
+wave. With stiff adhesives it becomes classical laminate theory.
+
+Layers may also be laid loosely (`Bond.NONE`): they slide on each other without friction.
+
+Not modelled: layers that change their thickness, as a foam does under a force at a point; change of
+an adhesive with temperature; air between loose layers.
+
+Air in a narrow gap behind a plate: its mass, its friction, and its stiffness.
+
+The plate displaces air, which flows along the gap. In the low reduced frequency model (Zwikker and
+Kosten 1949; Beltman, J. Sound Vib. 227 (1999) 555) the pressure is constant across the gap, the
+flow profile follows from viscosity, and the temperature from conduction to both walls:
+
+    iωρ b v = -grad p,    iω p / B = -div v - iω w / d,
+    1 / b = 1 - tanh(s) / s,               s = (d / 2) sqrt(iωρ / mu),
+    1 / B = (1 + (gamma - 1) tanh(t) / t) / (gamma p0),    t = (d / 2) sqrt(iωρ cp / k)
+
+with the mean velocity v over the depth d and the plate's deflection w away from the gap. Slow, b
+becomes 12 mu / (iωρ d²) + 6/5, the squeeze film of Reynolds' equation, and air is isothermal; fast,
+b = 1, and it is adiabatic. Holds while the gap is narrow compared with waves and with the plate.
+"""
+
+import cmath
 import math
+from bisect import bisect_left
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 from model.errors import InputError
-from model.structure.air_gap import AirGap
-from model.structure.laminate import Laminate
-from model.structure.material import Material
+
+
+@dataclass(frozen=True)
+class Material:
+    """An isotropic, linear material.
+
+    E: Young's modulus [Pa]; rho: density [kg/m³]; nu: Poisson's ratio.
+    """
+
+    name: str
+    E: float
+    rho: float
+    nu: float
+
+    def __post_init__(self) -> None:
+        """Refuse values of no isotropic solid."""
+        for key, value in (("E", self.E), ("rho", self.rho)):
+            if not (math.isfinite(value) and value > 0):
+                raise InputError(f"material {self.name}: {key} must be above zero, got {value}")
+        if not -1 < self.nu < 0.5:
+            raise InputError(
+                f"material {self.name}: nu must be between -1 and 0.5, got {self.nu} (most solids: "
+                "0.2 to 0.45)"
+            )
+
+    @property
+    def shear_modulus(self) -> float:
+        """G = E / 2 (1 + nu) [Pa]."""
+        return self.E / (2 * (1 + self.nu))
+
+
+class Bond(StrEnum):
+    """How the layers of a laminate hold together."""
+
+    FULL = "full"
+    NONE = "none"
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One layer of a laminate; thickness [m].
+
+    loss_factor: eta of its modulus E (1 + i eta). by_frequency: rows of frequency [Hz], ascending,
+    factor of E and loss factor, which then replaces loss_factor; linear in the logarithms of
+    frequency and factor, constant outside.
+    """
+
+    material: Material
+    thickness: float
+    loss_factor: float = 0.0
+    by_frequency: tuple[tuple[float, float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse a thickness that is not above zero."""
+        if not (math.isfinite(self.thickness) and self.thickness > 0):
+            raise InputError(f"layer: thickness must be above zero, got {self.thickness} m")
+
+    def modulus(self, frequency: float) -> complex:
+        """E (1 + i eta) [Pa] at a frequency [Hz]."""
+        if not self.by_frequency:
+            return self.material.E * (1 + 1j * self.loss_factor)
+        rows = self.by_frequency
+        after = min(max(bisect_left(rows, (frequency,)), 1), len(rows) - 1)
+        (f0, factor0, loss0), (f1, factor1, loss1) = rows[after - 1], rows[after]
+        share = min(max(math.log(frequency / f0) / math.log(f1 / f0), 0.0), 1.0)
+        factor = factor0 * math.pow(factor1 / factor0, share)
+        return self.material.E * factor * (1 + 1j * (loss0 + share * (loss1 - loss0)))
+
+    @property
+    def is_elastic(self) -> bool:
+        """Whether its modulus is real and the same at all frequencies."""
+        return not self.by_frequency and not self.loss_factor
+
+    @property
+    def surface_density(self) -> float:
+        """Mass per area [kg/m²]."""
+        return self.material.rho * self.thickness
+
+    @property
+    def flexural_rigidity(self) -> float:
+        """Flexural rigidity of the layer alone [N m], of its modulus E."""
+        return self.material.E * self.thickness**3 / (12 * (1 - self.material.nu**2))
+
+
+@dataclass(frozen=True)
+class Laminate:
+    """Layers from one face to the other."""
+
+    layers: tuple[Layer, ...]
+    bond: Bond = Bond.FULL
+
+    def __post_init__(self) -> None:
+        """Refuse a laminate without layers, and losses of layers that slide."""
+        if not self.layers:
+            raise InputError("laminate: must have at least one layer")
+        if self.bond is Bond.NONE and not all(layer.is_elastic for layer in self.layers):
+            raise InputError(
+                "laminate: layers must be without loss_factor and by_frequency with bond none; "
+                "give the loss factor of the plate"
+            )
+
+    @property
+    def thickness(self) -> float:
+        """Thickness of all layers together [m]."""
+        return sum(layer.thickness for layer in self.layers)
+
+    @property
+    def surface_density(self) -> float:
+        """Mass per area of all layers [kg/m²]."""
+        return sum(layer.surface_density for layer in self.layers)
+
+    def scaled(self, *, modulus: float = 1.0, thickness: float = 1.0) -> "Laminate":
+        """The laminate with all moduli and all thicknesses times a factor."""
+        layers = (
+            replace(
+                layer,
+                material=replace(layer.material, E=modulus * layer.material.E),
+                thickness=thickness * layer.thickness,
+            )
+            for layer in self.layers
+        )
+        return replace(self, layers=tuple(layers))
+
+
+# Dry air at 20 °C and 101325 Pa (Lemmon and Jacobsen, Int. J. Thermophys. 25 (2004) 21): density
+# [kg/m³], viscosity [Pa s], thermal conductivity [W/(m K)], heat capacity [J/(kg K)], its ratio.
+PRESSURE = 101_325.0
+DENSITY, VISCOSITY, CONDUCTIVITY, HEAT_CAPACITY, HEAT_RATIO = 1.204, 18.2e-6, 25.9e-3, 1006.0, 1.402
+
+# Depth [thicknesses of the boundary layer] down to which friction hardly couples modes, and down to
+# which by some 10 %: responses of the paper's plate and of a panel over 10 um to 10 mm, solved in
+# modes and at each frequency.
+_OPEN, _SEALED = (5.0, 1.4), (1.0, 0.28)
+
+
+@dataclass(frozen=True)
+class AirGap:
+    """An air gap between the whole plate and a rigid wall, its depth in m.
+
+    closed: sealed along all edges; otherwise open to the room along all of them.
+    """
+
+    depth: float
+    closed: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse a depth that is not above zero."""
+        if not (math.isfinite(self.depth) and self.depth > 0):
+            raise InputError(f"air gap: depth must be above zero, got {self.depth} m")
+
+    def coupling_error(self, frequency: float) -> float:
+        """Error of the response where friction couples modes, which is left out, at least [-].
+
+        At a frequency [Hz], by thicknesses of the boundary layer sqrt(2 mu / (rho omega)): within
+        3 % over a deeper open gap, 5 % over a deeper sealed one, where it is 0 here; then 10 %, and
+        in a gap too narrow for modes half of the response and more.
+        """
+        layers = self.depth / math.sqrt(VISCOSITY / (math.pi * DENSITY * frequency))
+        within, modal = _SEALED if self.closed else _OPEN
+        return 0.0 if layers >= within else 0.1 if layers >= modal else 0.5
+
+    def inertia(self, frequency: float) -> complex:
+        """rho b [kg/m³] at a frequency [Hz]: density of air that friction holds back."""
+        wall = self._wall_share(frequency, DENSITY / VISCOSITY)
+        return DENSITY / (1 - wall)
+
+    def bulk_modulus(self, frequency: float) -> complex:
+        """B [Pa] at a frequency [Hz]: isothermal in the slow limit, adiabatic in the fast."""
+        wall = self._wall_share(frequency, DENSITY * HEAT_CAPACITY / CONDUCTIVITY)
+        return HEAT_RATIO * PRESSURE / (1 + (HEAT_RATIO - 1) * wall)
+
+    def _wall_share(self, frequency: float, per_frequency: float) -> complex:
+        """tanh(s) / s, the share of the depth that walls govern."""
+        s = self.depth / 2 * cmath.sqrt(2j * math.pi * frequency * per_frequency)
+        return (1.0 if s.real > 300 else cmath.tanh(s)) / s
+
 
 MAX_LOSS_EXPONENT = 2.0
 

@@ -47,7 +47,7 @@ from model.table.request import (
     check_requests,
 )
 from model.table.table import LocalizationTable
-from model.vibration.peak import base_amplitudes
+from model.vibration.excitation import base_amplitudes
 
 
 def answer(

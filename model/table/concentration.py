@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray, lattice
-from model.finger.contrast import is_beyond
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import decibels
+from model.finger.perception import decibels, is_beyond
 from model.structure.plate import Plate
 from model.table.pattern import Concentration, Pattern
 from model.table.question import Question

@@ -26,8 +26,7 @@ from model.transients.loaded_ramps import (
 )
 from model.transients.onset import ringing_time
 from model.transients.shaping import RISE
-from model.vibration.excitation import Excitation
-from model.vibration.peak import base_amplitudes
+from model.vibration.excitation import Excitation, base_amplitudes
 
 SHAPED_FROM = 0.2
 """Shortest duration [s] with a shaped onset, which settles in half of it."""

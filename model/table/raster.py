@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
-from model.finger.disc import FIVE_AND_FINE, FIVE_POINTS
-from model.finger.fingertip import FINGERTIP_RADIUS, fingertips_on
+from model.finger.fingertip import FINGERTIP_RADIUS, FIVE_AND_FINE, FIVE_POINTS, fingertips_on
 from model.structure.footprint import mean_over
 from model.structure.plate import Plate
 
@@ -152,21 +151,6 @@ class Fingertips:
         """Values (point_count, c) of the raster at the few (k, 5, c) and the fine (k, 21, c)."""
         found = self.interpolation @ values.take(self.index, axis=0)
         return np.ascontiguousarray(found[:, :FEW]), np.ascontiguousarray(found[:, FEW:])
-
-
-@dataclass(frozen=True, eq=False)
-class ReducedOnRaster:
-    """As `ReducedPlate` of `model.reduction`, with shapes (points, r) on a raster."""
-
-    plate: Plate
-    omega: FloatArray
-    losses: FloatArray
-    raster: Raster
-    shapes: NDArray[np.float32]
-
-    def at(self, points: FloatArray) -> FloatArray:
-        """Shapes at points [m] (p, 2) of the plate, (p, r)."""
-        return self.raster.at(self.shapes, points).astype(float)
 
 
 def _powers(x: FloatArray, count: int) -> FloatArray:

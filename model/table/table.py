@@ -26,9 +26,9 @@ from model.ensemble.attached_plate import AttachedPlate, attach
 from model.ensemble.contact_forms import modal_fields
 from model.ensemble.preselection import Preselection
 from model.errors import InputError
-from model.finger.contrast import is_background
 from model.finger.grid import CELL_SAMPLES, Grid
-from model.finger.perception import decibels, detection_threshold
+from model.finger.perception import decibels, detection_threshold, is_background
+from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import physics_fingerprint
 from model.rig.uncertainty import Uncertainty
 from model.spectral.mesh import PlateMesh
@@ -48,11 +48,10 @@ from model.table.pattern_choice import (
 )
 from model.table.pulse_gains import OverEffect
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
-from model.table.raster import Raster, ReducedOnRaster
+from model.table.raster import Raster
 from model.transients.onset import RampedOnsets, RampedRinging, ramped_ringing
 from model.transients.time_response import PlateInTime, plate_in_time
-from model.vibration.excitation import Excitation
-from model.vibration.peak import base_amplitudes
+from model.vibration.excitation import Excitation, base_amplitudes
 from registry.limits import GuardLimits
 
 DEFAULT_FREQUENCIES = np.arange(40.0, 501.0, 10.0)
@@ -296,7 +295,12 @@ class LocalizationTable:
         fingers = fingertip_loads(self.fingertip, contacts, loads)
         shapes = self.shapes_at(contacts if fingers else ())
         return plate_in_time(
-            ReducedOnRaster(self.plate, self.omega, self.losses, self.raster, self.shapes),
+            ReducedPlate(
+                self.plate,
+                self.omega,
+                self.losses,
+                at=lambda points: self.raster.at(self.shapes, points).astype(float),
+            ),
             self.eras,
             loads=self.masses,
             contacts=fingers,

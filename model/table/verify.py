@@ -21,10 +21,9 @@ from numpy.typing import NDArray
 from model.arrays import FloatArray
 from model.drive_modes.sources import magnitudes_of_sources
 from model.errors import InputError
-from model.finger.contrast import contrast_db
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.grid import CELL_SAMPLES, Grid
-from model.finger.perception import decibels, detection_threshold
+from model.finger.perception import contrast_db, decibels, detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig
@@ -39,8 +38,7 @@ from model.transients.base_motion import ramped_onset
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.direct import Responder, direct_responder
-from model.vibration.excitation import Excitation
-from model.vibration.peak import base_amplitudes, tone_amplitudes
+from model.vibration.excitation import Excitation, base_amplitudes, tone_amplitudes
 
 CONTENT_TOLERANCE = 1e-4
 """Relative L2 error of the content; the paper's plate has some 1e-5, on its coarsest mesh 2e-5."""

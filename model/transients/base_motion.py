@@ -1,9 +1,8 @@
 """Motion of an ERA's base in parts for which the plate's equations are solved exactly.
 
-Envelopes: complex amplitudes of an ERA's base from one steady state to another.
-
-The drive stays a sinusoid at its frequency; its complex amplitude is linear between knots a fixed
-step apart. Amplifiers with envelopes play exactly that.
+Envelopes are complex amplitudes of a base from one steady state to another: the drive stays a
+sinusoid at its frequency; its complex amplitude is linear between knots a fixed step apart.
+Amplifiers with envelopes play exactly that.
 """
 
 import cmath

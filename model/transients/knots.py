@@ -5,17 +5,16 @@ Gains and phases of the ERAs are known to a few percent and degrees only (the ri
 with a complex factor 1 + d_e for ERA e the expected form grows by var(d) times each ERA's own part.
 Every form includes that, so that the minimum does not rely on exact cancellation.
 
-Responses of the plate to hat functions, the basis of piecewise linear envelopes, in closed form.
-
-A hat is a drive at a carrier exp(s t) that rises from zero to an ERA's full stroke in one step and
-falls to zero in the next. An envelope linear between knots is a sum of hats, one for each knot, and
-the responses to hats differ only by a shift in time: one response for each ERA serves all knots.
+The basis of piecewise linear envelopes are hat functions, with responses in closed form. A hat is a
+drive at a carrier exp(s t) that rises from zero to an ERA's full stroke in one step and falls to
+zero in the next. An envelope linear between knots is a sum of hats, one for each knot, and the
+responses to hats differ only by a shift in time: one response for each ERA serves all knots.
 Responses are demodulated: without the factor exp(s t), as the envelopes are.
 
 The response to a linear ramp t / step from time 0 on is z(t) = a0 + a1 t - a0 exp((lambda - s) t)
 in the coordinates of `PlateInTime`; that to a hat is its second difference.
 
-Minimum of a quadratic form of complex unknowns with bounded magnitudes.
+Minima have bounded magnitudes of their complex unknowns: no knot exceeds the stroke.
 """
 
 import math

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, Float32Array, FloatArray, IntArray
-from model.finger.contrast import contrast_ratio
+from model.finger.perception import contrast_ratio
 from model.transients.base_motion import rise
 from model.transients.measures import ONSET_WINDOW
 from model.transients.time_response import PlateInTime

@@ -19,15 +19,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.finger.contrast import is_background
 from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points, fingertip_weights
 from model.finger.grid import Grid
+from model.finger.perception import is_background
 from model.transients.base_motion import BaseEnvelope, Envelopes
 from model.transients.knots import Carrier, ending_knots, mean_square, onset_knots, solve_carrier
 from model.transients.measures import ENDING_WINDOW
 from model.transients.time_response import PlateInTime
-from model.vibration.excitation import Excitation
-from model.vibration.peak import base_amplitudes
+from model.vibration.excitation import Excitation, base_amplitudes
 
 RISE = 0.040
 """How long [s] a target takes to full vibration along its raised cosine."""

@@ -1,12 +1,10 @@
 """Discretisation error of natural frequencies and response, against a finer mesh.
 
-Estimate of the discretisation error of a response, without a converged one.
-
-Of polynomials over the plate it is the sum of two changes of the response: by two further degrees,
-and where the compliance under forces that polynomials do not resolve is higher by 20 % and, under
-points, by a decade of the logarithm (`model.spectral.local_compliance`). Of finite elements it is
-the change to polynomials over the plate, which are solved in a tenth of the time of elements as
-accurate or less (`reference_mesh`).
+Without a converged response the error is estimated: of polynomials over the plate it is the sum of
+two changes of the response: by two further degrees, and where the compliance under forces that
+polynomials do not resolve is higher by 20 % and, under points, by a decade of the logarithm
+(`model.spectral.local_compliance`). Of finite elements it is the change to polynomials over the
+plate, which are solved in a tenth of the time of elements as accurate or less (`reference_mesh`).
 """
 
 import math

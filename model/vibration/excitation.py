@@ -1,24 +1,19 @@
-"""Physical excitation of the plate: a tone per active ERA."""
+"""Physical excitation of the plate, a tone per active ERA; its peak acceleration and nulls.
+
+ERAs at the same frequency add as complex numbers; only magnitudes of different frequencies add
+(paper Eq. 28). Magnitudes added within a frequency would wipe out the nodal lines.
+"""
 
 import cmath
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self, TypeAlias
 
 import numpy as np
 
-from model.arrays import ComplexArray
-from model.rig.uncertainty import Uncertainty
-
-
-def random_gains(
-    rng: np.random.Generator, uncertainty: Uncertainty, *, draws: int, eras: int
-) -> ComplexArray:
-    """Draw complex gains of ERAs, normal in size and phase, (draws, eras)."""
-    gain = 1 + uncertainty.gain * rng.standard_normal((draws, eras))
-    phase = math.radians(uncertainty.phase_deg) * rng.standard_normal((draws, eras))
-    return np.asarray(gain * np.exp(1j * phase))
+from model.arrays import ComplexArray, FloatArray
+from model.errors import InputError
+from model.structure.actuator import Era
 
 
 @dataclass(frozen=True)
@@ -42,3 +37,70 @@ class Tone:
 
 Excitation: TypeAlias = Mapping[str, Tone]
 """A tone per active ERA, by the ERA's name; an ERA that is not named is still."""
+
+
+G = 9.8
+"""Standard gravity as the paper rounds it [m/s²]; used only where accelerations are shown in g."""
+
+NULL_SHARE = 0.1
+"""A null is below this share of the map's maximum."""
+
+
+def base_amplitudes(excitation: Excitation, eras: Sequence[Era]) -> tuple[FloatArray, ComplexArray]:
+    """Distinct frequencies (f,) [Hz], and phasors of each ERA's base at them, (f, eras) [m].
+
+    Raises InputError where no ERA is driven, or an unknown one.
+    """
+    if not excitation:
+        raise InputError("excitation: must drive at least one ERA")
+    names = [era.name for era in eras]
+    unknown = [name for name in excitation if name not in names]
+    if unknown:
+        raise InputError(f"the rig has no ERA {unknown[0]!r}; it has {', '.join(names)}")
+    frequencies = np.array(sorted({tone.frequency for tone in excitation.values()}))
+    amplitudes = np.zeros((len(frequencies), len(eras)), dtype=complex)
+    for name, tone in excitation.items():
+        row = np.searchsorted(frequencies, tone.frequency)
+        amplitudes[row, names.index(name)] = tone.phasor
+    return frequencies, amplitudes
+
+
+def tone_amplitudes(
+    excitation: Excitation,
+    eras: Sequence[Era],
+    response: Callable[[FloatArray], ComplexArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Peak acceleration [m/s²] per distinct frequency: frequencies (f,) [Hz], amplitudes (f, p).
+
+    response: frequencies (f,) -> acceleration of each ERA at full stroke (f, eras, p).
+    """
+    frequencies, field = tone_fields(excitation, eras, response)
+    return frequencies, np.abs(field)
+
+
+def tone_fields(
+    excitation: Excitation,
+    eras: Sequence[Era],
+    response: Callable[[FloatArray], ComplexArray],
+) -> tuple[FloatArray, ComplexArray]:
+    """Complex acceleration [m/s²] per distinct frequency: as `tone_amplitudes`, with phases."""
+    frequencies, amplitudes = base_amplitudes(excitation, eras)
+    weights = amplitudes / np.array([era.stroke for era in eras])
+    return frequencies, np.einsum("fe,fep->fp", weights, response(frequencies))
+
+
+def peak_acceleration(amplitudes: FloatArray) -> FloatArray:
+    """Peak acceleration over time (p,) [m/s²] from amplitudes per frequency (f, p): their sum."""
+    return np.asarray(amplitudes.sum(axis=0))
+
+
+def find_nulls(x: FloatArray, y: FloatArray, peak: FloatArray) -> FloatArray:
+    """Positions [m] (n, 2) of the nulls of a map (len(y), len(x)): low local minima.
+
+    A curve of nulls shows as the lowest points along it.
+    """
+    from scipy.ndimage import minimum_filter  # only maps need it, and it takes long to load
+
+    low = peak <= NULL_SHARE * peak.max()
+    rows, columns = np.nonzero(low & (peak == minimum_filter(peak, size=3, mode="nearest")))
+    return np.column_stack([x[columns], y[rows]])

@@ -18,11 +18,16 @@ from model.fem.mesh import check_frequencies
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.dispersion import Dispersion
-from model.structure.dynamic_stiffness import attached_stiffness, dynamic_stiffness
-from model.structure.low_rank import coupled_forces, on_diagonal
 from model.structure.modal_elasticity import ModalElasticity
 from model.structure.plate import Plate
-from model.structure.point_load import Load, footprints_of
+from model.structure.point_load import (
+    Load,
+    attached_stiffness,
+    coupled_forces,
+    dynamic_stiffness,
+    footprints_of,
+    on_diagonal,
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.finger.felt_band import felt_part
+from model.finger.perception import felt_part
 from sim.plant.fingers import Record
 
 

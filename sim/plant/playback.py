@@ -11,9 +11,13 @@ import numpy as np
 from model.arrays import FloatArray
 from model.counting import counted
 from model.errors import InputError
-from model.finger.contrast import contrast_db, mean_level_db_sl
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import DEFAULT_THRESHOLD, sensation_level
+from model.finger.perception import (
+    DEFAULT_THRESHOLD,
+    contrast_db,
+    mean_level_db_sl,
+    sensation_level,
+)
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
 from model.structure.fingertip import fingertip_loads
@@ -21,8 +25,7 @@ from model.table.pattern import ONSET_RAMP
 from model.table.question import Question
 from model.transients.base_motion import Envelopes, ramped_onset, shaped
 from model.transients.measures import ONSET_WINDOW
-from model.vibration.excitation import Excitation
-from model.vibration.peak import base_amplitudes, peak_acceleration
+from model.vibration.excitation import Excitation, base_amplitudes, peak_acceleration
 from sim.plant.felt import Felt, felt_peaks, measure_vibration
 from sim.plant.fingers import Record
 from sim.plant.imperfections import Imperfections, realised

@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 import era_haptics as era
 from model.cli import app
-from model.finger.contrast import mean_level_db_sl
 from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import mean_level_db_sl
 
 TARGET, QUIET = (0.08, 0.06), [(0.22, 0.16), (0.25, 0.04)]
 

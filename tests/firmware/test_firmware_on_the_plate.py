@@ -10,8 +10,8 @@ import pytest
 
 from firmware_script import Script, Shape, apply, arm, command, replay
 from model.arrays import FloatArray
-from model.finger.felt_band import felt_part
 from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import felt_part
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.fingertip import fingertip_loads

@@ -13,8 +13,7 @@ from scipy.linalg import eigh
 from model.arrays import FloatArray
 from model.fem.mesh import DOF_PER_NODE, Element, Mesh, rigidities
 from model.fem.plate import assemble, lowest_modes
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Material, Plate
 
 DX, DY = 0.03, 0.02  # m; not square, so that a swap of x and y shows
 PLATE = Plate(0.3, 0.24, 0.002, Material("aluminium", E=70e9, rho=2700.0, nu=0.33))

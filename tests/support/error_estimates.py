@@ -24,8 +24,7 @@ from model.reduction.free_plate import solve_free_plate
 from model.rig.meshes import mesh_of
 from model.spectral.mesh import SpectralMesh
 from model.structure.actuator import Era
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Material, Plate
 from model.vibration.convergence import estimate_error
 
 MAX_RATIO = 1.4

@@ -15,9 +15,8 @@ import numpy as np
 from felt_chain import LEVEL_DB_SL, LEVEL_LIMIT, Played
 from heard import ONSET, SENSORS, Heard
 from model.arrays import ComplexArray, FloatArray
-from model.finger.contrast import contrast_db, mean_level_db_sl
-from model.finger.felt_band import felt_part
 from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import contrast_db, felt_part, mean_level_db_sl
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.fingertip import FingertipLoad

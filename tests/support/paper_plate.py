@@ -3,8 +3,7 @@
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era, damping_from_ratio
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Material, Plate
 from registry.limits import GuardLimits
 
 # Section 3 of the founding paper; stiffness recovered from its Table 2, damping and stroke assumed.

@@ -25,8 +25,7 @@ from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Material, Plate
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone

@@ -15,8 +15,7 @@ from controller.sources.calibration import TouchCalibration
 from controller.sources.touch import Touch, TouchFrame, TouchSource
 from daemon_bench import until
 from model.errors import InputError
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Material, Plate
 
 PLATE = Plate(0.4, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
 

@@ -16,8 +16,7 @@ from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Material, Plate
 from model.transients.base_motion import BaseEnvelope
 from registry.limits import GuardLimits
 from sim.amplifier.capabilities import capabilities

@@ -12,8 +12,7 @@ from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.actuator import Era
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Material, Plate
 from model.vibration.excitation import Excitation, Tone
 from registry.limits import GuardLimits
 

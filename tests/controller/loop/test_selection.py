@@ -16,8 +16,7 @@ from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.perception import DEFAULT_THRESHOLD, detection_threshold
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Material, Plate
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone

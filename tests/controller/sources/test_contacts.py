@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from controller.sources.contacts import CONTACT_TIMEOUT, ContactKey, ContactTracker
 from controller.sources.touch import Touch, TouchFrame
 from model.finger import MAX_CONTACTS
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Material, Plate
 
 PLATE = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
 

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from controller.sources.calibration import CalibratedSource, TouchCalibration, fitted, turned
 from controller.sources.touch import Touch, TouchFrame, TouchSource
 from model.errors import InputError
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Material, Plate
 
 ALUMINIUM = Material("aluminium", E=70e9, rho=2700, nu=0.33)
 PLATE = Plate(length=0.4, width=0.2, thickness=1e-3, material=ALUMINIUM)

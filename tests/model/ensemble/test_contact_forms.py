@@ -14,8 +14,7 @@ from model.ensemble.thickness import responses_of_thicknesses, thickness_nodes
 from model.ensemble.tone_responses import NOMINAL, Tones, tone_responses
 from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import assemble, direct_acceleration
-from model.finger.disc import FIVE_POINTS
-from model.finger.fingertip import FINGERTIP_RADIUS
+from model.finger.fingertip import FINGERTIP_RADIUS, FIVE_POINTS
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.uncertainty import Uncertainty
 from model.structure.fingertip import FingertipLoad

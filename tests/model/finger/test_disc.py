@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 from scipy.integrate import dblquad
 
-from model.finger.disc import FINE_POINTS, FIVE_POINTS, DiscRule
-from model.finger.fingertip import FINGERTIP_RADIUS, fingertips_on
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.finger.fingertip import (
+    FINE_POINTS,
+    FINGERTIP_RADIUS,
+    FIVE_POINTS,
+    DiscRule,
+    fingertips_on,
+)
+from model.structure.plate import Material, Plate
 
 PLATE = Plate(0.3, 0.2, 0.0015, Material("any", E=70e9, rho=2700.0, nu=0.33))
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from model.finger.felt_band import felt_part
+from model.finger.perception import felt_part
 
 
 @pytest.mark.parametrize("rate", [8000.0, 10_000.0, 44_100.0])

@@ -3,8 +3,7 @@
 import numpy as np
 
 from model.finger.grid import CELL_SAMPLES, Grid
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Material, Plate
 
 PLATE = Plate(0.6, 0.2, 0.002, Material("steel", 210e9, 7850.0, 0.3))
 

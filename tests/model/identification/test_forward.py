@@ -18,8 +18,7 @@ from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.equivalent import equivalent_plate
 from model.structure.fingertip import Fingertip, FingertipLoad
-from model.structure.laminate import Bond, Laminate, Layer
-from model.structure.material import Material
+from model.structure.plate import Bond, Laminate, Layer, Material
 from model.structure.point_load import Load, PointLoad
 
 FREQUENCIES = np.array([60.0, 140.0, 222.0, 350.0, 480.0])

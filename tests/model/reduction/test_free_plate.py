@@ -13,8 +13,7 @@ from model.fem.plate import assemble, direct_acceleration, modes
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.spectral.mesh import SpectralMesh
 from model.structure.actuator import Era
-from model.structure.laminate import Laminate, Layer
-from model.structure.plate import Plate
+from model.structure.plate import Laminate, Layer, Plate
 from model.structure.point_load import PointLoad
 from paper_plate import ALUMINIUM, LENGTH, WIDTH
 

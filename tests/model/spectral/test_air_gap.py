@@ -14,9 +14,7 @@ from model.spectral.air_motion import air_motion
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralPlate
 from model.structure.actuator import Era
-from model.structure.air_gap import HEAT_RATIO, PRESSURE, VISCOSITY, AirGap
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import HEAT_RATIO, PRESSURE, VISCOSITY, AirGap, Material, Plate
 from model.vibration.direct import direct_responder
 from model.vibration.natural_modes import natural_modes
 

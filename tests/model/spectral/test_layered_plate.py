@@ -17,11 +17,8 @@ from model.rig.file import load_rig
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import Band, SpectralPlate
 from model.structure.actuator import Era
-from model.structure.air_gap import AirGap
 from model.structure.equivalent import equivalent_plate
-from model.structure.laminate import Bond, Laminate, Layer
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import AirGap, Bond, Laminate, Layer, Material, Plate
 from model.structure.point_load import footprints_of
 from model.table.build import build_table
 from model.table.file import load_table, save_table

@@ -11,9 +11,7 @@ from model.reduction.free_plate import solve_free_plate
 from model.spectral.mesh import SpectralMesh
 from model.spectral.shape_stiffness import stiffness_slopes
 from model.structure.equivalent import equivalent_plate
-from model.structure.laminate import Laminate, Layer
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Laminate, Layer, Material, Plate
 
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.22)
 PLATE = Plate(0.3, 0.21, 0.001, GLASS)

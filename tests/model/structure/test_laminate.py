@@ -10,7 +10,6 @@ from benchmarks.layers.elasticity import wave_number
 from long_form import in_turn
 from model.errors import InputError
 from model.structure.equivalent import bending, equivalent_plate
-from model.structure.laminate import Bond, Laminate, Layer
 from model.structure.laminate_section import (
     freely_sliding,
     perfectly_bonded,
@@ -18,7 +17,7 @@ from model.structure.laminate_section import (
     wave_rigidity,
     wavenumber_of,
 )
-from model.structure.material import Material
+from model.structure.plate import Bond, Laminate, Layer, Material
 
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
 ALUMINIUM = Material("aluminium", E=70e9, rho=2700.0, nu=0.33)

@@ -7,10 +7,8 @@ import pytest
 
 from model.errors import InputError
 from model.structure.actuator import Era
-from model.structure.laminate import Layer
-from model.structure.material import Material
 from model.structure.materials import material
-from model.structure.plate import Plate
+from model.structure.plate import Layer, Material, Plate
 from model.structure.point_load import PointLoad
 from paper_plate import make_paper_rig
 

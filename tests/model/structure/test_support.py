@@ -8,8 +8,7 @@ from model.errors import InputError
 from model.reduction.reduced_plate import reduce_plate, supported_modes
 from model.rig.file import example_rig_path, load_rig
 from model.structure.actuator import Era
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Material, Plate
 from model.structure.point_load import PointLoad
 from model.structure.support import check_supported, rigid_body_frequencies, support_problem
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from model.arrays import lattice
-from model.finger.contrast import is_beyond
 from model.finger.fingertip import fingertip_points
+from model.finger.perception import is_beyond
 from model.table.concentration import cell_centres, concentration_of, with_concentration
 from model.table.question import Question
 from paper_table import smooth_rig, smooth_table

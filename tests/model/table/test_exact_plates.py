@@ -15,7 +15,7 @@ from model.structure.fingertip import FingertipLoad
 from model.table.build import build_table
 from model.table.exact_plates import Plates, draw_plates, felt_on
 from model.table.question import Question
-from model.vibration.peak import base_amplitudes
+from model.vibration.excitation import base_amplitudes
 from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
 
 TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18), (0.03, 0.19))

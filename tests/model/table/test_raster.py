@@ -6,8 +6,7 @@ import pytest
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points
 from model.reduction.free_plate import solve_free_plate
-from model.structure.material import Material
-from model.structure.plate import Plate
+from model.structure.plate import Material, Plate
 from model.table.raster import Raster
 from paper_table import FREQUENCIES, smooth_rig
 

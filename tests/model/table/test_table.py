@@ -9,7 +9,7 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold
 from model.structure.fingertip import FingertipLoad
 from model.table.question import Question
-from model.vibration.peak import tone_amplitudes
+from model.vibration.excitation import tone_amplitudes
 from paper_table import contact_sets, smooth_rig, smooth_table
 
 TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)

@@ -13,7 +13,7 @@ from model.structure.point_load import PointLoad
 from model.table.build import build_in_parts
 from model.table.file import load_table, save_table
 from model.table.verify import AnswerCheck, verify_table
-from model.vibration.peak import tone_amplitudes
+from model.vibration.excitation import tone_amplitudes
 from paper_plate import make_paper_rig
 from small_table import small_problem, small_table
 

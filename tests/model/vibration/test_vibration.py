@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.vibration.excitation import Tone
+from model.vibration.excitation import Tone, find_nulls, peak_acceleration, tone_amplitudes
 from model.vibration.maps import plate_map
-from model.vibration.peak import find_nulls, peak_acceleration, tone_amplitudes
 
 FULL = 100e-6
 

@@ -7,9 +7,8 @@ import pytest
 from scipy.signal import lsim
 
 from model.arrays import FloatArray
-from model.finger.contrast import contrast_db
-from model.finger.felt_band import felt_part
 from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.perception import contrast_db, felt_part
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.point_load import footprints_of

@@ -8,9 +8,8 @@ import pytest
 
 from model.errors import InputError
 from model.fem.plate import assemble, direct_acceleration
-from model.finger.contrast import mean_level_db_sl
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import detection_threshold
+from model.finger.perception import detection_threshold, mean_level_db_sl
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.fingertip import Fingertip, FingertipLoad

@@ -1,19 +1,14 @@
 """Touch frames that wait to be delivered: the newest counts, but no finger that came is lost."""
 
 from collections.abc import Sequence
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 MAX_WAITING = 8  # frames of one source; more are no taps of a person
 
 
-class _Identified(Protocol):
-    @property
-    def id(self) -> int: ...
-
-
 class _Frame(Protocol):
     @property
-    def touches(self) -> Sequence[_Identified]: ...
+    def touches(self) -> Sequence[Any]: ...  # each with an id
 
 
 Frame = TypeVar("Frame", bound=_Frame)

@@ -131,36 +131,20 @@ def arm(
                 typer.echo("disarmed")
 
 
-@app.command()
-def disarm(socket: Socket = None, as_json: Json = False) -> None:
-    """Ramp to silence, then switch the high voltage off."""
-    with _client(socket) as era:
-        era.disarm()
-        _print_state(era, as_json=as_json)
+def _call(method: str, text: str) -> None:
+    """Add the command of a method of the API, which shows the state after it."""
+
+    @app.command(method, help=text)
+    def call(socket: Socket = None, as_json: Json = False) -> None:
+        with _client(socket) as era:
+            getattr(era, method)()
+            _print_state(era, as_json=as_json)
 
 
-@app.command()
-def stop(socket: Socket = None, as_json: Json = False) -> None:
-    """Quick-stop all amplifiers, latched until era clear. Not an emergency stop."""
-    with _client(socket) as era:
-        era.stop()
-        _print_state(era, as_json=as_json)
-
-
-@app.command()
-def clear(socket: Socket = None, as_json: Json = False) -> None:
-    """Acknowledge a stop, or a fault whose cause has gone. Stays disarmed."""
-    with _client(socket) as era:
-        era.clear()
-        _print_state(era, as_json=as_json)
-
-
-@app.command()
-def forget(socket: Socket = None, as_json: Json = False) -> None:
-    """Discard what was learned of the plate, and learn anew."""
-    with _client(socket) as era:
-        era.forget()
-        _print_state(era, as_json=as_json)
+_call("disarm", "Ramp to silence, then switch the high voltage off.")
+_call("stop", "Quick-stop all amplifiers, latched until era clear. Not an emergency stop.")
+_call("clear", "Acknowledge a stop, or a fault whose cause has gone. Stays disarmed.")
+_call("forget", "Discard what was learned of the plate, and learn anew.")
 
 
 @app.command()

@@ -1,6 +1,7 @@
 """The methods of the API, implemented by the daemon."""
 
 import asyncio
+import itertools
 import logging
 import time
 from collections.abc import Mapping
@@ -9,9 +10,11 @@ from typing import cast
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 from controller.api.methods import (
+    METHODS,
     ArmParams,
     ArmResult,
     DisarmParams,
+    EffectsResult,
     HelloParams,
     HelloResult,
     PlayParams,
@@ -28,9 +31,8 @@ from controller.api.methods import (
 from controller.api.schema import Empty, GroupStateName
 from controller.api.server import Handler
 from controller.daemon.active_layout import ActiveLayout
-from controller.daemon.api_views import amplifier_silence
+from controller.daemon.api_views import amplifier_silence, hello_result
 from controller.daemon.config import DaemonConfig
-from controller.daemon.hello import hello_result
 from controller.daemon.lease import LeaseHolder
 from controller.daemon.publisher import EventPublisher
 from controller.daemon.states import (
@@ -90,26 +92,12 @@ class ApiService:
         self._holders: set[Connection] = set()  # clients that armed or renewed the lease
         self._expiry: asyncio.TimerHandle | None = None
         self._client_numbers: dict[Connection, int] = {}
-        self._client_count = 0
+        self._next_number = itertools.count(1)
         self._started = clock.now()
 
     def handlers(self) -> Mapping[str, Handler]:
         """Handlers by method name."""
-        return {
-            "hello": self._hello,
-            "status": lambda client, params: self.status(),
-            "arm": self._arm,
-            "renew": self._renew,
-            "disarm": self._disarm,
-            "stop": self._stop,
-            "clear": self._clear,
-            "forget": self._forget,
-            "touch": self._touch,
-            "effects": lambda client, params: self._layout.effects(),
-            "play": self._play,
-            "subscribe": self._subscribe,
-            "unsubscribe": self._unsubscribe,
-        }
+        return {name: getattr(self, f"_{name}") for name in METHODS}
 
     def client_left(self, client: Connection) -> None:
         """Release what a disconnected client holds; lift its fingers."""
@@ -122,8 +110,7 @@ class ApiService:
         """Whether a client armed or renewed the current lease: it is never evicted."""
         return client in self._holders and self._lease.current(clock.now()) is not None
 
-    def status(self) -> StatusResult:
-        """Return the status of daemon, plate and amplifiers."""
+    def _status(self, client: Connection, params: Empty) -> StatusResult:
         machine, view, now = self._supervisor.machine, self._publisher.view, clock.now()
         lease = self._lease.current(now)
         pattern = view.pattern_event() if machine.state is _ENABLED else None
@@ -179,16 +166,15 @@ class ApiService:
             await self._handle(
                 DaemonEvent(Trigger.ARM, f"armed by {params.owner!a}", "era disarm, or era stop")
             )
+            if self._supervisor.machine.state is not _ENABLED:
+                raise _wrong_state(self._supervisor.machine)
+            # Arming may have taken longer than the lease, so its time starts now.
+            lease = self._lease.restart(lease.token, now=clock.now())
         except BaseException:
             self._disarm_for(lease.token, "arming failed")
             raise
-        if self._supervisor.machine.state is not _ENABLED:
-            self._disarm_for(lease.token, "arming failed")
-            raise _wrong_state(self._supervisor.machine)
-        # Arming may have taken longer than the lease, so its time starts now.
-        lease = self._lease.restart(lease.token, now=clock.now())
         self._holders = {client}
-        self._schedule_lease_check()
+        self._check_lease()
         # After the reply was sent, or failed to be sent.
         asyncio.get_running_loop().call_soon(self._check_holder, client, lease.token)
         return ArmResult(lease=lease.token, lease_s=lease.duration)
@@ -196,7 +182,7 @@ class ApiService:
     def _renew(self, client: Connection, params: RenewParams) -> RenewResult:
         lease = self._lease.renew(params.lease, now=clock.now())
         self._holders.add(client)
-        self._schedule_lease_check()
+        self._check_lease()
         return RenewResult(lease_s=lease.duration)
 
     async def _disarm(self, client: Connection, params: DisarmParams) -> Empty:
@@ -260,12 +246,14 @@ class ApiService:
 
     def _touch(self, client: Connection, params: TouchParams) -> Empty:
         if client not in self._client_numbers:
-            self._client_count += 1
-            self._client_numbers[client] = self._client_count
+            self._client_numbers[client] = next(self._next_number)
         self._touches.add(
             client, params, client_name=str(self._client_numbers[client]), now=client.received_at
         )
         return Empty()
+
+    def _effects(self, client: Connection, params: Empty) -> EffectsResult:
+        return self._layout.effects()
 
     def _play(self, client: Connection, params: PlayParams) -> PlayResult:
         machine = self._supervisor.machine
@@ -299,15 +287,18 @@ class ApiService:
         if self._expiry is not None:
             self._expiry.cancel()
 
-    def _schedule_lease_check(self) -> None:
-        """Check the lease when it expires."""
+    def _check_lease(self) -> None:
+        """End the lease if it has expired, else when it does; again, should that fail."""
         if self._expiry is not None:
             self._expiry.cancel()
         expires_at = self._lease.expires_at
-        if expires_at is not None:
-            self._expiry = asyncio.get_running_loop().call_later(
-                max(0.0, expires_at - clock.now()), self._check_lease
-            )
+        if expires_at is None:
+            return
+        left = expires_at - clock.now()
+        loop = asyncio.get_running_loop()
+        self._expiry = loop.call_later(left if left > 0 else _LEASE_RECHECK, self._check_lease)
+        if left <= 0:
+            self._supervisor.post(_LEASE_OVER)
 
     def _check_holder(self, client: Connection, token: str) -> None:
         """Disarm if the client disconnected before it received its lease."""
@@ -322,14 +313,6 @@ class ApiService:
             self._supervisor.post(DaemonEvent(Trigger.LEASE_LOST, cause, "arm again"))
         else:  # never armed
             self.end_lease()
-
-    def _check_lease(self) -> None:
-        # Checked again, should anything here fail.
-        self._expiry = asyncio.get_running_loop().call_later(_LEASE_RECHECK, self._check_lease)
-        if self._lease.current(clock.now()) is not None:
-            self._schedule_lease_check()
-            return
-        self._supervisor.post(_LEASE_OVER)
 
 
 def _wrong_state(machine: StateMachine, code: ErrorCode = ErrorCode.WRONG_STATE) -> RpcError:

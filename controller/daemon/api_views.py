@@ -3,17 +3,24 @@
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from importlib.metadata import version
 
+from controller.api.methods import HelloResult
 from controller.api.schema import (
+    API_VERSION,
     AmplifierSilence,
     AmplifierStatus,
     ContactStatus,
+    EraPosition,
     LatencySummary,
     LearningSummary,
     LinkCounters,
     PlayedTone,
+    RigSummary,
+    TableSummary,
 )
 from controller.api.topics import ContactsEvent, PatternEvent, PlateEvent, SilenceEvent
+from controller.daemon.config import DaemonConfig
 from controller.learning.learning_status import LearningStatus
 from controller.loop.observer import Applied, Silenced
 from controller.sources.contacts import Contact, ContactKey
@@ -23,6 +30,8 @@ from drivers.host.comparison import name_of
 from drivers.host.members import is_lost
 from drivers.protocol.table import FAULTS, QUANTITIES, STATES, STATUS_FLAGS
 from drivers.statistics import LinkStatistics
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
 
 _LEVEL, _TEMPERATURE = QUANTITIES["level"], QUANTITIES["temperature"]
 _VOLTAGE, _HIGH_VOLTAGE = QUANTITIES["voltage"], STATUS_FLAGS["high_voltage"]
@@ -118,6 +127,52 @@ def contact_status(
             level = applied.pattern.quiet_level_db_sl if len(applied.quiet) == 1 else None
             status |= {"role": "quiet", "level_db_sl": _finite(level)}
     return ContactStatus.model_validate(status)
+
+
+def hello_result(
+    config: DaemonConfig,
+    table: LocalizationTable,
+    amplifiers: Mapping[str, Amplifier],
+    *,
+    drive_mode: str,
+    layout: dict[str, object] | None,
+) -> HelloResult:
+    """Describe what the daemon drives."""
+    return HelloResult(
+        api_version=API_VERSION,
+        software_version=version("era-haptics"),
+        rig=_rig_summary(config.rig, amplifiers),
+        table=TableSummary(
+            fingerprint=table.fingerprint,
+            mode=drive_mode,
+            frequencies_hz=[float(each) for each in table.frequencies],
+            cells_x=table.grid.nx,
+            cells_y=table.grid.ny,
+        ),
+        rig_text=config.rig_text,
+        layout=layout,
+    )
+
+
+def _rig_summary(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> RigSummary:
+    return RigSummary(
+        length_m=rig.plate.length,
+        width_m=rig.plate.width,
+        eras=[
+            EraPosition(
+                name=era.name,
+                x_m=era.x,
+                y_m=era.y,
+                amplifier=rig.wiring[era.name].amplifier,
+                channel=rig.wiring[era.name].number,
+            )
+            for era in rig.eras
+        ],
+        simulated=any(
+            "simulated" in each.identity.get("product", "") for each in amplifiers.values()
+        ),
+        frequency_hz=[rig.limits.frequency_min, rig.limits.frequency_max],
+    )
 
 
 def amplifier_statuses(

@@ -95,13 +95,11 @@ class ApiTouches:
         """
         source = f"{API_SOURCES}:{client_name}:{params.source}"
         sources = self._sources.setdefault(client, {})
-        if not params.touches:
-            sources.pop(source, None)
-        else:
-            if source not in sources and len(sources) >= MAX_SOURCES_PER_CLIENT:
-                for old in [each for each in sources if now - sources[each] > _SOURCE_TIMEOUT]:
-                    del sources[old]
-            if source not in sources and len(sources) >= MAX_SOURCES_PER_CLIENT:
+        sources.pop(source, None)
+        if params.touches:
+            for old in [each for each in sources if now - sources[each] > _SOURCE_TIMEOUT]:
+                del sources[old]
+            if len(sources) >= MAX_SOURCES_PER_CLIENT:
                 raise InputError(
                     f"a client must have at most {MAX_SOURCES_PER_CLIENT} touch sources with "
                     "fingers down; lift some first"

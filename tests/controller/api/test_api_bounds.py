@@ -19,7 +19,7 @@ from controller.api.hub import Hub
 from controller.api.methods import METHODS
 from controller.api.schema import MAX_RATE, Message
 from controller.api.server import ApiServer
-from controller.api.topics import ContactsEvent
+from controller.api.topics import ContactsEvent, LogEvent
 from drivers.garbage_collection import no_long_collections
 from wire_of_memory import Wire
 
@@ -55,6 +55,29 @@ def test_connection_closes_when_unread_responses_exceed_256_kib() -> None:
     connection, wire = connect(lambda: 0.0)
     connection.respond(b"x" * (4 * MAX_UNREAD_BYTES))
     assert (len(wire.waiting), wire.is_aborted) == (1 << 20, False)
+
+
+def test_client_that_does_not_read_loses_notifications_then_the_connection() -> None:
+    """Unread output stays bounded, the next event counts the lost ones, then it is closed."""
+    now = 0.0
+    connection, wire = connect(lambda: now)
+    counts: list[int] = []
+
+    def make(lost: int) -> bytes:
+        counts.append(lost)
+        return b"x" * 1023 + b"\n"
+
+    for _ in range(500):
+        connection.notify(make)
+    assert (counts, len(wire.waiting)) == ([0] * 128, MAX_UNREAD_BYTES // 2)
+    wire.waiting = b""
+    connection.notify(make)
+    assert counts[-1] == 372
+    for now in (0.0, 4.9, 5.1):  # noqa: B007  s, from the first loss on; read by the clock
+        assert not wire.is_aborted
+        for _ in range(500):
+            connection.notify(make)
+    assert wire.is_aborted
 
 
 def serve(served: list[str]) -> tuple[ApiServer, Connection, Wire]:
@@ -317,25 +340,53 @@ async def test_hub_survives_an_exception_of_a_producer(caplog: pytest.LogCapture
     hub.close()
 
 
-async def test_hub_sends_a_coalesced_topic_at_most_sixty_times_per_second() -> None:
-    """The flush after one at this moment is a sixtieth of a second later."""
+async def test_hub_sends_the_newest_of_changes_at_most_sixty_times_per_second() -> None:
+    """Of a thousand changes one, a sixtieth of a second after the one before; records of the log
+    one by one, at once.
+    """
     now = 100.0
     hub = Hub({}, clock=lambda: now)
     connection, wire = connect(lambda: now)
-    hub.subscribe(connection, ["contacts"])
+    hub.subscribe(connection, ["contacts", "log"])
     loop = asyncio.get_running_loop()
+    made: list[str] = []
+
+    def make() -> Message:
+        made.append("contacts")
+        return ContactsEvent(contacts=[])
 
     def publish() -> float:
         before = loop.time()
-        hub.publish("contacts", lambda: ContactsEvent(contacts=[]))
+        for _ in range(1000):
+            hub.publish("contacts", make)
         return cast(asyncio.TimerHandle, hub._flush).when() - before
 
     assert publish() < 1 / MAX_RATE
+    for _ in range(3):
+        hub.publish("log", lambda: LogEvent(level="info", message="", cause=None, remedy=None))
     await asyncio.sleep(0.01)
-    assert wire.waiting
+    topics = [json.loads(line)["params"]["topic"] for line in wire.waiting.splitlines()]
+    assert (topics, made) == (["log", "log", "log", "contacts"], ["contacts"])
     assert publish() >= 1 / MAX_RATE - 1e-6
     cast(asyncio.TimerHandle, hub._flush).cancel()
     hub._flush = None
     now += 1.0
     assert publish() < 1 / MAX_RATE
     hub.close()
+
+
+async def test_hub_sends_each_periodic_topic_at_its_own_rate() -> None:
+    """A later subscription to another topic leaves that of the first; both end with the client."""
+    hub = Hub({"amplifiers": lambda: None, "latency": lambda: None}, clock=lambda: 0.0)
+    connection, _ = connect(lambda: 0.0)
+    loop = asyncio.get_running_loop()
+    hub.subscribe(connection, ["amplifiers"], rate=2.0)
+    hub.subscribe(connection, ["latency"], rate=50.0)
+    timers = {
+        topic: cast(asyncio.TimerHandle, timer) for topic, timer in hub._topics[connection].items()
+    }
+    due = {topic: timer.when() - loop.time() for topic, timer in timers.items()}
+    assert due == pytest.approx({"amplifiers": 0.5, "latency": 0.02}, abs=0.015)
+    hub.forget(connection)
+    assert all(timer.cancelled() for timer in timers.values())
+    assert not hub.is_subscribed(connection)

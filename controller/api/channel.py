@@ -66,15 +66,9 @@ class Channel(asyncio.Protocol):
         return channel
 
     async def _connect(self) -> None:
+        connected = await connected_socket(self.path)
         loop = asyncio.get_running_loop()
-        try:
-            connected = await _connected_socket(self.path)
-            transport, _ = await loop.create_unix_connection(lambda: self, sock=connected)
-            check_peer(self.path, transport.get_extra_info("socket"))
-        except Unreachable:
-            raise
-        except OSError as error:
-            raise Unreachable.at(self.path, error) from error
+        await loop.create_unix_connection(lambda: self, sock=connected)
 
     async def request(self, method: str, params: Message) -> Any:
         """Call a method and return its result as parsed JSON; raises RpcError and Unreachable."""
@@ -135,8 +129,8 @@ class Channel(asyncio.Protocol):
         self._on_lost()
 
 
-async def _connected_socket(path: Path) -> socket.socket:
-    """Connect a socket, waiting while the daemon's queue is full; raises OSError.
+async def connected_socket(path: Path) -> socket.socket:
+    """Connect to a daemon that is to be believed, however full its queue; raises Unreachable.
 
     asyncio would take a full queue for a connection in progress.
     """
@@ -149,7 +143,10 @@ async def _connected_socket(path: Path) -> socket.socket:
             except BlockingIOError:
                 await asyncio.sleep(_QUEUE_INTERVAL)
             else:
+                check_peer(path, connecting)
                 return connecting
-    except BaseException:
+    except BaseException as error:
         connecting.close()
+        if isinstance(error, OSError) and not isinstance(error, Unreachable):
+            raise Unreachable.at(path, error) from error
         raise

@@ -1,5 +1,6 @@
 """The gateway's routes: the page, the API over HTTP, and the WebSocket."""
 
+import asyncio
 import json
 import time
 from pathlib import Path
@@ -10,53 +11,42 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from controller.api.client_protocol import Unreachable, read_result
-from controller.api.jsonrpc import (
-    ErrorCode,
-    RpcError,
-    error_data,
-    parse_json,
-    read_params,
-    unknown_method,
-)
-from controller.api.jsonrpc import Request as RpcRequest
-from controller.api.methods import ArmParams, StatusResult
+from controller.api.jsonrpc import ErrorCode, RpcError, error_line, unknown_method
+from controller.api.methods import StatusResult
 from controller.api.rate_limit import RateLimiter
-from controller.api.schema import Empty, Message
 from controller.gateway.access import MAX_BODY, SUBPROTOCOL, Access
+from controller.gateway.bridge import bridge, client_name
+from controller.gateway.field import DrawnField
+from controller.gateway.link import KeptLink
 from controller.gateway.metrics import exposition
-from controller.gateway.mirror import DaemonMirror
 from controller.gateway.openapi import HTTP_METHODS, HTTP_STATUS, openapi
-from controller.gateway.session import (
-    TRY_AGAIN_LATER,
-    Session,
-    arm_for,
-    in_name_of,
-    name_client,
-    touch_params,
-)
 from controller.gateway.settings import Settings
 
-MAX_SESSIONS = 32
-MAX_HTTP_RATE = 500.0  # 1/s; of all clients together, of what is not UNLIMITED
+MAX_SESSIONS = 24  # WebSockets; the daemon has 32 connections, and some for stops
+MAX_OPENING_RATE, OPENING_BURST = 15.0, 48.0  # 1/s; of a host's connections to the daemon, and in
+# a burst: fewer than the daemon accepts of one process
+_MAX_HOSTS = 256  # above which those that have not connected lately are forgotten
 UNLIMITED = frozenset({"stop", "disarm"})
+TRY_AGAIN_LATER = 1013  # close code in the registry of RFC 6455
 
 _PAGE = Path(__file__).parent / "page"
 
 
 class Gateway:
-    """State shared by the routes; `app` is the ASGI application."""
+    """State shared by the routes; `app` is the ASGI application, `field` to be run beside it."""
 
     def __init__(self, settings: Settings) -> None:
-        self._sessions: set[Session] = set()
-        self._mirror = DaemonMirror(settings.socket, publish=self._publish)
-        self._rate = RateLimiter(MAX_HTTP_RATE, clock=time.monotonic)
+        self.field = DrawnField(settings.socket)
+        self._daemon = settings.socket
+        self._session_count = 0
+        self._rates: dict[str, RateLimiter] = {}  # of connections to the daemon, by host
         self._openapi = json.dumps(openapi()).encode()
         self.app = Starlette(
             routes=[
@@ -83,25 +73,15 @@ class Gateway:
             exception_handlers={HTTPException: _http_error},
         )
 
-    async def follow(self) -> None:
-        """Follow the daemon until cancelled."""
-        await self._mirror.run()
-
-    def _publish(self, topic: str, frame: str | bytes) -> None:
-        for session in self._sessions:
-            session.publish(topic, frame)
-
     async def _describe(self, _: Request) -> Response:
         return Response(self._openapi, media_type="application/json")
 
-    async def _metrics(self, _: Request) -> Response:
+    async def _metrics(self, request: Request) -> Response:
         """Read the daemon's status for Prometheus."""
-        if not self._rate.take():
-            raise HTTPException(429, "too many requests; send fewer per second")
         try:
-            found = await self._mirror.daemon.call("status", Empty())
-            status = read_result(found, StatusResult)
-        except (RpcError, Unreachable):
+            reply = await self._ask(request, "status", b"{}")
+            status = read_result(reply["result"], StatusResult)
+        except (KeyError, RpcError, Unreachable):
             status = None
         return Response(exposition(status), media_type=CONTENT_TYPE_LATEST)
 
@@ -111,45 +91,59 @@ class Gateway:
         try:
             if method not in HTTP_METHODS:
                 raise unknown_method(method, HTTP_METHODS)
-            body = await _body(request)
-            if method not in UNLIMITED and not self._rate.take():
-                raise RpcError(ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
-            call = RpcRequest(method, body, None, expects_response=True)
-            client = name_client("http", request)
-            if method == "touch":  # fingers belong to the connection
-                params: Message = touch_params(call, client)
-            else:
-                params = in_name_of(client, read_params(HTTP_METHODS[method].params, call))
-            if isinstance(params, ArmParams):
-                daemon, has_left = self._mirror.daemon, request.is_disconnected
-                return JSONResponse(await arm_for(daemon, params, has_left=has_left))
-            return JSONResponse(await self._mirror.daemon.call(method, params))
+            reply = await self._ask(request, method, await _body(request))
         except RpcError as error:
-            return _api_error(error)
-        except ClientDisconnect:
+            reply = json.loads(error_line(None, error))
+        except (ClientDisconnect, asyncio.CancelledError):  # cancelled when the gateway ends
             return Response(status_code=400)  # sent to nowhere
+        if "error" not in reply:
+            return JSONResponse(reply["result"])
+        failed = reply["error"]
+        content = {"error": failed["message"], "code": failed["code"], "data": failed["data"]}
+        return JSONResponse(content, HTTP_STATUS[failed["code"]])
+
+    async def _ask(self, request: Request, method: str, params: bytes) -> dict[str, Any]:
+        """The daemon's response, over the connection that this one keeps; raises RpcError."""
+        kept: KeptLink = request.state.daemon
+        if not (kept.is_open or method in UNLIMITED or self._may_connect(request)):
+            raise RpcError(ErrorCode.BUSY, "too many connections", remedy="keep one open")
+        name = client_name("http", request)
+        try:
+            reply: dict[str, Any] = json.loads(
+                await kept.request(self._daemon, name, method, params)
+            )
+        except Unreachable as error:
+            raise RpcError(ErrorCode.LINK, str(error)) from error
+        return reply
 
     async def _serve(self, socket: WebSocket) -> None:
         """Serve one browser."""
         if SUBPROTOCOL not in socket.scope["subprotocols"]:
             await socket.close(1002, f"the subprotocol must be {SUBPROTOCOL}")
             return
-        if len(self._sessions) >= MAX_SESSIONS:
+        if self._session_count >= MAX_SESSIONS or not self._may_connect(socket):
             await socket.close(TRY_AGAIN_LATER, "too many clients")
             return
-        session = Session(
-            socket, self._mirror.daemon, current=self._mirror.current, clock=time.monotonic
-        )
-        self._sessions.add(session)  # before the first await, so that the limit holds
+        self._session_count += 1  # before the first await, so that the limit holds
         try:
             await socket.accept(subprotocol=SUBPROTOCOL)
-            await session.run()
+            await bridge(socket, self._daemon, self.field)
         finally:
-            self._sessions.discard(session)
+            self._session_count -= 1
+
+    def _may_connect(self, client: HTTPConnection) -> bool:
+        """Whether a client's host may open a connection to the daemon; counts it."""
+        host = "" if client.client is None else client.client.host
+        if len(self._rates) >= _MAX_HOSTS:
+            self._rates = {name: each for name, each in self._rates.items() if not each.is_unused}
+        rate = self._rates.setdefault(
+            host, RateLimiter(MAX_OPENING_RATE, burst=OPENING_BURST, clock=time.monotonic)
+        )
+        return rate.take()
 
 
-async def _body(request: Request) -> dict[str, Any]:
-    """The JSON object in a request's body; raises HTTPException."""
+async def _body(request: Request) -> bytes:
+    """A request's body on one line, by default an empty object; raises HTTPException."""
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media not in ("application/json", ""):
         raise HTTPException(415, "the content type must be application/json")
@@ -160,20 +154,7 @@ async def _body(request: Request) -> dict[str, Any]:
             raise HTTPException(413, f"the body must have at most {MAX_BODY} bytes")
     if body and not media:  # an empty body needs no type
         raise HTTPException(415, "the content type must be application/json")
-    try:
-        params = parse_json(body or b"{}")
-    except RpcError as error:
-        raise HTTPException(400, f"the body must be a JSON object: {error}") from error
-    if not isinstance(params, dict):
-        raise HTTPException(400, "the body must be a JSON object")
-    return params
-
-
-def _api_error(error: RpcError) -> Response:
-    return JSONResponse(
-        {"error": str(error), "code": int(error.code), "data": error_data(error)},
-        HTTP_STATUS[error.code],
-    )
+    return body.replace(b"\n", b"\r") or b"{}"  # both are spaces, and neither is within a text
 
 
 async def _http_error(_: Request, error: Exception) -> Response:

@@ -5,6 +5,7 @@ Timeouts count from the last complete request, so sending byte by byte gains not
 """
 
 import asyncio
+from typing import Any
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
@@ -12,11 +13,12 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import CloseCode, Frame
 
 from controller.api.rate_limit import RateLimiter
+from controller.gateway.link import KeptLink
 
 MAX_IDLE = 128  # connections that have not sent a complete request
 REQUEST_TIMEOUT = 5.0  # s; for a complete request
 UNREAD_TIMEOUT = 5.0  # s; for reading a response over HTTP
-MAX_UNREAD = 1 << 18  # bytes per WebSocket; bounds pongs, responses are bounded by the outbox
+MAX_UNREAD = 1 << 18  # bytes per WebSocket; bounds pongs; other frames wait until it reads
 MAX_FRAGMENTS = 64  # per message; a browser sends 64 KiB in one or two
 MAX_CONTROL_RATE = 100.0  # 1/s; pings and pongs of one WebSocket; one in ten seconds is needed
 CLOSE_TIMEOUT = 1.0  # s; for a WebSocket to close after its last frame
@@ -30,8 +32,15 @@ class HttpConnection(H11Protocol):
     keep a browser out.
     """
 
-    _idle: dict["HttpConnection", asyncio.TimerHandle] = {}  # noqa: RUF012 (of all connections)
-    _unread: asyncio.TimerHandle | None = None
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self._unread: asyncio.TimerHandle | None = None
+        # Of all connections of the server, whose state is one dictionary.
+        self._idle: dict[HttpConnection, asyncio.TimerHandle] = self.app_state.setdefault(
+            "idle", {}
+        )
+        self._daemon = KeptLink()
+        self.app_state = {**self.app_state, "daemon": self._daemon}  # for requests
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Accept it as idle."""
@@ -57,6 +66,7 @@ class HttpConnection(H11Protocol):
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
         """Hand over to a WebSocket."""
         self._end_idle()
+        self._daemon.close()
         super().handle_websocket_upgrade(event)
 
     def pause_writing(self) -> None:
@@ -70,8 +80,9 @@ class HttpConnection(H11Protocol):
         self._cancel_unread()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Cancel all timeouts."""
+        """Cancel all timeouts, and close the connection to the daemon."""
         self._end_idle()
+        self._daemon.close()
         self._cancel_unread()
         super().connection_lost(exc)
 

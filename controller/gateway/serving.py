@@ -7,8 +7,7 @@ import re
 import signal
 import socket
 import ssl
-from collections.abc import AsyncIterator, Callable
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import uvicorn
 
@@ -26,7 +25,7 @@ _SHUTDOWN_TIMEOUT = 0.3  # s; for connections to close by themselves
 
 
 class _Server(uvicorn.Server):
-    """Announces its port; leaves signals to `serve`, which has its own exit status."""
+    """Announces its port; ends at a signal, with an exit status of its own."""
 
     def __init__(self, config: uvicorn.Config, *, announce: Callable[[int], None]) -> None:
         super().__init__(config)
@@ -44,9 +43,14 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
 
     @contextlib.contextmanager
-    def capture_signals(self) -> Any:
-        """Install no signal handlers."""
+    def capture_signals(self) -> Iterator[None]:
+        """Shut down at SIGINT and SIGTERM, with exit status 0."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, self._end)
         yield
+
+    def _end(self) -> None:
+        self.should_exit = True
 
     def _abort(self) -> None:
         for connection in list(self.server_state.connections):
@@ -80,18 +84,10 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
         ssl_certfile=settings.certificate,
         ssl_keyfile=settings.key,
     )
-    server = _Server(config, announce=announce)
-    following = asyncio.create_task(gateway.follow())
-    # Without the daemon's events the page would show outdated state.
-    following.add_done_callback(lambda _: setattr(server, "should_exit", True))
-    try:
-        async with _signals(server):
-            await server.serve(sockets=[listening])
-    finally:
-        following.cancel()
-        await asyncio.wait({following})
-    if not following.cancelled():
-        following.result()
+    drawing = asyncio.create_task(gateway.field.run())
+    await _Server(config, announce=announce).serve(sockets=[listening])
+    drawing.cancel()
+    await asyncio.wait({drawing})
 
 
 def check_certificate(settings: Settings) -> None:
@@ -130,20 +126,3 @@ def listen(settings: Settings) -> socket.socket:
             "other program or give another port (--listen)"
         ) from error
     return listening
-
-
-@contextlib.asynccontextmanager
-async def _signals(server: uvicorn.Server) -> AsyncIterator[None]:
-    """Shut the server down at SIGINT and SIGTERM."""
-    loop = asyncio.get_running_loop()
-
-    def end() -> None:
-        server.should_exit = True
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, end)
-    try:
-        yield
-    finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.remove_signal_handler(number)

@@ -26,6 +26,7 @@ from controller.api.methods import (
     METHODS,
     ArmResult,
     EffectsResult,
+    HelloParams,
     HelloResult,
     RenewResult,
     StatusResult,
@@ -61,6 +62,7 @@ class ScriptedDaemon:
     def __init__(self, folder: Path) -> None:
         self.socket = folder / "era.sock"
         self.calls: list[tuple[str, Message]] = []
+        self.callers: list[Connection] = []  # one per call
         self.silence: dict[str, AmplifierSilence] = {}  # after a stop that is not confirmed
         self._rig_text = write_rig(folder / "rig.yaml").read_text(encoding="utf-8")
         self._loop = asyncio.new_event_loop()
@@ -125,6 +127,9 @@ class ScriptedDaemon:
                 self._hub.subscribe(client, params.topics)
             if name not in ("hello", "subscribe"):  # called by the gateway itself
                 self.calls.append((name, params))
+                self.callers.append(client)
+            if isinstance(params, HelloParams):
+                client.name = params.client
             return self._arm() if name == "arm" else self._result(name)
 
         return handle
@@ -412,11 +417,15 @@ def upgrade(
 
 
 class RawWebSocket:
-    """A WebSocket client that sends any frames, by RFC 6455, section 5."""
+    """A WebSocket client that sends any frames, by RFC 6455, section 5.
 
-    def __init__(self, gateway: GatewayProcess) -> None:
+    hello: the first frame, the daemon's response to the gateway's hello.
+    """
+
+    def __init__(self, gateway: GatewayProcess, *, target: str = "/api/v1/ws") -> None:
         self.connection = gateway.connect()
-        self.connection.sendall(upgrade(gateway, origin=f"http://{gateway.host}"))
+        origin = f"http://{gateway.host}"
+        self.connection.sendall(upgrade(gateway, target=target, origin=origin))
         self._rest = b""
         while b"\r\n\r\n" not in self._rest:
             part = self.connection.recv(1 << 16)
@@ -424,6 +433,7 @@ class RawWebSocket:
             self._rest += part
         self.head, _, self._rest = self._rest.partition(b"\r\n\r\n")
         assert b" 101 " in self.head, self.head
+        _, self.hello = self.next()
 
     def __enter__(self) -> "RawWebSocket":
         return self

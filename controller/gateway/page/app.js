@@ -6,15 +6,16 @@ import { Fingers } from "./fingers.js";
 import { fixed, PlateOverlay } from "./plate.js";
 import { addEvent, annotate, showAmplifiers, showEffects, showLatency, STATES, timeOfDay } from "./side.js";
 
-const TOPICS = ["hello", "state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "plate", "field"];
+const TOPICS = ["state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout", "plate"];
 const LEASE_S = 5;
 const TOKEN_KEY = "era-haptics-token";
 const DISARMED = ["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"];
 const LATCHED = ["QUICK_STOP_ACTIVE", "FAULT"];
 // States that are left at once: the events before or after them are shown.
 const TRANSIENT = ["SWITCHED_ON", "FAULT_REACTION_ACTIVE", "READY_TO_SWITCH_ON"];
-// Why there is no connection to the gateway, and the remedy.
+// Why there is no connection to the daemon, and the remedy.
 const FAILURES = {
+  daemon: ["The daemon does not respond", "the gateway is connecting to the daemon"],
   refused: ["The gateway refuses the token of this page", "open the URL that it printed at its start"],
   full: ["The gateway responds but has too many clients", "retrying"],
   unreachable: ["The gateway does not respond", "retrying"],
@@ -26,7 +27,8 @@ let connection;
 let lease = null;  // until renewing is refused: the state may arrive later than the response to arm
 let state = null;
 let knownAlarms;  // of the plate; undefined before the first event of it
-let daemon;  // result of hello; undefined before the first, null while disconnected
+let daemon = null;  // result of hello; null while disconnected
+let ownName;  // of this page, in the daemon's log
 let failure = "unreachable";
 let lostSince = null;  // when the gateway, the daemon or a link to an amplifier was lost
 let watchdog;  // s; after which an amplifier without commands silences itself
@@ -72,7 +74,7 @@ async function stop() {
 }
 
 async function arm() {
-  const granted = await call("arm", { owner: "dashboard", lease_s: LEASE_S });
+  const granted = await call("arm", { owner: `dashboard (${ownName})`, lease_s: LEASE_S });
   lease = granted?.lease ?? null;
   showButtons();
 }
@@ -102,11 +104,8 @@ function showBanner() {
   let text = "";
   let reason = "";
   if (!connection?.isOpen) {
-    reason = `gateway-${failure}`;
-    text = `${FAILURES[failure][0]}${failure === "unreachable" ? since : ""}. ${warning}`;
-  } else if (daemon === null) {
-    reason = "daemon-unreachable";
-    text = `The daemon does not respond${since}. ${warning}`;
+    reason = failure === "daemon" ? "daemon-unreachable" : `gateway-${failure}`;
+    text = `${FAILURES[failure][0]}${["daemon", "unreachable"].includes(failure) ? since : ""}. ${warning}`;
   } else if (state === "COMM_LOST") {
     reason = "link-lost";
     text = `The link to an amplifier is lost${since}. It may still be energised`;
@@ -180,20 +179,6 @@ function summariseSilence() {
 }
 
 const HANDLERS = {
-  hello(next) {
-    if (daemon && !next) showOutage("the daemon does not respond");
-    daemon = next;
-    if (daemon === null) {
-      showUnknown("the gateway is connecting to the daemon");
-      return;
-    }
-    if (outage) annotate(outage, `${timeOfDay(new Date())} reconnected`);
-    outage = null;
-    showBanner();
-    overlay.setUp(daemon);
-    connection.call("status").then(showStatus).catch((error) => error.code && showError(error));  // 0: an outage, shown already
-    connection.call("effects").then(({ effects }) => showEffects(at("effects-section"), at("effects"), effects, play)).catch(() => {});
-  },
   state({ old, new: next, cause, remedy }) {
     const isChange = state !== null && old !== next && !TRANSIENT.includes(next);
     showState(next, cause);
@@ -226,6 +211,12 @@ const HANDLERS = {
   amplifiers({ amplifiers }) {
     showAmplifiers(at("amplifiers"), amplifiers, overlay.rig?.eras ?? []);
   },
+  layout({ layout }) {
+    if (JSON.stringify(layout) === JSON.stringify(daemon.layout)) return;
+    daemon.layout = layout;
+    overlay.setUp(daemon);
+    updateEffects();
+  },
   latency({ latency_ms }) {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
   },
@@ -254,26 +245,38 @@ async function play(effect) {
   if (result?.held_back) at("problem").textContent = `${effect}: ${result.held_back}`;
 }
 
-function opened() {
-  failure = "unreachable";  // if it is lost again
+function updateEffects() {
+  connection.call("effects").then(({ effects }) => showEffects(at("effects-section"), at("effects"), effects, play)).catch(() => {});
+}
+
+function opened(hello, name) {
+  daemon = hello;
+  ownName = name;
   lostSince = null;
   at("login").hidden = true;
   at("main").hidden = false;
-  if (!outage) addEvent(log, "info", "connected to the gateway");
+  if (outage) annotate(outage, `${timeOfDay(new Date())} reconnected`);
+  else addEvent(log, "info", "connected to the daemon");
+  outage = null;
+  showBanner();
+  overlay.setUp(daemon);
+  connection.call("status").then(showStatus).catch((error) => error.code && showError(error));  // 0: an outage, shown already
+  updateEffects();
 }
 
 function closed() {
-  if (connection?.wasOpen) showOutage("the gateway does not respond");
   lease = null;
-  daemon = undefined;
-  showUnknown(FAILURES[failure][1]);
+  daemon = null;
 }
 
 function failed(why) {
   failure = why;
+  const isGateway = why !== "daemon";
+  if (connection.wasOpen) showOutage(`the ${isGateway ? "gateway" : "daemon"} does not respond`);
   showUnknown(FAILURES[why][1]);
-  if (why === "refused" || !connection.wasEverOpen) showLogin(`${FAILURES[why][0]}.`);
+  if (why === "refused" || (isGateway && !connection.wasEverAccepted)) showLogin(`${FAILURES[why][0]}.`);
   else at("login").hidden = true;
+  if (!isGateway) at("main").hidden = false;
 }
 
 function showLogin(problem) {

@@ -2,6 +2,7 @@
 
 const RETRY_MS = [200, 500, 1000, 2000];
 const RESPONSE_TIMEOUT_MS = 6000;
+const NO_DAEMON = 4001;  // close code of the gateway
 
 export class RpcError extends Error {
   constructor({ code, message, data }) {
@@ -12,9 +13,10 @@ export class RpcError extends Error {
 }
 
 export class Connection {
-  // topics: to subscribe to. handlers: opened(), closed(), failed(why) after each failed attempt to
-  // connect, event(params), field(ArrayBuffer). why: "refused" because of the token, "full" if the
-  // gateway responds but accepts no WebSocket, or "unreachable".
+  // topics: to subscribe to. handlers: opened(hello, name) once the daemon has responded, closed(),
+  // failed(why) after each loss or failed attempt to connect, event(params), field(ArrayBuffer).
+  // name: of this page, in the daemon's log. why: "daemon" if the daemon does not respond, "refused"
+  // because of the token, "full" if the gateway responds but accepts no WebSocket, "unreachable".
   constructor(token, topics, handlers) {
     this.token = token;
     this.topics = topics;
@@ -22,40 +24,43 @@ export class Connection {
     this.pending = new Map();
     this.lastId = 0;
     this.attempts = 0;
-    this.wasEverOpen = false;
+    this.wasEverAccepted = false;
     this.wasOpen = false;  // since the last attempt to connect
     this.connect();
   }
 
   get isOpen() {
-    return this.socket.readyState === WebSocket.OPEN;
+    return this.wasOpen && this.socket.readyState === WebSocket.OPEN;
   }
 
   connect() {
-    const url = new URL("api/v1/ws", location.href);
+    const url = new URL("api/v1/ws?field", location.href);
     url.protocol = location.protocol === "https:" ? "wss:" : "ws:";
     url.hash = "";
     this.socket = new WebSocket(url, ["era-haptics.v1", `era-haptics.token.${this.token}`]);
     this.socket.binaryType = "arraybuffer";
-    this.socket.onopen = () => this.opened();
     this.socket.onmessage = ({ data }) => this.received(data);
-    this.socket.onclose = () => this.closed();
+    this.socket.onclose = ({ code }) => this.closed(code);
   }
 
-  opened() {
+  opened({ id, result }) {
     this.attempts = 0;
-    this.wasOpen = this.wasEverOpen = true;
+    this.wasOpen = this.wasEverAccepted = true;
     this.call("subscribe", { topics: this.topics, rate_hz: 10 }).catch(() => {});
-    this.handlers.opened();
+    this.handlers.opened(result, id);
   }
 
-  closed() {
+  closed(code) {
     for (const { reject } of this.pending.values()) {
       reject(new RpcError({ code: 0, message: "the gateway does not respond" }));
     }
     this.pending.clear();
     this.handlers.closed();
-    if (!this.wasOpen) this.diagnose();
+    if (code === NO_DAEMON) {
+      this.wasEverAccepted = true;
+      this.handlers.failed("daemon");
+    } else if (this.wasOpen) this.handlers.failed("unreachable");
+    else this.diagnose();
     this.wasOpen = false;
     setTimeout(() => this.connect(), RETRY_MS[Math.min(this.attempts++, RETRY_MS.length - 1)]);
   }
@@ -68,6 +73,10 @@ export class Connection {
     const message = JSON.parse(data);
     if (message.method === "event") {
       this.handlers.event(message.params);
+      return;
+    }
+    if (!this.wasOpen) {  // the first is the response to the gateway's hello
+      this.opened(message);
       return;
     }
     const call = this.pending.get(message.id);

@@ -8,9 +8,10 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
 
-from controller.api.methods import METHODS, TouchParams
+from controller.api.methods import METHODS
 from controller.api.schema import PlayedTone
 from controller.api.topics import LogEvent, PatternEvent
 from gateway_bench import (
@@ -45,6 +46,7 @@ def gateway(
 def no_calls_yet(daemon: ScriptedDaemon) -> None:
     """Each test sees its own calls."""
     daemon.calls.clear()
+    daemon.callers.clear()
 
 
 PARAMETERS: dict[str, dict[str, object]] = {
@@ -101,25 +103,21 @@ def test_http_stop_tells_what_is_known_of_every_amplifier(
     assert found == {name: each.model_dump() for name, each in UNCONFIRMED.items()}
 
 
-def test_http_hello_is_answered_by_the_gateway(
-    gateway: GatewayProcess, daemon: ScriptedDaemon
-) -> None:
-    """So that no client can rename the gateway in the daemon's log."""
-    status, result = call(gateway, "hello")
-    assert status == 200
-    assert result["api_version"] == "1.0"
-    assert daemon.calls == []
-
-
 def test_http_touches_belong_to_their_connection(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:
-    """The same source of another connection is another one: it lifts no other client's fingers."""
-    call(gateway, "touch")
-    call(gateway, "touch")
-    one, other = (params.source for _, params in daemon.calls if isinstance(params, TouchParams))
-    assert re.fullmatch(r"http 127\.0\.0\.1:\d+:me", one)
-    assert one != other
+    """A connection has one to the daemon, which ends with it: no other client lifts its fingers."""
+    headers = {"Authorization": f"Bearer {TOKEN}"}
+    with httpx.Client(base_url=gateway.url, headers=headers) as kept:
+        for _ in range(2):
+            assert kept.post("api/v1/touch", json=PARAMETERS["touch"]).status_code == 200
+        call(gateway, "touch")
+        one, again, other = daemon.callers
+        assert one is again is not other
+        assert re.fullmatch(r"http 127\.0\.0\.1:\d+", one.name)
+        wait_for(lambda: not other.is_open)
+        assert one.is_open
+    wait_for(lambda: not one.is_open)
 
 
 def test_http_method_without_parameters_needs_no_body(
@@ -226,7 +224,6 @@ def test_openapi_matches_the_responses(
 def subscribe(ws: RawWebSocket, *topics: str) -> None:
     """Subscribe to topics."""
     ws.call("subscribe", {"topics": topics}, id=100)
-    assert ws.response(100)["result"] == {}
 
 
 def next_event(ws: RawWebSocket, topic: str) -> dict[str, object] | None:
@@ -242,18 +239,16 @@ def next_event(ws: RawWebSocket, topic: str) -> dict[str, object] | None:
 def test_websocket_receives_current_state_and_events(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:
-    """`hello` and state at once, then every event, its text unchanged."""
+    """The daemon's hello first, to the browser's name; then events, their text unchanged."""
     text = '<img src=x onerror=alert(1)> "quoted" \u2028'
     with RawWebSocket(gateway) as ws:
-        subscribe(ws, "hello", "state", "log")
+        hello = json.loads(ws.hello)
+        assert re.fullmatch(r"web:\d+ 127\.0\.0\.1:\d+", hello["id"])
+        assert hello["result"]["rig"]["length_m"] == pytest.approx(0.3048)  # 12 inches
+        subscribe(ws, "state", "log")
         state = next_event(ws, "state")
         assert state is not None
         assert state["new"] == "READY_TO_SWITCH_ON"
-        hello = next_event(ws, "hello")
-        assert hello is not None
-        rig = hello["rig"]
-        assert isinstance(rig, dict)
-        assert rig["length_m"] == pytest.approx(0.3048)  # 12 inches, as in the rig's file
         daemon.publish("log", LogEvent(level="error", message=text, cause=text, remedy=text))
         assert next_event(ws, "log") == {
             "level": "error",
@@ -271,8 +266,7 @@ def test_websocket_receives_the_field_of_the_drive(
     Far below the first natural frequency the plate is rigid on four springs: driven at its
     south-west corner it moves most there.
     """
-    with RawWebSocket(gateway) as ws:
-        subscribe(ws, "field")
+    with RawWebSocket(gateway, target="/api/v1/ws?field") as ws:
         daemon.publish(
             "pattern",
             PatternEvent(
@@ -302,45 +296,23 @@ def test_websocket_receives_the_field_of_the_drive(
     assert south_west > 2 * max(south_east, north_west)
 
 
-def test_websocket_touches_are_separate_and_lifted_at_its_end(
-    gateway: GatewayProcess, daemon: ScriptedDaemon
-) -> None:
-    """Two pages with the same source name are two sources, each lifted when its page closes."""
-    touch = PARAMETERS["touch"]
+def test_websocket_is_a_client_of_its_own(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
+    """The daemon knows when it has left, and completes what it was sent before."""
     with RawWebSocket(gateway) as one, RawWebSocket(gateway) as other:
         for ws in (one, other):
-            ws.call("touch", touch)
+            ws.call("touch", PARAMETERS["touch"])
             assert ws.response()["result"] == {}
-        wait_for(lambda: len(daemon.calls) == 2)
-    wait_for(lambda: len(daemon.calls) == 4)
-    frames = [params for _, params in daemon.calls]
-    assert all(isinstance(params, TouchParams) for params in frames)
-    counts = [(params.source, len(params.touches)) for params in frames]  # type: ignore[attr-defined]
-    sources = {source for source, _ in counts}
-    assert len(sources) == 2
-    assert sorted(counts) == sorted((source, count) for source in sources for count in (0, 1))
-
-
-def test_websocket_stop_is_served_while_requests_are_pending(
-    gateway: GatewayProcess, daemon: ScriptedDaemon
-) -> None:
-    """Sixteen may be pending, further ones are refused, a stop is served."""
-    with RawWebSocket(gateway) as ws:
+        leaving, staying = daemon.callers
         with daemon.holding():
-            for id in range(17):
-                ws.call("arm", PARAMETERS["arm"], id=id)
-            error = ws.response(16)["error"]
-            assert isinstance(error, dict)
-            assert error["code"] == 1005
-            ws.call("stop", {}, id=99)
-            assert ws.response(99)["result"] == {"amplifiers": {}}
-        wait_for(lambda: is_accepted(ws))  # all pending requests are completed
-
-
-def is_accepted(ws: RawWebSocket) -> bool:
-    """Whether another request is served."""
-    ws.call("effects", {}, id=300)
-    return "result" in ws.response(300)
+            one.call("arm", PARAMETERS["arm"])
+            wait_for(lambda: "arm" in daemon.methods)
+            one.call("stop", {})
+            one.connection.close()
+            wait_for(lambda: leaving.has_left and "stop" in daemon.methods)
+        wait_for(lambda: not leaving.is_open)
+        assert staying.is_open
+        other.call("effects", {}, id=2)
+        assert other.response(2)["result"]
 
 
 def test_websocket_request_without_id_gets_no_response(
@@ -354,7 +326,7 @@ def test_websocket_request_without_id_gets_no_response(
         ws.call("effects", {}, id=5)
         opcode, payload = ws.next()
         assert (opcode, json.loads(payload)["id"]) == (1, 5)
-    assert daemon.methods == ["stop", "effects"]
+    assert sorted(daemon.methods) == ["effects", "stop"]
 
 
 def test_websocket_message_in_two_fragments_is_one(gateway: GatewayProcess) -> None:
@@ -365,3 +337,13 @@ def test_websocket_message_in_two_fragments_is_one(gateway: GatewayProcess) -> N
         ws.send(text[:at], first=0x01)
         ws.send(text[at:], first=0x80)
         assert json.loads(ws.next()[1]) == {"jsonrpc": "2.0", "id": "ü", "result": {}}
+
+
+def test_stop_and_disarm_are_served_to_a_host_that_connects_too_often(
+    gateway: GatewayProcess, daemon: ScriptedDaemon
+) -> None:
+    """Of all others, which are refused; this is the last test, for it is such a host."""
+    wait_for(lambda: call(gateway, "status")[0] == 429)
+    daemon.calls.clear()
+    assert [call(gateway, method)[0] for method in ("stop", "disarm")] == [200, 200]
+    assert daemon.methods == ["stop", "disarm"]

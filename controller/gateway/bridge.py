@@ -1,0 +1,79 @@
+"""One browser on a WebSocket: its frames are lines of the API to the daemon, and the other way."""
+
+import asyncio
+import contextlib
+import itertools
+from pathlib import Path
+
+from starlette.requests import HTTPConnection
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from controller.api.client_protocol import Unreachable
+from controller.gateway.field import DrawnField
+from controller.gateway.link import DaemonLink
+
+SEND_TIMEOUT = 5.0  # s; for one frame
+_MAX_NAME = 80  # characters; as in the API
+
+UNSUPPORTED_DATA = 1003  # close code of RFC 6455
+NO_DAEMON = 4001  # one of those for private use; the page connects again
+
+_numbers = itertools.count(1)
+
+
+async def bridge(socket: WebSocket, daemon: Path, field: DrawnField) -> None:
+    """Pass frames and lines on until the browser or the daemon at a socket closes.
+
+    The first frame is the daemon's reply to a hello, whose id is the browser's name in the daemon's
+    log. The daemon carries out what it was sent before the browser left, and lifts its fingers.
+    """
+    try:
+        link = await DaemonLink.open(daemon, client_name(f"web:{next(_numbers)}", socket))
+        with contextlib.closing(link):
+            await socket.send_text(link.hello.decode())
+            async with asyncio.TaskGroup() as ways:
+                ways.create_task(_to_daemon(socket, link))
+                ways.create_task(_to_browser(socket, link))
+                if "field" in socket.query_params:
+                    ways.create_task(_draw(socket, field))
+    except* Unreachable:
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # closed already
+            await socket.close(NO_DAEMON, "the daemon does not respond")
+    except* (TimeoutError, RuntimeError, WebSocketDisconnect):
+        pass  # closed, or does not read
+
+
+async def _to_daemon(socket: WebSocket, link: DaemonLink) -> None:
+    """Pass the browser's frames on; raises WebSocketDisconnect."""
+    while True:
+        message = await socket.receive()
+        if message["type"] == "websocket.disconnect":
+            raise WebSocketDisconnect(message["code"])
+        text = message.get("text")
+        if text is None or "\n" in text:
+            await socket.close(UNSUPPORTED_DATA, "send text frames of one line")
+            raise WebSocketDisconnect(UNSUPPORTED_DATA)
+        await link.send(text.encode())
+
+
+async def _to_browser(socket: WebSocket, link: DaemonLink) -> None:
+    """Pass the daemon's lines on; raises Unreachable, and TimeoutError if one is not read."""
+    while True:
+        line = await link.next_line()
+        async with asyncio.timeout(SEND_TIMEOUT):
+            await socket.send_text(line.decode())
+
+
+async def _draw(socket: WebSocket, field: DrawnField) -> None:
+    """Send the plate's vibration, now and whenever it changes."""
+    frame = None
+    while True:
+        frame = await field.newer_than(frame)
+        async with asyncio.timeout(SEND_TIMEOUT):
+            await socket.send_bytes(frame)
+
+
+def client_name(name: str, connection: HTTPConnection) -> str:
+    """A client's name for the daemon's log, with its address."""
+    address = connection.client
+    return name if address is None else f"{name} {address.host}:{address.port}"[:_MAX_NAME]

@@ -1,0 +1,158 @@
+"""The plate's vibration for drawing, as the daemon reports that it plays."""
+
+import asyncio
+import cmath
+import json
+import logging
+import math
+import threading
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from controller.api.schema import PlayedTone
+from controller.gateway.link import DaemonLink
+from model.arrays import ComplexArray, lattice
+from model.reduction.free_plate import solve_free_plate
+from model.rig.file import parse_rig
+from model.rig.rig import Rig
+
+_COLUMNS = 64  # grid points along the longer side; several per bending wavelength
+_MAX_FREQUENCIES = 64  # in the cache
+_FULL_SCALE = 32767
+_NO_FIELD = bytes(8 + 4)  # no columns, no rows, no frequencies, scale 0
+_RETRY_INTERVAL = 0.5  # s; of connecting to the daemon
+_TOPICS = b'{"jsonrpc":"2.0","method":"subscribe","params":{"topics":["pattern","silence"]}}'
+
+_logger = logging.getLogger(__name__)
+
+
+class FieldSolver:
+    """Draws the vibration of one rig's plate, which is solved once, and once per frequency."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._free = solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
+        longer = max(rig.plate.length, rig.plate.width)
+        self.columns, self.rows = (
+            max(2, math.ceil(_COLUMNS * side / longer))
+            for side in (rig.plate.length, rig.plate.width)
+        )
+        self._points = lattice(
+            np.linspace(0, rig.plate.length, self.columns),
+            np.linspace(0, rig.plate.width, self.rows),
+        )
+        self._response = lru_cache(_MAX_FREQUENCIES)(self._solve)
+
+    def frame(self, drive: Mapping[str, PlayedTone]) -> bytes:
+        """The complex acceleration under a drive by ERA, as a frame; raises InputError.
+
+        Little-endian: u16 columns, u16 rows, u16 frequencies, u16 zero; f32 scale [m/s²]; f32 per
+        frequency [Hz]; then i16 per frequency, row from the south and column from the west: real
+        and imaginary part, of 32767 as the scale.
+        """
+        frequencies = sorted({tone.frequency_hz for tone in drive.values()})
+        names = [era.name for era in self._rig.eras]
+        amplitude = np.zeros((len(frequencies), self.rows * self.columns), dtype=complex)
+        for name, tone in drive.items():
+            weight = cmath.rect(tone.level, math.radians(tone.phase_deg))
+            response = self._response(tone.frequency_hz)
+            amplitude[frequencies.index(tone.frequency_hz)] += weight * response[names.index(name)]
+        parts = np.stack([amplitude.real, amplitude.imag], axis=-1)
+        scale = float(np.abs(parts).max(initial=0.0))
+        whole = np.rint(parts / (scale or 1.0) * _FULL_SCALE).astype("<i2")
+        sizes = np.array([self.columns, self.rows, len(frequencies), 0], dtype="<u2")
+        numbers = np.array([scale, *frequencies], dtype="<f4")
+        return sizes.tobytes() + numbers.tobytes() + whole.tobytes()
+
+    def _solve(self, frequency: float) -> ComplexArray:
+        """Acceleration [m/s²] (eras, points) per ERA at full stroke."""
+        response: ComplexArray = self._free.acceleration(
+            self._rig.eras, np.array([frequency]), self._points, loads=self._rig.masses
+        )[0]
+        return response
+
+
+class DrawnField:
+    """The vibration of the plate as it plays, drawn once for all browsers; see `run`.
+
+    Nothing that fails here ends anything but the picture.
+    """
+
+    def __init__(self, daemon: Path) -> None:
+        self._daemon = daemon
+        self._frame = _NO_FIELD
+        self._changed = asyncio.Event()
+        self._due = threading.Event()
+        self._plays: tuple[str, Mapping[str, Any]] | None = None  # a rig file, and tones by ERA
+        self._problem = ""
+
+    async def newer_than(self, frame: bytes | None) -> bytes:
+        """Wait for another frame than one, which is the current one at once for None."""
+        while self._frame is frame:
+            await self._changed.wait()
+        return self._frame
+
+    async def run(self) -> None:
+        """Follow the daemon at the socket, and connect again after a loss, until cancelled."""
+        draw = threading.Thread(target=self._draw, args=(asyncio.get_running_loop(),), daemon=True)
+        draw.start()
+        while True:
+            try:
+                await self._follow()
+            except Exception as error:
+                self._note("not connected to a daemon", error)
+            self._show(None)
+            await asyncio.sleep(_RETRY_INTERVAL)
+
+    async def _follow(self) -> None:
+        """Have what plays drawn until the daemon disconnects; raises Unreachable."""
+        link = await DaemonLink.open(self._daemon, "gateway")
+        self._problem = ""
+        try:
+            rig_text = json.loads(link.hello)["result"]["rig_text"]
+            await link.send(_TOPICS)
+            while True:
+                event = json.loads(await link.next_line())["params"]
+                self._show((rig_text, event["data"].get("drive", {})))
+        finally:
+            link.close()
+
+    def _show(self, plays: tuple[str, Mapping[str, Any]] | None) -> None:
+        self._plays = plays
+        self._due.set()
+
+    def _draw(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Draw what plays whenever it changes: in a thread, for the first takes a while."""
+        solvers = lru_cache(1)(lambda text: FieldSolver(parse_rig("the daemon's rig", text)))
+        while not loop.is_closed():
+            self._due.wait()
+            self._due.clear()
+            frame, plays = _NO_FIELD, self._plays
+            try:
+                if plays is not None:
+                    frame = solvers(plays[0]).frame(_tones(plays[1]))
+            except Exception as error:
+                self._note("field of the plate not drawn", error)
+            if not (self._due.is_set() or loop.is_closed()):
+                loop.call_soon_threadsafe(self._publish, frame)
+
+    def _publish(self, frame: bytes) -> None:
+        self._frame = frame
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    def _note(self, what: str, error: Exception) -> None:
+        """Log a problem, once while it lasts."""
+        problem = f"{what}: {str(error) or type(error).__name__}"
+        if problem != self._problem:
+            self._problem = problem
+            _logger.warning("%s", problem)
+
+
+def _tones(drive: Mapping[str, Any]) -> dict[str, PlayedTone]:
+    """Tones by ERA, without what a later daemon may add to them."""
+    return {era: PlayedTone.model_validate(tone, extra="ignore") for era, tone in drive.items()}

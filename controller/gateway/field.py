@@ -119,7 +119,7 @@ class DrawnField:
                 event = json.loads(await link.next_line())["params"]
                 self._show((rig_text, event["data"].get("drive", {})))
         finally:
-            link.close()
+            link.abort()
 
     def _show(self, plays: tuple[str, Mapping[str, Any]] | None) -> None:
         self._plays = plays
@@ -147,7 +147,8 @@ class DrawnField:
 
     def _note(self, what: str, error: Exception) -> None:
         """Log a problem, once while it lasts."""
-        problem = f"{what}: {str(error) or type(error).__name__}"
+        reason, _, _ = str(error).partition("\n")
+        problem = f"{what}: {reason or type(error).__name__}"
         if problem != self._problem:
             self._problem = problem
             _logger.warning("%s", problem)

@@ -37,7 +37,7 @@ class DaemonLink:
             link.hello = await link.request("hello", params, id=name)
             check_version(json.loads(link.hello).get("result"), path)
         except BaseException:
-            link.close()
+            link.abort()
             raise
         return link
 
@@ -88,8 +88,11 @@ class DaemonLink:
         """
         self._is_closed = True
         self._writer.write_eof()
-        loop = asyncio.get_running_loop()
-        loop.call_later(RESPONSE_TIMEOUT, self._writer.transport.abort)
+        asyncio.get_running_loop().call_later(RESPONSE_TIMEOUT, self.abort)
+
+    def abort(self) -> None:
+        """Close at once."""
+        self._writer.transport.abort()
 
 
 class KeptLink:

@@ -130,11 +130,11 @@ async def test_banner_shows_the_state_of_the_gateway(tab: Page, tmp_path: Path) 
 
 async def test_full_gateway_is_shown_as_full(tab: Page, tmp_path: Path) -> None:
     """Not as unreachable."""
-    with gateway_process(tmp_path, tmp_path / "none.sock") as gateway:
+    with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
         others = [RawWebSocket(gateway) for _ in range(MAX_SESSIONS)]
         await tab.show(f"{gateway.url}#token={gateway.token}")
         await tab.until(f"{REASON} === 'gateway-full'")
         others.pop().connection.close()
-        await tab.until(f"{REASON} === 'daemon-unreachable'")
+        await tab.until(f"{REASON} === 'simulated'")
         for other in others:
             other.connection.close()

@@ -42,8 +42,8 @@ ENABLED = "OPERATION_ENABLED"
 IMPATIENT = """
 import sys
 from controller.cli.main import main
-from controller.gateway import connections, session
-connections.REQUEST_TIMEOUT = connections.UNREAD_TIMEOUT = session.SEND_TIMEOUT = 1.0
+from controller.gateway import bridge, connections
+connections.REQUEST_TIMEOUT = connections.UNREAD_TIMEOUT = bridge.SEND_TIMEOUT = 1.0
 sys.exit(main())
 """
 """`era` with shorter timeouts of the gateway."""

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import json
-import re
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,12 @@ import pytest
 
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
-from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.client_protocol import Unreachable
 from controller.api.methods import METHODS
-from controller.api.schema import Empty
 from controller.api.topics import TOPICS, EventParams
-from controller.gateway.daemon_link import DaemonLink
-from controller.gateway.mirror import FIELD, DaemonMirror
-from daemon_bench import PLACE, holding, running_daemon, until, until_state
+from controller.gateway.field import DrawnField
+from controller.gateway.link import DaemonLink
+from daemon_bench import PLACE, holding, running_daemon, until_state
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 MAPPINGS = ("drive", "rejected_touches", "parameters", "layout")  # keyed by name, not messages
@@ -79,23 +77,22 @@ async def test_extra_keys_of_a_later_minor_version_are_ignored(tmp_path: Path) -
             return seen
 
     later = tmp_path / "later.sock"
-    frames: dict[str, str | bytes] = {}
     async with running_daemon(tmp_path) as bench, relay(bench.socket, later, with_extra_keys):
         async with await AsyncClient.connect(later) as era:
             await until_state(era, READY)
             assert await asyncio.to_thread(use, later) == [READY, "state"]
-            mirroring = asyncio.create_task(DaemonMirror(later, publish=frames.__setitem__).run())
-            await until(lambda: FIELD in frames)
-            empty = frames[FIELD]
+            field = DrawnField(later)
+            drawing = asyncio.create_task(field.run())
+            empty = await field.newer_than(None)
             await era.subscribe("pattern")
             async with era.armed("me"), holding(era, PLACE), asyncio.timeout(60):
                 async for event in era.events():
                     assert "extra" in event.data["contacts"][0]
                     assert "extra" in next(iter(event.data["drive"].values()))
                     break
-                await until(lambda: "pattern" in frames and frames[FIELD] != empty)
-        mirroring.cancel()
-        await asyncio.gather(mirroring, return_exceptions=True)
+                await field.newer_than(empty)
+        drawing.cancel()
+        await asyncio.wait({drawing})
 
 
 async def test_daemon_sends_exactly_the_documented_keys(tmp_path: Path) -> None:
@@ -153,15 +150,5 @@ async def test_gateway_reports_a_daemon_of_another_major_version(tmp_path: Path)
 
     other = tmp_path / "other.sock"
     async with running_daemon(tmp_path) as bench, relay(bench.socket, other, changed):
-        link = DaemonLink(other, on_hello=lambda hello: None, on_event=lambda event: None)
-        following = asyncio.create_task(link.run())
-        message = ""
-        while "version" not in message:
-            with pytest.raises(RpcError) as caught:
-                await link.call("status", Empty())
-            message = str(caught.value)
-            await asyncio.sleep(0.01)
-        following.cancel()
-        await asyncio.gather(following, return_exceptions=True)
-        assert re.search(r"2\.0 .* 1\.\d+; update the older", message)
-        assert caught.value.code is ErrorCode.LINK
+        with pytest.raises(Unreachable, match=r"2\.0 .* 1\.\d+; update the older"):
+            await DaemonLink.open(other, "web")

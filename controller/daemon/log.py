@@ -63,12 +63,11 @@ def open_log_file(file: Path) -> TextIO:
     return stream
 
 
-UNLIMITED = frozenset({"controller.daemon.supervisor"})
-"""Loggers without a rate limit: state transitions, which are rare by nature."""
-
-
 class RateLimitFilter(logging.Filter):
-    """Limits the rate of records per logging call; clock [s]."""
+    """Limits the rate of records per logging call; clock [s].
+
+    State transitions, marked by their topic, are rare by nature and not limited.
+    """
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
@@ -77,7 +76,7 @@ class RateLimitFilter(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether to write a record; its field `skipped` counts the records not written before."""
-        if record.name in UNLIMITED:
+        if getattr(record, "topic", None) == "state":
             return True
         call, now = (record.pathname, record.lineno), self._clock()
         tokens, updated_at, skipped = self._buckets.get(call, (float(_BURST), now, 0))

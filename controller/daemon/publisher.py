@@ -113,8 +113,6 @@ class EventPublisher:
         if change == "retry" and message != self._last_link_message:
             _logger.warning("link: retrying: %s", message, extra={"topic": "link"})
         self._last_link_message = message
-        if change in ("lost", "reopened"):  # contacts are not followed meanwhile and start anew
-            self._contacts_changed((), Change())
         event = LinkEvent(
             event=change,
             amplifier=lost[0] if len(lost) == 1 else None,

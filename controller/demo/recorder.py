@@ -139,7 +139,6 @@ class TouchRecorder:
         if change.down or change.up:
             self._changed_at = clock.now()
         for contact in change.down:
-            self._lift(contact.key)  # one that was down when the link was lost
             others = {_id(other): (other.x, other.y) for other in contacts if other != contact}
             self._touches[contact.key] = _Touch(contact, others, reason=self._fault)
         if contacts:
@@ -147,15 +146,10 @@ class TouchRecorder:
         else:
             self._lifted.set()
         for contact in change.up:
-            self._lift(contact.key)
-
-    def _lift(self, key: ContactKey) -> None:
-        touch = self._touches.pop(key, None)
-        if touch is None:
-            return
-        touch.until = clock.now()
-        if self._playing is None or touch is not self._playing.touch:
-            self._run(self._add_row(touch))
+            touch = self._touches.pop(contact.key)
+            touch.until = clock.now()
+            if self._playing is None or touch is not self._playing.touch:
+                self._run(self._add_row(touch))
 
     def _pattern_applied(self, applied: Applied) -> None:
         self._end_pattern(applied.time)

@@ -79,6 +79,7 @@ class Learning:
         self._robust: Answers | None = None
         self._only_alarms, self._is_held = "", False
         self._sensors: Sequence[PlateSensor] = ()
+        self._are_sensors_known = False
         self._readings: SettledReadings | None = None
         self._estimator: EstimatorProcess | None = None
         self._tasks: dict[str, asyncio.Task[None]] = {}
@@ -136,7 +137,10 @@ class Learning:
                 "writable for the daemon, then repeat era forget"
             ) from error
         finally:
-            self._start()
+            if self._are_sensors_known:
+                self._start()
+            else:
+                self.open()
 
     async def close(self) -> None:
         """End the estimator, which keeps what it has learned."""
@@ -161,6 +165,7 @@ class Learning:
                 )
                 await asyncio.sleep(_PAUSE)
             else:
+                self._are_sensors_known = True
                 self._start()
                 return
 

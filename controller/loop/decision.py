@@ -88,7 +88,7 @@ class _Playback:
 
 
 class Decider:
-    """Contacts, intent, selection and sets of one plate; synchronous, times are arguments.
+    """Intent, selection and sets for the contacts on one plate; synchronous, times are arguments.
 
     A decision never raises: it falls back to silence on any exception.
     """
@@ -98,6 +98,7 @@ class Decider:
         rig: Rig,
         table: LocalizationTable,
         *,
+        tracker: ContactTracker,
         capabilities: PlaybackCapabilities,
         intent_source: IntentSource,
         timing: Timing | None = None,
@@ -106,7 +107,7 @@ class Decider:
         self._table = table
         self._timing = timing
         self._capabilities = capabilities
-        self._tracker = ContactTracker(rig.plate)
+        self._tracker = tracker
         self._intent_source = intent_source
         self._intent_due: float | None = None  # when the intent may change without a touch
         self._selector = Selector(table, None if timing is None else timing.levels)
@@ -131,11 +132,6 @@ class Decider:
         self._table, self._timing = table, timing
         self._selector.replace(table, None if timing is None else timing.levels)
         self._builder.replace(timing)
-
-    @property
-    def contacts(self) -> tuple[Contact, ...]:
-        """All contacts in order of arrival."""
-        return self._tracker.contacts
 
     def prepare(self) -> None:
         """Precompute what the first touch would have to wait for; tens of milliseconds.
@@ -172,11 +168,6 @@ class Decider:
         """
         moments = (self._tracker.next_expiry, self._intent_due, self._playing.retry_at)
         return min((moment for moment in moments if moment is not None), default=None)
-
-    @property
-    def next_expiry(self) -> float | None:
-        """When [s] the next source times out unless a frame of it arrives."""
-        return self._tracker.next_expiry
 
     @property
     def is_silence_pending(self) -> bool:

@@ -10,7 +10,7 @@ from controller.loop.decision import RELEASE_RAMP, Decider, Decision
 from controller.loop.intent import IntentSource
 from controller.loop.observer import Observer, applied_by, silenced_by
 from controller.loop.plate_set import PlateSet
-from controller.sources.contacts import Change
+from controller.sources.contacts import Change, ContactTracker
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import TouchFrame
 from drivers import clock
@@ -90,6 +90,7 @@ class Controller:
         self._intent_source = intent_source
         self._timing = timing
         self._drive_mode = drive_mode
+        self._tracker = ContactTracker(rig.plate)  # also while no amplifier is open
         self._rejects = RejectCounter(_logger)
         self._decider_if_open: Decider | None = None
         self._wake = asyncio.Event()
@@ -175,6 +176,7 @@ class Controller:
             decider = Decider(
                 self._rig,
                 self._table,
+                tracker=self._tracker,
                 capabilities=playback_capabilities(
                     self._rig, amplifiers, drive_mode=self._drive_mode
                 ),
@@ -323,9 +325,8 @@ class Controller:
 
         A timer that is due before stays: nothing is set anew for every frame of a source.
         """
-        due = self._decider.next_expiry
-        if due is None or self.group_state is not GroupState.ARMED:
-            due = math.inf
+        due = self._tracker.next_expiry
+        due = math.inf if due is None else due
         if self._expiry is not None:
             if self._expiry.when() <= due < math.inf:
                 return
@@ -447,7 +448,7 @@ class Controller:
 
     def _report_change(self, change: Change) -> None:
         if change:
-            self._report(lambda each: each.contacts_changed(self._decider.contacts, change))
+            self._report(lambda each: each.contacts_changed(self._tracker.contacts, change))
 
     def _report(self, event: Callable[[Observer], None]) -> None:
         """Report an event to all observers; their exceptions are only logged."""

@@ -4,15 +4,11 @@ Their ERAs play one frequency together, so that what they differ by in time is f
 """
 
 import itertools
-import math
-import re
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import drivers
 from can_mailboxes import MailboxBus
 from drivers.codec.can_bus.canopen import CanFrame
 from felt_assertions import CHECKS, Truth, contrasts
@@ -36,7 +32,6 @@ STREAM = Stream(
     ],
 )
 ONE, TWO = {"main": "slcan"}, {"main": "slcan", "side": "slcan"}
-PAGE = Path(drivers.__file__).parent.parent / "docs" / "reference" / "several-amplifiers.md"
 CHANGES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "one": (),
     "two": TWO_AMPLIFIERS,
@@ -131,19 +126,3 @@ def test_frames_were_reordered(played: Mapping[str, Played], buses: list[Mailbox
 def _message(frame: CanFrame) -> tuple[int, bytes]:
     """Identifier and number, which all frames of a request share."""
     return frame.id, frame.data[:1]
-
-
-def test_table_of_skews_follows_from_the_formula() -> None:
-    """-20 log10(2 sin(pi f t)), at least 0, in whole dB, as the page says."""
-    table = PAGE.read_text("utf-8").partition("| skew | ")[2].partition("\n\n")[0]
-    frequencies = [float(each) for each in re.findall(r"(\d+) Hz", table.splitlines()[0])]
-    rows = re.findall(r"^\| ([\d.]+) (µs|ms) \| (.*) \|$", table, re.MULTILINE)
-    assert [(row[0], row[1]) for row in rows] == [
-        *(("10", "µs"), ("0.1", "ms"), ("0.5", "ms"), ("1", "ms"))
-    ]
-    for size, unit, cells in rows:
-        skew = float(size) * (1e-6 if unit == "µs" else 1e-3)
-        shown = [int(cell.removesuffix(" dB")) for cell in cells.split(" | ")]
-        for frequency, cell in zip(frequencies, shown, strict=True):
-            left = 2 * math.sin(math.pi * frequency * skew)
-            assert cell == max(0, round(-20 * math.log10(left)))

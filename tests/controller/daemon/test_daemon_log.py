@@ -56,7 +56,7 @@ def test_log_limits_rate_of_each_call_except_state_changes() -> None:
     assert allowed.__dict__["skipped"] == 995
     assert not limit.filter(record("again"))
     transition = record("READY -> ON")
-    transition.name = "controller.daemon.supervisor"
+    transition.__dict__["topic"] = "state"
     assert all(limit.filter(transition) for _ in range(1000))
 
 

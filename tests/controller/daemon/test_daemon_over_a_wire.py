@@ -67,22 +67,6 @@ async def test_daemon_plays_touches_only_while_armed(tmp_path: Path) -> None:
         assert (await era.status()).drive == {}
 
 
-async def test_daemon_lifts_contacts_of_disconnected_client(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The contacts of another client stay: two clients are two sources."""
-    monkeypatch.setattr("controller.sources.contacts.CONTACT_TIMEOUT", 60.0)  # nothing else lifts
-    async with ready_daemon(tmp_path) as (bench, era):
-        other = await bench.client()
-        await other.touch([(0.25, 0.2)])
-        await era.touch([PLACE])
-        await until(lambda: len(bench.daemon._publisher.view.contacts) == 2)
-        await other.close()
-        await until(lambda: len(bench.daemon._publisher.view.contacts) == 1)
-        (left,) = (await era.status()).contacts
-        assert (left.x_m, left.y_m) == pytest.approx(PLACE)
-
-
 async def test_daemon_disarms_when_lease_not_renewed(tmp_path: Path) -> None:
     """Armed for 1.4 s by a lease of 1 s that is renewed once; then disarmed."""
     async with ready_daemon(tmp_path) as (bench, era):

@@ -48,13 +48,14 @@ async def test_daemon_combines_contacts_of_panels_and_clients(tmp_path: Path) ->
         }
 
 
-async def test_daemon_drops_contacts_when_link_lost(tmp_path: Path) -> None:
-    """A finger that lifts during the loss is shown neither then nor after it."""
+async def test_daemon_follows_contacts_while_link_lost(tmp_path: Path) -> None:
+    """A finger that rests is shown; one that lifts during the loss neither then nor after it."""
     async with ready_daemon(tmp_path) as (bench, era):
         async with holding(era, PLACE):
             await until(lambda: bench.daemon._publisher.view.contacts)
             bench.far.device.inject_fault(FaultWindow("hang"))
             await until_state(era, "COMM_LOST")
+            assert len((await era.status()).contacts) == 1
         await era.touch([])
         assert (await era.status()).contacts == []
         bench.far.device.recover()

@@ -264,3 +264,21 @@ async def test_alarm_of_a_watched_plate_is_a_warning(
     assert learning.status.state is LearningState.ONLY_ALARMS
     assert [each.levelname for each in caplog.records] == ["WARNING"]
     await learning.close()
+
+
+@in_virtual_time
+async def test_forget_asks_for_sensors_that_were_never_read(
+    estimators: Estimators, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without them no estimator is started; a failure to read them is said again."""
+
+    async def failing(*args: object) -> None:
+        raise RuntimeError("no such words")
+
+    monkeypatch.setattr(module, "plate_sensors", failing)
+    learning, _ = await opened(tmp_path)
+    assert learning.status.state is LearningState.FAILED
+    await learning.forget()
+    await asyncio.sleep(0.1)
+    assert (learning.status.state, estimators.count) == (LearningState.FAILED, 0)
+    await learning.close()

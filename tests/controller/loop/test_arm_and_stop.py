@@ -277,24 +277,6 @@ async def test_no_clear_is_sent_between_a_stop_and_its_frame() -> None:
 
 
 @in_virtual_time
-async def test_contacts_are_followed_while_amplifiers_are_stopped() -> None:
-    """Touches that change during a stop are reported."""
-    async with running() as bench:
-        bench.touch(FINGER)
-        await asyncio.sleep(0.001)
-        bench.far_end.answer = refusing("Commit", "BAD_VALUE")
-        bench.far_end.delay = 0.02
-        bench.touch((1, 0.7, 0.5))
-        await asyncio.sleep(0.05)
-        assert len(bench.far_end.requests("Stop")) == 1
-        bench.touch()
-        await asyncio.sleep(0.1)
-        assert bench.far_end.state == STOPPED
-        assert bench.reports.contacts == [1, 1, 0]
-        assert len(bench.reports.refused) == 1
-
-
-@in_virtual_time
 async def test_incomplete_set_is_silenced_before_the_next() -> None:
     """A lift aborts the wait for commits, and a finger comes before silence: silence goes first.
 

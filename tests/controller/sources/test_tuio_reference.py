@@ -48,25 +48,6 @@ class Scene:
         self.log += [(self.now, "up", contact.key.id) for contact in change.up]
 
 
-def test_resting_finger_stays_and_makes_no_new_touch_when_it_moves() -> None:
-    """Nothing is sent for 2.5 s; the next bundle moves the same contact."""
-    scene = Scene(ReferenceSender())
-    scene.play(0.25, lambda now: {1: (0.25 + now, 0.5)})
-    sent = scene.sent
-    scene.play(2.5, lambda now: {1: (0.5, 0.5)})
-    assert scene.sent == sent + 1  # the last movement
-    scene.play(0.25, lambda now: {1: (0.5 + CAMERA, 0.5)})
-    scene.play(0.25, lambda now: {})
-    assert scene.log == [(0.0, "down", 1), (3.0, "up", 1)]
-
-
-def test_second_finger_confirms_the_one_that_rests() -> None:
-    """Its position comes once only; every bundle says that it is alive."""
-    scene = Scene(ReferenceSender())
-    scene.play(10.0, lambda now: {1: (0.25, 0.5), 2: (0.5 + 0.02 * (now % 1), 0.5)})
-    assert scene.log == [(0.0, "down", 1), (0.0, "down", 2)]
-
-
 @pytest.mark.parametrize(("periodic", "ends"), [(False, [(3.0, "up", 1)]), (True, [])])
 def test_resting_finger_of_a_silent_sender_is_lifted_after_three_seconds(
     periodic: bool, ends: list[tuple[float, str, int]]
@@ -81,12 +62,4 @@ def test_timeout_of_the_url_replaces_the_default() -> None:
     """A sender that is known to repeat itself may have half a second."""
     scene = Scene(ReferenceSender(), timeout=0.5)
     scene.play(1.0, lambda now: {1: (0.25, 0.5)})
-    assert scene.log == [(0.0, "down", 1), (0.5, "up", 1)]
-
-
-def test_sender_that_ends_or_restarts_lifts_its_fingers_at_once() -> None:
-    """The empty bundle with which it starts and ends lifts them."""
-    scene = Scene(ReferenceSender())
-    scene.play(0.5, lambda now: {1: (0.25, 0.5)})
-    scene.send(ReferenceSender().empty())
     assert scene.log == [(0.0, "down", 1), (0.5, "up", 1)]

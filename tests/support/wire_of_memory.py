@@ -1,6 +1,8 @@
 """A transport of memory, whose other end reads nothing."""
 
 import asyncio
+import json
+from typing import Any
 
 
 class Wire(asyncio.Transport):
@@ -10,6 +12,11 @@ class Wire(asyncio.Transport):
         super().__init__()
         self.waiting = b""
         self.is_aborted = False
+
+    def lines(self) -> list[dict[str, Any]]:
+        """Take the lines that were written, as JSON."""
+        lines, self.waiting = self.waiting.splitlines(), b""
+        return [json.loads(line) for line in lines]
 
     def is_closing(self) -> bool:
         """Whether it was closed."""

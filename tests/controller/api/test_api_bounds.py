@@ -16,11 +16,10 @@ import pytest
 from controller.api.admission import MAX_CONNECTIONS, Acceptor, Admission
 from controller.api.connection import MAX_REQUEST_RATE, MAX_UNREAD_BYTES, Connection
 from controller.api.hub import Hub
-from controller.api.methods import METHODS
 from controller.api.schema import MAX_RATE, Message
-from controller.api.server import ApiServer
 from controller.api.topics import ContactsEvent, LogEvent
 from drivers.garbage_collection import no_long_collections
+from served_api import ServedApi, request
 from wire_of_memory import Wire
 
 
@@ -80,91 +79,70 @@ def test_client_that_does_not_read_loses_notifications_then_the_connection() -> 
     assert wire.is_aborted
 
 
-def serve(served: list[str]) -> tuple[ApiServer, Connection, Wire]:
-    """A server that records its calls, and a client of it."""
-
-    def handler(name: str) -> Callable[[Connection, Message], Message]:
-        def handle(client: Connection, params: Message) -> Message:
-            served.append(name)
-            return METHODS[name].result.model_construct()
-
-        return handle
-
-    server = ApiServer(
-        {name: handler(name) for name in METHODS},
-        on_disconnect=lambda client: None,
-        holds_lease=lambda client: True,
-        is_subscribed=lambda client: False,
-        clock=lambda: 0.0,
-        processor_time=lambda: 0.0,
-    )
-    connection, wire = server._make_connection(1), Wire()
-    connection.connection_made(wire)
-    return server, connection, wire
-
-
-def line(method: str, params: str = "{}", *, head: str = "") -> bytes:
-    """A request, without an id unless the head has one."""
-    return f'{{"jsonrpc":"2.0",{head}"method":"{method}","params":{params}}}\n'.encode()
+NO_TOUCH = '{"source":"a","touches":[]}'
 
 
 async def test_server_limits_the_request_rate_except_for_stop_and_touch() -> None:
     """After 2000 requests at once the next is refused; stop and touch are served."""
-    served: list[str] = []
-    _, connection, _ = serve(served)
-
-    async def send(*lines: bytes) -> None:
-        for each in lines:
-            connection.data_received(each)
-            await iterate()
-
-    await send(*[line("disarm")] * (int(MAX_REQUEST_RATE) + 1))
-    assert served == ["disarm"] * 2000
-    await send(line("stop"), line("touch", '{"source":"a","touches":[]}'), line("clear"))
-    assert served[2000:] == ["stop", "touch"]
+    served = ServedApi()
+    client, _ = served.client()
+    for line in [request("disarm")] * (int(MAX_REQUEST_RATE) + 1):
+        client.data_received(line)
+        await served.settle()
+    assert served.names == ["disarm"] * 2000
+    for line in (
+        request("stop"),
+        request("touch", '{"source":"a","touches":[]}'),
+        request("clear"),
+    ):
+        client.data_received(line)
+        await served.settle()
+    assert served.names[2000:] == ["stop", "touch"]
 
 
 async def test_refused_requests_count_in_the_rate() -> None:
     """Whatever is wrong with them: after 2000 at once the connection is closed."""
-    for wrong in (b"\n", b"{}\n", line("nothing"), line("stop", '{"x":1}')):
-        _, connection, wire = serve([])
+    for wrong in (b"\n", b"{}\n", request("nothing"), request("stop", '{"x":1}')):
+        served = ServedApi()
+        client, wire = served.client()
         for _ in range(int(MAX_REQUEST_RATE)):
-            connection.data_received(wrong)
             wire.waiting = b""
-            await iterate()
-        assert connection.is_open
-        connection.data_received(wrong)
-        await iterate()
+            client.data_received(wrong)
+            await served.settle()
+        assert client.is_open
+        client.data_received(wrong)
+        await served.settle()
         assert wire.is_aborted
-        assert json.loads(wire.waiting.splitlines()[-1])["error"]["code"] == 1005
+        assert wire.lines()[-1]["error"]["code"] == 1005
 
 
 TOUCH = '{"id":1,"x_m":0.1,"y_m":0.1}'
 WRONG = '{"id":"a","x_m":"b","y_m":[],"z":0,"t":0}'
 HEAVY = {
     "newlines": b"\n" * (1 << 18),
-    "keys": line("arm", "{" + ",".join(f'"{n}":1' for n in range(7000)) + "}"),
-    "keys within the bound": line("arm", "{" + ",".join(f'"{n}":1' for n in range(490)) + "}"),
-    "repeated keys": line("arm", "{" + ",".join(['"a":1'] * 490) + "}"),
+    "keys": request("arm", "{" + ",".join(f'"{n}":1' for n in range(7000)) + "}"),
+    "keys within the bound": request("arm", "{" + ",".join(f'"{n}":1' for n in range(490)) + "}"),
+    "repeated keys": request("arm", "{" + ",".join(['"a":1'] * 490) + "}"),
     "members": b"{" + b",".join(b'"%d":1' % n for n in range(490)) + b"}\n",
     "depth": b'{"a":' * 5000 + b"\n",
     "depth within the bound": b"[" * 159 + b"]" * 159 + b"\n",
-    "touches": line("touch", f'{{"source":"a","touches":[{",".join([TOUCH] * 64)}]}}') * 30,
+    "touches": request("touch", f'{{"source":"a","touches":[{",".join([TOUCH] * 64)}]}}') * 30,
     "touches in turn": b"".join(
-        line("touch", f'{{"source":"{n}","touches":[{",".join([TOUCH] * 64)}]}}') for n in range(30)
+        request("touch", f'{{"source":"{n}","touches":[{",".join([TOUCH] * 64)}]}}')
+        for n in range(30)
     ),
-    "wrong touches": line("touch", f'{{"source":"a","touches":[{",".join([WRONG] * 70)}]}}'),
-    "digits": b"9" * 60_000 + b"\n" + line("stop", "{}", head=f'"id":{"9" * 4000},'),
-    "text": line("hello", f'{{"client":"{"é" * 30_000}"}}', head='"id":1,'),
+    "wrong touches": request("touch", f'{{"source":"a","touches":[{",".join([WRONG] * 70)}]}}'),
+    "digits": b"9" * 60_000 + b"\n" + request("stop", "{}", id="9" * 4000),
+    "text": request("hello", f'{{"client":"{"é" * 30_000}"}}', id=1),
     "no end": b"x" * (1 << 18),
-    "requests": line("hello", '{"client":"a"}', head='"id":1,') * 3000,
-    "stops": line("stop", head='"id":1,') * 3000,
+    "requests": request("hello", '{"client":"a"}', id=1) * 3000,
+    "stops": request("stop", id=1) * 3000,
 }
 
 
 async def longest_callback(data: bytes) -> float:
     """Longest processor time [s] of a callback while a client's data is handled."""
-    _, connection, _ = serve([])
+    connection, _ = ServedApi().client()
     times: list[float] = []
     run = asyncio.Handle._run
 

@@ -1,0 +1,81 @@
+"""The API's server in memory: its methods only record their calls, its clients read nothing."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from functools import partial
+
+from controller.api.connection import Connection
+from controller.api.methods import METHODS
+from controller.api.schema import Empty, Message
+from controller.api.server import ApiServer
+from wire_of_memory import Wire
+
+
+def request(method: str, params: str = "{}", *, id: str | int | None = None) -> bytes:
+    """A line with a request, without an id unless one is given."""
+    head = "" if id is None else f'"id":{id},'
+    return f'{{"jsonrpc":"2.0",{head}"method":"{method}","params":{params}}}\n'.encode()
+
+
+class ServedApi:
+    """A server whose methods take a processor time [s] each; clock [s].
+
+    calls: name, parameters and time of each; is_busy: whether a touch is on its way to the wire;
+    may_arm: what arming waits for; called: called with each name.
+    """
+
+    def __init__(self, *, clock: Callable[[], float] = lambda: 0.0, costs: float = 0.0) -> None:
+        self.calls: list[tuple[str, Message, float]] = []
+        self.is_busy = False
+        self.may_arm = asyncio.Event()
+        self.called: Callable[[str], object] = lambda name: None
+        self._processor_time = 0.0
+        self.clock = clock
+        self._costs = costs
+        self._clients: list[Connection] = []
+        self._server = ApiServer(
+            {name: partial(self._handle, name) for name in METHODS},
+            on_disconnect=lambda client: None,
+            holds_lease=lambda client: False,
+            is_subscribed=lambda client: False,
+            is_busy=lambda: self.is_busy,
+            clock=clock,
+            processor_time=lambda: self._processor_time,
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the methods called."""
+        return [name for name, _, _ in self.calls]
+
+    def times(self, method: str) -> list[float]:
+        """When a method was called [s]."""
+        return [time for name, _, time in self.calls if name == method]
+
+    def client(self, *, process: int = 1) -> tuple[Connection, Wire]:
+        """A client of a process."""
+        client, wire = self._server._make_connection(process), Wire()
+        client.connection_made(wire)
+        self._clients.append(client)
+        return client, wire
+
+    async def settle(self) -> None:
+        """Run the event loop until nothing is left to be served at once, and a little longer."""
+        left = 8
+        while left:
+            await asyncio.sleep(0)
+            left = 8 if any(client.has_lines for client in self._clients) else left - 1
+
+    def _handle(
+        self, name: str, client: Connection, params: Message
+    ) -> Message | Awaitable[Message]:
+        self._processor_time += self._costs
+        self.calls.append((name, params, self.clock()))
+        self.called(name)
+        if name == "play":
+            raise KeyError("a bug, with /a/path in it")
+        return self._arm() if name == "arm" else METHODS[name].result.model_construct()
+
+    async def _arm(self) -> Message:
+        await self.may_arm.wait()
+        return Empty()

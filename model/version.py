@@ -21,6 +21,6 @@ def code_version() -> str:
         for entry in sorted(pending.pop().iterdir(), key=lambda entry: entry.name):
             if entry.is_dir():
                 pending.append(entry)
-            elif entry.name.endswith((".py", ".c")):
+            elif entry.name.endswith((".py", ".c", ".h")):
                 digest.update(entry.read_bytes())
     return f"{metadata.version('era-haptics')}+{digest.hexdigest()[:12]}"

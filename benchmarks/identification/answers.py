@@ -1,12 +1,15 @@
 """The model's answers for a rig as written, as identified, and for the plate known exactly."""
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from benchmarks.identification.hidden import finger_stiffness
 from benchmarks.identification.server import Truth
 from benchmarks.identification.thin_plate import Complexes, Reals
+from model.arrays import Complex64Array
+from model.ensemble.attached_plate import AttachedPlate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.plate import LOSS_FREQUENCY
@@ -16,6 +19,18 @@ from model.table.question import Question
 from model.table.table import LocalizationTable
 
 DRIVES = Uncertainty(gain=0.01, phase_deg=1, thickness=0, stiffness=0, damping=1, fingertip=0)
+
+
+@dataclass(frozen=True, eq=False)
+class _UnderKnownFingers(AttachedPlate):
+    """A plate whose fingers are of dynamic stiffness (f, k) [N/m], of none for k = 0."""
+
+    fingers: Complex64Array
+
+    def finger_stiffness(self, count: int, loads: Sequence[float] = ()) -> Complex64Array:
+        """As they are."""
+        is_known = self.fingers.shape[-1] == count
+        return self.fingers if is_known else super().finger_stiffness(count, loads)
 
 
 def table_of(rig: Rig, frequencies: Reals, *, loaded: bool) -> LocalizationTable:
@@ -52,13 +67,11 @@ def known_table(table: LocalizationTable, truth: Truth, factors: Reals) -> Local
         discretisation_error=np.zeros(len(table.frequencies)),
     )
     # Its loss is not hysteretic, and its fingers are not multiples of one.
-    attached = replace(known.attached, receptance=truth.receptance.astype(np.complex64))
-    if len(factors):
-        stiffness = [
-            [finger_stiffness(float(f), each) for each in factors] for f in table.frequencies
-        ]
-        attached._by_count[len(factors)] = attached._attach_fingers(np.array(stiffness))
-    known.__dict__["attached"] = attached
+    stiffness = [[finger_stiffness(float(f), each) for each in factors] for f in table.frequencies]
+    known.__dict__["attached"] = _UnderKnownFingers(
+        **(vars(known.attached) | {"receptance": truth.receptance.astype(np.complex64)}),
+        fingers=np.array(stiffness, dtype=np.complex64),
+    )
     return known
 
 

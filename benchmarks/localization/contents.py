@@ -124,7 +124,7 @@ def _kept(
     powers = []
     for layer in found.layers:
         rows, power = powers_on(table, question, layer.excitation, plates)
-        above = power[0] / table.threshold_at(rows)[0] ** 2
+        above = power[0] / table.thresholds[rows[0]] ** 2
         powers.append(above.reshape(*weights.shape, -1))
     power = np.array(powers)
     own = [weights[j] @ np.sqrt(power[j, j]) for j in contents]

@@ -164,7 +164,7 @@ def _hindsight(case: _Case) -> Excitation:
     )
     points = len(case.weights) // k
     fingers = _HeldOut(case, np.repeat(np.arange(k), points), case.weights, k)
-    least = 10 ** (case.found.level_db_sl / 20) * table.threshold_at(rows)
+    least = 10 ** (case.found.level_db_sl / 20) * table.thresholds[rows]
     drive = optimum(
         cast("Any", fingers),  # what it uses of them
         table.frequencies[rows],

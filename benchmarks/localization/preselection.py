@@ -53,18 +53,20 @@ def main() -> None:
 
 def _lost(table: "LocalizationTable", question: "Question") -> list[float]:
     """Decibels of robust felt contrast that are lost; none where the level is not reached."""
-    from model.ensemble.preselection import Preselection
+    import numpy as np
+
+    from model.drive_modes import preselection
     from model.errors import InputError
 
-    kept = Preselection.rows
+    kept = preselection.preselect
     try:
         some = table.query(question).robust_felt_contrast_db
-        Preselection.rows = lambda *given: given[4]  # type: ignore[method-assign]
+        preselection.preselect = lambda forms: np.arange(forms.frequency_count)
         every = table.query(question).robust_felt_contrast_db
     except InputError:
         return []
     finally:
-        Preselection.rows = kept  # type: ignore[method-assign]
+        preselection.preselect = kept
     return [] if some is None or every is None else [every - some]
 
 

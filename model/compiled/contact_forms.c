@@ -1,156 +1,120 @@
-/* The plate with fingers on it: `model.ensemble.contact_forms` in C, whose symbols are used. */
-#include "lanes.h"
+/* Expected powers at fingertips: `model.ensemble.contact_forms` in C, whose symbols are used. */
+#include "fingers.h"
 
 typedef struct {
-    int n, b, k, p, r; /* ERAs; these and masses; fingers; points of each; reduced coordinates */
-    int deviating;     /* plates of other thickness */
+    int p, fine;               /* points of each finger; fine points, of all fingers */
+    int others;                /* whether plates of other thickness count */
     float gain_variance, ridge;
-    const float *shapes, *points, *weights; /* (b + k, r); (k p, r); (k p) */
-    const float *receptance, *others;       /* (f, r); (f, deviating, r) */
-    const float *minus_omega2, *error;      /* (f); (f, n) */
-    const float *stiffness, *drives, *strokes, *by_damping; /* (f, b + k); (f, n) */
-    const float *changes;                                   /* (f, n + k), of ERAs and fingers */
-    /* Found: (f, a, a); (f, a, n); (f, a, n); (f, k p, n); (f, k, n, n) */
-    float *inverse, *forces, *motion, *fields, *power;
-} contacts;
+    const float *points, *fine_points, *weights; /* (k p, r); (fine, r); (k p) */
+    const float *error;        /* (f, n) */
+    /* Found: (rows, k p, n) h; (rows, fine, n); (rows, k, n, n) R */
+    float *fields, *fine_fields, *power;
+} forms;
 
 /* Values of work space. */
-size_t contact_forms_space(const contacts *on) {
-    size_t n = on->n, k = on->k, a = on->b + k, j = n + k, at = k * on->p, every = a + at;
-    size_t complex_values = (2 + on->deviating) * on->r + every * a + a * a + 3 * a * n +
-                            (2 + on->deviating) * at * n + at * a + j * n + k * n * n +
-                            ((2 + on->deviating) * on->p + j) * n + n * n + a + 3 * n + j;
-    size_t real_values = at * j + n;
-    return complex_values + real_values / 2 + 1;
+size_t contact_forms_space(const plates *on, const forms *of) {
+    size_t n = on->n, b = on->b, k = on->k, a = b + k, at = k * of->p;
+    size_t points = (size_t)of->fine > at ? (size_t)of->fine : at;
+    return touched_space(on) + points * a + at * a + 4 * at * n + of->fine * n + a * n + b * n +
+           4 * n + 2 * n * n + k * n + (4 * of->p + n + k) * n + k * n * n + k * n;
 }
 
-/* B (a + k p, a) of receptance g: from every attachment and point to each attachment. */
-INLINE void between(value *restrict B, value *restrict modal, const value *g, const contacts *on) {
-    const size_t a = on->b + on->k, p = on->p, r = on->r;
-    for (size_t i = 0; i < a; i++) {
-        for (size_t s = 0; s < r; s++) modal[s] = scaled(g[s], filled(on->shapes[i * r + s]));
-        multiply(B + i * a, on->shapes, modal, i + 1, r, 1);
-        for (size_t j = 0; j < i; j++) B[j * a + i] = B[i * a + j];
-    }
-    for (size_t i = 0; i < on->k * p; i++) {
-        value *found = B + (a + i) * a;
-        if (i % p == 0) { /* a finger's centre is an attachment */
-            memcpy(found, B + (on->b + i / p) * a, a * sizeof(value));
-            continue;
-        }
-        for (size_t s = 0; s < r; s++) modal[s] = scaled(g[s], filled(on->points[i * r + s]));
-        multiply(found, on->shapes, modal, a, r, 1);
-    }
+/* Times the force of each ERA, of accelerations (p, n) by forces. */
+INLINE void drive(value *h, const value *drives, size_t p, size_t n) {
+    for (size_t i = 0; i < p; i++)
+        for (size_t e = 0; e < n; e++) h[i * n + e] = times(h[i * n + e], drives[e]);
 }
 
-/* K = (1 + Z A)^-1 (a, a), one attachment after the other: none gives energy, the plate is damped. */
-INLINE void invert(value *restrict K, const value *A, const value *Z, size_t a) {
-    for (size_t i = 0; i < a; i++)
-        for (size_t j = 0; j < a; j++) K[i * a + j] = times(Z[i], A[i * a + j]);
-    for (size_t i = 0; i < a; i++) K[i * a + i].re += 1;
-    for (size_t s = 0; s < a; s++) {
-        value *own = K + s * a, pivot = own[s];
-        value factor = reciprocal(pivot);
-        own[s] = (value){filled(1), ZERO.im};
-        for (size_t j = 0; j < a; j++) own[j] = times(own[j], factor);
-        for (size_t i = 0; i < a; i++) {
-            if (i == s) continue;
-            value by = K[i * a + s];
-            K[i * a + s] = ZERO;
-            for (size_t j = 0; j < a; j++) K[i * a + j] = subtract_product(K[i * a + j], by, own[j]);
-        }
+/* At frequencies (count) from first on. */
+void contact_forms(const plates *on, const forms *of, int first, int count, const int *frequencies,
+                   value *work) {
+    const size_t n = on->n, b = on->b, k = on->k, a = b + k, p = of->p, at = k * p, j = n + k;
+    const int parts = of->others ? 4 : 2;
+    int rows[LANES], cases[LANES];
+    for (int l = 0; l < LANES; l++) {
+        rows[l] = frequencies[first + (l < count ? l : count - 1)];
+        cases[l] = rows[l] * on->t;
     }
-}
-
-void contact_forms(const contacts *on, int first, int count, value *work) {
-    const size_t n = on->n, b = on->b, k = on->k, p = on->p, r = on->r, a = b + k;
-    const size_t every = a + k * p, at = k * p, others = on->deviating, j = n + k;
-    int rows[LANES];
-    for (int l = 0; l < LANES; l++) rows[l] = first + (l < count ? l : count - 1);
-
-    value *g = work, *B = g + (1 + others) * r, *K = B + every * a, *F = K + a * a;
-    value *u = F + a * n, *h = u + a * n, *T = h + (2 + others) * at * n, *moved = T + at * a;
-    value *R = moved + j * n, *X = R + k * n * n, *Z = X + ((2 + others) * p + j) * n;
-    value *drives = Z + a, *strokes = drives + n, *by_damping = strokes + n, *changes = by_damping + n;
-    value *damped = changes + j, *wide = damped + n * n, *modal = wide + a * n;
-    lanes *reach = (lanes *)(modal + r), *error = reach + at * j;
-
-    load(g, on->receptance, r, rows);
-    load(g + r, on->others, others * r, rows);
-    load(Z, on->stiffness, a, rows);
+    touched now;
+    const size_t points = (size_t)of->fine > at ? (size_t)of->fine : at;
+    value *room = put_fingers(&now, on, rows, cases, work), *t = room + points * a;
+    value *h = t + at * a, *fine = h + 4 * at * n, *moved = fine + of->fine * n, *without = moved + a * n;
+    value *drives = without + b * n, *strokes = drives + n, *by_damping = strokes + n;
+    value *by_stiffness = by_damping + n, *damped = by_stiffness + n, *changes = damped + n * n;
+    value *X = changes + j * n, *R = X + (4 * p + j) * n;
+    lanes *error = (lanes *)(R + k * n * n);
     load(drives, on->drives, n, rows);
     load(strokes, on->strokes, n, rows);
     load(by_damping, on->by_damping, n, rows);
-    load(changes, on->changes, j, rows);
-    load_real(error, on->error, n, rows);
-    lanes minus_omega2;
-    load_real(&minus_omega2, on->minus_omega2, 1, rows);
+    load(by_stiffness, on->by_stiffness, n, rows);
+    load(without, on->moved, b * n, cases);
+    load_real(error, of->error, n, rows);
 
-    for (size_t plate = 0; plate <= others; plate++) {
-        between(B, modal, g + plate * r, on);
-        invert(K, B, Z, a);
-        for (size_t i = 0; i < a; i++)
-            for (size_t e = 0; e < n; e++) F[i * n + e] = times(K[i * a + e], drives[e]);
-        value *fields = plate ? h + (1 + plate) * at * n : h;
-        for (size_t i = 0; i < a * n; i++) wide[i] = scaled(F[i], minus_omega2);
-        product(fields, B + a * a, a, wide, at, a, n);
-        if (plate) {
-            lanes factor = filled(sqrtf(1 / (float)others));
-            for (size_t i = 0; i < at * n; i++) {
-                fields[i].re = (fields[i].re - h[i].re) * factor;
-                fields[i].im = (fields[i].im - h[i].im) * factor;
-            }
-            continue;
-        }
-        product(u, B, a, F, a, a, n);
-        for (size_t i = 0; i < a * n; i++) u[i] = scaled(u[i], filled(-1));
-        for (size_t e = 0; e < n; e++) u[e * n + e] = (value){u[e * n + e].re + strokes[e].re,
-                                                              u[e * n + e].im + strokes[e].im};
-        store(on->inverse + 2 * first * a * a, K, a * a, count);
-        store(on->forces + 2 * first * a * n, F, a * n, count);
-        store(on->motion + 2 * first * a * n, u, a * n, count);
-        for (size_t i = 0; i < a * a; i++) K[i] = scaled(K[i], minus_omega2);
-        product(T, B + a * a, a, K, at, a, a);
-        for (size_t e = 0; e < n; e++)
-            for (size_t i = 0; i < n; i++) damped[e * n + i] = times(by_damping[e], u[e * n + i]);
-        product(h + at * n, T, a, damped, at, n, n);
-        for (size_t i = 0; i < at; i++)
-            for (size_t s = 0; s < j; s++) reach[i * j + s] = power(T[i * a + (s < n ? s : b + s - n)]);
-        for (size_t s = 0; s < j; s++)
-            for (size_t e = 0; e < n; e++)
-                moved[s * n + e] = times(changes[s], u[(s < n ? s : b + s - n) * n + e]);
+    /* By a force at each attachment; h by each ERA; and how it changes with all dampers. */
+    to_points(t, a, of->points, at, &now, on, room);
+    for (size_t i = 0; i < at; i++)
+        for (size_t e = 0; e < n; e++) h[i * n + e] = times(t[i * a + e], drives[e]);
+    if (of->fine) {
+        to_points(fine, n, of->fine_points, of->fine, &now, on, room);
+        drive(fine, drives, of->fine, n);
+        store(of->fine_fields + 2 * (size_t)first * of->fine * n, fine, of->fine * n, count);
     }
-    store(on->fields + 2 * first * at * n, h, at * n, count);
+    store(of->fields + 2 * (size_t)first * at * n, h, at * n, count);
+    with_fingers_moved(moved, without, &now, drives, on);
+    for (size_t i = 0; i < n; i++) {
+        for (size_t e = 0; e < n; e++) {
+            value own = scaled(moved[i * n + e], filled(-1));
+            if (i == e) own = (value){own.re + strokes[e].re, own.im + strokes[e].im};
+            damped[i * n + e] = times(by_damping[i], own);
+            changes[i * n + e] = times(by_stiffness[i], own);
+        }
+    }
+    for (size_t i = 0; i < k; i++)
+        for (size_t e = 0; e < n; e++)
+            changes[(n + i) * n + e] =
+                scaled(times(now.D[i], moved[(b + i) * n + e]), filled(on->load_std));
+    product(h + at * n, t, a, damped, at, n, n);
+
+    /* Plates thicker and thinner, each counting half. */
+    for (int part = 2; part < parts; part++) {
+        for (int l = 0; l < LANES; l++) cases[l] = rows[l] * on->t + part - 1;
+        put_fingers(&now, on, rows, cases, work);
+        value *other = h + part * at * n;
+        to_points(other, n, of->points, at, &now, on, room);
+        drive(other, drives, at, n);
+        for (size_t i = 0; i < at * n; i++)
+            other[i] = scaled((value){other[i].re - h[i].re, other[i].im - h[i].im}, filled(sqrtf(0.5f)));
+    }
 
     /* Forms of the mean over each fingertip, of the rows at its points and of what is uncertain. */
     for (size_t finger = 0; finger < k; finger++) {
         value *form = R + finger * n * n, *to = X;
         for (size_t i = finger * p; i < (finger + 1) * p; i++) {
-            lanes share = filled(sqrtf(on->weights[i]));
-            for (size_t part = 0; part < 2 + others; part++)
+            lanes share = filled(sqrtf(of->weights[i]));
+            for (int part = 0; part < parts; part++)
                 for (size_t e = 0; e < n; e++) *to++ = scaled(h[(part * at + i) * n + e], share);
         }
         for (size_t s = 0; s < j; s++) {
             lanes share = {0};
             for (size_t i = finger * p; i < (finger + 1) * p; i++)
-                share += on->weights[i] * reach[i * j + s];
+                share += of->weights[i] * power(t[i * a + (s < n ? s : b + s - n)]);
             share = root(share);
-            for (size_t e = 0; e < n; e++) *to++ = scaled(moved[s * n + e], share);
+            for (size_t e = 0; e < n; e++) *to++ = scaled(changes[s * n + e], share);
         }
-        gram(form, X, (2 + others) * p + j, n);
+        gram(form, X, parts * p + j, n);
         lanes trace = {0};
         for (size_t e = 0; e < n; e++) {
             lanes size = {0};
             for (size_t i = finger * p; i < (finger + 1) * p; i++)
-                size += on->weights[i] * power(h[i * n + e]);
-            form[e * n + e].re += on->gain_variance * size + error[e];
+                size += of->weights[i] * power(h[i * n + e]);
+            form[e * n + e].re += of->gain_variance * size + error[e];
             trace += form[e * n + e].re;
         }
         for (size_t e = 0; e < n; e++) {
-            form[e * n + e] = (value){form[e * n + e].re + trace * (on->ridge / (float)n), ZERO.im};
+            form[e * n + e] = (value){form[e * n + e].re + trace * (of->ridge / (float)n), ZERO.im};
             for (size_t v = 0; v < e; v++)
                 form[e * n + v] = (value){form[v * n + e].re, -form[v * n + e].im};
         }
     }
-    store(on->power + 2 * first * k * n * n, R, k * n * n, count);
+    store(of->power + 2 * (size_t)first * k * n * n, R, k * n * n, count);
 }

@@ -16,7 +16,7 @@ from model.errors import InputError
 
 _HERE = Path(__file__).parent
 _SOURCES = tuple(sorted(_HERE.glob("*.c")))
-_HEADERS = (_HERE / "lanes.h",)
+_HEADERS = tuple(sorted(_HERE.glob("*.h")))
 _FLAGS = ("-std=gnu99", "-O2", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
 _WHAT = "the library of kernels"
 

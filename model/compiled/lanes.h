@@ -72,14 +72,15 @@ static const value ZERO;
 
 /* Load rows of an array (f, width) of complex values. */
 SHARED void load(value *restrict to, const float *from, size_t width, const int *rows) {
-    for (size_t l = 0; l < LANES; l++) {
-        const float *at = from + 2 * width * rows[l];
-        float *re = (float *)to + l, *im = re + LANES;
-        for (size_t i = 0; i < width; i++) {
-            re[2 * LANES * i] = at[2 * i];
-            im[2 * LANES * i] = at[2 * i + 1];
+    for (size_t start = 0; start < width; start += 32) /* what stays in the nearest cache */
+        for (size_t l = 0; l < LANES; l++) {
+            const float *at = from + 2 * width * rows[l];
+            float *re = (float *)to + l, *im = re + LANES;
+            for (size_t i = start; i < width && i < start + 32; i++) {
+                re[2 * LANES * i] = at[2 * i];
+                im[2 * LANES * i] = at[2 * i + 1];
+            }
         }
-    }
 }
 
 /* Load rows of an array (f, width) of real values. */
@@ -106,34 +107,37 @@ INLINE void store_real(float *to, const lanes *restrict from, size_t width, size
         for (size_t i = 0; i < width; i++) to[width * l + i] = ((const float *)from)[LANES * i + l];
 }
 
-/* found (rows, columns) = a (rows, r), real, times b (columns, r) transposed. */
-SHARED void multiply(value *restrict found, const float *restrict a, const value *restrict b,
-                     size_t rows, size_t r, size_t columns) {
-    for (size_t column = 0; column < columns; column++, b += r) {
-        value *to = found + column;
-        size_t row = 0;
-        for (; row + 4 <= rows; row += 4) {
-            const float *a0 = a + row * r, *a1 = a0 + r, *a2 = a1 + r, *a3 = a2 + r;
-            value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO; /* in registers, as no array is */
-            for (size_t j = 0; j < r; j++) {
-                value from = b[j];
-                s0.re += a0[j] * from.re, s0.im += a0[j] * from.im;
-                s1.re += a1[j] * from.re, s1.im += a1[j] * from.im;
-                s2.re += a2[j] * from.re, s2.im += a2[j] * from.im;
-                s3.re += a3[j] * from.re, s3.im += a3[j] * from.im;
-            }
-            to[row * columns] = s0, to[(row + 1) * columns] = s1;
-            to[(row + 2) * columns] = s2, to[(row + 3) * columns] = s3;
+/* found (rows), each step apart, = a (rows, r), real, times b (r). */
+SHARED void multiply_into(value *restrict found, size_t step, const float *restrict a,
+                          const value *restrict b, size_t rows, size_t r) {
+    size_t row = 0;
+    for (; row + 4 <= rows; row += 4) {
+        const float *a0 = a + row * r, *a1 = a0 + r, *a2 = a1 + r, *a3 = a2 + r;
+        value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO; /* in registers, as no array is */
+        for (size_t j = 0; j < r; j++) {
+            value from = b[j];
+            s0.re += a0[j] * from.re, s0.im += a0[j] * from.im;
+            s1.re += a1[j] * from.re, s1.im += a1[j] * from.im;
+            s2.re += a2[j] * from.re, s2.im += a2[j] * from.im;
+            s3.re += a3[j] * from.re, s3.im += a3[j] * from.im;
         }
-        for (; row < rows; row++) {
-            value sum = ZERO;
-            for (size_t j = 0; j < r; j++) {
-                sum.re += a[row * r + j] * b[j].re;
-                sum.im += a[row * r + j] * b[j].im;
-            }
-            to[row * columns] = sum;
-        }
+        found[row * step] = s0, found[(row + 1) * step] = s1;
+        found[(row + 2) * step] = s2, found[(row + 3) * step] = s3;
     }
+    for (; row < rows; row++) {
+        value sum = ZERO;
+        for (size_t j = 0; j < r; j++) {
+            sum.re += a[row * r + j] * b[j].re;
+            sum.im += a[row * r + j] * b[j].im;
+        }
+        found[row * step] = sum;
+    }
+}
+
+/* found (rows, columns) = a (rows, r), real, times b (columns, r) transposed. */
+INLINE void multiply(value *found, const float *a, const value *b, size_t rows, size_t r, size_t columns) {
+    for (size_t column = 0; column < columns; column++)
+        multiply_into(found + column, columns, a, b + column * r, rows, r);
 }
 
 /* found (columns) from the first on = a (inner) b (inner, columns), each step apart in a, or of a

@@ -2,13 +2,12 @@
 
 import threading
 from ctypes import c_void_p
-from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import Complex64Array, Float32Array
+from model.arrays import Float32Array
 from model.compiled.kernels import Kernels
 
 _ALIGNMENT = 16  # floats: the widest vector
@@ -31,38 +30,16 @@ def work_space(of: Kernels, size: int) -> c_void_p:
     return c_void_p(_kept.work.ctypes.data)
 
 
-def in_lanes(of: Kernels, values: Complex64Array | Float32Array) -> Float32Array:
-    """Values (f, ...) in blocks of as many frequencies as lanes, (blocks, ..., parts, lanes).
-
-    parts: real and imaginary, or one of real values; the last block repeats the last frequency.
-    """
-    blocks = -(-len(values) // of.lanes)
-    every = values[_padded(len(values), of.lanes)]
-    every = every.reshape(blocks, of.lanes, *values.shape[1:])
-    parts = (every.real, every.imag) if np.iscomplexobj(values) else (every,)
-    found = _aligned(blocks, *values.shape[1:], len(parts), of.lanes)
-    for number, part in enumerate(parts):
-        found[..., number, :] = np.moveaxis(part, 1, -1)
-    return found
-
-
 class _Kept(threading.local):
     def __init__(self) -> None:
         self.work = _aligned(0)
 
 
-def _aligned(*shape: int) -> Float32Array:
+def _aligned(count: int) -> Float32Array:
     """An empty array whose first element is where a vector of all lanes may begin."""
-    count = int(np.prod(shape))
     room = np.empty(count + _ALIGNMENT, dtype=np.float32)
     start = -room.ctypes.data % (4 * _ALIGNMENT) // 4
-    return room[start : start + count].reshape(shape)
-
-
-@cache
-def _padded(count: int, lanes: int) -> NDArray[np.int64]:
-    """Numbers of frequencies, the last repeated up to a multiple of lanes."""
-    return np.minimum(np.arange(-(-count // lanes) * lanes), count - 1)
+    return room[start : start + count]
 
 
 _kept = _Kept()

@@ -10,11 +10,10 @@ and frequencies higher by it (`model.vibration.parametric_plate`), so that of on
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
-from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
+from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
 from model.rig.uncertainty import Uncertainty
 from model.structure.actuator import Era
 from model.structure.dispersion import Dispersion
@@ -34,8 +33,7 @@ class AttachedPlate:
     All in single precision: accelerations are within 1e-5 of their largest.
 
     - minus_omega2: (f,) [rad²/s²]
-    - receptance: (f, r) g; by_loss: (f, r) its change by one standard deviation of the loss factor;
-      deviating: (f, 2, r) that of plates thicker and thinner by a standard deviation
+    - receptance: (f, r) g; by_loss: (f, r) its change by one standard deviation of the loss factor
     - shapes: (b, r) of the attachments; stiffness: (f, b) their dynamic stiffness [N/m]
     - forces: (f, n) of each ERA at full stroke [N]; strokes: (f, n) of its base [m]
     - by_stiffness: (f, n), by_damping: (f, n) change of the ERAs' dynamic stiffness by one standard
@@ -50,7 +48,6 @@ class AttachedPlate:
     minus_omega2: Float32Array
     receptance: Complex64Array
     by_loss: Complex64Array
-    deviating: Complex64Array
     shapes: Float32Array
     stiffness: Complex64Array
     forces: Complex64Array
@@ -71,87 +68,37 @@ class AttachedPlate:
         """Number of ERAs."""
         return int(self.forces.shape[1])
 
-    @cached_property
-    def modal_rows(self) -> Float32Array:
-        """Real and imaginary part of the receptance side by side, (r, 2 f)."""
-        return np.ascontiguousarray(self.receptance.T).view(np.float32)
-
-    def at(self, frequencies: IntArray) -> "AttachedPlate":
-        """The plate at some of its frequencies, by index (n,)."""
-        return replace(
-            self, **{name: getattr(self, name).take(frequencies, axis=0) for name in _BY_FREQUENCY}
-        )
-
-    def receptance_at(self, deviations: FloatArray, frequencies: IntArray) -> Complex64Array:
-        """Receptance of plates of deviating thickness at frequencies, by index: (f, d, r).
+    def of_thicknesses(self, deviations: FloatArray, frequency: int) -> "AttachedPlate":
+        """Plates of known thicknesses at a frequency by index, in place of several frequencies.
 
         deviations (d,): in standard deviations.
         """
-        w2 = -self.minus_omega2.take(frequencies).astype(float)
-        stiffness = 1 / self.receptance.take(frequencies, axis=0).astype(complex) + w2[:, None]
-        return _deviating(stiffness, w2, self.thickness * deviations)
+        each = {name: getattr(self, name)[[frequency] * len(deviations)] for name in _BY_FREQUENCY}
+        g, w2 = each["receptance"], -each["minus_omega2"].astype(float)[:, None]
+        factor = np.maximum(1 + self.thickness * deviations, LEAST_THICKNESS)[:, None]
+        stiffness = 1 / g.astype(complex) + w2
+        receptance = (1 / (factor * (factor**2 * stiffness - w2))).astype(np.complex64)
+        by_loss = each["by_loss"] * (factor**3).astype(np.float32) * (receptance / g) ** 2
+        each |= {"receptance": receptance, "by_loss": by_loss}
+        return replace(self, **each, thickness=0.0)
 
-    def of_thicknesses(self, deviations: FloatArray, frequencies: IntArray) -> "AttachedPlate":
-        """Plates of known thicknesses, each deviation at each of the frequencies, by index.
-
-        deviations (d,): in standard deviations. The result has (f d,) frequencies.
-        """
-        count = len(deviations)
-        each = self.at(frequencies.repeat(count))
-        receptance = self.receptance_at(deviations, frequencies).reshape(each.receptance.shape)
-        factor = np.maximum(1 + self.thickness * deviations, LEAST_THICKNESS)
-        stiffer = np.tile(factor**3, len(frequencies))[:, None].astype(np.float32)
-        by_loss = each.by_loss * stiffer * (receptance / each.receptance) ** 2
-        return replace(each, receptance=receptance, by_loss=by_loss, thickness=0.0)
-
-    def with_fingers(self, count: int, loads: Sequence[float] = ()) -> "Attachments":
-        """What is attached to the plate with a number of fingers on it.
+    def finger_stiffness(self, count: int, loads: Sequence[float] = ()) -> Complex64Array:
+        """Dynamic stiffness of a number of fingers [N/m], (f, count).
 
         loads (count,): of each relative to the rig's fingertip, empty for 1.
         """
-        if loads:
-            return self._attach_fingers(np.column_stack([*map(self._finger, loads)]))
-        if count not in self._by_count:
-            finger = np.repeat(self.finger[:, None], count, axis=1)
-            self._by_count[count] = self._attach_fingers(finger)
-        return self._by_count[count]
-
-    def _attach_fingers(self, fingers: ComplexArray) -> "Attachments":
-        """Attach fingers of dynamic stiffness (f, k) [N/m]."""
-        b, n, k = self.stiffness.shape[1], self.era_count, fingers.shape[1]
-        changes = (self.load_std * fingers).astype(np.complex64)
-        return Attachments(
-            np.concatenate([self.stiffness, fingers.astype(np.complex64)], axis=1),
-            np.concatenate([np.arange(n), np.arange(b, b + k)]),
-            np.concatenate([self.by_stiffness, changes], axis=1),
-        )
-
-    def _finger(self, load: float) -> ComplexArray:
-        """Dynamic stiffness of a finger of a load, (f,) [N/m]."""
-        if self.fingertip is None or load == 1:
-            return self.finger
-        return self.fingertip.scaled(load).dynamic_stiffness(self.omega)
-
-    @cached_property
-    def _by_count(self) -> dict[int, "Attachments"]:
-        return {}
-
-
-def _deviating(stiffness: ComplexArray, w2: FloatArray, deviations: FloatArray) -> Complex64Array:
-    """Receptance of plates thicker by deviations (d,), relative, (f, d, r).
-
-    stiffness (f, r) [rad²/s²] of the modelled plate; w2 (f,) squared frequencies.
-    """
-    factor = np.maximum(1 + deviations, LEAST_THICKNESS)[:, None]
-    found = 1 / (factor * (factor**2 * stiffness[:, None] - w2[:, None, None]))
-    return np.asarray(found, dtype=np.complex64)
+        found = np.repeat(self.finger[:, None], count, axis=1)
+        if self.fingertip is not None:
+            for number, load in enumerate(loads):
+                if load != 1:
+                    found[:, number] = self.fingertip.scaled(load).dynamic_stiffness(self.omega)
+        return found.astype(np.complex64)
 
 
 _BY_FREQUENCY = (
     "minus_omega2",
     "receptance",
     "by_loss",
-    "deviating",
     "stiffness",
     "forces",
     "strokes",
@@ -160,19 +107,6 @@ _BY_FREQUENCY = (
     "finger",
     "omega",
 )
-
-
-@dataclass(frozen=True, eq=False)
-class Attachments:
-    """The fixed attachments of a plate and then k fingers on it, a = b + k.
-
-    stiffness: (f, a) dynamic stiffness [N/m]; uncertain: (j,) which are, the ERAs and the fingers;
-    changes: (f, j) of their stiffness by one standard deviation.
-    """
-
-    stiffness: Complex64Array
-    uncertain: IntArray
-    changes: Complex64Array
 
 
 def attach(
@@ -199,7 +133,6 @@ def attach(
     stiffness = elasticity.stiffness(w)
     g = 1 / (stiffness - w2)
     by_loss = -1j * stiffness.imag * g**2
-    thickness = uncertainty.thickness
     k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))
     log_damping = math.log(uncertainty.damping)
     single = np.complex64
@@ -207,7 +140,6 @@ def attach(
         minus_omega2=-w2[:, 0].astype(np.float32),
         receptance=g.astype(single),
         by_loss=(log_damping * by_loss).astype(single),
-        deviating=_deviating(stiffness, w2[:, 0], np.array([thickness, -thickness])),
         shapes=shapes.astype(np.float32),
         stiffness=attached_stiffness(eras, masses, w).astype(single),
         forces=drive_forces(eras, w).astype(single),
@@ -221,5 +153,5 @@ def attach(
         gain=uncertainty.gain,
         phase=math.radians(uncertainty.phase_deg),
         gain_variance=uncertainty.gain_variance,
-        thickness=thickness,
+        thickness=uncertainty.thickness,
     )

@@ -11,41 +11,39 @@ from functools import lru_cache
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array
-from model.ensemble.contact_forms import power_of
-from model.ensemble.tone_responses import DAMPING, FIRST_STIFFNESS, LOSS, NOMINAL
+from model.arrays import Complex64Array, Float32Array, IntArray
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """How many plates are drawn, of how many thicknesses.
+
+    bases: thicknesses at which the changes by all else that is uncertain are computed, each for as
+    many plates; 1 for the plate as modelled.
+    """
+
+    count: int
+    seed: int
+    thicknesses: int
+    bases: int = 1
 
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Factors of d plates, the first as modelled, the others from the thinnest to the thickest.
+    """Parameters of d plates from the thinnest to the thickest, in standard deviations.
 
-    factors: (columns, d) of the columns of `tone_responses`, and of one more for each thickness;
-    errors: (k, d) of discretisation at each finger.
+    loss, damping (d,): of the plate, and of all ERAs; own (a, d): stiffness of each ERA, nothing of
+    masses, load of each finger; gains (a, d): relative change of each ERA's, complex; errors (k,
+    d): of discretisation at each finger, complex of mean square 1; node (d,): which of the
+    thicknesses each has.
     """
 
-    factors: Complex64Array
+    loss: Float32Array
+    damping: Float32Array
+    own: Float32Array
+    gains: Complex64Array
     errors: Complex64Array
-
-    def accelerations(self, responses: Complex64Array, at_nodes: Complex64Array) -> Complex64Array:
-        """Of responses (m, k p, columns): (m, k p, d).
-
-        at_nodes (m, k p, thicknesses): nominal responses of plates of the thicknesses; all else is
-        as on the plate as modelled.
-        """
-        changes = at_nodes - responses[:, :, NOMINAL, None]
-        return np.asarray(np.concatenate([responses, changes], axis=2) @ self.factors)
-
-    def power(self, accelerations: Complex64Array, error: Float32Array) -> Float32Array:
-        """Squared amplitudes (m, k p, d) of accelerations, which are lost.
-
-        error (m,): root mean square of the discretisation error.
-        """
-        by_finger = accelerations.reshape(
-            len(accelerations), len(self.errors), -1, self.errors.shape[1]
-        )
-        by_finger += (error[:, None, None] * self.errors)[:, :, None]
-        return power_of(accelerations)
+    node: IntArray
 
 
 @lru_cache(maxsize=64)
@@ -53,35 +51,34 @@ def draw(
     era_count: int,
     finger_count: int,
     *,
+    masses: int = 0,
     count: int,
     seed: int,
     gain: float,
     phase: float,
-    thicknesses: int = 0,
+    thicknesses: int,
 ) -> Draws:
-    """Draw plates, count beside that as modelled.
+    """Draw plates of ERAs, masses and fingers, of a number of thicknesses.
 
-    gain, phase [rad]: standard deviations of each ERA's; thicknesses: number of `thickness_nodes`
-    that the plates have, 0 for all as modelled. Errors of discretisation are complex normal of mean
-    square 1.
+    gain, phase [rad]: standard deviations of each ERA's. Of each thickness as many plates, or one
+    less.
     """
     rng = np.random.default_rng([seed, era_count, finger_count])
     n, k = era_count, finger_count
     numbers = _exact(rng, 3 + n + k + 2 * n + 2 * k, count)
     numbers = numbers[:, numbers[0].argsort()]  # by thickness
     parameters, sizes, phases, real, imaginary = np.split(numbers, np.cumsum([3 + n + k, n, n, k]))
-    factors = np.zeros((FIRST_STIFFNESS + n + k + n + thicknesses, 1 + count), dtype=np.complex64)
-    factors[NOMINAL] = 1
-    factors[[LOSS, DAMPING], 1:] = parameters[1:3]
-    factors[FIRST_STIFFNESS : FIRST_STIFFNESS + n + k, 1:] = parameters[3:]
     gains = (1 + gain * sizes) * np.exp(1j * phase * phases) - 1
-    factors[FIRST_STIFFNESS + n + k : FIRST_STIFFNESS + n + k + n, 1:] = gains
-    if thicknesses:  # of each as many, or one less
-        plates = np.arange(count)
-        factors[-thicknesses + plates * thicknesses // count, 1 + plates] = 1
-    errors = np.pad(math.sqrt(0.5) * (real + 1j * imaginary), ((0, 0), (1, 0)))
-    drawn = Draws(factors, errors.astype(np.complex64))
-    for shared in (drawn.factors, drawn.errors):
+    own = np.insert(parameters[3:], [n] * masses, 0.0, axis=0)
+    drawn = Draws(
+        loss=parameters[1].astype(np.float32),
+        damping=parameters[2].astype(np.float32),
+        own=own.astype(np.float32),
+        gains=np.pad(gains, ((0, masses + k), (0, 0))).astype(np.complex64),
+        errors=np.asarray(math.sqrt(0.5) * (real + 1j * imaginary), dtype=np.complex64),
+        node=np.arange(count) * thicknesses // count,
+    )
+    for shared in vars(drawn).values():
         shared.setflags(write=False)  # cached, and so shared
     return drawn
 

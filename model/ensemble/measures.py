@@ -1,6 +1,6 @@
 """What fingers feel on drawn plates: levels at the targets, and contrast to the quiet fingers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,33 +57,44 @@ def felt(
     thresholds; their peak accelerations add (paper Eq. 28). The result has plates (c, d).
     """
     is_mixed = len(starts) < len(power)
+    sensed = power / (threshold**2)[:, None, None]
     if is_mixed:
-        sensed = np.add.reduceat(power / (threshold**2)[:, None, None], starts, axis=0)
-        level, loudest = _weakest_and_loudest(sensed, fingertips)
-    else:
-        level, loudest = _weakest_and_loudest(power, fingertips) / threshold[:, None]
-    if len(fingertips.weights) == len(fingertips.gains):
-        return Felt(level, None)
-    contrast = level / loudest
-    if not is_mixed:
-        return Felt(level, Contrasts(loudest, contrast, contrast))
+        sensed = np.add.reduceat(sensed, starts, axis=0)
+    found = felt_at(*over_fingertips(sensed, fingertips.weights), fingertips.gains)
+    if found.contrast is None or not is_mixed:
+        return found
     peak = np.add.reduceat(np.sqrt(power), starts, axis=0)
-    weakest, loud = _weakest_and_loudest(peak * peak, fingertips)
-    return Felt(level, Contrasts(loudest, contrast, weakest / loud))
+    peaks = felt_at(*over_fingertips(peak * peak, fingertips.weights), fingertips.gains)
+    if peaks.contrast is None:
+        raise AssertionError("fingers are the same")
+    return Felt(found.level, replace(found.contrast, acceleration=peaks.contrast.felt))
 
 
-def _weakest_and_loudest(power: Float32Array | FloatArray, fingertips: Fingertips) -> FloatArray:
-    """Amplitudes (2, c, d) of squared ones (c, k p, d).
+def over_fingertips(
+    power: Float32Array | FloatArray, weights: Float32Array
+) -> tuple[Float32Array, Float32Array]:
+    """Mean amplitude, and squared one at the loudest point, of squared ones (c, k p, d): (c, k, d).
 
-    Of the mean at the weakest target, and the maximum over all quiet points.
+    weights (k, p): of the points in the mean.
     """
-    c, _, d = power.shape
-    p, t = fingertips.weights.shape[1], len(fingertips.gains)
-    at_targets = np.sqrt(power[:, : t * p]).reshape(c, t, p, d)
-    means = (fingertips.weights[:t, None] @ at_targets)[:, :, 0]
-    weakest = np.minimum.reduce(means * fingertips.gains[:, None], axis=1)
-    loudest = np.maximum.reduce(power[:, t * p :], axis=1, initial=0)
-    return np.array([weakest, np.maximum(np.sqrt(loudest), 1e-30)])
+    by_finger = power.reshape(len(power), *weights.shape, -1)
+    means = np.asarray((weights[:, None] @ np.sqrt(by_finger))[:, :, 0])
+    loudest = np.maximum.reduce(by_finger, axis=2)
+    return means, np.asarray(loudest)
+
+
+def felt_at(means: Float32Array, loudest: Float32Array, gains: Float32Array) -> Felt:
+    """Measure drives of which every fingertip feels so much, as `over_fingertips`.
+
+    gains (t,): factors on the targets, which come first.
+    """
+    t = len(gains)
+    level = np.minimum.reduce(means[:, :t] * gains[:, None], axis=1)
+    if means.shape[1] == t:
+        return Felt(level, None)
+    loud = np.maximum(np.sqrt(np.maximum.reduce(loudest[:, t:], axis=1)), 1e-30)
+    contrast = level / loud
+    return Felt(level, Contrasts(loud, contrast, contrast))
 
 
 def percentile(values: FloatArray, percent: float = PERCENTILE) -> FloatArray:

@@ -191,11 +191,12 @@ class _Answering:
             tuple(each.at for each in every), loads=tuple(each.load for each in every)
         )
         return FingersOnPlate.of(
-            table.attached.at(self._rows),
+            table.on_eras,
             table.read_fingertips(question.contacts),
             question,
-            threshold=table.threshold_at(self._rows),
-            error_power=table.error_power.take(self._rows, axis=0),
+            self._rows,
+            threshold=table.thresholds,
+            error_power=table.error_power,
         )
 
     @cached_property

@@ -86,14 +86,12 @@ def choose_contents(
     fingers: all on the plate, at rows (f,) of frequencies [Hz]; quiet: those that feel nothing.
     """
     candidates = _candidates(fingers, streams, quiet, frequencies, apart_hz)
-    weights = fingers.tips.fine_weights
-    responses = _respond(fingers, candidates.rows, candidates.weights)
-    power = _to_threshold(responses.drawn(**JUDGING_DRAWS), responses, weights)
-    loudest = power.max(axis=2)[:, :, 1:]
-    own = np.empty((len(power), loudest.shape[2]), dtype=np.float32)
+    judged = _respond(fingers, candidates.rows, candidates.weights).drawn(JUDGING_DRAWS)
+    loudest = judged.loudest[:, :, 1:]
+    own = np.empty((len(loudest), loudest.shape[2]), dtype=np.float32)
     for number, stream in enumerate(streams):
         of = candidates.streams == number
-        own[of] = own_amplitudes(power[of], weights, stream.targets)[:, 1:]
+        own[of] = judged.means[of][:, [*stream.targets], 1:].min(axis=1)
         gain = 10 ** (stream.level_db_sl / 20) / np.maximum(percentile(own[of]), _TINY)
         own[of] *= gain[:, None]
         loudest[of] *= gain[:, None, None] ** 2
@@ -107,10 +105,11 @@ def tones_chosen(
     fingers: FingersOnPlate, rows: IntArray, weights: Complex64Array, *, is_apart: bool = True
 ) -> Chosen:
     """Tones at rows (K,) of the frequencies with weights (K, n), and what they promise."""
-    responses = _respond(fingers, rows, weights)
-    power = _to_threshold(
-        responses.promised(**PROMISED_DRAWS), responses, fingers.tips.fine_weights
-    )
+    drawn = _respond(fingers, rows, weights).drawn(PROMISED_DRAWS, with_powers=True)
+    if drawn.powers is None:
+        raise AssertionError("powers must be given")
+    points = fingers.tips.fine_weights.shape
+    power = drawn.powers.reshape(len(rows), *points, -1)
     return Chosen(rows, weights, power, is_apart)
 
 
@@ -201,14 +200,6 @@ def _respond(fingers: FingersOnPlate, rows: IntArray, weights: Complex64Array) -
     return fingers.respond(
         [Weights.at(row, each) for row, each in zip(rows.tolist(), weights, strict=True)]
     )
-
-
-def _to_threshold(
-    power: Float32Array, responses: DriveResponses, weights: Float32Array
-) -> Float32Array:
-    """Squared amplitudes to threshold, (m, k, p, d), of squared ones (m, k p, d)."""
-    power /= (responses.threshold**2)[:, None, None]
-    return power.reshape(len(power), *weights.shape, -1)
 
 
 def _candidates(

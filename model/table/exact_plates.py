@@ -74,7 +74,7 @@ def felt_on(
     rows, power = powers_on(table, question, excitation, plates)
     weights = table.read_fingertips(question.contacts).fine_weights
     fingertips = Fingertips(weights, np.array(question.gains))
-    return felt(power, table.threshold_at(rows), np.zeros(1, dtype=int), fingertips)
+    return felt(power, table.thresholds[rows], np.zeros(1, dtype=int), fingertips)
 
 
 def powers_on(

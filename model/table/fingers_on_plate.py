@@ -8,14 +8,13 @@ from itertools import accumulate
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from model.arrays import Complex64Array, Float32Array, IntArray
 from model.drive_modes.forms import Forms, Weights
-from model.ensemble.attached_plate import AttachedPlate
-from model.ensemble.contact_forms import LoadedContacts, gram, load_contacts
-from model.ensemble.draws import Draws, draw
-from model.ensemble.measures import Felt, Fingertips, felt
-from model.ensemble.thickness import responses_of_thicknesses, thickness_nodes
-from model.ensemble.tone_responses import NOMINAL, Tones, drawn_changes, tone_responses
+from model.ensemble.draws import Drawing, draw
+from model.ensemble.measures import Felt, Fingertips, felt, felt_at
+from model.ensemble.plate_on_eras import MODELLED, PlateOnEras
+from model.ensemble.touched_by_kernel import touch
+from model.ensemble.touched_plate import LoadedContacts, Sensed, TouchedPlate, gram
 from model.table.fingertip_shapes import FingertipShapes
 from model.table.pulse_gains import PulseResponses
 from model.table.question import Question
@@ -35,17 +34,18 @@ MAX_VARIANCE_FINE = 0.005
 class FingersOnPlate:
     """Fields, expected powers and drawn plates at fingers, some of which are targets, some quiet.
 
-    tips: of k fingers; threshold (f,) [m/s²]; error_power (f, eras): mean square of the
-    discretisation error of each ERA's field; loads (k,): of the fingers, as of a question; targets,
-    quiet: indices of fingers; gains: factors on the fields of the targets that make all levels the
-    same; wanted: their amplitude to threshold.
+    touched: the table's plate with k fingers on it; rows (f,): of its frequencies; tips: of the
+    fingers; threshold (f,) [m/s²]; error_power (all, eras): mean square of the discretisation error
+    of each ERA's field, at all of the plate's frequencies; contacts: at the rows; targets, quiet:
+    indices of fingers; gains: factors on the fields of the targets that make all levels the same;
+    wanted: their amplitude to threshold.
     """
 
-    plate: AttachedPlate
+    touched: TouchedPlate
+    rows: IntArray
     tips: FingertipShapes
     threshold: Float32Array
     error_power: Float32Array
-    loads: tuple[float, ...]
     contacts: LoadedContacts
     targets: IntArray
     quiet: IntArray
@@ -55,24 +55,28 @@ class FingersOnPlate:
     @classmethod
     def of(
         cls,
-        plate: AttachedPlate,
+        on: PlateOnEras,
         tips: FingertipShapes,
         question: Question,
+        rows: IntArray,
         *,
         threshold: Float32Array,
         error_power: Float32Array,
     ) -> "FingersOnPlate":
-        """Put the fingers of a question on a plate, targets first."""
-        t, loads = len(question.targets), question.loads
-        fingers = np.arange(len(tips.few))
-        contacts = load_contacts(plate, tips.few, tips.few_weights, error_power, loads)
+        """Put the fingers of a question on a plate, targets first; at its frequencies by row.
+
+        threshold (all,) [m/s²], at all of them.
+        """
+        t, fingers = len(question.targets), np.arange(len(tips.few))
+        touched = touch(on, tips.few[:, 0], question.loads)
+        fine = tips.fine if len(fingers) <= 1 + MAX_FINGERS_BY_POINT else None
         return cls(
-            plate,
+            touched,
+            rows,
             tips,
-            threshold,
+            threshold.take(rows),
             error_power,
-            loads,
-            contacts,
+            touched.forms(rows, tips.few, tips.few_weights, error_power, fine),
             fingers[:t],
             fingers[t:],
             np.array(question.gains, dtype=np.float32),
@@ -89,6 +93,15 @@ class FingersOnPlate:
             quiet=np.array(quiet, dtype=int),
             gains=np.ones(len(targets), dtype=np.float32),
             wanted=10 ** (level_db_sl / 20),
+        )
+
+    def at(self, rows: IntArray) -> "FingersOnPlate":
+        """At some of its rows, by index (n,)."""
+        return replace(
+            self,
+            rows=self.rows.take(rows),
+            threshold=self.threshold.take(rows),
+            contacts=self.contacts.at(rows),
         )
 
     def forms(self, background: Complex64Array | None) -> Forms:
@@ -110,7 +123,7 @@ class FingersOnPlate:
             else self._expected(background)[:, None]
         )
         found = Forms(by_target, power, quiet, self.threshold, self.wanted)
-        is_deep = self.plate.gain_variance < MAX_VARIANCE_FINE
+        is_deep = self.touched.on.plate.gain_variance < MAX_VARIANCE_FINE
         if background is not None or not is_deep or len(self.quiet) > MAX_FINGERS_BY_POINT:
             return found
         return replace(found, few=self._few_fields, fine=self._fine_fields)
@@ -124,16 +137,14 @@ class FingersOnPlate:
     @cached_property
     def _fine_fields(self) -> Complex64Array:
         """Fields of each ERA at the fine points of the quiet fingers, (f, q, p, n)."""
-        contacts, plate, fine = self.contacts, self.plate, self.tips.fine[self.quiet]
-        f, a, n = contacts.forces.shape
-        by_attachment = np.ascontiguousarray(contacts.forces.transpose(1, 0, 2)).reshape(a, -1)
-        modal = (contacts.shapes.T @ by_attachment.view(np.float32)).view(np.complex64)
-        modal = (
-            modal.reshape(-1, f, n) * (plate.receptance * plate.minus_omega2[:, None]).T[..., None]
-        )
-        rows = np.ascontiguousarray(modal).reshape(len(modal), -1).view(np.float32)
-        found = (fine.reshape(-1, fine.shape[2]) @ rows).view(np.complex64).reshape(-1, f, n)
-        return np.ascontiguousarray(found.swapaxes(0, 1)).reshape(f, *fine.shape[:2], n)
+        found, tips = self.contacts.fine_fields, self.tips
+        if found is None:
+            found = self.touched.forms(
+                self.rows, tips.few, tips.few_weights, self.error_power, tips.fine
+            ).fine_fields
+        if found is None:
+            raise AssertionError("fine points must be given")
+        return found.take(self.quiet, axis=1)
 
     def forms_over(self, ringing: RampedRinging) -> Forms:
         """Forms to search for a short effect, by quiet fingertip; its level is that as modelled.
@@ -193,130 +204,106 @@ class FingersOnPlate:
 
     def respond(self, drives: Sequence[Weights]) -> "DriveResponses":
         """Responses of the fingertips to drives."""
-        plate, tips = self.plate, self.tips
         each = [drive.tones() for drive in drives]
         ends = list(accumulate(len(tones) for tones in each))
-        tones = Tones(
-            np.array([index for tones in each for index, _ in tones]),
-            np.array([weights for tones in each for _, weights in tones]),
-        )
-        points = tips.fine.reshape(-1, tips.fine.shape[-1])
-        error = self.error_power.take(tones.frequencies, axis=0) * np.abs(tones.weights) ** 2
+        rows = np.array([index for tones in each for index, _ in tones])
         return DriveResponses(
-            tone_responses(plate, self.contacts, tones, points),
-            np.sqrt(np.add.reduce(error, axis=1)),
-            self.threshold.take(tones.frequencies),
+            self,
+            self.rows.take(rows),
+            np.array([weights for tones in each for _, weights in tones]),
+            self.threshold.take(rows),
             np.array([0, *ends[:-1]]),
-            np.array(ends),
-            Fingertips(tips.fine_weights, self.gains),
-            plate,
-            self.contacts,
-            tones,
-            points,
-            self.loads,
         )
 
     def _expected(self, background: Complex64Array) -> Complex64Array:
         """The mean power under errors of the gains, (f, eras, eras)."""
         expected = background.copy()
         diagonal = expected.reshape(len(expected), -1)[:, :: expected.shape[1] + 1]
-        diagonal *= 1 + np.float32(self.plate.gain_variance)
+        diagonal *= 1 + np.float32(self.touched.on.plate.gain_variance)
         return expected
 
 
 @dataclass(frozen=True, eq=False)
 class DriveResponses:
-    """Responses of the fingertips' points to the tones of drives.
+    """Responses of the fingertips' points to m tones of c drives.
 
-    values (m, k p, columns): of `tone_responses`; error (m,): root mean square of the
-    discretisation error of each tone's field; threshold (m,) [m/s²]; starts, ends (c,): ranges of
-    the drives' tones; points (k p, r): shapes; loads (k,): of the fingers, as of a question.
+    rows (m,): of the plate's frequencies; weights (m, n): of the ERAs; threshold (m,) [m/s²];
+    starts (c,): the first tone of each drive.
     """
 
-    values: Complex64Array
-    error: Float32Array
+    fingers: FingersOnPlate
+    rows: IntArray
+    weights: Complex64Array
     threshold: Float32Array
     starts: IntArray
-    ends: IntArray
-    fingertips: Fingertips
-    plate: AttachedPlate
-    contacts: LoadedContacts
-    tones: Tones
-    points: Float32Array
-    loads: tuple[float, ...]
 
     def of(self, drive: int) -> "DriveResponses":
         """Responses to one of the drives, by index."""
-        start, end = self.starts[drive], self.ends[drive]
+        start, *end = self.starts[drive : drive + 2]
+        tones = slice(start, *end or [None])
         return replace(
             self,
-            values=self.values[start:end],
-            error=self.error[start:end],
-            threshold=self.threshold[start:end],
+            rows=self.rows[tones],
+            weights=self.weights[tones],
+            threshold=self.threshold[tones],
             starts=np.zeros(1, dtype=int),
-            ends=np.array([end - start]),
-            tones=Tones(self.tones.frequencies[start:end], self.tones.weights[start:end]),
         )
 
-    def drawn(self, *, count: int, seed: int, thicknesses: int) -> Float32Array:
-        """Squared amplitudes on the plate as modelled, and on drawn ones, (m, k p, 1 + count).
-
-        thicknesses: how many the drawn plates have. All else that is uncertain changes their
-        responses as on the plate as modelled, in proportion.
-        """
-        draws, nodes = self._draws(count, seed, thicknesses)
-        return draws.power(draws.accelerations(self.values, self._at_nodes(nodes)), self.error)
-
-    def promised(self, *, count: int, seed: int, thicknesses: int, bases: int) -> Float32Array:
-        """As `drawn`, but all else that is uncertain acts on a thickness as it does there.
-
-        bases: thicknesses at which its changes are computed, each for as many drawn plates.
-        """
-        if not self.plate.thickness:
-            return self.drawn(count=count, seed=seed, thicknesses=0)
-        draws, nodes = self._draws(count, seed, thicknesses)
-        tones, m, columns = self.tones, len(self.tones.frequencies), self.values.shape[2]
-        plates = self.plate.of_thicknesses(thickness_nodes(bases), tones.frequencies)
-        centres = self.contacts.shapes[self.plate.stiffness.shape[1] :, None]
-        contacts = load_contacts(
-            plates,
-            centres,
-            np.ones(centres.shape[:2], dtype=np.float32),
-            np.zeros((m * bases, self.plate.era_count), dtype=np.float32),  # of forms, not needed
-            self.loads,
+    def drawn(self, by: Drawing, *, with_powers: bool = False) -> Sensed:
+        """What is felt on the plate as modelled, and on drawn ones."""
+        touched, tips, m = self.fingers.touched, self.fingers.tips, len(self.rows)
+        on, plate = touched.on, touched.on.plate
+        points = tips.fine.reshape(-1, tips.fine.shape[2])
+        first = on.first.get(by.thicknesses, MODELLED)
+        nodes = np.array([MODELLED, *range(first, first + (by.thicknesses if first else 1))])
+        at_nodes = touched.fields(
+            self.rows.repeat(len(nodes)),
+            np.tile(nodes, m),
+            self.weights.repeat(len(nodes), axis=0),
+            points,
+        ).reshape(m, len(nodes), -1)
+        first_base = on.first.get(by.bases, MODELLED)
+        bases = by.bases if first_base else 1
+        rows, which = np.unique(self.rows, return_inverse=True)
+        by_force, moved = touched.sources(
+            rows.repeat(bases), np.tile(first_base + np.arange(bases), len(rows)), points
         )
-        factors = draws.factors[:columns, 1:].reshape(columns, bases, -1).swapaxes(0, 1)
-        changes = drawn_changes(
-            plates,
-            contacts,
-            Tones(np.arange(m * bases), tones.weights.repeat(bases, axis=0)),
-            self.points,
-            np.tile(factors, (m, 1, 1)),
-        ).reshape(len(self.points), m, count)
-        nominal = self._at_nodes(nodes).repeat(count // len(nodes), axis=2)
-        plates_drawn = nominal + changes.swapaxes(0, 1)
-        found = np.concatenate([self.values[:, :, NOMINAL, None], plates_drawn], axis=2)
-        return draws.power(found, self.error)
-
-    def felt(self, power: Float32Array) -> Felt:
-        """Measures of the drives where the fingers' targets come first, (c, plates)."""
-        return felt(power, self.threshold, self.starts, self.fingertips)
-
-    def _draws(self, count: int, seed: int, thicknesses: int) -> tuple[Draws, FloatArray]:
-        """Drawn plates, and the deviations of their thickness, none where it is certain."""
-        plate = self.plate
-        thicknesses = thicknesses if plate.thickness > 0 else 0
+        sources = which[:, None] * bases + np.arange(bases)
+        weights = self.weights.repeat(bases, axis=0)
+        changes = touched.changes(
+            self.rows.repeat(bases),
+            np.tile(first_base + np.arange(bases), m),
+            weights,
+            np.matvec(moved[sources.ravel()], weights),
+            points,
+        )
         draws = draw(
             plate.era_count,
-            len(self.fingertips.weights),
-            count=count,
-            seed=seed,
+            len(tips.fine),
+            masses=plate.stiffness.shape[1] - plate.era_count,
+            count=by.count,
+            seed=by.seed,
             gain=plate.gain,
             phase=plate.phase,
-            thicknesses=thicknesses,
+            thicknesses=len(nodes) - 1,
         )
-        return draws, thickness_nodes(thicknesses) if thicknesses else np.empty(0)
+        error = self.fingers.error_power.take(self.rows, axis=0) * np.abs(self.weights) ** 2
+        return touched.felt(
+            draws,
+            by_force,
+            sources,
+            changes,
+            at_nodes,
+            np.sqrt(np.add.reduce(error, axis=1)),
+            self.threshold,
+            tips.fine_weights,
+            with_powers=with_powers or len(self.starts) < m,
+        )
 
-    def _at_nodes(self, nodes: FloatArray) -> Complex64Array:
-        """Nominal responses at thicknesses, (m, k p, thicknesses)."""
-        return responses_of_thicknesses(self.plate, self.contacts, self.tones, self.points, nodes)
+    def felt(self, sensed: Sensed) -> Felt:
+        """Measures of the drives where the fingers' targets come first, (c, plates)."""
+        weights, gains = self.fingers.tips.fine_weights, self.fingers.gains
+        if sensed.powers is None:
+            return felt_at(sensed.means, sensed.loudest, gains)
+        power = sensed.powers * (self.threshold**2)[:, None, None]
+        return felt(power, self.threshold, self.starts, Fingertips(weights, gains))

@@ -5,7 +5,7 @@ nine of ten goes first, then felt contrast. The promise is of other draws.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeAlias
@@ -21,6 +21,7 @@ from model.drive_modes.exact_search import search_exactly, sensation_found
 from model.drive_modes.forms import Forms, Weights
 from model.drive_modes.phased import PHASED
 from model.drive_modes.tones import excitation_of
+from model.ensemble.draws import Drawing
 from model.ensemble.measures import Felt, percentile, percentile_of_sorted
 from model.errors import InputError
 from model.finger.perception import decibels
@@ -36,8 +37,8 @@ from model.table.pulse_gains import OverEffect, contrast_over_effect
 from model.table.question import Question
 from model.transients.onset import RampedRinging
 
-JUDGING_DRAWS: Mapping[str, int] = {"count": 64, "seed": 1, "thicknesses": 5}
-PROMISED_DRAWS: Mapping[str, int] = {"count": 200, "seed": 8, "thicknesses": 40, "bases": 5}
+JUDGING_DRAWS = Drawing(count=64, seed=1, thicknesses=5)
+PROMISED_DRAWS = Drawing(count=200, seed=8, thicknesses=40, bases=5)
 """Drawn plates that judge candidates, and those of the promise."""
 
 MAX_DURING_EFFECT = 3
@@ -271,7 +272,7 @@ def _judged(
     """
     if len(drives) == 1:
         return 0
-    judged = responses.felt(responses.drawn(**JUDGING_DRAWS))
+    judged = responses.felt(responses.drawn(JUDGING_DRAWS))
     if candidates.over_effect is not None:
         return _judged_over_effect(question, drives, scores, judged, candidates.over_effect)
     least = percentile(judged.level[:, 1:])
@@ -340,7 +341,7 @@ def _pattern(
     gap_db: float | None,
 ) -> Pattern:
     """The pattern of a drive, turned down to the wanted level at nine of ten plates."""
-    drawn = responses.felt(responses.promised(**PROMISED_DRAWS))
+    drawn = responses.felt(responses.drawn(PROMISED_DRAWS))
     measures = [drawn.level]
     if drawn.contrast is not None:
         measures += [drawn.contrast.loudest, drawn.contrast.acceleration, drawn.contrast.felt]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
-from model.drive_modes import UNRESTRICTED
+from model.drive_modes import UNRESTRICTED, preselection
 from model.drive_modes.exact_search import pattern_count
 from model.drive_modes.forms import Forms
 from model.drive_modes.sources import (
@@ -23,8 +23,8 @@ from model.drive_modes.sources import (
     sums_of_sources,
 )
 from model.ensemble.attached_plate import AttachedPlate, attach
-from model.ensemble.contact_forms import modal_fields
-from model.ensemble.preselection import Preselection
+from model.ensemble.plate_on_eras import PlateOnEras
+from model.ensemble.touched_by_kernel import touch
 from model.errors import InputError
 from model.finger.grid import CELL_SAMPLES, Grid
 from model.finger.perception import decibels, detection_threshold, is_background
@@ -37,10 +37,12 @@ from model.structure.dispersion import Dispersion
 from model.structure.fingertip import Fingertip, fingertip_loads
 from model.structure.plate import Plate
 from model.structure.point_load import PointLoad
-from model.table.fingers_on_plate import FingersOnPlate
+from model.table.fingers_on_plate import MAX_FINGERS_BY_POINT, FingersOnPlate
 from model.table.fingertip_shapes import FingertipReader, FingertipShapes
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.pattern_choice import (
+    JUDGING_DRAWS,
+    PROMISED_DRAWS,
     Candidates,
     OnsetContrast,
     choose_pattern,
@@ -165,7 +167,7 @@ class LocalizationTable:
             playable=playable,
             fingers=self._fingers(question, tips),
             background=None if question.quiet else self._background(question),
-            threshold=self._threshold,
+            threshold=self.thresholds,
             threshold_name=self.threshold,
             onset_contrast=self._onset_contrast(question, tips),
             over_effect=over_effect,
@@ -198,21 +200,13 @@ class LocalizationTable:
         tips = self.read_fingertips(question.contacts)
         return self._fingers(question, tips).forms(background)
 
-    def threshold_at(self, rows: IntArray) -> Float32Array:
-        """Detection thresholds [m/s²] at frequencies, by index (n,)."""
-        return self._threshold.take(rows)
-
     def unit_fields(self, points: FloatArray, *, contacts: Sequence[Point] = ()) -> Complex64Array:
         """Acceleration [m/s²] at points (p, 2) [m] by each ERA alone at full stroke, (f, eras, p).
 
         contacts [m]: of the fingers that load the plate.
         """
         shapes = self.raster.at(self.shapes, points)
-        modal = self._modal_fields(contacts)
-        f, r, eras = modal.shape
-        rows = np.ascontiguousarray(modal.transpose(1, 0, 2)).reshape(r, -1).view(np.float32)
-        found = (shapes @ rows).view(np.complex64).reshape(len(shapes), f, eras)
-        return np.ascontiguousarray(found.transpose(1, 2, 0))
+        return np.ascontiguousarray(self._modal_fields(contacts) @ shapes.T)
 
     def amplitudes(
         self,
@@ -230,9 +224,9 @@ class LocalizationTable:
         frequencies, bases = base_amplitudes(excitation, self.eras)
         weights = (bases / [era.stroke for era in self.eras]).astype(np.complex64)
         rows = np.searchsorted(self.frequencies, frequencies)
-        modal = self._modal_fields(contacts, loads)[rows] @ weights[:, :, None]
+        modal = weights[:, None] @ self._modal_fields(contacts, loads)[rows]
         shapes = self.raster.at(self.shapes, points)
-        return frequencies, np.abs(modal[:, :, 0] @ shapes.T).astype(float)
+        return frequencies, np.abs(modal[:, 0] @ shapes.T).astype(float)
 
     def shapes_at(self, points: Sequence[Point]) -> FloatArray:
         """Shapes of the reduced plate at points [m] of it, (p, r)."""
@@ -256,7 +250,7 @@ class LocalizationTable:
     def available_level_db_sl(self) -> FloatArray:
         """Highest level [dB SL] of any `switched` pattern at the centre of each cell, (cells,)."""
         sources = magnitudes_of_sources(self._cell_fields)
-        powers = (sources / per_source(self._threshold, len(self.eras))) ** 2
+        powers = (sources / per_source(self.thresholds, len(self.eras))) ** 2
         # Cell by cell, since fine frequency steps make millions of patterns.
         maxima = [sums_of_sources(cell[None], len(self.eras)).max() for cell in powers.T]
         return decibels(np.sqrt(np.array(maxima, dtype=float)))
@@ -332,7 +326,8 @@ class LocalizationTable:
         return {}
 
     @cached_property
-    def _threshold(self) -> NDArray[np.float32]:
+    def thresholds(self) -> NDArray[np.float32]:
+        """Detection thresholds [m/s²] at all frequencies, (f,)."""
         return detection_threshold(self.frequencies, self.threshold).astype(np.float32)
 
     @cached_property
@@ -359,6 +354,12 @@ class LocalizationTable:
         )
 
     @cached_property
+    def on_eras(self) -> PlateOnEras:
+        """The plate with its ERAs and masses eliminated, of all thicknesses that answers count."""
+        counts = {JUDGING_DRAWS.thicknesses, PROMISED_DRAWS.thicknesses, PROMISED_DRAWS.bases}
+        return PlateOnEras.of(self.attached, *sorted(counts))
+
+    @cached_property
     def read_fingertips(self) -> FingertipReader:
         """Reads the shapes at fingertips, by their positions [m]."""
         return FingertipReader(self.raster, self.shapes)
@@ -368,7 +369,7 @@ class LocalizationTable:
         """Mean square over the plate of the discretisation error of each ERA's field, (f, eras)."""
         gram = self.shapes.T @ self.shapes / np.float32(self.raster.point_count)
         modal = self._modal_fields(())
-        mean_square = np.einsum("fre,rs,fse->fe", modal.conj(), gram, modal, optimize=True).real
+        mean_square = np.einsum("fer,rs,fes->fe", modal.conj(), gram, modal, optimize=True).real
         return np.asarray(self.discretisation_error[:, None] ** 2 * mean_square, dtype=np.float32)
 
     @cached_property
@@ -379,21 +380,27 @@ class LocalizationTable:
     def _modal_fields(
         self, contacts: Sequence[Point], loads: Sequence[float] = ()
     ) -> Complex64Array:
-        """Accelerations of the reduced coordinates by each ERA at full stroke, (f, r, eras)."""
-        fingers = self.shapes_at(contacts).astype(np.float32)
-        return modal_fields(self.attached, fingers, loads)
+        """Accelerations of the reduced coordinates by each ERA at full stroke, (f, eras, r)."""
+        if not contacts:
+            return self.on_eras.fields
+        centres = self.shapes_at(contacts).astype(np.float32)
+        return touch(self.on_eras, centres, tuple(loads)).coordinates()
 
     def _background(self, question: Question) -> Complex64Array:
         """Mean power of the plate beyond the targets, without fingers on it, (f, eras, eras)."""
         rest = self._cell_fields[:, :, is_background(self.cell_centres, question.targets)]
         return np.asarray(rest.conj() @ rest.swapaxes(1, 2) / np.float32(rest.shape[2]))
 
-    def _fingers(self, question: Question, tips: FingertipShapes) -> FingersOnPlate:
+    def _fingers(
+        self, question: Question, tips: FingertipShapes, rows: IntArray | None = None
+    ) -> FingersOnPlate:
+        """Fingers at rows (n,) of the frequencies, None for all."""
         return FingersOnPlate.of(
-            self.attached,
+            self.on_eras,
             tips,
             question,
-            threshold=self._threshold,
+            np.arange(len(self.frequencies)) if rows is None else rows,
+            threshold=self.thresholds,
             error_power=self.error_power,
         )
 
@@ -403,35 +410,28 @@ class LocalizationTable:
         """The best pattern at the frequencies most worth a search, None where those do not do."""
         if len(question.targets) > 1 or not question.quiet:
             return None
-        wanted = np.float32(10 ** (question.level_db_sl / 20)) * self._threshold
-        rows = self._preselection.rows(tips.few, tips.few_weights, wanted, playable, question.loads)
-        if len(rows) in (0, len(playable)):
+        is_ranked_by_points = len(question.quiet) <= MAX_FINGERS_BY_POINT
+        ranked_at = tips if is_ranked_by_points else tips.at_centres()
+        fingers = self._fingers(question, ranked_at, playable)
+        kept = preselection.preselect(fingers.forms(None))
+        if len(kept) in (0, len(playable)):
             return None
-        threshold = self._threshold.take(rows)
+        rows = playable.take(kept)
         part = Candidates(
             eras=self.eras,
             frequencies=self.frequencies.take(rows),
             playable=np.arange(len(rows)),
-            fingers=FingersOnPlate.of(
-                self.attached.at(rows),
-                tips,
-                question,
-                threshold=threshold,
-                error_power=self.error_power.take(rows, axis=0),
+            fingers=(
+                fingers.at(kept) if is_ranked_by_points else self._fingers(question, tips, rows)
             ),
             background=None,
-            threshold=threshold,
+            threshold=self.thresholds.take(rows),
             threshold_name=self.threshold,
             onset_contrast=self._onset_contrast(question, tips, rows),
             over_effect=None,
             ringing=None,
         )
         return choose_reaching(question, drive_mode, part)
-
-    @cached_property
-    def _preselection(self) -> Preselection:
-        """Ranks the frequencies for a question."""
-        return Preselection(self.attached, self.error_power)
 
     def _onset_contrast(
         self, question: Question, tips: FingertipShapes, among: IntArray | None = None

@@ -1,0 +1,127 @@
+/* Fingers on plates without ERAs: `model.ensemble.touched_plate` in C, whose symbols are used. */
+#ifndef FINGERS_H
+#define FINGERS_H
+
+#include "lanes.h"
+
+typedef struct {
+    int n, b, k, r, t;          /* ERAs; these and masses; fingers; reduced coordinates; thicknesses */
+    float load_std;
+    const float *receptance, *by_force, *coupling, *moved; /* (f, t, ...) g (r), T (b, r), Y (b, b), (b, n) */
+    const float *minus_omega2, *drives, *strokes;          /* (f), (f, n), (f, n) */
+    const float *by_damping, *by_stiffness;                /* (f, n) */
+    const float *centres, *stiffness;                      /* (k, r); (f, k) D */
+} plates;
+
+/* Some cases, each of a frequency and a thickness, with the fingers on them. */
+typedef struct {
+    value *T, *g, *Y;        /* (b, r), (r), (b, b) */
+    value *at;               /* (k, b) accelerations of the fingers by a force at each attachment, without them */
+    value *resting, *P, *D;  /* (k, b) the same with them; (k, k) (1 + G D)^-1, (k) */
+    value *row;              /* room for (b + r) */
+    lanes minus_omega2;
+} touched;
+
+INLINE size_t touched_space(const plates *on) {
+    size_t b = on->b, k = on->k, r = on->r;
+    return b * r + r + b * b + 2 * k * b + k * k + k + b + r;
+}
+
+/* P = (1 + G D)^-1 of G, one finger after the other: none gives energy, the plate is damped. */
+INLINE void invert(value *restrict P, const value *D, size_t k) {
+    for (size_t i = 0; i < k; i++) {
+        for (size_t j = 0; j < k; j++) P[i * k + j] = times(P[i * k + j], D[j]);
+        P[i * k + i].re += 1;
+    }
+    for (size_t s = 0; s < k; s++) {
+        value *own = P + s * k, factor = reciprocal(own[s]);
+        own[s] = (value){filled(1), ZERO.im};
+        for (size_t j = 0; j < k; j++) own[j] = times(own[j], factor);
+        for (size_t i = 0; i < k; i++) {
+            if (i == s) continue;
+            value by = P[i * k + s];
+            P[i * k + s] = ZERO;
+            for (size_t j = 0; j < k; j++) P[i * k + j] = subtract_product(P[i * k + j], by, own[j]);
+        }
+    }
+}
+
+/* G (p, k): displacement at points (p, r) by a force at each finger, without the others; of X (p, b),
+ * accelerations there by a force at each attachment. */
+INLINE void by_fingers(value *restrict G, const float *points, size_t p, const value *X, const touched *of,
+                       const plates *on) {
+    const size_t b = on->b, k = on->k, r = on->r;
+    value *modal = of->row + b;
+    for (size_t j = 0; j < k; j++) {
+        for (size_t s = 0; s < r; s++) modal[s] = scaled(of->g[s], filled(on->centres[j * r + s]));
+        multiply_into(G + j, k, points, modal, p, r);
+    }
+    for (size_t i = 0; i < p; i++) {
+        row_product(of->row, X + i * b, 1, of->Y, b, b, 0, 0); /* Y is symmetric */
+        for (size_t j = 0; j < k; j++)
+            for (size_t s = 0; s < b; s++)
+                G[i * k + j] = add_product(G[i * k + j], of->row[s], of->at[j * b + s]);
+    }
+}
+
+/* Put the fingers on plates of frequencies (LANES) and cases (LANES) in work space; the end of it. */
+SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const int *cases, value *work) {
+    const size_t b = on->b, k = on->k, r = on->r;
+    to->T = work, to->g = to->T + b * r, to->Y = to->g + r, to->at = to->Y + b * b;
+    to->resting = to->at + k * b, to->P = to->resting + k * b, to->D = to->P + k * k, to->row = to->D + k;
+    load(to->T, on->by_force, b * r, cases);
+    load(to->g, on->receptance, r, cases);
+    load(to->Y, on->coupling, b * b, cases);
+    load(to->D, on->stiffness, k, rows);
+    load_real(&to->minus_omega2, on->minus_omega2, 1, rows);
+    multiply(to->at, on->centres, to->T, k, r, b);
+    by_fingers(to->P, on->centres, k, to->at, to, on);
+    invert(to->P, to->D, k);
+    product(to->resting, to->P, k, to->at, k, k, b);
+    return to->row + b + r;
+}
+
+/* found (p, width): accelerations at points (p, r) by a force at each of the first width attachments
+ * and fingers; room for (p, b + k). */
+SHARED void to_points(value *restrict found, size_t width, const float *points, size_t p, const touched *of,
+                      const plates *on, value *room) {
+    const size_t b = on->b, k = on->k, of_fingers = width > b ? width - b : 0, fields = width - of_fingers;
+    value *X = room, *G = X + p * b;
+    multiply(X, points, of->T, p, on->r, b);
+    by_fingers(G, points, p, X, of, on);
+    for (size_t i = 0; i < p; i++) {
+        value *own = found + i * width;
+        for (size_t j = 0; j < of_fingers; j++) {
+            value sum = ZERO;
+            for (size_t s = 0; s < k; s++) sum = add_product(sum, G[i * k + s], of->P[j * k + s]);
+            own[b + j] = scaled(sum, of->minus_omega2);
+        }
+        memcpy(own, X + i * b, fields * sizeof(value));
+        for (size_t s = 0; s < k; s++) {
+            value force = times(G[i * k + s], of->D[s]);
+            for (size_t j = 0; j < fields; j++)
+                own[j] = subtract_product(own[j], force, of->resting[s * b + j]);
+        }
+    }
+}
+
+/* moved (b + k, n): displacement of attachments and fingers by each ERA at full stroke, of that
+ * without fingers (b, n). */
+INLINE void with_fingers_moved(value *moved, const value *without, const touched *of, const value *drives,
+                               const plates *on) {
+    const size_t n = on->n, b = on->b, k = on->k;
+    lanes by_motion = inverse(of->minus_omega2);
+    value *fingers = moved + b * n;
+    for (size_t i = 0; i < k; i++)
+        for (size_t e = 0; e < n; e++)
+            fingers[i * n + e] = scaled(times(of->resting[i * b + e], drives[e]), by_motion);
+    memcpy(moved, without, b * n * sizeof(value));
+    for (size_t i = 0; i < k; i++)
+        for (size_t j = 0; j < b; j++) {
+            value by = scaled(times(of->at[i * b + j], of->D[i]), by_motion);
+            for (size_t e = 0; e < n; e++)
+                moved[j * n + e] = subtract_product(moved[j * n + e], by, fingers[i * n + e]);
+        }
+}
+
+#endif

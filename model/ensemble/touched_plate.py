@@ -1,0 +1,299 @@
+"""Fingers on plates whose ERAs are eliminated, and what is felt of drawn ones, in numpy.
+
+k fingers of dynamic stiffness D at centres c change fields X of a plate on its ERAs to
+
+    X - G D P X_c,  P = (1 + G_cc D)^-1,
+
+where G is the displacement by a force at each finger without the others; with them -w² G P^T is the
+acceleration by it. Symbols are those of `plate_on_eras`; cases are those of a frequency and of a
+thickness each. The expected power of weights w at a fingertip is w^H R w to first order,
+
+    R = mean_p { h* h^T + dh* dh^T + dc* dc^T + sum_j |s_j t_pj|² r_j* r_j^T + sigma² diag |h|² },
+
+with h the field of each ERA, t_pj the acceleration by a force at attachment j, and r_j by how much
+each ERA at full stroke deforms it. Each change d is one by a standard deviation, s_j that of the
+stiffness: the ERAs' damping c together, stiffness of each ERA and load of each finger j on their
+own, gains as sigma: exact derivatives of the loaded plate, but for what a finger deflects locally.
+For the thickness, half the sum of dh* dh^T of the plates thicker and thinner by it, exactly. The
+loss factor changes next to nothing.
+
+`model.ensemble.touched_by_kernel` is the same in C.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import Complex64Array, Float32Array, IntArray
+from model.ensemble.draws import Draws
+from model.ensemble.measures import over_fingertips
+from model.ensemble.plate_on_eras import MODELLED, THICKER, THINNER, PlateOnEras
+
+RIDGE = 1e-6
+"""Share of a form's trace that is added to its diagonal: keeps it definite."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedContacts:
+    """What k fingertips have of the ERAs at f frequencies.
+
+    fields: (f, k, p, n) h [m/s²] at points; fine_fields: (f, k, fine, n) at others, None unless
+    wanted; power: (f, k, n, n) R.
+    """
+
+    fields: Complex64Array
+    fine_fields: Complex64Array | None
+    power: Complex64Array
+
+    def at(self, frequencies: IntArray) -> "LoadedContacts":
+        """Some of the frequencies, by index (n,)."""
+        fine = self.fine_fields
+        return LoadedContacts(
+            self.fields.take(frequencies, axis=0),
+            None if fine is None else fine.take(frequencies, axis=0),
+            self.power.take(frequencies, axis=0),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """Forces at attachments a in c cases, by one standard deviation of what is uncertain.
+
+    loss, damping, own (c, a): of the loss factor, of all dampers, and of the attachment's own
+    stiffness; drives (c, a): of each ERA as it plays, which its gain multiplies; by_loss (c, p):
+    acceleration at points by the loss factor beside those forces.
+    """
+
+    loss: Complex64Array
+    damping: Complex64Array
+    own: Complex64Array
+    drives: Complex64Array
+    by_loss: Complex64Array
+
+
+@dataclass(frozen=True, eq=False)
+class Sensed:
+    """Amplitudes to threshold of m tones at k fingertips, as modelled and on d drawn plates.
+
+    means: (m, k, 1 + d) mean amplitude over each fingertip; loudest: (m, k, 1 + d) squared
+    amplitude at its loudest point; powers: (m, k p, 1 + d) at all points, None unless wanted.
+    """
+
+    means: Float32Array
+    loudest: Float32Array
+    powers: Float32Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class TouchedPlate:
+    """Plates with k fingers at centres of shapes (k, r), of dynamic stiffness (f, k) [N/m]."""
+
+    on: PlateOnEras
+    centres: Float32Array
+    stiffness: Complex64Array
+
+    def sources(
+        self, rows: IntArray, nodes: IntArray, points: Float32Array
+    ) -> tuple[Complex64Array, Complex64Array]:
+        """Accelerations by forces, and motion by ERAs, in cases of rows (c,) and nodes (c,).
+
+        Accelerations [m/s²/N] at points of shapes (p, r) by a force at each attachment and then
+        each finger, (c, p, b + k); displacement of these by each ERA at full stroke, (c, b + k, n).
+        """
+        on, plate, n = self.on, self.on.plate, self.on.plate.era_count
+        w2 = plate.minus_omega2[rows, None, None]
+        at, G, P = self._fingers(rows, nodes)
+        coordinates, resting = self._with_fingers(rows, on.by_force[rows, nodes], at, G, P)
+        coordinates = np.concatenate([coordinates, w2 * (P @ G)], axis=1)
+        fingers = resting[:, :, :n] * plate.forces[rows, None] / w2
+        held = at.swapaxes(1, 2) @ (self.stiffness[rows, :, None] * fingers) / w2
+        moved = np.concatenate([on.moved[rows, nodes] - held, fingers], axis=1)
+        return product(points, coordinates), moved
+
+    def fields(
+        self, rows: IntArray, nodes: IntArray, weights: Complex64Array, points: Float32Array
+    ) -> Complex64Array:
+        """Accelerations (c, p) at points of shapes (p, r) by weights (c, n) of the ERAs."""
+        forces = self.on.plate.forces[rows] * weights
+        by_force = self.on.by_force[rows, nodes, : forces.shape[1]]
+        driven = np.asarray(forces[:, None] @ by_force, dtype=np.complex64)
+        _, G, P = self._fingers(rows, nodes)
+        found, _ = self._with_fingers(rows, driven, product(self.centres, driven), G, P)
+        return product(points, found)[:, :, 0]
+
+    def coordinates(self) -> Complex64Array:
+        """Reduced coordinates by each ERA at full stroke at all frequencies, (f, n, r)."""
+        driven, rows = self.on.fields, np.arange(len(self.stiffness))
+        _, G, P = self._fingers(rows, np.full(len(rows), MODELLED))
+        found, _ = self._with_fingers(rows, driven, product(self.centres, driven), G, P)
+        return found
+
+    def forms(
+        self,
+        rows: IntArray,
+        points: Float32Array,
+        weights: Float32Array,
+        error_power: Float32Array,
+        fine: Float32Array | None = None,
+    ) -> LoadedContacts:
+        """Fields and expected powers at frequencies, by row (f,).
+
+        points (k, p, r), fine (k, fine, r): shapes under each finger; weights (k, p): of its
+        points, sum 1; error_power: mean square of the discretisation error of each ERA's field, at
+        all frequencies of the plate, (all, n).
+        """
+        plate, n, f, (k, p, r) = self.on.plate, self.on.plate.era_count, len(rows), points.shape
+        forces, every = plate.forces[rows, None], points.reshape(-1, r)
+        modelled = np.full(f, MODELLED)
+        by_force, moved = self.sources(rows, modelled, every)
+        h = by_force[:, :, :n] * forces
+        stretched = -moved
+        stretched.reshape(f, -1)[:, : n * n : n + 1] += plate.strokes[rows]
+        changes = [h, by_force[:, :, :n] @ (plate.by_damping[rows, :, None] * stretched[:, :n])]
+        if plate.thickness > 0:
+            for node in (THICKER, THINNER):
+                other, _ = self.sources(rows, np.full(f, node), every)
+                changes.append((other[:, :, :n] * forces - h) * np.float32(math.sqrt(0.5)))
+        each = np.stack(changes, axis=1).reshape(f, -1, k, p, n).swapaxes(1, 2)
+        power = gram((each * np.sqrt(weights)[:, None, :, None]).reshape(f, k, -1, n))
+        a = moved.shape[1]
+        uncertain = np.concatenate([np.arange(n), np.arange(a - k, a)])
+        load = np.float32(plate.load_std) * self.stiffness[rows]
+        by_one = np.concatenate([plate.by_stiffness[rows], load], axis=1)
+        deformed = stretched[:, uncertain] * by_one[:, :, None]
+        reach = power_of(by_force[:, :, uncertain]).reshape(f, k, p, -1)
+        mean = weights[:, None]
+        outer = (deformed.conj()[..., None] * deformed[:, :, None]).reshape(f, n + k, -1)
+        power += ((mean @ reach)[:, :, 0] @ outer).reshape(f, k, n, n)
+        size = (mean @ power_of(h).reshape(f, k, p, n))[:, :, 0]
+        diagonal = power.reshape(f, k, -1)[..., :: n + 1]
+        values = diagonal.real + plate.gain_variance * size + error_power[rows, None]
+        diagonal[:] = values + RIDGE / n * values.sum(axis=-1, keepdims=True)
+        found = h.reshape(f, k, p, n)
+        if fine is None:
+            return LoadedContacts(found, None, power)
+        by_fine, _ = self.sources(rows, modelled, fine.reshape(-1, r))
+        at_fine = (by_fine[:, :, :n] * forces).reshape(f, k, -1, n)
+        return LoadedContacts(found, at_fine, power)
+
+    def changes(
+        self,
+        rows: IntArray,
+        nodes: IntArray,
+        weights: Complex64Array,
+        moved: Complex64Array,
+        points: Float32Array,
+    ) -> Changes:
+        """What changes forces, of weights (c, n) and their motions moved (c, b + k) [m]."""
+        plate, n = self.on.plate, weights.shape[1]
+        shapes = np.concatenate([plate.shapes, self.centres])
+        stiffness = np.concatenate([plate.stiffness[rows], self.stiffness[rows]], axis=1)
+        damping, own, drives = (np.zeros_like(moved) for _ in range(3))
+        drives[:, :n] = plate.forces[rows] * weights
+        stretched = -moved
+        stretched[:, :n] += plate.strokes[rows] * weights
+        damping[:, :n] = plate.by_damping[rows] * stretched[:, :n]
+        own[:, :n] = plate.by_stiffness[rows] * stretched[:, :n]
+        b = plate.stiffness.shape[1]
+        own[:, b:] = np.float32(plate.load_std) * self.stiffness[rows] * stretched[:, b:]
+        held = np.asarray(drives - stiffness * moved, dtype=np.complex64)
+        by_loss = self.on.by_loss[rows, nodes]
+        lost = np.asarray(by_loss * real_product(held, shapes), dtype=np.complex64)
+        at_points = plate.minus_omega2[rows, None] * real_product(lost, points.T)
+        loss = -stiffness * real_product(lost, shapes.T)
+        return Changes(loss, damping, own, drives, at_points)
+
+    def felt(
+        self,
+        draws: Draws,
+        by_force: Complex64Array,
+        sources: IntArray,
+        changes: Changes,
+        at_nodes: Complex64Array,
+        error: Float32Array,
+        threshold: Float32Array,
+        weights: Float32Array,
+        *,
+        with_powers: bool,
+    ) -> Sensed:
+        """What is felt on drawn plates of m tones, whose changes are those of some thicknesses.
+
+        by_force (s, k p, a): of `sources`, and which is that of each tone and thickness, (m, t);
+        changes (m t, ...): in that order; at_nodes (m, 1 + nodes, k p): accelerations on the plate
+        as modelled, and of the draws' thicknesses; error (m,): root mean square of the
+        discretisation error; threshold (m,) [m/s²]; weights (k, p): in the mean over fingertips.
+        """
+        (m, t), (k, p), d = sources.shape, weights.shape, len(draws.node)
+        parts = [
+            each[:, :, None] * numbers
+            for each, numbers in (
+                (changes.loss, draws.loss),
+                (changes.damping, draws.damping),
+                (changes.own, draws.own),
+                (changes.drives, draws.gains),
+            )
+        ]
+        forces = np.add.reduce(parts).reshape(m, t, -1, t, d // t)
+        by_loss = changes.by_loss.reshape(m, t, -1, 1) * draws.loss.reshape(t, 1, -1)
+        own = np.arange(t)
+        changed = by_force[sources] @ forces[:, own, :, own].swapaxes(0, 1) + by_loss
+        found = at_nodes[:, 1 + draws.node].swapaxes(1, 2)
+        found = found + changed.swapaxes(1, 2).reshape(m, k * p, d)
+        found.reshape(m, k, p, d)[:] += (error[:, None, None] * draws.errors)[:, :, None]
+        every = np.concatenate([at_nodes[:, 0, :, None], found], axis=2)
+        powers = power_of(every) / (threshold**2)[:, None, None]
+        return Sensed(*over_fingertips(powers, weights), powers if with_powers else None)
+
+    def _fingers(
+        self, rows: IntArray, nodes: IntArray
+    ) -> tuple[Complex64Array, Complex64Array, Complex64Array]:
+        """T at the centres (c, k, b), G (c, k, r) and P (c, k, k)."""
+        on, by_force = self.on, self.on.by_force[rows, nodes]
+        at = product(self.centres, by_force)
+        free = on.receptance[rows, nodes][:, None] * self.centres
+        G = np.asarray(free + (at @ on.coupling[rows, nodes]) @ by_force, dtype=np.complex64)
+        system = product(self.centres, G) * self.stiffness[rows, None]
+        k = len(self.centres)
+        system.reshape(len(rows), -1)[:, :: k + 1] += 1
+        return at, G, np.asarray(np.linalg.inv(system))
+
+    def _with_fingers(
+        self,
+        rows: IntArray,
+        free: Complex64Array,
+        at: Complex64Array,
+        G: Complex64Array,
+        P: Complex64Array,
+    ) -> tuple[Complex64Array, Complex64Array]:
+        """Coordinates (c, q, r) with the fingers, of those without; and the field at these.
+
+        at (c, k, q): of those without.
+        """
+        resting = np.asarray(P @ at)
+        held = self.stiffness[rows, :, None] * resting
+        return np.asarray(free - held.swapaxes(1, 2) @ G), resting
+
+
+def product(points: Float32Array, modal: Complex64Array) -> Complex64Array:
+    """Values (c, p, q) at points of shapes (p, r) of reduced coordinates (c, q, r)."""
+    c, q, r = modal.shape
+    parts = np.stack([modal.real, modal.imag], axis=2).reshape(c, 2 * q, r)
+    return np.ascontiguousarray(points @ parts.swapaxes(1, 2)).view(np.complex64)
+
+
+def real_product(values: Complex64Array, matrix: Float32Array) -> Complex64Array:
+    """Values (c, i) times a real matrix (i, j)."""
+    found = np.empty((len(values), matrix.shape[1]), dtype=np.complex64)
+    found.real, found.imag = values.real @ matrix, values.imag @ matrix
+    return found
+
+
+def gram(rows: Complex64Array) -> Complex64Array:
+    """Forms of the sum over rows (..., rows, n): (..., n, n)."""
+    return np.asarray(rows.conj().swapaxes(-1, -2) @ rows)
+
+
+def power_of(values: Complex64Array) -> Float32Array:
+    """Squared magnitude."""
+    return np.asarray(values.real * values.real + values.imag * values.imag)

@@ -1,0 +1,249 @@
+"""Fields at loading fingertips and their sensitivities, by differences of the direct solve."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from model.ensemble.attached_plate import attach
+from model.ensemble.draws import draw
+from model.ensemble.plate_on_eras import MODELLED, PlateOnEras, thickness_nodes
+from model.ensemble.touched_by_kernel import touch
+from model.ensemble.touched_plate import TouchedPlate
+from model.fem.mesh import ELEMENTS, Mesh
+from model.fem.plate import assemble, direct_acceleration
+from model.finger.fingertip import FINGERTIP_RADIUS, FIVE_POINTS
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.uncertainty import Uncertainty
+from model.structure.fingertip import FingertipLoad
+from model.structure.point_load import PointLoad, footprints_of
+from paper_plate import LENGTH, WIDTH
+from paper_table import smooth_rig
+
+PLACES = np.array([[0.09, 0.07], [0.25, 0.18], [0.03, 0.19]])
+FREQUENCIES = np.array([60.0, 145.0, 260.0, 430.0])
+RIG = replace(
+    smooth_rig(),
+    mesh=Mesh(4, 3, LENGTH, WIDTH, ELEMENTS["Q5"]),
+    masses=(PointLoad(0.2, 0.05, mass=0.03),),
+)
+POINTS = PLACES[:, None] + FINGERTIP_RADIUS * FIVE_POINTS.points
+
+
+def solved(uncertainty, loads=()):
+    """The plate with three fingers on it; reduced for them too, so that nothing is left out."""
+    fixed = footprints_of(RIG.eras, RIG.masses)
+    fingers = np.column_stack([PLACES, np.zeros(3)])
+    reduced = reduce_plate(RIG.plate, RIG.mesh, np.vstack([fixed, fingers]), frequency_max=500.0)
+    plate = attach(
+        RIG.plate,
+        reduced.omega,
+        reduced.losses,
+        reduced.at(fixed),
+        eras=RIG.eras,
+        masses=RIG.masses,
+        fingertip=RIG.fingertip,
+        uncertainty=uncertainty,
+        frequencies=FREQUENCIES,
+    )
+    shapes = reduced.at(POINTS.reshape(-1, 2)).astype(np.float32).reshape(3, 5, -1)
+    weights = np.tile(FIVE_POINTS.weights, (3, 1)).astype(np.float32)
+    touched = touch(PlateOnEras.of(plate, 2, 5), shapes[:, 0], loads)
+    error = np.zeros((4, 4), np.float32)
+    return touched, touched.forms(np.arange(4), shapes, weights, error), shapes.reshape(15, -1)
+
+
+def changed(touched, points, weights, *, node=MODELLED):
+    """Accelerations at all frequencies by weights, and their changes by each parameter."""
+    at, nodes = np.arange(4), np.full(4, node)
+    by_force, moved = touched.sources(at, nodes, points)
+    motion = np.einsum("fan,fn->fa", moved, weights)
+    changes = touched.changes(at, nodes, weights, motion, points)
+    return {
+        "nominal": np.matvec(by_force, changes.drives),
+        "loss": np.matvec(by_force, changes.loss) + changes.by_loss,
+        "damping": np.matvec(by_force, changes.damping),
+        "stiffness": by_force[:, :, 1] * changes.own[:, 1, None],
+        "load": by_force[:, :, 6] * changes.own[:, 6, None],  # after four ERAs and a mass
+    }
+
+
+@cache
+def directly(
+    *,
+    thickness=1.0,
+    loss=1.0,
+    damping=1.0,
+    stiffness=(1, 1, 1, 1),
+    load=(1, 1, 1),
+    pressed=(1, 1, 1),
+):
+    """Fields (f, eras, points) of a plate that differs by these factors.
+
+    pressed: on pulp and contact mass of each finger; load: on all of it.
+    """
+    plate = replace(
+        RIG.plate,
+        thickness=thickness * RIG.plate.thickness,
+        loss_factor=loss * RIG.plate.loss_factor,
+    )
+    eras = [
+        replace(era, stiffness=k * era.stiffness, damping=damping * era.damping)
+        for era, k in zip(RIG.eras, stiffness, strict=True)
+    ]
+    fingers = [
+        FingertipLoad(*place, RIG.fingertip.scaled(more).multiplied(factor))
+        for place, more, factor in zip(PLACES, pressed, load, strict=True)
+    ]
+    return direct_acceleration(
+        assemble(plate, RIG.mesh),
+        eras,
+        FREQUENCIES,
+        POINTS.reshape(-1, 2),
+        loads=[*RIG.masses, *fingers],
+    )
+
+
+@pytest.mark.usefixtures("kernels_or_numpy")
+@pytest.mark.parametrize("loads", [(), (0.4, 1.0, 2.5)])
+def test_fields_are_those_of_the_direct_solve(loads):
+    """At every finger's points, with an ERA's drive and a mass on the plate: to 1e-4.
+
+    Whether all fingers press alike or not.
+    """
+    _, contacts, _ = solved(Uncertainty(), loads)
+    found = contacts.fields.transpose(0, 3, 1, 2).reshape(4, 4, 15)
+    exact = directly(pressed=loads or (1, 1, 1))
+    error = np.abs(found - exact).max(axis=(1, 2)) / np.abs(exact).max(axis=(1, 2))
+    assert error.max() < 2e-4
+
+
+NO_ERROR = np.zeros(4, np.float32)
+WEIGHTS = np.array([0.6, -0.3 + 0.5j, 1.0, 0.2j], dtype=np.complex64)
+
+CHANGES = {
+    "loss": lambda d: {"loss": math.exp(d)},
+    "damping": lambda d: {"damping": math.exp(d)},
+    "stiffness": lambda d: {"stiffness": (1, 1 + d, 1, 1)},
+    "load": lambda d: {"load": (1, 1 + d, 1)},
+}
+
+
+def test_sensitivity_to_the_load_of_a_finger_that_presses_harder():
+    """Of a finger pressed 2.5 times as much between others, by a difference of the direct solve."""
+    pressed = (0.4, 2.5, 1.0)
+    touched, _, points = solved(Uncertainty(0, 0, 1.0, 1.0, math.e, 1.0), pressed)
+    found = changed(touched, points, np.ones((4, 4), dtype=np.complex64))["load"]
+    more, less = (directly(pressed=pressed, load=(1, 1 + d, 1)) for d in (1e-3, -1e-3))
+    exact = ((more - less) / 2e-3).sum(axis=1)
+    error = np.abs(found - exact).max(axis=1) / np.abs(exact).max(axis=1)
+    assert error.max() < 0.01
+
+
+@pytest.mark.usefixtures("kernels_or_numpy")
+def test_thickness_is_exact_at_its_nodes():
+    """The direct solve of plates so much thicker, far from what is in proportion."""
+    touched, _, points = solved(Uncertainty(thickness=0.02))
+    weights, nodes, first = np.tile(WEIGHTS, (4, 1)), thickness_nodes(5), touched.on.first[5]
+    at = np.arange(4)
+    found = [touched.fields(at, np.full(4, first + node), weights, points) for node in range(5)]
+    for node in (0, 1, 4):
+        exact = np.einsum("e,fep->fp", WEIGHTS, directly(thickness=1 + 0.02 * float(nodes[node])))
+        error = np.abs(found[node] - exact).max(axis=1) / np.abs(exact).max(axis=1)
+        assert error.max() < 5e-3
+    nominal = touched.fields(at, np.full(4, MODELLED), weights, points)
+    size = float(np.abs(nominal).max())
+    assert found[2] == pytest.approx(nominal, rel=1e-3, abs=1e-4 * size)
+    assert np.abs(found[0] + found[4] - 2 * nominal).max() > 0.1 * size
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_sensitivities_of_a_thicker_plate_are_differences_of_the_direct_solve(what):
+    """Of a plate 3 % thicker, by central differences: within 1 % of the largest change."""
+    touched, _, points = solved(Uncertainty(0, 0, 0.02, 1.0, math.e, 1.0))
+    node = touched.on.first[5] + 4
+    found = changed(touched, points, np.tile(WEIGHTS, (4, 1)), node=node)[what]
+    thickness = 1 + 0.02 * float(thickness_nodes(5)[4])
+    more, less = (directly(thickness=thickness, **CHANGES[what](d)) for d in (1e-3, -1e-3))
+    exact = np.einsum("e,fep->fp", WEIGHTS, (more - less) / 2e-3)
+    error = np.abs(found - exact).max(axis=1) / np.abs(exact).max(axis=1)
+    assert error.max() < 0.01
+
+
+@pytest.mark.parametrize("count", [2, 5, 10])
+def test_thickness_nodes_are_those_of_a_normal_deviation(count):
+    """Mean 0, variance 1; with many, nine of ten are below 1.28."""
+    nodes = thickness_nodes(count)
+    assert (nodes.mean(), nodes.var()) == pytest.approx((0, 1))
+    assert (np.diff(nodes) > 0).all()
+    assert np.quantile(thickness_nodes(1000), 0.9) == pytest.approx(1.2816, abs=0.01)
+
+
+def test_responses_add_up_from_the_parts_of_each_era():
+    """The response to a drive is the sum of the parts that the gains multiply."""
+    touched, _, points = solved(Uncertainty())
+    weights = np.tile(np.array([1, 2j, -1, 0.5], dtype=np.complex64), (4, 1))
+    found = touched.fields(np.arange(4), np.full(4, MODELLED), weights, points)
+    parts = changed(touched, points, weights)["nominal"]
+    np.testing.assert_allclose(parts, found, rtol=1e-3, atol=1e-2)
+
+
+def felt_of(touched, points, weights, **drawn):
+    """What drawn plates feel of a tone of weights (4, n) at each frequency, at all points."""
+    at, nodes, first = np.arange(4), np.full(4, MODELLED), touched.on.first[drawn["thicknesses"]]
+    by_force, moved = touched.sources(at, nodes, points)
+    of_nodes = [MODELLED, *range(first, first + drawn["thicknesses"])]
+    at_nodes = [touched.fields(at, np.full(4, node), weights, points) for node in of_nodes]
+    plate = touched.on.plate
+    return touched.felt(
+        draw(4, 3, masses=1, gain=plate.gain, phase=plate.phase, **drawn),
+        by_force,
+        at[:, None],
+        touched.changes(at, nodes, weights, np.einsum("fan,fn->fa", moved, weights), points),
+        np.stack(at_nodes, axis=1),
+        np.array([0.0, 0.02, 0.1, 0.0], dtype=np.float32) if drawn["count"] < 100 else NO_ERROR,
+        np.ones(4, dtype=np.float32),
+        np.tile(FIVE_POINTS.weights, (3, 1)).astype(np.float32),
+        with_powers=True,
+    )
+
+
+@pytest.mark.usefixtures("kernels_or_numpy")
+def test_expected_power_is_the_mean_square_of_the_draws():
+    """w^H R w of random weights equals the mean over 4000 drawn plates but for the loss factor.
+
+    Of two thicknesses that deviate so little that they count in proportion.
+    """
+    touched, contacts, points = solved(replace(Uncertainty(), thickness=0.002, damping=1.0))
+    rng = np.random.default_rng(0)
+    weights = (rng.normal(size=(4, 4)) + 1j * rng.normal(size=(4, 4))).astype(np.complex64)
+    powers = felt_of(touched, points, weights, count=4000, seed=5, thicknesses=2).powers
+    powers = powers[:, :, 1:].mean(axis=2).reshape(4, 3, 5)
+    found = np.einsum("fi,fqij,fj->fq", weights.conj(), contacts.power, weights).real
+    np.testing.assert_allclose(found, powers @ FIVE_POINTS.weights, rtol=0.05)
+
+
+@pytest.mark.usefixtures("kernels_or_numpy")
+def test_every_stage_is_that_of_numpy():
+    """Fields, forms and what drawn plates feel, in single precision: to 1e-4 of the largest."""
+    touched, _, points = solved(Uncertainty(), (0.4, 1.0, 2.5))
+    by_numpy = TouchedPlate(touched.on, touched.centres, touched.stiffness)
+    weights = np.tile(WEIGHTS, (4, 1))
+    few, shares = points.reshape(3, 5, -1), np.tile(FIVE_POINTS.weights, (3, 1))
+    error = np.full((4, 4), 0.01, np.float32)
+    forms = [
+        each.forms(np.array([2, 0, 3]), few, shares.astype(np.float32), error, few[:, 1:3])
+        for each in (touched, by_numpy)
+    ]
+    felt = [
+        felt_of(each, points, weights, count=45, seed=1, thicknesses=5)
+        for each in (touched, by_numpy)
+    ]
+    for one, other in (forms, felt):
+        for name, exact in vars(other).items():
+            np.testing.assert_allclose(
+                getattr(one, name), exact, rtol=1e-4, atol=1e-4 * float(np.abs(exact).max())
+            )
+    assert felt[0].means.std(axis=2).min() > 0

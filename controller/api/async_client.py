@@ -44,7 +44,6 @@ from drivers.pauses import pauses
 MAX_QUEUED_EVENTS = 1000  # not yet taken; the oldest is dropped
 _MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.05, 0.5  # s
 _REPEATED_FOR = 0.3  # s; requests whose connection is lost, as by a daemon with many clients
-_MIN_PAUSE, _MAX_PAUSE = 0.001, 0.02  # s
 _RENEWAL_INTERVAL = 0.25  # s; within it a lost lease is noticed, however long it was
 
 _T = TypeVar("_T")
@@ -239,7 +238,13 @@ class AsyncClient:
                 while not self._events and not self._is_closed:
                     self._changed.clear()
                     if self._channel is None or self._channel.lost is not None:
-                        await self._within_timeout(self._reconnected())
+                        await self._within_timeout(
+                            self._repeated(
+                                self._connected,
+                                after=(RpcError, Unreachable),
+                                duration=0.9 * self._timeout,
+                            )
+                        )
                     else:
                         await self._changed.wait()
         return self._events.popleft() if self._events else None
@@ -266,15 +271,21 @@ class AsyncClient:
             return await channel.request(method, params)
         return await self._repeated(attempt)
 
-    async def _repeated(self, attempt: Callable[[], Awaitable[_T]]) -> _T:
-        """The result of an attempt, which is repeated for a while if the connection is lost."""
+    async def _repeated(
+        self,
+        attempt: Callable[[], Awaitable[_T]],
+        *,
+        after: type[Exception] | tuple[type[Exception], ...] = ConnectionLost,
+        duration: float = _REPEATED_FOR,
+    ) -> _T:
+        """The result of an attempt, which is repeated after some errors for a while [s]."""
         loop = asyncio.get_running_loop()
-        end = loop.time() + _REPEATED_FOR
-        following = pauses(first=_MIN_PAUSE, maximum=_MAX_PAUSE)
+        end = loop.time() + duration
+        following = pauses(first=duration / 100, maximum=duration / 10)
         while True:
             try:
                 return await attempt()
-            except ConnectionLost:
+            except after:
                 pause = next(following)
                 if self._is_closed or loop.time() + pause >= end:
                     raise
@@ -306,19 +317,6 @@ class AsyncClient:
                     raise
                 self._channel = channel
             return self._channel
-
-    async def _reconnected(self) -> None:
-        """Connect again, trying until cancelled at the timeout; raises the last error."""
-        end = asyncio.get_running_loop().time() + 0.9 * self._timeout
-        for pause in pauses(first=_MIN_RETRY_INTERVAL, maximum=_MAX_RETRY_INTERVAL):
-            try:
-                await self._connected()
-            except (RpcError, Unreachable):
-                if self._is_closed or asyncio.get_running_loop().time() + pause >= end:
-                    raise
-                await asyncio.sleep(pause)
-            else:
-                return
 
     def _received(self, event: Notification) -> None:
         self._events.append(event)

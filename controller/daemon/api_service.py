@@ -36,7 +36,6 @@ from controller.daemon.config import DaemonConfig
 from controller.daemon.lease import LeaseHolder
 from controller.daemon.publisher import EventPublisher
 from controller.daemon.states import (
-    ACKNOWLEDGE,
     ENERGISED,
     DaemonEvent,
     DaemonState,
@@ -48,7 +47,6 @@ from controller.daemon.touch_inputs import ApiTouches
 from controller.learning.learning import Learning
 from controller.loop.loop import Controller
 from drivers import clock
-from drivers.errors import DriverError
 from model.table.table import LocalizationTable
 
 _LEASE_RECHECK = 0.25  # s
@@ -154,7 +152,9 @@ class ApiService:
     async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
         is_over = self._lease.current(clock.now()) is None
         if self._supervisor.machine.state is _ENABLED and is_over:
-            await self._handle(_LEASE_OVER)  # before its timer: what plays is not inherited
+            await self._supervisor.handle(
+                _LEASE_OVER
+            )  # before its timer: what plays is not inherited
         machine, now = self._supervisor.machine, clock.now()
         if machine.state not in (DaemonState.READY_TO_SWITCH_ON, *ENERGISED):
             raise _wrong_state(machine)
@@ -163,7 +163,7 @@ class ApiService:
         duration = min(params.lease_s, self.longest_lease)
         lease = self._lease.grant(params.owner, duration=duration, now=now)
         try:
-            await self._handle(
+            await self._supervisor.handle(
                 DaemonEvent(Trigger.ARM, f"armed by {params.owner!a}", "era disarm, or era stop")
             )
             if self._supervisor.machine.state is not _ENABLED:
@@ -191,7 +191,7 @@ class ApiService:
             self._lease.check(params.lease, now=clock.now())
         if machine.state in ENERGISED:
             cause = f"disarmed by {params.client or client.name!a}"
-            await self._handle(DaemonEvent(Trigger.DISARM, cause))
+            await self._supervisor.handle(DaemonEvent(Trigger.DISARM, cause))
             machine = self._supervisor.machine
         if machine.state is not DaemonState.READY_TO_SWITCH_ON:  # disarmed and read back
             raise _wrong_state(machine)
@@ -215,7 +215,7 @@ class ApiService:
         if machine.state is DaemonState.COMM_LOST:
             raise _wrong_state(machine, ErrorCode.LINK)
         if machine.state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT):
-            await self._handle(
+            await self._supervisor.handle(
                 DaemonEvent(Trigger.CLEAR, f"acknowledged by {params.client or client.name!a}")
             )
             machine = self._supervisor.machine
@@ -233,16 +233,6 @@ class ApiService:
         await self._learning.forget()
         _logger.info("plate: forgotten by %a", params.client or client.name)
         return Empty()
-
-    async def _handle(self, event: DaemonEvent) -> None:
-        """Let the supervisor handle an event; an unexpected exception stops all amplifiers."""
-        try:
-            await self._supervisor.handle(event)
-        except (DriverError, asyncio.CancelledError):
-            raise
-        except Exception:
-            await self._supervisor.stop("a request failed", ACKNOWLEDGE)
-            raise
 
     def _touch(self, client: Connection, params: TouchParams) -> Empty:
         if client not in self._client_numbers:

@@ -1,15 +1,14 @@
 """What an amplifier must show after what it was sent: states, latches, tokens, levels, watchdog.
 
-What a channel plays is asked of `drivers.playback`. When a request was carried out is known as an
-interval, so there are a few playbacks, whose sets were committed sooner or later within theirs.
+What a channel plays is asked of `drivers.uncertain_playback`, since when a request was carried
+out is known as an interval.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 
 from drivers.conformance.client import When
-from drivers.conformance.findings import expect, expect_equal, expect_one_of, expect_within
-from drivers.playback import Playback, playback_of
+from drivers.conformance.findings import Late, expect, expect_equal, expect_one_of, expect_within
+from drivers.playback import playback_of
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import (
@@ -21,7 +20,7 @@ from drivers.protocol.table import (
     STATUS_FLAGS,
 )
 from drivers.protocol.tokens import token_after
-from drivers.transition import Transition
+from drivers.uncertain_playback import UncertainPlayback
 
 SLACK = 0.002  # s; of times in milliseconds
 DRIFT = 1e-3  # of a time; of the amplifier's clock
@@ -32,11 +31,8 @@ _FALLING = {"SWITCHED_ON": ("SWITCHED_ON", OFF), "FAULT": ("FAULT_REACTION_ACTIV
 _TRIP, FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until a trip, of a fault, until a state shows
 _LASTING = 3.0  # s; what ends after it is not awaited
 _LATE = 0.002  # s; by which a set may begin later
-_SHARES = ((0, 0), (0, 1), (1, 0), (0.5, 0.5))
-"""Of the interval of a commit, for the sets of even and odd number of each playback."""
-_POINTS, _POINT = 600, 2e-5  # at which an interval is looked at; s apart
-_PER_TURN, _PER_FADE = 1000, 100  # points of a step that may pass 0, of a rise or fade
 _TOLERANCE = 0.002  # of full level
+_MAX_STEPS = 4  # halves, beside one of each voice
 _FULL = QUANTITIES["level"].per_unit
 
 
@@ -56,11 +52,10 @@ class Expected:
         self.watchdog = 0.0
         self.fed = self.began = self.silent = self._first = when
         self.cause = "rest"
-        self.tolerance = max(2 * can["level_step"] / _FULL, _TOLERANCE)
+        self._half_step = can["level_step"] / 2 / _FULL
         self._has_floor = True  # or levels may be lower: of a fault, whose fade may be shorter
-        self._playbacks = [playback_of(can) for _ in _SHARES]
-        self._moments = [when.earliest] * len(_SHARES)
-        self._count = self._incoming = 0
+        self._plays = UncertainPlayback(playback_of(can))
+        self._incoming = 0
         self._received: set[int] = set()
 
     # What it was sent
@@ -115,27 +110,30 @@ class Expected:
         self.token, self.cause = token, f"set {token} of layers {[one.layer for one in layers]}"
         self._incoming = 0
         self._has_floor = True
-        self._start(when)
-        for playback, moment in zip(self._playbacks, self._moments, strict=True):
-            playback.commit(layers, token, moment)
+        self.began = when
+        begins = self._begins_in(when, layers)
+        self._plays.commit(layers, token, begins)
 
     def _fall_silent(self, state: str, when: When, ramp: float, *, has_floor: bool = True) -> None:
         self.state, self._has_floor = state, has_floor
         self._incoming = 0
-        self._start(when)
-        ends = []
-        for playback, moment in zip(self._playbacks, self._moments, strict=True):
-            playback.silence(moment, ramp)
-            ends.append(max(playback.ends_by, moment))
-        self.silent = When(min(ends) if has_floor else when.earliest, max(ends))
+        self.began = when
+        begins = self._begins_in(when, None, ramp)
+        self._plays.silence(begins, ramp)
+        first, last = (
+            max(self._plays.playback.ends_by + late, begin)
+            for late, begin in zip((-self._plays.lag, self._plays.lag), begins, strict=True)
+        )
+        self.silent = When(first if has_floor else when.earliest, last)
 
-    def _start(self, when: When) -> None:
-        """Let something begin within an interval, in each playback at a moment of its own."""
-        self.began, self._count = when, self._count + 1
-        width = when.latest + _LATE - when.earliest
-        shares = [both[self._count % 2] for both in _SHARES]
-        moments = [when.earliest + share * width for share in shares]
-        self._moments = [max(pair) for pair in zip(moments, self._moments, strict=True)]
+    def _begins_in(
+        self, when: When, layers: Sequence[LayerSet] | None, ramp: float = 0.0
+    ) -> tuple[float, float]:
+        """Return between which times begins what comes within an interval; raises Late."""
+        begins = when.earliest, when.latest + _LATE
+        if self._plays.is_ambiguous(begins, layers, ramp):
+            raise Late("a request came as a layer ended by itself, or its onset")
+        return begins
 
     # What it must show
 
@@ -195,78 +193,36 @@ class Expected:
         where = f"{after[0]:.1f} to {after[1]:.1f} ms after {self.cause}"
         for channel, (low, high) in enumerate(bounds):
             level, low = shown["levels"][channel] / _FULL, low * self._has_floor
-            slack, what = self.tolerance, f"level of channel {channel}, {where}"
-            expect_within(level, low - slack, high + slack, what)
+            voices = len(self._plays.playback.voices_of(channel))
+            slack = max((_MAX_STEPS + voices) * self._half_step, _TOLERANCE)
+            expect_within(level, low - slack, high + slack, f"level of channel {channel}, {where}")
         for number, known in enumerate(tokens):
             expect_one_of(shown["tokens"][number], known, f"token of layer {number}, {where}")
 
     def _played(self, when: When) -> tuple[list[tuple[float, float]], list[set[int]]]:
         """Return least and largest level of each channel, and possible tokens of each layer."""
-        levels: list[list[float]] = [[] for _ in range(self.can["channels"])]
-        tokens: list[set[int]] = [set() for _ in range(self.can["layers"])]
-        for original, moment in zip(self._playbacks, self._moments, strict=True):
-            playback = original.copied()
-            passed = when.latest - self.began.earliest
-            first = moment + when.earliest - self.began.latest - _LATE - DRIFT * passed
-            last = moment + passed * (1 + DRIFT)
-            moments = _moments_of(playback, max(first, moment), last)
-            for time in moments:
-                playback.advance(time)
-                for channel, seen in enumerate(levels):
-                    if playback.voices_of(channel):
-                        seen += _levels(playback, channel, time, is_exact=self.is_exact)
-                    else:
-                        seen.append(0.0)
-                if time in (moments[0], moments[-1]):
-                    playing = playback.tokens
-                    for number, known in enumerate(tokens):
-                        known.add(playing.get(number, 0))
-        return [(min(1.0, *each), min(1.0, max(each))) for each in levels], tokens
+        drift = DRIFT * (when.latest - self.began.earliest)
+        begin, end = when.earliest - drift, when.latest + drift
+        states = [*self._plays.possible(begin, end)]
+        bounds = []
+        for channel in range(self.can["channels"]):
+            each = [one.bounds(channel, begin, end, is_exact=self.is_exact) for one in states]
+            low, high = min(low for low, _ in each), max(high for _, high in each)
+            bounds.append((min(low, 1.0), min(high, 1.0)))
+        after = states[-1].copied()
+        after.advance(end + 2 * after.lag)
+        tokens = [one.playback.tokens for one in (*states, after)]
+        layers = range(self.can["layers"])
+        return bounds, [{each.get(number, 0) for each in tokens} for number in layers]
 
     def settled_at(self, now: float) -> float:
         """Return when all that plays lasts for long or is silent [s], as far as is known."""
-        playback, last = self._playbacks[0].copied(), now + _LASTING
+        playback, last = self._plays.playback.copied(), now + _LASTING
         while (due := playback.next_due) < last:
             playback.advance(due)
             now = due
         ends = [voice.transition.end for voices in playback.all_voices for voice in voices]
         return max([now, *ends])
-
-
-def _moments_of(playback: Playback, first: float, last: float) -> Sequence[float]:
-    """Return moments at which an interval is looked at: one where nothing changes."""
-    if playback.is_settled(first) and playback.next_due > last:
-        return (first,)
-    apart = [
-        each.transition.step / (_PER_TURN if _may_turn(each.transition) else _PER_FADE)
-        for voices in playback.all_voices
-        for each in voices
-        if each.transition.end > first
-    ]
-    width = max(min(apart, default=math.inf), _POINT)
-    count = min(math.ceil((last - first) / width) + 3, _POINTS)
-    return [first + (last - first) * at / (count - 1) for at in range(count)]
-
-
-def _may_turn(transition: Transition) -> bool:
-    """Whether its amplitude may be least on its way, not at an end."""
-    return bool(transition.knots or (transition.first and transition.last))
-
-
-def _levels(
-    playback: Playback, channel: int, time: float, *, is_exact: bool
-) -> tuple[float, float]:
-    """Return the least and largest level that a channel may show."""
-    voices = playback.voices_of(channel)
-    parts = [abs(voice.transition.at(time)) for voice in voices]
-    highest = sum(parts)
-    if is_exact:
-        return (playback.level(channel, time),) * 2
-    if len({voice.frequency for voice in voices}) == len(voices):
-        return highest, highest
-    if len({voice.origin for voice in voices}) == 1:
-        return playback.level(channel, time), highest
-    return max(2 * max(parts) - highest, 0.0), highest
 
 
 def flag(status: Mapping[str, int], name: str) -> bool:

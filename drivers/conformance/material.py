@@ -93,11 +93,13 @@ class Material:
     def near(self, number: int) -> int:
         """Return one of many frequencies, all alike where there is no room."""
         room = max(self.highest - self.frequency, 0)
-        return int(self.frequency + min(10 * number, room))
+        return int(self.frequency + min(max(10, self.can["frequency_step"]) * number, room))
 
     def apart(self, number: int) -> int:
         """Return a frequency of a layer of its own, so that layers do not interfere."""
-        return int(min(self.frequency + 40 * number, self.highest - len(self.layers) + number))
+        step = self.can["frequency_step"]
+        above = self.frequency + max(40, step) * number
+        return int(min(above, self.highest - (len(self.layers) - number) * step))
 
 
 def layer(

@@ -5,8 +5,9 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 
+from drivers import trace
 from drivers.conformance.can_client import CanClient
-from drivers.conformance.client import Client
+from drivers.conformance.client import Client, Port
 from drivers.conformance.modbus_client import ModbusClient
 from drivers.conformance.serial_client import SerialClient
 from drivers.errors import LinkError
@@ -22,6 +23,18 @@ CLIENTS: Mapping[str, Callable[[int], Client]] = {
 """Clients by the protocol that a wire's settings name."""
 
 
+class _TracedPort:
+    """A port whose bytes are traced under a name."""
+
+    def __init__(self, port: Port, name: str) -> None:
+        self._port, self._name = port, name
+
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+        trace.frame(trace.Direction.OUT, data, self._name, str)
+        self._port.write(data)
+
+
 @asynccontextmanager
 async def opened(url: str) -> AsyncIterator[Client]:
     """The client of an amplifier by its URL while its line is open.
@@ -33,7 +46,13 @@ async def opened(url: str) -> AsyncIterator[Client]:
     if protocol not in CLIENTS:
         raise LinkError(f"{url}: wire must be {', '.join(CLIENTS)}, got {protocol}")
     client = CLIENTS[protocol](address.number)
-    port = client.port = await address.open_port(client.received, client.lost)
+
+    def received(data: bytes) -> None:
+        trace.frame(trace.Direction.IN, data, url, str)
+        client.received(data)
+
+    port = await address.open_port(received, client.lost)
+    client.port = _TracedPort(port, url)
     try:
         client.session = random.getrandbits(16)
         client.transit = address.make_wire().exchange_time(0, MAX_WORDS)

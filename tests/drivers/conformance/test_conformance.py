@@ -5,6 +5,8 @@ import math
 import os
 import pty
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +23,9 @@ from drivers.conformance.material import layer
 from drivers.conformance.report import Check, CheckResult, Report
 from drivers.conformance.subject import Subject
 from drivers.errors import LinkError
+from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
+from drivers.trace import tracing
 from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
 from model.rig.rig import Rig
 from sim.amplifier.contract import Amplifier, capabilities
@@ -79,6 +83,31 @@ async def test_sensors_on_a_plate_pass(coarse_rig: Rig) -> None:
     results = await results_of("serial", far, ["sensors", "readings"])
     running.cancel()
     expect_passed(results, set())
+
+
+class _Coarse(Amplifier):
+    """An amplifier that keeps its own steps of frequency and level, and says so."""
+
+    def _play(self, layers: Sequence[LayerSet], token: int, now: float) -> None:
+        steps = {name: self.capabilities[f"{name}_step"] for name in ("frequency", "level")}
+
+        def rounded(tone: Command) -> Command:
+            own = {name: step * round(getattr(tone, name) / step) for name, step in steps.items()}
+            return replace(tone, **own)
+
+        played = [replace(one, commands=tuple(map(rounded, one.commands))) for one in layers]
+        super()._play(played, token, now)
+
+    def _take(self, part: Values, now: float) -> Values:
+        return {**super()._take(part, now), "exact": 0}
+
+
+@pytest.mark.parametrize("steps", [{"frequency_step": 20, "level_step": 5}, {"level_step": 40}])
+def test_amplifier_that_keeps_its_own_steps_passes(steps: dict[str, int]) -> None:
+    """Those that it states: 1 Hz, thousandths or even 0.4 % of full level."""
+    far = _Coarse("coarse", channels=2)
+    far.capabilities.update(steps)
+    expect_passed(judged("serial", far=far), SKIPPED["serial"] - {"steps_as_stated"})
 
 
 class _PlaysOn(Amplifier):
@@ -143,14 +172,17 @@ async def test_machine_that_is_always_late_has_no_verdict() -> None:
     line.close()
 
 
-async def test_verdict_over_a_real_port() -> None:
-    """Those that only read, then all others continue the report; its keys are a contract."""
+async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
+    """Those that only read; the keys of the report are a contract, and all frames are traced."""
     far, near = pty.openpty()
     loop = asyncio.get_running_loop()
     end = SerialAmplifiers({1: plain()}, lambda data: _written(far, data))
     loop.add_reader(far, lambda: end.receive(os.read(far, 4096), clock.now()))
     url = f"serial://{os.ttyname(near)}"
-    report = await judge(url, drives=False)
+    with tracing(tmp_path / "trace"):
+        report = await judge(url, drives=False)
+    lines = (tmp_path / "trace").read_text().splitlines()
+    assert {">", "<"} <= {word for line in lines for word in line.split()}
     loop.remove_reader(far)
     os.close(far)
     os.close(near)

@@ -369,6 +369,22 @@ async def test_late_replies_are_credited_to_nothing(
     assert ends[0].line.wire.counters.unexpected_frames == 1
 
 
+@grouped(("a",))
+async def test_late_reply_is_not_that_of_the_next_request(
+    group: Group, ends: list[MemoryLine], wire: str
+) -> None:
+    """A reply after 70 ms comes while another request waits, whose own comes after 20 ms."""
+    (host,) = group.amplifiers.values()
+    delays = iter([0.07, 0.0002, 0.02])
+    ends[0].outward = lambda name, data: [(next(delays, 0.0002), data)]
+    await host.ping()
+    await asyncio.sleep(0.03)
+    began = asyncio.get_running_loop().time()
+    await host.ping()
+    assert asyncio.get_running_loop().time() - began >= 0.02
+    assert ends[0].line.wire.counters.unexpected_frames == 1
+
+
 @pytest.mark.parametrize("alone", ["b", "abcd"])
 @grouped(tuple("abcde"), wire="serial")
 async def test_stop_reaches_those_beside_a_mute_amplifier(

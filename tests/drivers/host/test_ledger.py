@@ -226,6 +226,16 @@ def test_on_time_and_duty_shorten_what_is_admitted() -> None:
     assert silent.ramp <= 100
 
 
+def test_duty_counts_vibrations_that_have_ended() -> None:
+    """2 s of 10 s: after one of 0.5 s and its ramp there are 1.46 s left and a ramp of 20 ms."""
+    ledger = Ledger(replace(WIDE, duty=0.2), CAN)
+    play(ledger, 1, 0.0, Layer(0, (tone(),), valid_for=0.5))
+    (one,) = ledger.admit([Layer(0, (tone(),))], 2.0)
+    assert (
+        1460 - 100 <= one.valid_for <= 1460
+    )  # 0.1 s: the first may have been played so much later
+
+
 def test_rate_is_limited_with_the_time_from_which_it_is_allowed() -> None:
     """Three sets a second; silence is never refused."""
     ledger = Ledger(replace(WIDE, rate=3.0), CAN)

@@ -1,0 +1,208 @@
+"""What channels may play by sets whose commits are known only as intervals.
+
+The playback has each commit in the middle of its interval. Beside every transition stands by how
+much sooner or later it may have begun, and a radius by which its first amplitude may differ. Times
+[s] are of any one clock; intervals are two times.
+"""
+
+import cmath
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, TypeAlias
+
+from drivers.playback import Playback
+from drivers.protocol.sets import LayerSet
+from drivers.protocol.table import QUANTITIES
+from drivers.transition import Transition
+from drivers.voices import Voice
+
+Interval: TypeAlias = tuple[float, float]
+_LAYERS = QUANTITIES["layer_count"].maximum
+
+
+class _Mark(NamedTuple):
+    """Half the time within which a transition began [s], and the radius of its first amplitude."""
+
+    way: Transition
+    half: float = 0.0
+    radius: float = 0.0
+
+
+class UncertainPlayback:
+    """Bounds of what channels play; playback: with every commit in the middle of its interval.
+
+    half: by how much what a layer plays may end or start sooner or later by itself.
+    """
+
+    def __init__(self, playback: Playback) -> None:
+        self.playback = playback
+        self.half = [0.0] * _LAYERS
+        self._marks: dict[int, _Mark] = {}
+        self._ghosts: list[tuple[int, _Mark]] = []  # by channel: voices that may still fade
+        self._origins: dict[float, float] = {}  # half the interval of the origins of phases
+
+    def copied(self) -> "UncertainPlayback":
+        """Return it as it is, to look ahead while the original stays."""
+        copied = UncertainPlayback(self.playback.copied())
+        copied.half, copied._ghosts = [*self.half], self._ghosts
+        copied._marks, copied._origins = self._marks, {**self._origins}
+        return copied
+
+    @property
+    def lag(self) -> float:
+        """Longest time by which a transition under way may be earlier or later [s]."""
+        return max(*self.half, *(mark.half for mark in self._marks.values()), 0.0)
+
+    def is_ambiguous(
+        self, when: Interval, layers: Sequence[LayerSet] | None = None, ramp: float = 0.0
+    ) -> bool:
+        """Whether something else may happen by itself just as what is to happen.
+
+        layers: of a set; None: all fall silent along a ramp [s].
+        """
+        waiting = {one.layer for one in self.playback.waiting}
+        changed = dict.fromkeys(range(_LAYERS), False)
+        if layers is not None:
+            changed = {one.layer: one.after for one in layers}
+        ends = [(self.playback.end_of(layer), self.half[layer]) for layer in changed]
+        for voice in (voice for voices in self.playback.all_voices for voice in voices):
+            way, half = voice.transition, self._mark_of(voice.transition).half
+            is_followed = voice.layer in waiting or changed.get(voice.layer, False)
+            is_due = not way.last or (is_followed and bool(way.knots))
+            if layers is None and ramp and not way.last and way.step:  # or it ends sooner
+                ends.append((way.end - ramp, half))
+            if not voice.has_ended and voice.layer in changed and is_due:
+                ends.append((way.end, half))
+        return any(when[0] - half <= end <= when[1] + half for end, half in ends)
+
+    def commit(self, layers: Sequence[LayerSet], token: int, when: Interval) -> None:
+        """Play a set from some time between two on."""
+        half = (when[1] - when[0]) / 2
+        self.advance(when[0])
+        self._pass_until(when[0] + half)
+        for one in layers:
+            self.half[one.layer] = max(half, self.half[one.layer] if one.after else 0.0)
+        before = [*self.playback.all_voices]
+        self.playback.commit(layers, token, when[0] + half)
+        self._mark(before, when)
+
+    def silence(self, when: Interval, ramp: float) -> None:
+        """Fade all layers along a ramp [s], from some time between two on."""
+        middle = (when[0] + when[1]) / 2
+        self.advance(when[0])
+        self._pass_until(middle)
+        before = [*self.playback.all_voices]
+        self.playback.silence(middle, ramp)
+        self._mark(before, when)
+
+    def advance(self, time: float) -> None:
+        """End layers and start what waits, where that must have happened by a time."""
+        certain = time - self.lag
+        self._pass_until(certain)
+        self.playback.advance(certain)
+
+    def _pass_until(self, time: float) -> None:
+        while (due := self.playback.next_due) <= time:
+            self._pass(due)
+
+    def _pass(self, due: float) -> None:
+        """Carry out what is due at a time."""
+        half, before = max(self.half), [*self.playback.all_voices]
+        self.playback.advance(due)
+        self._mark(before, (due - half, due + half))
+
+    def possible(self, begin: float, end: float) -> Iterator["UncertainPlayback"]:
+        """Yield what may play between two times: before and after what may be due then."""
+        self.advance(begin)
+        state = self
+        yield state
+        while (due := state.playback.next_due) <= end + state.lag:
+            state = state.copied()
+            state._pass(due)
+            yield state
+
+    def _mark(self, before: Sequence[Sequence[Voice]], when: Interval) -> None:
+        """Note the radius of every transition that is new."""
+        half, marks = (when[1] - when[0]) / 2, dict[int, _Mark]()
+        ghosts = [each for each in self._ghosts if each[1].way.end + each[1].half > when[0]]
+        for channel, were in enumerate(before):
+            left = {(each.layer, each.frequency, each.origin): each.transition for each in were}
+            known = dict(left)
+            for voice in self.playback.voices_of(channel):
+                name, way = (voice.layer, voice.frequency, voice.origin), voice.transition
+                left.pop(name, None)
+                self._origins.setdefault(voice.origin, half)
+                radius = self.radius(known[name], *when) if name in known else 0.0
+                marks[id(way)] = self._marks.get(id(way)) or _Mark(way, half, radius)
+            gone = [self._mark_of(way) for way in left.values()]
+            ghosts += [(channel, each) for each in gone if each.way.end + each.half > when[0]]
+        self._marks, self._ghosts = marks, ghosts
+        origins = {voice.origin for voices in self.playback.all_voices for voice in voices}
+        self._origins = {each: self._origins[each] for each in origins}
+
+    def _mark_of(self, way: Transition) -> _Mark:
+        return self._marks.get(id(way)) or _Mark(way)
+
+    def radius(self, way: Transition, begin: float, end: float) -> float:
+        """Return by how much an amplitude may differ from that in the middle of an interval."""
+        _, half, radius = self._mark_of(way)
+        center = way.at((begin + end) / 2)
+        since, until = begin - half, end + half
+        moments = (way.start + way.step * (index + 1) for index in range(len(way.knots)))
+        between = [knot for at, knot in zip(moments, way.knots, strict=True) if since < at < until]
+        reach = max(abs(each - center) for each in (way.at(since), *between, way.at(until)))
+        if not radius:
+            return reach
+        # The first amplitude counts the less the farther its transition has led.
+        left = Transition(way.start, way.step, radius, 0, way.end, (0j,) * len(way.knots))
+        return reach + abs(left.at(since))
+
+    def bounds(self, channel: int, begin: float, end: float, *, is_exact: bool = False) -> Interval:
+        """Return the least and the largest level of a channel between two times.
+
+        Nothing may be due between them; see `possible`. is_exact: tones of one frequency interfere;
+        else they may add up as if they did not.
+        """
+        least = most = 0.0
+        groups: dict[float, dict[float, list[Voice]]] = {}
+        for voice in self.playback.voices_of(channel):
+            groups.setdefault(voice.frequency, {}).setdefault(voice.origin, []).append(voice)
+        for frequency, by_origin in groups.items():
+            low, high = self._sum(frequency, by_origin, begin, end, is_exact=is_exact)
+            least += low
+            most += high
+        for at, mark in self._ghosts:
+            if at == channel and mark.way.end + mark.half > begin:
+                ghost = abs(mark.way.at(begin - mark.half)) + mark.radius
+                least, most = least - ghost, most + ghost
+        return max(least, 0.0), most
+
+    def _sum(
+        self,
+        frequency: float,
+        by_origin: dict[float, list[Voice]],
+        begin: float,
+        end: float,
+        *,
+        is_exact: bool,
+    ) -> Interval:
+        """Return the least and largest sum of tones of one frequency, by their origins."""
+        highest, total, uncertain = 0.0, 0j, 0.0
+        discs: list[tuple[float, float]] = []
+        for origin, voices in by_origin.items():
+            center, radius = 0j, 0.0
+            for voice in voices:
+                amplitude = voice.transition.at((begin + end) / 2)
+                reach = self.radius(voice.transition, begin, end)
+                highest += abs(amplitude) + reach
+                center += amplitude
+                radius += reach
+            discs.append((abs(center), radius))
+            total += center * cmath.rect(1, -2 * math.pi * frequency * origin)
+            turned = min(math.pi * frequency * self._origins.get(origin, 0.0), math.pi / 2)
+            uncertain += radius + 2 * abs(center) * math.sin(turned) * (len(by_origin) > 1)
+        if is_exact:
+            return max(abs(total) - uncertain, 0.0), min(abs(total) + uncertain, highest)
+        # Tones of one frequency that began at different times may cancel.
+        highs = sum(center + radius for center, radius in discs)
+        return max(2 * center - highs for center, _ in discs), highest

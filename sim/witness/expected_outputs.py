@@ -1,17 +1,16 @@
-"""What the channels of an amplifier must play: `drivers.playback`, with what is not known of it.
+"""What the channels of an amplifier must play: `drivers.uncertain_playback`.
 
-A commit came at some time between its request and its reply. The playback has it in the middle;
-every transition has a radius beside, by which its amplitude may differ meanwhile.
+A commit came at some time between its request and its reply.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
-from drivers.playback import Playback, Voice
+from drivers.playback import Playback
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES
-from drivers.transition import Transition
+from drivers.uncertain_playback import Interval, UncertainPlayback
 from sim.witness.violation import ReportViolation
 
 LEVEL = 0.002
@@ -20,7 +19,6 @@ _RAMP, _VOICES = QUANTITIES["ramp"], QUANTITIES["voices"]
 _FINE = 0.026  # Hz; half a step of the wire
 _MAX_ENDING = 3.3  # s; 32 knots, 0.1 s apart
 _FRACTIONS = 16  # of a transition at which sums are looked at
-Interval = tuple[float, float]
 
 
 def silent() -> Playback:
@@ -49,15 +47,12 @@ class ExpectedOutputs:
 
     def settle(self, cause: str) -> None:
         """Treat all channels as silent, their fades over."""
-        self.playback = silent()
+        self._plays = UncertainPlayback(silent())
         self.cause = cause
         self.is_exact = True
-        layers = QUANTITIES["layer_count"].maximum
-        self._half = [0.0] * layers  # s; by which what a layer plays may be earlier or later
-        self._marks: dict[int, tuple[Transition, float, float]] = {}  # half a time, radius at first
-        self._unknown = [-math.inf] * layers  # until when what a layer plays is not known [s]
+        # Until when what a layer plays is not known [s].
+        self._unknown = [-math.inf] * QUANTITIES["layer_count"].maximum
         self._before: Sequence[float] = ()  # levels of channels before the last commit
-        self._ghosts: list[tuple[int, Transition, float]] = []  # of voices that may still fade
         self._last_due = -math.inf
         self._uncertain_until = -math.inf  # fades may have been cut short
         self._highest = 0.0  # of the sums of a channel since the last status, at most
@@ -69,33 +64,33 @@ class ExpectedOutputs:
 
     # what happens
 
+    @property
+    def playback(self) -> Playback:
+        """What plays, with each commit in the middle of its interval."""
+        return self._plays.playback
+
     def _advance(self, time: float) -> None:
-        """End layers whose `valid_for` has passed, and start what waits."""
-        while self.playback.next_due <= time:
-            due = self._last_due = self.playback.next_due
-            before, half = [*self.playback.all_voices], max(self._half)
-            self.playback.advance(due)
-            self._mark(before, (due - half, due + half), half)
-        self.playback.advance(time)
+        """End layers and start what waits, where that must have happened by a time."""
+        due = self.playback.next_due
+        self._plays.advance(time - self._slack)
+        if self.playback.next_due != due:
+            self._last_due = due
 
     def play(self, layers: Sequence[LayerSet], token: int, when: Interval, *, exact: bool) -> None:
         """Play a set from some time between two on."""
         begin, end = when
-        middle, half = (begin + end) / 2, (end - begin) / 2
-        self._advance(begin - self._lag)
+        self._advance(begin)
         self._before = [*map(self.playback.settled, range(self.playback.channels))]
         for one in layers:
             number, ends = one.layer, self.playback.end_of(one.layer)
-            is_ending = begin - self._half[number] <= ends <= end + self._half[number]
+            half = self._plays.half[number]
+            is_ending = begin - half <= ends <= end + half
             if is_ending and (one.renew or any(each.keep_phase for each in one.commands)):
                 self._unknown[number] = math.inf
             elif not one.renew and not one.after:
-                fade = middle + half + _MAX_ENDING + _RAMP.from_wire(one.ramp)
+                fade = end + _MAX_ENDING + _RAMP.from_wire(one.ramp)
                 self._unknown[number] = min(self._unknown[number], fade)
-            self._half[number] = max(half, self._half[number] if one.after else 0.0)
-        voices = [*self.playback.all_voices]
-        self.playback.commit(layers, token, middle)
-        self._mark(voices, when, half)
+        self._plays.commit(layers, token, when)
         self.cause, self.is_exact = "a set", exact and self.is_exact
         for channel, each in enumerate(self.playback.all_voices):
             self._highest = max(self._highest, self.playback.peak(channel, begin))
@@ -105,47 +100,15 @@ class ExpectedOutputs:
 
     def silence(self, when: Interval, ramp: float, cause: str) -> None:
         """Silence all channels along a ramp [s], from some time between two on."""
-        begin, end = when
-        self._advance(begin - self._lag)
-        voices = [*self.playback.all_voices]
-        self.playback.silence((begin + end) / 2, ramp)
-        self._mark(voices, when, (end - begin) / 2)
-        self._unknown = [min(until, end + ramp) for until in self._unknown]
+        self._advance(when[0])
+        self._plays.silence(when, ramp)
+        self._unknown = [min(until, when[1] + ramp) for until in self._unknown]
         self.cause = cause
-
-    def _mark(self, before: Sequence[Sequence[Voice]], when: Interval, half: float) -> None:
-        """Note the radius of every transition that is new."""
-        marks: dict[int, tuple[Transition, float, float]] = {}
-        self._ghosts = [each for each in self._ghosts if each[1].end + each[2] > when[0]]
-        for channel, were in enumerate(before):
-            left = {(each.layer, each.frequency, each.origin): each.transition for each in were}
-            known = dict(left)
-            for voice in self.playback.voices_of(channel):
-                name, way = (voice.layer, voice.frequency, voice.origin), voice.transition
-                left.pop(name, None)
-                radius = self._radius(known[name], *when) if name in known else 0.0
-                marks[id(way)] = self._marks.get(id(way), (way, half, radius))
-            for way in left.values():
-                late = self._marks.get(id(way), (way, 0.0, 0.0))[1]
-                if way.end + late > when[0]:
-                    self._ghosts.append((channel, way, late))
-        self._marks = marks
-
-    def _radius(self, way: Transition, begin: float, end: float) -> float:
-        """Return by how much an amplitude may differ from that in the middle of an interval."""
-        _, half, radius = self._marks.get(id(way), (way, 0.0, 0.0))
-        center = way.at((begin + end) / 2)
-        since, until = begin - half, end + half
-        moments = (way.start + way.step * (index + 1) for index in range(len(way.knots)))
-        between = [knot for at, knot in zip(moments, way.knots, strict=True) if since < at < until]
-        reach = max(abs(each - center) for each in (way.at(since), *between, way.at(until)))
-        return reach + (radius if since < way.end else 0.0)
 
     @property
     def _lag(self) -> float:
         """Longest time by which a transition under way may be earlier or later [s]."""
-        halves = [half for _, half, _ in self._marks.values()]
-        return max(*self._half, *halves, 0.0) + self._slack
+        return self._plays.lag + self._slack
 
     # what is reported
 
@@ -155,7 +118,7 @@ class ExpectedOutputs:
         None ends or starts by itself near these.
         """
         half = self._lag
-        self._advance(begin - half)
+        self._advance(begin)
         is_known = all(until < begin for until in self._unknown)
         is_due = self.playback.next_due <= end + half or self._last_due >= begin - half
         vanish = any(  # onsets that lead to silence
@@ -167,23 +130,7 @@ class ExpectedOutputs:
 
     def _bounds(self, channel: int, begin: float, end: float) -> Interval:
         """Return the least and the largest sum of a channel between two times."""
-        low = high = 0.0
-        by_frequency: dict[float, dict[float, tuple[complex, float]]] = {}
-        for voice in self.playback.voices_of(channel):
-            group = by_frequency.setdefault(voice.frequency, {})
-            center, radius = group.get(voice.origin, (0j, 0.0))
-            center += voice.transition.at((begin + end) / 2)
-            group[voice.origin] = center, radius + self._radius(voice.transition, begin, end)
-        for group in by_frequency.values():
-            highs = [abs(center) + radius for center, radius in group.values()]
-            # Tones of one frequency that began at different times may cancel.
-            others = [sum(highs) - own for own in highs]
-            lows = [abs(center) - radius for center, radius in group.values()]
-            low += max(0.0, *(one - other for one, other in zip(lows, others, strict=True)))
-            high += sum(highs)
-        for at, way, late in self._ghosts:
-            if at == channel and way.end + late > begin:
-                low, high = 0.0, high + abs(way.at(begin - late))
+        low, high = self._plays.bounds(channel, begin, end)
         return 0.0 if begin <= self._uncertain_until else low, high
 
     def check_levels(

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from drivers.protocol.records import Values
 from drivers.protocol.table import LATCHED, QUANTITIES, REACTION, STAGED_LIFE
 from drivers.protocol.tokens import is_newer_token
+from drivers.uncertain_playback import Interval
 from sim.witness.decoded import (
     CHANGING,
     ENABLED,
@@ -21,7 +22,6 @@ from sim.witness.decoded import (
     Sent,
     is_carried_out,
 )
-from sim.witness.expected_outputs import Interval
 from sim.witness.expected_state import (
     DISABLED,
     FAULT,

@@ -1,6 +1,6 @@
 """Every wire with its far end, for tests that hold on all of them: one entry a wire."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 from model.rig.rig import Channel, Rig
@@ -23,16 +23,6 @@ SHARED_WIRES: Mapping[str, Wire] = {
     "can+slcan": Wire("slcan", shared=True),
 }
 """Those on which several amplifiers hear one broadcast."""
-
-
-PROCESS_WIRES: Mapping[str, Sequence[str]] = {
-    "serial": ["--serial"],
-    "modbus+tcp": ["--modbus-tcp", "0"],
-    "modbus+rtu": ["--modbus-rtu"],
-    "can+socketcand": ["--socketcand", "0"],
-    "can+slcan": ["--slcan"],
-}
-"""The same as options of `era sim`, for a far end that is a process of its own."""
 
 
 def on_two_amplifiers(rig: Rig) -> Rig:

@@ -369,9 +369,9 @@ async def test_late_replies_are_credited_to_nothing(
     assert ends[0].line.wire.counters.unexpected_frames == 1
 
 
-@grouped(("a",))
+@grouped(("a",), wire="serial")
 async def test_late_reply_is_not_that_of_the_next_request(
-    group: Group, ends: list[MemoryLine], wire: str
+    group: Group, ends: list[MemoryLine]
 ) -> None:
     """A reply after 70 ms comes while another request waits, whose own comes after 20 ms."""
     (host,) = group.amplifiers.values()

@@ -70,15 +70,6 @@ def test_status_has_the_bytes_of_the_decision(bus: Bus) -> None:
     ]
 
 
-def test_set_is_played_by_a_broadcast(bus: Bus) -> None:
-    """Armed, staged by four frames in any order, committed without a reply."""
-    bus.put(0.0, ARM)
-    staged = bus.put(0.1, *reversed(SET))
-    assert [data for _, data in staged] == ["0200050307000600", "0201000000000000"]
-    assert bus.put(0.1, COMMIT) == []
-    assert bus.level(0.1) == 0.5
-
-
 @pytest.mark.parametrize("lost", range(4))
 def test_set_without_one_of_its_frames_is_not_played(bus: Bus, lost: int) -> None:
     """No reply, nothing to commit; the repetition under a newer number is."""
@@ -116,16 +107,6 @@ def test_broadcast_of_another_message_is_not_obeyed(bus: Bus) -> None:
     assert bus.far[0].state == "SWITCH_ON_DISABLED"
     bus.put(0.0, ARM, *SET, (0x200, f"03{COMMIT[1][2:]}"))
     assert bus.level(0.0) == 0.0
-
-
-def test_amplifier_takes_another_node(bus: Bus) -> None:
-    """Node 9, by the serial number SIM-a; it replies as node 1, then boots as 9."""
-    # Five bytes of text, two a word, the first of them high.
-    frames = ("01000f0509000500", "010149532d4d0061")
-    sent = bus.put(0.0, *((0x201, data) for data in frames))
-    assert [can_id for can_id, _ in sent] == [0x181] * 7 + [0x709]
-    assert bus.put(0.2, START, (0x201, "0100090000000000")) == []
-    assert len(bus.put(0.3, (0x209, "0100090000000000"))) == 7
 
 
 class Reader(canopen.Network):

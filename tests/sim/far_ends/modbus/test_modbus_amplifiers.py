@@ -47,21 +47,6 @@ class Port:
         return tuple(pdu[1:]) if pdu[0] & 0x80 else struct.unpack(f">{count}H", pdu[2:])
 
 
-def test_present_state_is_read_without_a_write() -> None:
-    """Disarmed, then armed, with functions 3 and 4, in part too; the tag is that of the write."""
-    port = Port()
-    assert port.read(STATUS, 3) == (0, 0, STATES["SWITCH_ON_DISABLED"])
-    port.write(0x300, 5, 9, 250)
-    assert port.read(0x380, 3) == (5, 0, STATES["OPERATION_ENABLED"])
-    assert port.read(STATUS + 2, 1, function=4) == (STATES["OPERATION_ENABLED"],)
-    port.now = 0.1
-    assert port.read(STATUS + 6, 1) == (150,)
-    assert port.read(0x380 + 6, 1) == (250,)
-    port.write(0x900, 6)
-    port.now = 0.2
-    assert port.read(STATUS, 7) == (6, 0, 4, 0, 1, 0, 50)
-
-
 def test_broadcast_reaches_all_units_and_has_no_response() -> None:
     """A stop silences both; to arm is for one unit alone; other units are silent."""
     port = Port()

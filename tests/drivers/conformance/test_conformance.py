@@ -28,7 +28,8 @@ from drivers.protocol.sets import Command, LayerSet
 from drivers.trace import tracing
 from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
 from model.rig.rig import Rig
-from sim.amplifier.contract import Amplifier, capabilities
+from sim.amplifier.capabilities import capabilities
+from sim.amplifier.contract import Amplifier
 from sim.bench.bench import Bench, keep_time
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from virtual_loop import VirtualLoop, in_virtual_time

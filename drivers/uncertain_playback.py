@@ -111,9 +111,9 @@ class UncertainPlayback:
         self.playback.advance(due)
         self._mark(before, (due - half, due + half))
 
-    def possible(self, begin: float, end: float) -> Iterator["UncertainPlayback"]:
+    def possible(self, start: float, end: float) -> Iterator["UncertainPlayback"]:
         """Yield what may play between two times: before and after what may be due then."""
-        self.advance(begin)
+        self.advance(start)
         state = self
         yield state
         while (due := state.playback.next_due) <= end + state.lag:
@@ -143,11 +143,11 @@ class UncertainPlayback:
     def _mark_of(self, way: Transition) -> _Mark:
         return self._marks.get(id(way)) or _Mark(way)
 
-    def radius(self, way: Transition, begin: float, end: float) -> float:
+    def radius(self, way: Transition, start: float, end: float) -> float:
         """Return by how much an amplitude may differ from that in the middle of an interval."""
         _, half, radius = self._mark_of(way)
-        center = way.at((begin + end) / 2)
-        since, until = begin - half, end + half
+        center = way.at((start + end) / 2)
+        since, until = start - half, end + half
         moments = (way.start + way.step * (index + 1) for index in range(len(way.knots)))
         between = [knot for at, knot in zip(moments, way.knots, strict=True) if since < at < until]
         reach = max(abs(each - center) for each in (way.at(since), *between, way.at(until)))
@@ -157,43 +157,43 @@ class UncertainPlayback:
         left = Transition(way.start, way.step, radius, 0, way.end, (0j,) * len(way.knots))
         return reach + abs(left.at(since))
 
-    def bounds(self, channel: int, begin: float, end: float, *, is_exact: bool = False) -> Interval:
-        """Return the least and the largest level of a channel between two times.
+    def bounds(self, channel: int, start: float, end: float, *, is_exact: bool = False) -> Interval:
+        """Return the lowest and the largest level of a channel between two times.
 
         Nothing may be due between them; see `possible`. is_exact: tones of one frequency interfere;
         else they may add up as if they did not.
         """
-        least = most = 0.0
+        lowest = highest = 0.0
         groups: dict[float, dict[float, list[Voice]]] = {}
         for voice in self.playback.voices_of(channel):
             groups.setdefault(voice.frequency, {}).setdefault(voice.origin, []).append(voice)
         for frequency, by_origin in groups.items():
-            low, high = self._sum(frequency, by_origin, begin, end, is_exact=is_exact)
-            least += low
-            most += high
+            low, high = self._sum(frequency, by_origin, start, end, is_exact=is_exact)
+            lowest += low
+            highest += high
         for at, mark in self._ghosts:
-            if at == channel and mark.way.end + mark.half > begin:
-                ghost = abs(mark.way.at(begin - mark.half)) + mark.radius
-                least, most = least - ghost, most + ghost
-        return max(least, 0.0), most
+            if at == channel and mark.way.end + mark.half > start:
+                ghost = abs(mark.way.at(start - mark.half)) + mark.radius
+                lowest, highest = lowest - ghost, highest + ghost
+        return max(lowest, 0.0), highest
 
     def _sum(
         self,
         frequency: float,
         by_origin: dict[float, list[Voice]],
-        begin: float,
+        start: float,
         end: float,
         *,
         is_exact: bool,
     ) -> Interval:
-        """Return the least and largest sum of tones of one frequency, by their origins."""
+        """Return the lowest and largest sum of tones of one frequency, by their origins."""
         highest, total, uncertain = 0.0, 0j, 0.0
         discs: list[tuple[float, float]] = []
         for origin, voices in by_origin.items():
             center, radius = 0j, 0.0
             for voice in voices:
-                amplitude = voice.transition.at((begin + end) / 2)
-                reach = self.radius(voice.transition, begin, end)
+                amplitude = voice.transition.at((start + end) / 2)
+                reach = self.radius(voice.transition, start, end)
                 highest += abs(amplitude) + reach
                 center += amplitude
                 radius += reach

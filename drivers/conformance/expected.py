@@ -121,8 +121,8 @@ class Expected:
         begins = self._begins_in(when, None, ramp)
         self._plays.silence(begins, ramp)
         first, last = (
-            max(self._plays.playback.ends_by + late, begin)
-            for late, begin in zip((-self._plays.lag, self._plays.lag), begins, strict=True)
+            max(self._plays.playback.ends_by + late, start)
+            for late, start in zip((-self._plays.lag, self._plays.lag), begins, strict=True)
         )
         self.silent = When(first if has_floor else when.earliest, last)
 
@@ -202,11 +202,11 @@ class Expected:
     def _played(self, when: When) -> tuple[list[tuple[float, float]], list[set[int]]]:
         """Return least and largest level of each channel, and possible tokens of each layer."""
         drift = DRIFT * (when.latest - self.began.earliest)
-        begin, end = when.earliest - drift, when.latest + drift
-        states = [*self._plays.possible(begin, end)]
+        start, end = when.earliest - drift, when.latest + drift
+        states = [*self._plays.possible(start, end)]
         bounds = []
         for channel in range(self.can["channels"]):
-            each = [one.bounds(channel, begin, end, is_exact=self.is_exact) for one in states]
+            each = [one.bounds(channel, start, end, is_exact=self.is_exact) for one in states]
             low, high = min(low for low, _ in each), max(high for _, high in each)
             bounds.append((min(low, 1.0), min(high, 1.0)))
         after = states[-1].copied()

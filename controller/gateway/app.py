@@ -79,7 +79,7 @@ class Gateway:
     async def _metrics(self, request: Request) -> Response:
         """Read the daemon's status for Prometheus."""
         try:
-            reply = await self._ask(request, "status", b"{}")
+            reply = await self._request(request, "status", b"{}")
             status = read_result(reply["result"], StatusResult)
         except (KeyError, RpcError, Unreachable):
             status = None
@@ -91,7 +91,7 @@ class Gateway:
         try:
             if method not in HTTP_METHODS:
                 raise unknown_method(method, HTTP_METHODS)
-            reply = await self._ask(request, method, await _body(request))
+            reply = await self._request(request, method, await _body(request))
         except RpcError as error:
             reply = json.loads(error_line(None, error))
         except (ClientDisconnect, asyncio.CancelledError):  # cancelled when the gateway ends
@@ -102,7 +102,7 @@ class Gateway:
         content = {"error": failed["message"], "code": failed["code"], "data": failed["data"]}
         return JSONResponse(content, HTTP_STATUS[failed["code"]])
 
-    async def _ask(self, request: Request, method: str, params: bytes) -> dict[str, Any]:
+    async def _request(self, request: Request, method: str, params: bytes) -> dict[str, Any]:
         """The daemon's response, over the connection that this one keeps; raises RpcError."""
         kept: KeptLink = request.state.daemon
         if not (kept.is_open or method in UNLIMITED or self._may_connect(request)):

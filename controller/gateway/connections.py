@@ -5,6 +5,7 @@ Timeouts count from the last complete request, so sending byte by byte gains not
 """
 
 import asyncio
+import re
 from typing import Any
 
 import h11
@@ -23,6 +24,8 @@ MAX_FRAGMENTS = 64  # per message; a browser sends 64 KiB in one or two
 MAX_CONTROL_RATE = 100.0  # 1/s; pings and pongs of one WebSocket; one in ten seconds is needed
 CLOSE_TIMEOUT = 1.0  # s; for a WebSocket to close after its last frame
 _SLICE = 1 << 12  # bytes that are processed between checks of the bounds
+_BLANK_LINE = re.compile(rb"\n\r?\n")
+_BARE_OR_FOLDED = re.compile(rb"(?<!\r)\n|\n[ \t]")
 
 
 class HttpConnection(H11Protocol):
@@ -48,7 +51,10 @@ class HttpConnection(H11Protocol):
         self._start_idle()
 
     def handle_events(self) -> None:
-        """Stop the idle timer at a complete request."""
+        """Refuse an ambiguous head of a request; stop the idle timer at a complete request."""
+        if self.conn.their_state is h11.IDLE and _is_ambiguous(self.conn.trailing_data[0]):
+            self.send_400_response("Ambiguous HTTP request received.")
+            return
         try:
             super().handle_events()
         except h11.LocalProtocolError:  # invalid data in the body of a request already answered
@@ -164,6 +170,17 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
         if not is_within:
             self.transport.abort()
         return is_within
+
+
+def _is_ambiguous(received: bytes) -> bool:
+    """Whether a proxy may read the head of a request otherwise, once it is complete.
+
+    Lines that end with a line feed alone, folded lines, two ways to give the length of the body.
+    """
+    end = _BLANK_LINE.search(received)
+    head = b"" if end is None else received[: end.start() + 1].lower()
+    lengths = [name for name in (b"\ncontent-length:", b"\ntransfer-encoding:") if name in head]
+    return len(lengths) > 1 or _BARE_OR_FOLDED.search(head) is not None
 
 
 def _is_utf8(data: bytes) -> bool:

@@ -186,6 +186,11 @@ CHUNKED = (
     + b"\r\nContent-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n"
 )
 
+GRANTED = CHUNKED.replace(
+    b"Transfer-Encoding: chunked", b"Connection: close\r\nContent-Length: %d" % len(ARM)
+)
+GRANTED += ARM
+
 
 @pytest.mark.parametrize(
     ("data", "statuses"),
@@ -195,10 +200,22 @@ CHUNKED = (
         ),
         pytest.param(CHUNKED + (b"10000\r\n" + b" " * 65536 + b"\r\n") * 8, {413}, id="chunks"),
         pytest.param(bytes(range(256)) * 40 + b"\r\n\r\n", {400}, id="noise"),
+        pytest.param(GRANTED.replace(b"\r\n", b"\n"), {400}, id="line feeds alone"),
+        pytest.param(
+            GRANTED.replace(TOKEN.encode() + b"\r\n", TOKEN.encode() + b"\n"),
+            {400},
+            id="one line feed alone",
+        ),
+        pytest.param(GRANTED.replace(b"Type: ", b"Type:\r\n "), {400}, id="folded line"),
+        pytest.param(
+            GRANTED.replace(b"Content-L", b"Transfer-Encoding: chunked\r\nContent-L"),
+            {400},
+            id="two lengths",
+        ),
     ],
 )
 def test_http_bytes_are_refused(gateway: GatewayProcess, data: bytes, statuses: set[int]) -> None:
-    """A request without Host, a chunked body without end, and no HTTP at all."""
+    """Without Host, a chunked body without end, no HTTP, and heads that a proxy may misread."""
     assert raw(gateway, filled(data, gateway)).status in statuses
 
 

@@ -1,7 +1,6 @@
 """`era gateway`: the daemon's API and the dashboard for browsers."""
 
 import os
-import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -75,9 +74,7 @@ def gateway(
         print(f"dashboard: {scheme}://{settings.shown_host}:{port}/{token}", flush=True)
 
     asyncio.run(serve(settings, announce=announce))
-    if threading.active_count() > 1:
-        # The field is still being computed; Python would abort in that thread at its exit.
-        os._exit(0)
+    os._exit(0)  # Python would abort in the thread that draws the field
 
 
 def _host_and_port(text: str) -> tuple[str, int]:

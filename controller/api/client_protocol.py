@@ -61,13 +61,12 @@ class LeaseLost(RpcError):
 
 @dataclass(frozen=True)
 class Notification:
-    """An event: topic, time [s], number of events dropped before it, data; line: as received."""
+    """An event: topic, time [s], number of events dropped before it, data."""
 
     topic: str
     time: float
     lost: int
     data: Mapping[str, Any]
-    line: bytes = b""
 
 
 def read_line(line: bytes) -> Mapping[str, Any] | Notification:
@@ -78,7 +77,7 @@ def read_line(line: bytes) -> Mapping[str, Any] | Notification:
             content["id"]  # None: of a request that could not be read
             return content
         params = content["params"]
-        return Notification(params["topic"], params["time_s"], params["lost"], params["data"], line)
+        return Notification(params["topic"], params["time_s"], params["lost"], params["data"])
     except (ValueError, AttributeError, KeyError, TypeError) as error:
         raise _not_understood() from error
 

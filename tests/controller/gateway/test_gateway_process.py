@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from controller.gateway.cli import gateway as gateway_command
 from controller.gateway.serving import check_certificate, listen, serve
 from controller.gateway.settings import Settings, read_token
 from gateway_bench import (
@@ -170,20 +169,6 @@ def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
         port = other.getsockname()[1]
         with pytest.raises(InputError, match=rf"port {port} \(Address already in use\).*--listen"):
             listen(Settings(socket=tmp_path / "era.sock", port=port))
-
-
-@pytest.mark.parametrize("listen", ["127.0.0.1", "127.0.0.1:-1"])
-def test_gateway_refuses_an_invalid_listen_option(listen: str) -> None:
-    """With the option, its form and the value."""
-    with pytest.raises(InputError, match=rf"--listen .*HOST:PORT.* got {listen}$"):
-        gateway_command(listen)
-
-
-def test_gateway_names_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """When a library is missing, which only `era gateway` needs."""
-    monkeypatch.setattr("controller.gateway.installed._LIBRARIES", ("no_such_library",))
-    with pytest.raises(InputError, match=r"no_such_library.*\[gateway\]"):
-        gateway_command("127.0.0.1:0")
 
 
 def test_gateway_refuses_unusable_certificates(tmp_path: Path, pair: tuple[Path, Path]) -> None:

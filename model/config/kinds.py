@@ -3,10 +3,11 @@
 The keys of a file determine its kind.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, Protocol, cast
+from typing import Any
 
 from model.config.document import Document
 from model.errors import InputError
@@ -23,20 +24,29 @@ class CheckedFile:
     warnings: Sequence[str] = ()
 
 
-class ConfigKind(Protocol):
-    """One kind of configuration file."""
+@dataclass(frozen=True)
+class ConfigKind:
+    """One kind of configuration file.
 
-    def recognises(self, document: Document) -> bool:
-        """Whether a document is of this kind."""
+    recognises: whether a document is of this kind; check: of a file and the files that it names,
+    raises ConfigError; example_file: a commented one to start from; keys: their JSON schema, which
+    gets the title.
+    """
 
-    def check(self, document: Document) -> CheckedFile:
-        """Check a file and the files that it names; raises ConfigError."""
+    title: str
+    recognises: Callable[[Document], bool]
+    check: Callable[[Document], CheckedFile]
+    example_file: Path
+    keys: Callable[[], dict[str, Any]]
 
     def example(self) -> str:
         """A commented file to start from."""
+        return self.example_file.read_text(encoding="utf-8")
 
     def schema(self) -> dict[str, Any]:
         """The JSON schema for editors."""
+        draft = "https://json-schema.org/draft/2020-12/schema"
+        return {"$schema": draft, **self.keys(), "title": self.title}
 
 
 _KINDS = {
@@ -54,7 +64,8 @@ def kind_called(name: str) -> ConfigKind:
         raise InputError(
             f"unknown kind of configuration {name[:40]!r}; {suggested}known are {', '.join(_KINDS)}"
         )
-    return cast(ConfigKind, resolve_name(_KINDS[name]))
+    kind: ConfigKind = resolve_name(_KINDS[name])
+    return kind
 
 
 def kind_of(document: Document) -> ConfigKind:

@@ -1,7 +1,6 @@
 """Reading a rig from its file."""
 
 from pathlib import Path
-from typing import Any
 
 from model.arguments import expect_path, shown
 from model.config.document import Document, parse_document, read_document
@@ -84,12 +83,6 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
             if amplifier.full_level == "output"
         ),
     )
-
-
-def rig_schema() -> dict[str, Any]:
-    """The JSON schema of a rig file for editors."""
-    schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    return schema | RigSection.model_json_schema() | {"title": "A rig of era-haptics"}
 
 
 def example_rig_path() -> Path:

@@ -9,17 +9,16 @@ import math
 from collections import Counter
 from itertools import pairwise
 from pkgutil import resolve_name
-from typing import Any
 from urllib.parse import quote
 
 from model.config.document import ConfigError, Document, Problem
-from model.config.kinds import CheckedFile
+from model.config.kinds import CheckedFile, ConfigKind
 from model.fem.mesh import SHEAR_CORRECTION
 from model.rig.checks import STIFF_MOUNT
-from model.rig.file import example_rig_path, rig_of, rig_schema
+from model.rig.file import example_rig_path, rig_of
 from model.rig.parts import limits_of
 from model.rig.rig import Rig
-from model.rig.sections import LimitsSection
+from model.rig.sections import LimitsSection, RigSection
 from model.structure.actuator import Era
 from model.structure.laminate_section import slide_frequency
 from model.structure.support import support_problem
@@ -29,43 +28,34 @@ from model.structure.support import support_problem
 _FAR_FROM_SLIDING = 2.0
 
 
-class RigKind:
-    """A rig file."""
-
-    def recognises(self, document: Document) -> bool:
-        """A rig has a plate."""
-        return "plate" in document.data
-
-    def check(self, document: Document) -> CheckedFile:
-        """Check a rig and its amplifiers; return its values in a line, to show unlikely ones."""
-        problems: list[Problem] = []
-        rig = None
-        try:
-            rig = rig_of(document)
-        except ConfigError as error:
-            problems += error.problems
-        wrong, warnings = check_amplifiers(document, rig)
-        support = None if rig is None else support_problem(rig.plate, rig.eras, loads=rig.masses)
-        if support is not None:
-            problems.append(document.problem(("eras",), support))
-        known = {problem.key for problem in problems}
-        problems += [problem for problem in wrong if problem.key not in known]
-        if rig is None or problems:
-            raise ConfigError(document.source, problems)
-        note = rig.uncertainty.note
-        costs = [*gain_notes(rig), *_air_costs(rig), *_layer_costs(rig), *_point_costs(rig)]
-        return CheckedFile(_summary(rig), [*warnings, *costs, *([note] if note else [])])
-
-    def example(self) -> str:
-        """The paper's plate."""
-        return example_rig_path().read_text(encoding="utf-8")
-
-    def schema(self) -> dict[str, Any]:
-        """The JSON schema for editors."""
-        return rig_schema()
+def _check(document: Document) -> CheckedFile:
+    """Check a rig and its amplifiers; return its values in a line, to show unlikely ones."""
+    problems: list[Problem] = []
+    rig = None
+    try:
+        rig = rig_of(document)
+    except ConfigError as error:
+        problems += error.problems
+    wrong, warnings = check_amplifiers(document, rig)
+    support = None if rig is None else support_problem(rig.plate, rig.eras, loads=rig.masses)
+    if support is not None:
+        problems.append(document.problem(("eras",), support))
+    known = {problem.key for problem in problems}
+    problems += [problem for problem in wrong if problem.key not in known]
+    if rig is None or problems:
+        raise ConfigError(document.source, problems)
+    note = rig.uncertainty.note
+    costs = [*gain_notes(rig), *_air_costs(rig), *_layer_costs(rig), *_point_costs(rig)]
+    return CheckedFile(_summary(rig), [*warnings, *costs, *([note] if note else [])])
 
 
-RIG = RigKind()
+RIG = ConfigKind(
+    "A rig of era-haptics",
+    recognises=lambda document: "plate" in document.data,
+    check=_check,
+    example_file=example_rig_path(),
+    keys=RigSection.model_json_schema,
+)
 
 
 def _air_costs(rig: Rig) -> list[str]:

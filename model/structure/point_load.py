@@ -6,36 +6,14 @@ The plate on its attachments is a low-rank correction of the free plate (Woodbur
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.structure.actuator import Era
-
-
-class Located(Protocol):
-    """What is attached to the plate at x, y [m], on a disc of radius foot [m], 0 for a point."""
-
-    @property
-    def x(self) -> float:
-        """Position along the length [m]."""
-
-    @property
-    def y(self) -> float:
-        """Position along the width [m]."""
-
-    @property
-    def foot(self) -> float:
-        """Radius of the disc on which it acts [m]."""
-
-
-class Load(Located, Protocol):
-    """A passive load: a point mass, a fingertip."""
-
-    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
-        """Force on it per displacement of the plate [N/m] at omega [rad/s], of the same shape."""
+from model.structure.fingertip import FingertipLoad
 
 
 @dataclass(frozen=True)
@@ -79,7 +57,11 @@ class PointLoad:
         return cls(era.x, era.y, era.stiffness, era.damping, era.bolt_mass, era.foot)
 
 
-def footprints_of(*attached: Iterable[Located]) -> FloatArray:
+Load: TypeAlias = PointLoad | FingertipLoad
+"""A passive load of the plate."""
+
+
+def footprints_of(*attached: Iterable[Era | Load]) -> FloatArray:
     """Footprints x, y, radius [m] of ERAs and loads, one group after the other, (n, 3)."""
     places = [[each.x, each.y, each.foot] for group in attached for each in group]
     return np.array(places, dtype=float).reshape(-1, 3)

@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import (
@@ -20,7 +19,7 @@ from model.calibration.calibration_screening import (
     silent_eras,
     silent_sensors,
 )
-from model.calibration.fit import Fit, Problem, misfit, solve
+from model.calibration.fit import Fit, Problem, first_fit, solve
 from model.calibration.fitted_rig import (
     gain_rows,
     moved_eras,
@@ -29,16 +28,15 @@ from model.calibration.fitted_rig import (
     standard_error,
     uncertainty_of,
 )
-from model.calibration.form_errors import SENSOR_SCALE, SIDE, FormModel, form_model
-from model.calibration.form_fit import FormFit, solve_with_form
+from model.calibration.form_errors import SENSOR_SCALE, SIDE, form_model
 from model.calibration.held_out import hold_out, initial_responses, relative_error
-from model.calibration.parameters import Parameter, parameters_of, starts
+from model.calibration.parameters import parameters_of, responses_at, starts
 from model.calibration.responses import Responses
-from model.calibration.variable_projection import row_rms
+from model.calibration.variable_projection import modal_assurance, row_rms
 from model.choice import best_by, best_of, ranked_by
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.vibration.parametric_plate import ParametricPlate, parametric_plate
+from model.vibration.parametric_plate import parametric_plate
 
 _STARTS = 2  # those with the least misfit of shapes
 _WRONG_SCALE = 0.02  # common tolerance of sensors
@@ -56,39 +54,42 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
     values = responses.values.copy()
     values[:, dead_eras] = np.nan
     check_enough_sensors(alive, responses)
-    plate = parametric_plate(rig, responses.points, responses.frequencies)
-    parameters = parameters_of(rig)
+    problem = Problem(
+        rig,
+        form_model(rig, responses.points, responses.frequencies),
+        parameters_of(rig),
+        values,
+        np.ones(len(parameters_of(rig)), dtype=bool),
+        np.ones(len(alive), dtype=bool),
+    )
 
     # All scales are free at first, so that a wrong one does not bias the fit.
-    problem = _problem(rig, plate, parameters, values, alive)
-    fit = _best_fit(problem)
-    relative = fit.scales / np.median(fit.scales)
-    unlike = sensors_off_model(problem, fit, relative)
+    part = problem.at(alive)
+    fit = _first_fit(part, responses.points[alive], responses.frequencies)
+    unlike = sensors_off_model(part, fit)
     if unlike.any():
         alive[alive] = ~unlike
         check_enough_sensors(alive, responses)
-        relative = relative[~unlike] / np.median(relative[~unlike])
-        problem = _problem(rig, plate, parameters, values, alive)
-        fit = solve(problem, fit.x, relative)
-        relative = fit.scales / np.median(fit.scales)
-    error = fit.scales_error / np.abs(np.median(fit.scales))
-    wrong = np.abs(relative - 1) > np.maximum(_WRONG_SCALE, _SIGNIFICANCE * error)
-
-    free_scales = np.ones(len(wrong), dtype=bool) if all_scales else wrong
-    if not all_scales:
-        relative = np.where(wrong, relative, 1.0)
-    problem = replace(problem, free_scales=free_scales)
+        part = problem.at(alive)
+        fit = first_fit(part, fit.x)
+    fit = solve(part, replace(fit, scales=fit.scales / np.median(fit.scales)))
+    if all_scales:
+        free_scales = part.free_scales
+    else:
+        middle = np.median(fit.scales)
+        error = fit.scales_error / np.abs(middle)
+        off = np.abs(fit.scales / middle - 1)
+        free_scales = off > np.maximum(_WRONG_SCALE, _SIGNIFICANCE * error)
+        fit = replace(fit, scales=np.where(free_scales, fit.scales / middle, 1.0))
     points = responses.points[alive]
-    model = form_model(rig, points, responses.frequencies)
-    problem, found = _identified(problem, model, solve(problem, fit.x, relative))
+    problem, found = _identified(replace(part, free_scales=free_scales), fit)
     if all_scales:
         found = _with_median_scale_one(found)
-    _check_sides(problem, model, found)
+    _check_sides(problem, found)
     _check_outliers(problem, found)
     names = tuple(name for name, live in zip(responses.sensors, alive, strict=True) if live)
     return _report(
         problem,
-        model,
         found,
         points=points,
         names=names,
@@ -100,57 +101,43 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
     )
 
 
-def _problem(
-    rig: Rig,
-    plate: ParametricPlate,
-    parameters: tuple[Parameter, ...],
-    values: ComplexArray,
-    alive: NDArray[np.bool_],
-) -> Problem:
-    """Problem of the live sensors with all parameters and scales free."""
-    count = int(alive.sum())
-    return Problem(
-        rig,
-        plate.at(alive),
-        parameters,
-        values[:, :, alive],
-        np.ones(len(parameters), dtype=bool),
-        np.ones(count, dtype=bool),
-    )
-
-
-def _best_fit(problem: Problem) -> Fit:
+def _first_fit(problem: Problem, points: FloatArray, frequencies: FloatArray) -> Fit:
     """Fit from several starts, since a fit finds only the nearest minimum; return the best."""
-    possible = starts(problem.parameters)
-    nearest = ranked_by(possible, lambda x: -misfit(problem, x))[:_STARTS]
-    ones = np.ones(problem.values.shape[2])
-    fits = [solve(problem, each, ones) for each in nearest]
-    return best_by(fits, lambda fit: -misfit(problem, fit.x))
+    rig, parameters = problem.rig, problem.parameters
+    plate = parametric_plate(rig, points, frequencies)
+
+    def misfit(model: ComplexArray) -> float:
+        return float(np.nanmedian(1 - modal_assurance(problem.values, model)))
+
+    nearest = ranked_by(
+        starts(parameters), lambda x: -misfit(responses_at(plate, rig, parameters, x))
+    )
+    fits = [first_fit(problem, x) for x in nearest[:_STARTS]]
+    return best_by(fits, lambda fit: -misfit(fit.predicted))
 
 
-def _identified(problem: Problem, model: FormModel, start: Fit) -> tuple[Problem, FormFit]:
+def _identified(problem: Problem, start: Fit) -> tuple[Problem, Fit]:
     """Hold parameters that the data determine less than their prior does, and fit again."""
     prior = np.array([parameter.prior_std for parameter in problem.parameters])
     own = np.array([parameter.start for parameter in problem.parameters])
-    fit = solve_with_form(problem, model, start)
+    fit = solve(problem, start)
     while True:
         excess = np.where(problem.free, fit.x_error / prior, 0)
         # Values of a plate that does not fit are meaningless.
-        if not excess.max() > 1 or _fit_error(problem, model, fit) > MAX_FIT_ERROR:
+        if not excess.max() > 1 or _fit_error(problem, fit) > MAX_FIT_ERROR:
             return problem, fit
         free = problem.free.copy()
         free[best_of(excess)] = False
         problem = replace(problem, free=free)
-        fit = solve_with_form(problem, model, replace(fit, x=np.where(free, fit.x, own)))
+        fit = solve(problem, replace(fit, x=np.where(free, fit.x, own)))
 
 
-def _fit_error(problem: Problem, model: FormModel, fit: FormFit) -> float:
-    responses, _ = model.responses(problem.parameters, fit.x, fit.form)
-    predicted = fit.gains[:, :, None] * responses * fit.scales
-    return relative_error(problem.values, predicted, row_rms(problem.values, fit.used), fit.used)
+def _fit_error(problem: Problem, fit: Fit) -> float:
+    size = row_rms(problem.values, fit.used)
+    return relative_error(problem.values, fit.predicted, size, fit.used)
 
 
-def _check_outliers(problem: Problem, fit: FormFit) -> None:
+def _check_outliers(problem: Problem, fit: Fit) -> None:
     count = int(np.isfinite(problem.values).sum())
     out = count - int(fit.used.sum())
     if out > MAX_OUTLIERS * count:
@@ -161,13 +148,13 @@ def _check_outliers(problem: Problem, fit: FormFit) -> None:
         )
 
 
-def _check_sides(problem: Problem, model: FormModel, fit: FormFit) -> None:
+def _check_sides(problem: Problem, fit: Fit) -> None:
     """Raise InputError where the responses fit a plate of another size better."""
-    if _fit_error(problem, model, fit) > MAX_FIT_ERROR:
+    if _fit_error(problem, fit) > MAX_FIT_ERROR:
         return
     plate = problem.rig.plate
     for key, side, off in zip(
-        ("length", "width"), (plate.length, plate.width), fit.form[model.sides], strict=True
+        ("length", "width"), (plate.length, plate.width), fit.form[problem.model.sides], strict=True
     ):
         if abs(off) > _MAX_SIDE:
             found = side + SIDE * float(off)
@@ -178,7 +165,7 @@ def _check_sides(problem: Problem, model: FormModel, fit: FormFit) -> None:
             )
 
 
-def _with_median_scale_one(fit: FormFit) -> FormFit:
+def _with_median_scale_one(fit: Fit) -> Fit:
     """Attribute the common scale of sensors to the gains, which do not tell them apart."""
     middle = float(np.median(fit.scales))
     common = SENSOR_SCALE * math.sqrt(math.pi / (2 * len(fit.scales)))  # of a median
@@ -193,8 +180,7 @@ def _with_median_scale_one(fit: FormFit) -> FormFit:
 
 def _report(
     problem: Problem,
-    model: FormModel,
-    fit: FormFit,
+    fit: Fit,
     *,
     points: FloatArray,
     names: tuple[str, ...],
@@ -203,7 +189,7 @@ def _report(
     dead_eras: tuple[str, ...],
 ) -> Calibration:
     before = problem.rig
-    rig = rig_of_fit(problem, model, fit)
+    rig = rig_of_fit(problem, fit)
     responses, gains = predicted_by(rig, problem, points, fit)
     eras = tuple(
         replace(era, gains=gain_rows(gains[:, number], frequencies) or era.gains)
@@ -220,13 +206,13 @@ def _report(
             problem.parameters, fit.x, fit.x_error, problem.free, strict=True
         )
     )
-    held_out = hold_out(problem, model, fit, points, names)
+    held_out = hold_out(problem, fit, points, names)
     uncertainty = uncertainty_of(before.uncertainty, problem, fit, parameters, held_out, gains)
     measured_count = int(np.isfinite(problem.values).sum())
     return Calibration(
         rig=replace(rig, eras=eras, uncertainty=uncertainty),
         parameters=parameters,
-        moved=moved_eras(before, model, fit),
+        moved=moved_eras(problem, fit),
         gains_error=np.hypot(fit.gains_error, np.abs(gains) - np.abs(fit.gains)),
         dead_sensors=dead_sensors,
         dead_eras=dead_eras,
@@ -239,7 +225,7 @@ def _report(
         ),
         outlier_count=measured_count - int(fit.used.sum()),
         value_count=measured_count,
-        error=_fit_error(problem, model, fit),
+        error=_fit_error(problem, fit),
         chi2=fit.chi2,
         held_out=held_out,
         sensors=names,

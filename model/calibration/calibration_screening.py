@@ -3,9 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import FloatArray
 from model.calibration.fit import Fit, Problem
-from model.calibration.parameters import rig_with
 from model.calibration.responses import Responses
 from model.errors import InputError
 
@@ -53,13 +51,13 @@ def _median(values: NDArray[np.inexact]) -> float:
     return float(np.median(finite)) if len(finite) else float("nan")
 
 
-def sensors_off_model(problem: Problem, fit: Fit, relative: FloatArray) -> NDArray[np.bool_]:
+def sensors_off_model(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     """Mask of sensors whose response is not that of the fitted plate (s,)."""
-    rig = rig_with(problem.rig, problem.parameters, fit.x)
-    model = np.nan_to_num(fit.gains)[:, :, None] * problem.plate.responses(rig)
     weight = fit.used / fit.noise[:, :, None]
-    model, values = weight * model, weight * np.where(fit.used, problem.values, 0)
+    model = weight * np.nan_to_num(fit.predicted)
+    values = weight * np.where(fit.used, problem.values, 0)
     inner = np.abs((model.conj() * values).sum(axis=(0, 1)))
     power = (np.abs(model) ** 2).sum(axis=(0, 1)) * (np.abs(values) ** 2).sum(axis=(0, 1))
     coherence = inner / np.sqrt(np.maximum(power, 1e-300))
-    return np.asarray((np.abs(relative) < _DEAD_SCALE) | (coherence < _DEAD_COHERENCE))
+    relative = np.abs(fit.scales / np.median(fit.scales))
+    return np.asarray((relative < _DEAD_SCALE) | (coherence < _DEAD_COHERENCE))

@@ -1,16 +1,23 @@
-"""Nonlinear least squares for the parameters of a rig, gains and sensor scales.
+"""Maximum a posteriori fit of a rig's parameters, with the form errors of its plate.
 
-    d_fes = g_fe s_s a_fes(x) + noise
+    d_fes = g_fe s_s a_fes(x, t) + noise,    t ~ N(0, 1),  s ~ N(1, tolerance)
 
 d measured, a of the model, g a complex gain of every frequency and ERA, s a real scale of every
-sensor. Gains are projected out (`model.calibration.variable_projection`); x and s are searched.
-The standard errors include what the gains leave undetermined.
+sensor, t form errors (`model.calibration.form_errors`). Gains are projected out
+(`model.calibration.variable_projection`); x, s and t are searched.
 
 Noise has a constant part and a part in proportion to the response, both estimated from the
-residuals. Outliers are left out, the worst of a row first, since one pulls the gain of its row.
+residuals. A first fit has no form errors and leaves outliers out, the worst of a row first, since
+one pulls the gain of its row. What tolerances leave undetermined is part of the standard errors:
+C = (J^T J)^-1 with the tolerances as rows of J, times chi² per degree of freedom where that is
+above 1. With gains projected out of J this is the Schur complement, so that of a gain
+
+    var g_fe = sigma_fe² + (dg_fe/dz) C (dg_fe/dz)^T
+
+sigma of the noise, z all that is searched: scales that sensors have in common are part of it.
 """
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
@@ -18,22 +25,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 
-from model.arrays import ComplexArray, FloatArray, IntArray
-from model.calibration.parameters import Parameter, response_slopes, responses_at
-from model.calibration.variable_projection import (
-    modal_assurance,
-    project_gains,
-    projection_slopes,
-    row_rms,
-)
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.form_errors import SENSOR_SCALE, FormModel
+from model.calibration.parameters import Parameter
+from model.calibration.variable_projection import project_gains, projection_slopes, row_rms
 from model.rig.rig import Rig
-from model.vibration.parametric_plate import ParametricPlate
 
 _Loss: TypeAlias = Literal["linear", "soft_l1"]
 
-MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
+_MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
 _PEAK = 3.0  # times the median of a row; twice that is rare on a plate
 _ROUNDS = 8
+_SETTLED = 0.1  # of the noise between two rounds
 _LEAST_LEFT = 0.1  # of a value's noise: residuals with less tell nothing of it
 _STEPS = 60  # of one search; a plate that fits takes ten
 _HOLD = 1e3  # by which a mean of scales is held
@@ -42,177 +45,267 @@ _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong b
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A rig and the measured values (f, e, s), NaN where not measured.
+    """A rig with the model of its plate, and the measured values (f, e, s), NaN where none.
 
-    free (n,), free_scales (s,): masks of the parameters and sensor scales to be fitted.
+    free (n,), free_scales (s,): masks of the parameters to be fitted, and of the scales without a
+    tolerance; has_form: whether form errors are fitted, or held at zero.
     """
 
     rig: Rig
-    plate: ParametricPlate
+    model: FormModel
     parameters: tuple[Parameter, ...]
     values: ComplexArray
     free: NDArray[np.bool_]
     free_scales: NDArray[np.bool_]
+    has_form: bool = True
+
+    def at(self, kept: NDArray[np.bool_]) -> "Problem":
+        """Select some of the sensors (s,)."""
+        return replace(
+            self,
+            model=self.model.at(kept),
+            values=self.values[:, :, kept],
+            free_scales=self.free_scales[kept],
+        )
+
+    @property
+    def searched(self) -> NDArray[np.bool_]:
+        """Mask of what is searched: free x, all scales, form errors."""
+        scales = np.ones(len(self.free_scales), dtype=bool)
+        return np.concatenate([self.free, scales, np.full(len(self.model.std), self.has_form)])
+
+    def split(self, z: FloatArray) -> list[FloatArray]:
+        """Parameters x, scales and form errors of z."""
+        n = len(self.parameters)
+        return np.split(z, [n, n + len(self.free_scales)])
+
+    def responses(self, z: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """Responses (f, e, s) as sensors of these scales read them, and derivatives by z."""
+        x, scales, form = self.split(z)
+        plain, by = self.model.responses(self.parameters, x, form)
+        by_scale = plain[None] * np.eye(len(scales))[:, None, None, :]
+        by_x, by_form = np.split(by * scales, [len(x)])
+        return plain * scales, np.concatenate([by_x, by_scale, by_form])
+
+    def tolerances(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rows (m, z) that hold scales and form errors, in tolerances, and their targets (m,)."""
+        n, s, t = len(self.parameters), len(self.free_scales), len(self.model.std)
+        scales = np.where(self.free_scales, 0, 1 / SENSOR_SCALE)
+        size = np.concatenate([np.zeros(n), scales, np.full(t, float(self.has_form))])
+        rows = np.diag(size)[size > 0]
+        targets = rows[:, n : n + s].sum(axis=1)
+        if self.free_scales.all():
+            # Gains determine a common scale; the mean is held.
+            mean = np.zeros((1, len(start)))
+            mean[0, n : n + s] = _HOLD / s
+            rows, targets = np.vstack([rows, mean]), np.append(targets, mean @ start)
+        return rows, targets
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Result of a fit.
 
-    x, x_error (n,); scales, scales_error (s,); gains, gains_error (f, e), NaN where unmeasured;
-    noise (f, e): standard deviation of a value; used (f, e, s): mask of values without outliers;
-    residual (f, e, s) in standard deviations.
+    x, x_error (n,); scales, scales_error (s,); gains, gains_error (f, e), NaN where unmeasured, the
+    latter of magnitudes, phases_error (f, e) [rad]; form, form_error (t,): form errors in their
+    tolerances; predicted (f, e, s): with gains and scales; noise (f, e): standard deviation of a
+    value; used (f, e, s): mask of values without outliers; chi2: sum of squares per degree of
+    freedom.
     """
 
     x: FloatArray
     x_error: FloatArray
     scales: FloatArray
     scales_error: FloatArray
+    form: FloatArray
+    form_error: FloatArray
     gains: ComplexArray
     gains_error: FloatArray
+    phases_error: FloatArray
+    predicted: ComplexArray
     noise: FloatArray
     used: NDArray[np.bool_]
+    chi2: float
+
+    def at(self, kept: NDArray[np.bool_], model: FormModel) -> "Fit":
+        """Select some of the sensors (s,) as the start of another fit."""
+        return replace(
+            self,
+            scales=self.scales[kept],
+            used=self.used[:, :, kept],
+            form=model.select(self.form, kept),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Where a search ended: z, with the derivatives of the residuals by what is searched."""
+
+    z: FloatArray
+    jacobian: FloatArray
     residual: FloatArray
 
 
-def solve(problem: Problem, x: FloatArray, scales: FloatArray) -> Fit:
-    """Fit from starting values x (n,) and scales (s,), which those not free keep."""
+def first_fit(problem: Problem, x: FloatArray) -> Fit:
+    """Fit from starting values x (n,), all scales free and no form errors, despite outliers."""
+    scales = np.ones(len(problem.free_scales))
+    problem = replace(problem, has_form=False, free_scales=scales > 0)
+    z = np.concatenate([x, scales, np.zeros(len(problem.model.std))])
     used = np.isfinite(problem.values)
     # Without residuals to judge by, peaks of a row are clipped at first.
-    first = replace(problem, values=_without_peaks(problem.values, used))
-    noise = 0.05 * row_rms(first.values, used)
-    x, scales, _ = _search(first, x, scales, used / noise[:, :, None], loss="soft_l1")
+    clipped = replace(problem, values=_without_peaks(problem.values, used))
+    noise = 0.05 * row_rms(clipped.values, used)
+    found = _search(clipped, z, used / noise[:, :, None], loss="soft_l1")
     for number in range(_ROUNDS):
-        left = _residual(problem, x, scales, used / noise[:, :, None])
-        raw = np.abs(left) * noise[:, :, None]
-        noise = noise_of(problem.values, raw, used)
-        kept = _without_outliers(raw / noise[:, :, None], used)
+        raw = _deviation(problem, found.z, used / noise[:, :, None])
+        noise = _noise_of(problem.values, raw, used)
+        kept = _without_worst(raw / noise[:, :, None], used)
         is_settled = number > 0 and bool((kept == used).all())
         used = kept
-        weight = used / noise[:, :, None]
         loss: _Loss = "linear" if is_settled else "soft_l1"
-        x, scales, errors = _search(problem, x, scales, weight, loss=loss)
+        found = _search(problem, found.z, used / noise[:, :, None], loss=loss)
         if is_settled:
             break
-    model = _model(problem, x) * scales
-    gains, residual = project_gains(model, problem.values, weight)
-    power = (np.abs(weight * model) ** 2).sum(axis=2)
-    with np.errstate(divide="ignore"):
-        gains_error = np.where(power > 0, 1 / np.sqrt(power), np.nan)
-    x_error = np.zeros(len(x))
-    x_error[problem.free] = errors[: problem.free.sum()]
-    scales_error = np.zeros(len(scales))
-    scales_error[problem.free_scales] = errors[problem.free.sum() :]
-    return Fit(x, x_error, scales, scales_error, gains, gains_error, noise, used, np.abs(residual))
+    return _result(problem, found, noise, used)
 
 
-def misfit(problem: Problem, x: FloatArray) -> float:
-    """Median over rows of 1 - MAC, 0 to 1, for all parameters x (n,), free or not."""
-    model = _model(problem, x)
-    return float(np.nanmedian(1 - modal_assurance(problem.values, model)))
+def solve(problem: Problem, start: Fit) -> Fit:
+    """Fit parameters, scales and form errors, from those of another fit."""
+    z = np.concatenate([start.x, start.scales, start.form])
+    noise, used = start.noise, start.used
+    finite = np.isfinite(problem.values)
+    for _ in range(_ROUNDS):
+        weight = used / noise[:, :, None]
+        found = _search(problem, z, weight)
+        z, before = found.z, noise
+        raw = _deviation(problem, z, weight)
+        noise = _noise_of(problem.values, raw, used, _noise_left(problem, found, weight))
+        # What form errors explain comes back.
+        kept = finite & ~(raw > _MAX_DEVIATION * np.sqrt(2) * noise[:, :, None])
+        is_settled = bool((kept == used).all() and (np.abs(noise / before - 1) < _SETTLED).all())
+        used = kept
+        if is_settled:
+            break
+    return _result(problem, _search(problem, z, used / noise[:, :, None]), noise, used)
 
 
 def _search(
-    problem: Problem, x: FloatArray, scales: FloatArray, weight: FloatArray, *, loss: _Loss
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return x, scales, and standard errors of the free parameters and scales."""
-    free, free_scales = problem.free, problem.free_scales
-    count = int(free.sum())
+    problem: Problem, start: FloatArray, weight: FloatArray, *, loss: _Loss = "linear"
+) -> _Found:
+    searched, inside = problem.searched, weight > 0
+    tolerances, targets = problem.tolerances(start)
+    last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
-    # Gains determine a common scale; the mean is held.
-    is_mean_held = bool(free_scales.all())
+    def full(y: FloatArray) -> FloatArray:
+        whole = start.copy()
+        whole[searched] = y
+        return whole
 
-    def unpack(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        full, sensors = x.copy(), scales.copy()
-        full[free], sensors[free_scales] = z[:count], z[count:]
-        return full, sensors
+    def both(y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        key = y.tobytes()
+        if key not in last:
+            last.clear()
+            z = full(y)
+            model, by_z = problem.responses(z)
+            _, left = project_gains(model, problem.values, weight)
+            _, slopes = projection_slopes(model, by_z[searched], problem.values, weight)
+            data, rows = left[inside], slopes[:, inside].T
+            last[key] = (
+                np.concatenate([data.real, data.imag, tolerances @ z - targets]),
+                np.vstack([rows.real, rows.imag, tolerances[:, searched]]),
+            )
+        return last[key]
 
-    def residual(z: FloatArray) -> FloatArray:
-        full, sensors = unpack(z)
-        left = _residual(problem, full, sensors, weight)[weight > 0]
-        parts = [left.real, left.imag]
-        if is_mean_held:
-            parts.append(_HOLD * (sensors.mean(keepdims=True) - scales.mean()))
-        return np.concatenate(parts)
+    def residuals(y: FloatArray) -> FloatArray:
+        return both(y)[0]
 
-    def jacobian(z: FloatArray) -> FloatArray:
-        full, sensors = unpack(z)
-        plain, by_x = response_slopes(problem.plate, problem.rig, problem.parameters, full)
-        by_scale = plain * np.eye(len(scales))[free_scales, None, None]
-        slopes = np.concatenate([by_x[free] * sensors, by_scale])
-        _, slopes = projection_slopes(plain * sensors, slopes, problem.values, weight)
-        rows = slopes[:, weight > 0]
-        parts = [rows.real, rows.imag]
-        if is_mean_held:
-            parts.append(np.repeat([[0.0], [_HOLD / len(scales)]], [count, len(scales)], axis=0))
-        return np.concatenate(parts, axis=1).T
+    def jacobian(y: FloatArray) -> FloatArray:
+        return both(y)[1]
 
-    start = np.concatenate([x[free], scales[free_scales]])
-    if len(start) == 0:
-        return x, scales, start
-    lower, upper = _bounds(problem.parameters, free, len(start) - count)
+    n = len(problem.parameters)
+    lower, upper = np.full(len(start), -np.inf), np.full(len(start), np.inf)
+    lower[:n] = [parameter.lower for parameter in problem.parameters]
+    upper[:n] = [parameter.upper for parameter in problem.parameters]
     found = least_squares(
-        residual,
-        np.clip(start, lower + 1e-9, upper - 1e-9),
+        residuals,
+        np.clip(start, lower + 1e-9, upper - 1e-9)[searched],
         jacobian,
-        bounds=(lower, upper),
+        bounds=(lower[searched], upper[searched]),
         loss=loss,
         x_scale="jac",
         max_nfev=_STEPS,
-        xtol=1e-9,
-        ftol=1e-9,
+        xtol=1e-7,
+        ftol=1e-8,
     )
-    full, sensors = unpack(found.x)
-    frequency = np.broadcast_to(np.arange(len(weight))[:, None, None], weight.shape)[weight > 0]
-    rows = int((weight > 0).any(axis=2).sum())
-    freedom = max(2 * int((weight > 0).sum()) - 2 * rows - len(start), 1)
-    errors = _standard_errors(
-        np.asarray(found.jac), found.fun, np.tile(frequency, 2), freedom=freedom
-    )
-    return full, sensors, errors
+    return _Found(full(found.x), np.asarray(found.jac), np.asarray(found.fun))
 
 
-def _standard_errors(
-    jacobian: FloatArray, residual: FloatArray, group: IntArray, *, freedom: int
-) -> FloatArray:
-    """Standard errors of the fitted (n,); infinite where undetermined.
+def _deviation(problem: Problem, z: FloatArray, weight: FloatArray) -> FloatArray:
+    """Magnitudes (f, e, s) of the residuals of all values, outliers included [1/s²]."""
+    model, _ = problem.responses(z)
+    gains, _ = project_gains(model, problem.values, weight)
+    return np.abs(problem.values - np.nan_to_num(gains)[:, :, None] * model)
 
-    The larger of two: with all residuals (m,) independent, and with those of a frequency
-    correlated, as they are where the model is wrong (sandwich estimate). group: frequency index of
-    each residual, except of those at the end that have none.
+
+def _noise_left(problem: Problem, found: _Found, weight: FloatArray) -> FloatArray:
+    """Share (f, e, s) of each value's noise that is left in its residual: 1 - its leverage.
+
+    That is of its row's gain, and of all that is searched, for which tolerances leave less.
     """
-    size = np.linalg.norm(jacobian, axis=0)
+    inside = weight > 0
+    model, _ = problem.responses(found.z)
+    by_gain = np.abs(weight * model) ** 2
+    total = by_gain.sum(axis=2, keepdims=True)
+    left = 1 - by_gain / np.where(total > 0, total, 1)
+    size = np.linalg.norm(found.jacobian, axis=0)
+    scaled = found.jacobian / np.where(size > 0, size, 1)
+    rows, strength, _ = np.linalg.svd(scaled, full_matrices=False)
+    leverage = (rows[:, strength > 1e-9 * strength[0]] ** 2).sum(axis=1)
+    left[inside] -= leverage[: 2 * inside.sum()].reshape(2, -1).mean(axis=0)
+    return np.asarray(left)
+
+
+def _result(problem: Problem, found: _Found, noise: FloatArray, used: NDArray[np.bool_]) -> Fit:
+    searched, weight = problem.searched, used / noise[:, :, None]
+    rows = int(used.any(axis=2).sum())
+    freedom = max(len(found.residual) - 2 * rows - int(searched.sum()), 1)
+    chi2 = float((found.residual**2).sum()) / freedom
+    size = np.linalg.norm(found.jacobian, axis=0)
     size[size == 0] = 1e-300
-    _, strength, directions = np.linalg.svd(jacobian / size, full_matrices=False)
+    _, strength, directions = np.linalg.svd(found.jacobian / size, full_matrices=False)
     seen = strength > 1e-9 * strength[0]
     blind = (np.abs(directions[~seen]) > 1e-6).any(axis=0)
-    inverse = (directions[seen].T / strength[seen] ** 2) @ directions[seen]
-    independent = np.diagonal(inverse) * (residual**2).sum() / freedom
-    pull = (jacobian / size * residual[:, None])[: len(group)]
-    pulls = np.zeros((int(group.max()) + 1, len(size)))
-    np.add.at(pulls, group, pull)
-    grouped = ((pulls @ inverse) ** 2).sum(axis=0)
-    return np.where(blind, np.inf, np.sqrt(np.maximum(independent, grouped)) / size)
-
-
-def _bounds(
-    parameters: Sequence[Parameter], free: NDArray[np.bool_], scales: int
-) -> tuple[FloatArray, FloatArray]:
-    fitted = [parameter for parameter, is_free in zip(parameters, free, strict=True) if is_free]
-    lower = [parameter.lower for parameter in fitted] + [-100.0] * scales
-    upper = [parameter.upper for parameter in fitted] + [100.0] * scales
-    return np.array(lower), np.array(upper)
-
-
-def _residual(
-    problem: Problem, x: FloatArray, scales: FloatArray, weight: FloatArray
-) -> ComplexArray:
-    """Weighted residual (f, e, s) with the best gains; zero where nothing was measured."""
-    return project_gains(_model(problem, x) * scales, problem.values, weight)[1]
-
-
-def _model(problem: Problem, x: FloatArray) -> ComplexArray:
-    return responses_at(problem.plate, problem.rig, problem.parameters, x)
+    root = directions[seen].T / strength[seen] / size[:, None] * math.sqrt(max(chi2, 1.0))
+    errors = np.zeros(len(found.z))
+    errors[searched] = np.where(blind, np.inf, np.linalg.norm(root, axis=1))
+    model, by_z = problem.responses(found.z)
+    gains, _ = project_gains(model, problem.values, weight)
+    by_gain, _ = projection_slopes(model, by_z[searched], problem.values, weight)
+    power = (np.abs(weight * model) ** 2).sum(axis=2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = by_gain / gains
+        of_noise = np.where(power > 0, max(chi2, 1.0) / (power * np.abs(gains) ** 2), np.nan)
+    magnitude, phase = (
+        np.sqrt(of_noise + (np.tensordot(root.T, part, axes=1) ** 2).sum(axis=0))
+        for part in (relative.real, relative.imag)
+    )
+    x, scales, form = problem.split(found.z)
+    x_error, scales_error, form_error = problem.split(errors)
+    return Fit(
+        x,
+        x_error,
+        scales,
+        np.where(problem.free_scales, scales_error, 0.0),
+        form,
+        form_error,
+        gains,
+        np.abs(gains) * magnitude,
+        phase,
+        gains[:, :, None] * model,
+        noise,
+        used,
+        chi2,
+    )
 
 
 def _without_peaks(values: ComplexArray, used: NDArray[np.bool_]) -> ComplexArray:
@@ -224,7 +317,7 @@ def _without_peaks(values: ComplexArray, used: NDArray[np.bool_]) -> ComplexArra
     return np.asarray(values * np.minimum(1, limit[:, :, None] / np.maximum(size, 1e-300)))
 
 
-def noise_of(
+def _noise_of(
     values: ComplexArray,
     raw: FloatArray,
     used: NDArray[np.bool_],
@@ -261,11 +354,11 @@ def noise_of(
     return np.asarray(np.sqrt(a2 + b2 * size**2 + floor**2))
 
 
-def _without_outliers(deviation: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _without_worst(deviation: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Take the worst value out of each row that has one beyond bounds and others to stay."""
     deviation = np.where(used, deviation / np.sqrt(2), 0)
     worst = deviation.argmax(axis=2)
-    f, e = np.nonzero((deviation.max(axis=2) > MAX_DEVIATION) & (used.sum(axis=2) > 2))
+    f, e = np.nonzero((deviation.max(axis=2) > _MAX_DEVIATION) & (used.sum(axis=2) > 2))
     kept = used.copy()
     kept[f, e, worst[f, e]] = False
     return kept

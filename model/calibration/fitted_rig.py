@@ -10,9 +10,8 @@ from scipy.special import ndtr
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import FittedParameter, HeldOut, MovedEra
-from model.calibration.fit import Problem
-from model.calibration.form_errors import FormModel, mass_scale_error
-from model.calibration.form_fit import FormFit
+from model.calibration.fit import Fit, Problem
+from model.calibration.form_errors import mass_scale_error
 from model.calibration.parameters import Parameter, rig_with
 from model.calibration.variable_projection import project_gains
 from model.rig.rig import Rig
@@ -29,10 +28,10 @@ _HELD, _HALF_WIDTH = 0.9, 1.645  # share that an interval holds, in standard err
 _MODEL_ERROR = 2e-3
 
 
-def rig_of_fit(problem: Problem, model: FormModel, fit: FormFit) -> Rig:
+def rig_of_fit(problem: Problem, fit: Fit) -> Rig:
     """Rig with fitted values, and ERAs at the places where they clearly are; gains unchanged."""
     rig = rig_with(problem.rig, problem.parameters, fit.x)
-    moves = {moved.name: moved.after for moved in moved_eras(problem.rig, model, fit)}
+    moves = {moved.name: moved.after for moved in moved_eras(problem, fit)}
     eras = tuple(
         replace(era, x=moves[era.name][0], y=moves[era.name][1]) if era.name in moves else era
         for era in rig.eras
@@ -40,9 +39,9 @@ def rig_of_fit(problem: Problem, model: FormModel, fit: FormFit) -> Rig:
     return replace(rig, eras=eras)
 
 
-def moved_eras(rig: Rig, model: FormModel, fit: FormFit) -> tuple[MovedEra, ...]:
+def moved_eras(problem: Problem, fit: Fit) -> tuple[MovedEra, ...]:
     """List the ERAs that are off their places by several standard errors."""
-    found = []
+    rig, model, found = problem.rig, problem.model, []
     sides = np.array([rig.plate.length, rig.plate.width])
     places, errors = model.places(fit.form), model.places(fit.form_error)
     for era, place, error in zip(rig.eras, places.T, errors.T, strict=True):
@@ -61,11 +60,10 @@ def moved_eras(rig: Rig, model: FormModel, fit: FormFit) -> tuple[MovedEra, ...]
 
 
 def predicted_by(
-    rig: Rig, problem: Problem, points: FloatArray, fit: FormFit
+    rig: Rig, problem: Problem, points: FloatArray, fit: Fit
 ) -> tuple[ComplexArray, ComplexArray]:
     """Responses (f, e, s) of a rig at points (s, 2) [m], and its gains (f, e) that fit best."""
-    frequencies = problem.plate.omega / (2 * np.pi)
-    model = parametric_plate(rig, points, frequencies).responses(rig)
+    model = parametric_plate(rig, points, problem.model.frequencies).responses(rig)
     weight = fit.used / fit.noise[:, :, None]
     gains, _ = project_gains(model * fit.scales, problem.values, weight)
     return model, gains
@@ -91,7 +89,7 @@ def standard_error(rig: Rig, parameter: Parameter, x: float, error: float) -> fl
 def uncertainty_of(
     before: Uncertainty,
     problem: Problem,
-    fit: FormFit,
+    fit: Fit,
     parameters: Sequence[FittedParameter],
     held_out: HeldOut | None,
     gains: ComplexArray,

@@ -75,6 +75,11 @@ class FormModel:
     shifted: IntArray
     std: FloatArray
 
+    @property
+    def frequencies(self) -> FloatArray:
+        """Of the responses (f,) [Hz]."""
+        return self.omega / (2 * np.pi)
+
     def at(self, kept: NDArray[np.bool_]) -> "FormModel":
         """Select some of the sensors (s,)."""
         return replace(

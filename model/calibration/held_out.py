@@ -7,10 +7,8 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import HeldOut
-from model.calibration.fit import Problem
+from model.calibration.fit import Fit, Problem, solve
 from model.calibration.fitted_rig import predicted_by, rig_of_fit
-from model.calibration.form_errors import FormModel
-from model.calibration.form_fit import FormFit, solve_with_form
 from model.calibration.variable_projection import row_rms
 
 _HELD_OUT_SHARE = 0.2  # of the sensors
@@ -18,7 +16,7 @@ _LEAST_TO_HOLD_OUT = 5  # sensors
 
 
 def hold_out(
-    problem: Problem, model: FormModel, fit: FormFit, points: FloatArray, names: tuple[str, ...]
+    problem: Problem, fit: Fit, points: FloatArray, names: tuple[str, ...]
 ) -> HeldOut | None:
     """Fit without some of the sensors of known scale, and predict their responses.
 
@@ -34,15 +32,9 @@ def hold_out(
     evenly_spaced = np.linspace(0, len(candidates) - 1, wanted + 2)[1:-1].round().astype(int)
     unseen = np.zeros(count, dtype=bool)
     unseen[candidates[evenly_spaced]] = True
-    part = replace(
-        problem,
-        plate=problem.plate.at(~unseen),
-        values=problem.values[:, :, ~unseen],
-        free_scales=problem.free_scales[~unseen],
-    )
-    model_part = model.at(~unseen)
-    seen = solve_with_form(part, model_part, fit.at(~unseen, model))
-    rig = rig_of_fit(part, model_part, seen)
+    part = problem.at(~unseen)
+    seen = solve(part, fit.at(~unseen, problem.model))
+    rig = rig_of_fit(part, seen)
     everywhere = replace(seen, used=fit.used & ~unseen, noise=fit.noise, scales=fit.scales)
     responses, gains = predicted_by(rig, problem, points, everywhere)
     predicted = gains[:, :, None] * responses * fit.scales
@@ -60,9 +52,11 @@ def hold_out(
 
 def initial_responses(problem: Problem) -> ComplexArray:
     """Responses (f, e, s) of the rig before the fit, with its gains."""
-    frequencies = problem.plate.omega / (2 * np.pi)
-    gains = np.column_stack([era.gain(frequencies) for era in problem.rig.eras])
-    return np.asarray(gains[:, :, None] * problem.plate.responses(problem.rig))
+    gains = np.column_stack([era.gain(problem.model.frequencies) for era in problem.rig.eras])
+    start = np.array([parameter.start for parameter in problem.parameters])
+    none = np.zeros(len(problem.model.std))
+    responses, _ = problem.model.responses(problem.parameters, start, none)
+    return np.asarray(gains[:, :, None] * responses)
 
 
 def relative_error(

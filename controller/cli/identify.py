@@ -106,10 +106,10 @@ def identify(
     from model.files.array_file import whole_or_nothing
     from model.files.replacing import check_ending, check_place
     from model.identification import identification_report
-    from model.identification.identified_text import identified_text
     from model.identification.identify import identify as fit
     from model.identification.measured_plate import DeviceSettings
     from model.identification.promise import expected_contrast
+    from model.rig.rewritten import rewritten_text
 
     settings: DeviceSettings | None = None
     if device is None:
@@ -162,7 +162,7 @@ def identify(
     if found.is_explained:
         comment = [f"{source.name} identified in place by `era rig identify`:"]
         comment += [f"  {row}" for row in rows]
-        text = identified_text(document, rig, found.rig, comment="\n".join(comment))
+        text = rewritten_text(document, rig, found.rig, comment="\n".join(comment))
         with whole_or_nothing(output) as stream:
             stream.write(text.encode())
         files.append(str(output))

@@ -39,7 +39,7 @@ def calibrate(
     from model.calibration.calibrate import calibrate as fit
     from model.calibration.responses import responses_of
     from model.calibration.responses_file import read_functions
-    from model.config.document import parse_document, read_document
+    from model.config.document import read_document
     from model.diagnosis.consistency import check_consistency
     from model.files.array_file import whole_or_nothing
     from model.files.replacing import check_ending, check_picture, check_place
@@ -70,15 +70,13 @@ def calibrate(
     ]
     files = []
     if calibration.is_good:
-        from model.calibration.calibrated_rig import calibrated_text, check_reads_back
+        from model.rig.rewritten import rewritten_text
 
         comment = "\n".join(
             [f"{rig_file.name} calibrated with {measured_file.name} by `era calibrate`:"]
             + [f"  {row}" for row in [*rows, *notes]]
         )
-        text = calibrated_text(document, rig, calibration, comment=comment)
-        new = rig_of(parse_document(str(output), text), mesh=mesh)
-        check_reads_back(new, calibration, output)
+        text = rewritten_text(document, rig, calibration.rig, comment=comment, mesh=mesh)
         with whole_or_nothing(output) as stream:
             stream.write(text.encode())
         files.append(str(output))

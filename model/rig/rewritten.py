@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from model.config.document import Document
+from model.config.document import Document, parse_document
 from model.config.editing import edited_text
+from model.errors import InputError
+from model.rig.file import rig_of
 from model.rig.rig import Rig
 from model.structure.actuator import Gain
 from model.structure.plate import Material
@@ -24,11 +26,14 @@ _PLACEHOLDER = re.compile(
 )
 
 
-def rewritten_text(document: Document, before: Rig, after: Rig, *, comment: str) -> str:
+def rewritten_text(
+    document: Document, before: Rig, after: Rig, *, comment: str, mesh: str | None = None
+) -> str:
     """Return a rig file's text with the values of another rig of the same ERAs, after a comment.
 
     Written are plate, ERAs and uncertainty where they differ, and further masses after its own.
-    Raises ConfigError if a comment of the file would be lost.
+    mesh: that replaces the file's. Raises ConfigError if a comment of the file would be lost,
+    InputError where the text, read as a rig, has other values.
     """
 
     def change(data: CommentedMap) -> None:
@@ -59,8 +64,33 @@ def rewritten_text(document: Document, before: Rig, after: Rig, *, comment: str)
         return match["start"] + _rows_text(rows, indent=indent)
 
     lines = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
-    text = edited_text(document, change)
-    return f"{lines}\n{_PLACEHOLDER.sub(rows_text, text)}"
+    text = f"{lines}\n{_PLACEHOLDER.sub(rows_text, edited_text(document, change))}"
+    back = rig_of(parse_document(document.source, text), mesh=mesh)
+    read, expected = _numbers(back), _numbers(after)
+    # The absolute part is for numbers near zero: 1 mg, 1 µm, a ten-thousandth of a gain.
+    if len(read) != len(expected) or not np.allclose(read, expected, rtol=1e-4, atol=1e-4):
+        raise InputError(
+            f"{document.source}: values read back must be those written; write plate and ERAs as "
+            "`era config init` does, and try again"
+        )
+    return text
+
+
+def _numbers(rig: Rig) -> list[float]:
+    """Values of a rig that are written: lengths in mm, masses in g."""
+    plate = rig.plate
+    layers = rig.laminate.layers if rig.laminate else ()
+    found = [layer.material.E for layer in layers] or [plate.material.E]
+    found += [1e3 * plate.thickness, plate.loss_factor, plate.loss_exponent]
+    found += [part for pair in plate.mode_deviations for part in pair]
+    found += asdict(rig.uncertainty).values()
+    for era in rig.eras:
+        found += [1e3 * era.x, 1e3 * era.y, era.stiffness, era.damping, 1e3 * era.bolt_mass]
+        for _, size, phase in era.gains:
+            found += [size, np.cos(phase), np.sin(phase)]
+    for mass in rig.masses:
+        found += [1e3 * mass.x, 1e3 * mass.y, 1e3 * mass.mass]
+    return found
 
 
 def _change_plate(data: CommentedMap, before: Rig, after: Rig) -> None:

@@ -3,11 +3,90 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import pytest
+
 from model.config.document import parse_document
+from model.errors import InputError
+from model.rig import rewritten
 from model.rig.file import rig_of
 from model.rig.rewritten import rewritten_text
+from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
 
 RIG = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"
+
+
+FLOW = """\
+# my panel
+plate: {length: 0.3, width: 0.2, thickness: 2 mm, material: steel}  # from stock
+mesh: 12x9
+limits: {frequency: [40, 200]}
+eras:
+  A: {at: [0, 0], stiffness: 9 kN/m, damping_ratio: 0.1, amplifier: m, channel: 0}
+  B: {at: [0.3, 0], stiffness: 9000, amplifier: m, channel: 1, }
+  C: {at: [0, 0.2], stiffness: 9000, damping: 2, bolt_mass: 3 g, amplifier: m, channel: 2}
+amplifiers: {m: {url: "sim://"}}
+"""
+
+BLOCK = """\
+plate:
+  length: 0.3
+  width: 0.2
+  layers:   # glass on glass
+    - material: soda-lime-glass
+      thickness: 2 mm
+    - material: {E: 60 GPa, rho: 2500, nu: 0.2}
+      thickness: 1 mm   # the touch side
+  bond: none
+  loss_factor: 2 %   # bonded
+mesh: 12x9
+limits: {frequency: [40, 200]}
+eras:
+  A:   # "ä" in a comment: µ
+    at:
+      - 0
+      - 0
+    stiffness: 9000   # maker's
+    amplifier: m
+    channel: 0
+    gains:
+      - [50, 1, 0]
+      - [60, 1, 0]
+  B:
+    at: [0.3, 0]
+    bolt_mass: 1 g
+    stiffness: 9000
+    amplifier: m
+    channel: 1
+  C: {at: [0, 0.2], stiffness: 9000, amplifier: m, channel: 2}
+amplifiers: {m: {url: "sim://"}}
+"""
+
+BONDED = BLOCK.replace("bond: none", "bond: full").replace("12x9", "auto")
+
+
+def other_values(rig: Rig) -> Rig:
+    """Other values everywhere, gains for all but the last ERA."""
+    plate = replace(rig.plate.scaled(modulus=1.2345678), loss_factor=0.0234)
+    eras = tuple(
+        replace(
+            era,
+            stiffness=era.stiffness * 1.1 + number,
+            damping=era.damping + 1.5,
+            bolt_mass=era.bolt_mass + 0.0123456,
+            x=0.00123 if number == 0 else era.x,
+            gains=((50.0, 0.91234, -0.2), (60.5, 1.1, 3.0)) if number < 2 else (),
+        )
+        for number, era in enumerate(rig.eras)
+    )
+    return replace(
+        rig,
+        plate=plate,
+        laminate=rig.laminate and rig.laminate.scaled(modulus=1.2345678),
+        eras=eras,
+        uncertainty=Uncertainty(0.004, 0.3, 0.002, 0.01, 1.02, 0.5),
+    )
 
 
 def test_gains_are_rewritten_wherever_yaml_wraps_the_line() -> None:
@@ -29,3 +108,39 @@ def test_gains_are_rewritten_wherever_yaml_wraps_the_line() -> None:
         after = rewritten_text(document, rig, replace(rig, eras=eras), comment="measured")
         read = rig_of(parse_document("new.yaml", after))
         assert [[row[0] for row in era.gains] for era in read.eras] == [[50.0, 60.0]] * 4
+
+
+@pytest.mark.parametrize("text", [FLOW, BLOCK, BONDED], ids=["flow", "block", "bonded"])
+def test_rewritten_text_keeps_comments_and_has_every_value(text: str) -> None:
+    """Comments of any style stay, and values are those of the other rig, layers' moduli too."""
+    document = parse_document("rig.yaml", text)
+    rig = rig_of(document)
+    other = other_values(rig)
+    written = rewritten_text(document, rig, other, comment="new\nvalues")
+    assert written.startswith("# new\n# values\n\n")
+    for line in text.splitlines():
+        if "#" in line:
+            assert line[line.index("#") :] in written
+    back = rig_of(parse_document("new.yaml", written))
+    if back.plate.laminate is None:
+        assert pytest.approx(other.plate.material.E, rel=1e-6) == back.plate.material.E
+    else:
+        moduli = [layer.material.E for layer in back.plate.laminate.layers]
+        assert moduli == pytest.approx([1.2345678 * 70e9, 1.2345678 * 60e9], rel=1e-6)
+    assert back.plate.loss_factor == 0.0234
+    for era, expected in zip(back.eras, other.eras, strict=True):
+        assert era.stiffness == pytest.approx(expected.stiffness, rel=1e-5)
+        assert era.damping == pytest.approx(expected.damping, rel=1e-5)
+        assert era.bolt_mass == pytest.approx(expected.bolt_mass, rel=1e-5)
+        np.testing.assert_allclose(era.gains, expected.gains, rtol=1e-5)
+    assert back.wiring == rig.wiring
+    assert back.plate.mass == pytest.approx(rig.plate.mass, rel=1e-9)
+
+
+def test_text_that_reads_back_otherwise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file whose plate cannot be changed is not taken for that of the other rig."""
+    document = parse_document("rig.yaml", FLOW)
+    rig = rig_of(document)
+    monkeypatch.setattr(rewritten, "_set_modulus", lambda *_: None)
+    with pytest.raises(InputError, match="read back"):
+        rewritten_text(document, rig, other_values(rig), comment="")

@@ -18,16 +18,17 @@ sigma of the noise, z all that is searched: scales that sensors have in common a
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares, nnls
+from scipy.optimize import OptimizeResult, least_squares, nnls
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.form_errors import SENSOR_SCALE, FormModel
-from model.calibration.parameters import Parameter
+from model.calibration.parameters import Parameter, bounds_of
 from model.calibration.variable_projection import project_gains, projection_slopes, row_rms
 from model.rig.rig import Rig
 
@@ -80,12 +81,12 @@ class Problem:
         return np.split(z, [n, n + len(self.free_scales)])
 
     def responses(self, z: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """Responses (f, e, s) as sensors of these scales read them, and derivatives by z."""
+        """Responses (f, e, s) as sensors read them, and derivatives by what is searched of z."""
         x, scales, form = self.split(z)
-        plain, by = self.model.responses(self.parameters, x, form)
+        plain, by = self.model.responses(self.parameters, x, form, has_form=self.has_form)
         by_scale = plain[None] * np.eye(len(scales))[:, None, None, :]
         by_x, by_form = np.split(by * scales, [len(x)])
-        return plain * scales, np.concatenate([by_x, by_scale, by_form])
+        return plain * scales, np.concatenate([by_x[self.free], by_scale, by_form])
 
     def tolerances(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rows (m, z) that hold scales and form errors, in tolerances, and their targets (m,)."""
@@ -189,31 +190,24 @@ def solve(problem: Problem, start: Fit) -> Fit:
     return _result(problem, _search(problem, z, used / noise[:, :, None]), noise, used)
 
 
-def _search(
-    problem: Problem, start: FloatArray, weight: FloatArray, *, loss: _Loss = "linear"
-) -> _Found:
-    searched, inside = problem.searched, weight > 0
-    tolerances, targets = problem.tolerances(start)
-    last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+def search(
+    linearised: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    start: FloatArray,
+    bounds: FloatArray,
+    *,
+    loss: _Loss = "linear",
+) -> OptimizeResult:
+    """Least squares of residuals (m,) with derivatives (m, n), from a start (n,) within bounds.
 
-    def full(y: FloatArray) -> FloatArray:
-        whole = start.copy()
-        whole[searched] = y
-        return whole
+    bounds (2, n).
+    """
+    last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
     def both(y: FloatArray) -> tuple[FloatArray, FloatArray]:
         key = y.tobytes()
         if key not in last:
             last.clear()
-            z = full(y)
-            model, by_z = problem.responses(z)
-            _, left = project_gains(model, problem.values, weight)
-            _, slopes = projection_slopes(model, by_z[searched], problem.values, weight)
-            data, rows = left[inside], slopes[:, inside].T
-            last[key] = (
-                np.concatenate([data.real, data.imag, tolerances @ z - targets]),
-                np.vstack([rows.real, rows.imag, tolerances[:, searched]]),
-            )
+            last[key] = linearised(y)
         return last[key]
 
     def residuals(y: FloatArray) -> FloatArray:
@@ -222,21 +216,44 @@ def _search(
     def jacobian(y: FloatArray) -> FloatArray:
         return both(y)[1]
 
-    n = len(problem.parameters)
-    lower, upper = np.full(len(start), -np.inf), np.full(len(start), np.inf)
-    lower[:n] = [parameter.lower for parameter in problem.parameters]
-    upper[:n] = [parameter.upper for parameter in problem.parameters]
-    found = least_squares(
+    return least_squares(
         residuals,
-        np.clip(start, lower + 1e-9, upper - 1e-9)[searched],
+        np.clip(start, bounds[0] + 1e-9, bounds[1] - 1e-9),
         jacobian,
-        bounds=(lower[searched], upper[searched]),
+        bounds=(bounds[0], bounds[1]),
         loss=loss,
         x_scale="jac",
         max_nfev=_STEPS,
         xtol=1e-7,
         ftol=1e-8,
     )
+
+
+def _search(
+    problem: Problem, start: FloatArray, weight: FloatArray, *, loss: _Loss = "linear"
+) -> _Found:
+    searched, inside = problem.searched, weight > 0
+    tolerances, targets = problem.tolerances(start)
+
+    def full(y: FloatArray) -> FloatArray:
+        whole = start.copy()
+        whole[searched] = y
+        return whole
+
+    def linearised(y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        z = full(y)
+        model, by_z = problem.responses(z)
+        _, left = project_gains(model, problem.values, weight)
+        _, slopes = projection_slopes(model, by_z, problem.values, weight)
+        data, rows = left[inside], slopes[:, inside].T
+        return (
+            np.concatenate([data.real, data.imag, tolerances @ z - targets]),
+            np.vstack([rows.real, rows.imag, tolerances[:, searched]]),
+        )
+
+    bounds = np.full((2, len(start)), [[-np.inf], [np.inf]])
+    bounds[:, : len(problem.parameters)] = bounds_of(problem.parameters)
+    found = search(linearised, start[searched], bounds[:, searched], loss=loss)
     return _Found(full(found.x), np.asarray(found.jac), np.asarray(found.fun))
 
 
@@ -280,7 +297,7 @@ def _result(problem: Problem, found: _Found, noise: FloatArray, used: NDArray[np
     errors[searched] = np.where(blind, np.inf, np.linalg.norm(root, axis=1))
     model, by_z = problem.responses(found.z)
     gains, _ = project_gains(model, problem.values, weight)
-    by_gain, _ = projection_slopes(model, by_z[searched], problem.values, weight)
+    by_gain, _ = projection_slopes(model, by_z, problem.values, weight)
     power = (np.abs(weight * model) ** 2).sum(axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = by_gain / gains

@@ -112,11 +112,16 @@ class FormModel:
         return [*places, *map(len, (self.cell_shapes, self.stiffening, self.shifted))]
 
     def responses(
-        self, parameters: Sequence[Parameter], x: FloatArray, form: FloatArray
+        self,
+        parameters: Sequence[Parameter],
+        x: FloatArray,
+        form: FloatArray,
+        *,
+        has_form: bool = True,
     ) -> tuple[ComplexArray, ComplexArray]:
         """Responses (f, e, s) [1/s²] of x (n,) and form errors (t,), and derivatives (n + t, ...).
 
-        form: in their tolerances.
+        form: in their tolerances; without has_form derivatives are by x alone (n, ...).
         """
         era_count, sensor_count = len(self.era_shapes), len(self.sensor_shapes)
         values = np.array([p.value(float(at)) for p, at in zip(parameters, x, strict=True)])
@@ -177,6 +182,9 @@ class FormModel:
                 1j * omega[:, :, None] * by_spring[..., era] * slope[at + 1],
                 (wide**2 * by_mass)[..., era] * slope[at + 2],
             ]
+        scale = -(omega**2)[:, :, None]
+        if not has_form:
+            return scale * response, scale * np.array(found)
         for direction in range(2):
             steeper = self.era_slopes[direction]
             moved_more = np.swapaxes(steeper @ q, 1, 2)
@@ -204,7 +212,6 @@ class FormModel:
             found.append(-loss * stiffer * self.eigenvalues[mode] * alone)
         derivatives = np.array(found)
         derivatives[len(x) :] *= self.std[:, None, None, None]
-        scale = -(omega**2)[:, :, None]
         return scale * response, scale * derivatives
 
 

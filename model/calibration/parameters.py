@@ -105,6 +105,11 @@ def parameters_of(rig: Rig) -> tuple[Parameter, ...]:
     return tuple(found)
 
 
+def bounds_of(parameters: Sequence[Parameter]) -> FloatArray:
+    """Lower and upper bounds of x, (2, n)."""
+    return np.array([(parameter.lower, parameter.upper) for parameter in parameters]).T
+
+
 def responses_at(
     plate: ParametricPlate, rig: Rig, parameters: Sequence[Parameter], x: FloatArray
 ) -> ComplexArray:

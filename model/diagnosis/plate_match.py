@@ -15,11 +15,12 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from model.arrays import ComplexArray, FloatArray
+from model.calibration.fit import search
 from model.calibration.parameters import (
     Parameter,
+    bounds_of,
     parameters_of,
     response_slopes,
     responses_at,
@@ -35,7 +36,6 @@ _GAIN_TOLERANCE = 0.08  # standard deviation over frequency, of itself
 MAX_FIT_ERROR = 0.2  # largest relative rms error of an acceptable plate
 MODEL_ERROR = 0.05  # of a row's rms: scales and positions of sensors, and what is not modelled
 _ROBUST = 2.0  # standard deviations
-_STEPS = 40
 
 _Number = TypeVar("_Number", np.float64, np.complex128)
 
@@ -90,37 +90,16 @@ def match_plate(
     size = row_rms(values)
     weight = np.isfinite(values) / (model_error * size[:, :, None])
     count = len(parameters)
-    driven = list(drives)
+    inside, driven = weight > 0, list(drives)
 
-    def responses(x: FloatArray) -> ComplexArray:
-        return np.asarray(responses_at(plate, rig, parameters, x)[:, driven])
-
-    def expected(z: FloatArray) -> FloatArray:
-        gains = np.ones(values.shape[1])
-        gains[used] = np.exp(_GAIN_STD * z[count:])
-        return gains
-
-    def residuals(z: FloatArray) -> FloatArray:
-        gains = expected(z)
-        projected, left = project_gains(
-            responses(center + std * z[:count]),
-            values,
-            weight,
-            expected=gains,
-            tolerance=_GAIN_TOLERANCE,
-        )
-        left = _robust(left[weight > 0])
-        wander = _robust(((np.abs(projected) / gains - 1) / _GAIN_TOLERANCE)[rows])
-        return np.concatenate([left.real, left.imag, wander, z])
-
-    def jacobian(z: FloatArray) -> FloatArray:
-        gains = expected(z)
+    def linearised(z: FloatArray) -> tuple[FloatArray, FloatArray]:
         model, by_x = response_slopes(plate, rig, parameters, center + std * z[:count])
         model = model[:, driven]
         slopes = np.zeros((len(z), *model.shape), dtype=complex)
         slopes[:count] = by_x[:, :, driven] * std[:, None, None, None]
-        gain_slopes = np.zeros((len(z), len(gains)))
-        gain_slopes[count + np.arange(len(used)), used] = _GAIN_STD * gains[used]
+        gains, by_gains = np.ones(values.shape[1]), np.zeros((len(z), values.shape[1]))
+        gains[used] = np.exp(_GAIN_STD * z[count:])
+        by_gains[count:, used] = np.diag(_GAIN_STD * gains[used])
         projected, left = project_gains(
             model, values, weight, expected=gains, tolerance=_GAIN_TOLERANCE
         )
@@ -130,51 +109,41 @@ def match_plate(
             values,
             weight,
             expected=gains,
-            expected_slopes=gain_slopes,
+            expected_slopes=by_gains,
             tolerance=_GAIN_TOLERANCE,
         )
         size = np.abs(projected)
         by_size = (projected.conj() * by_gain).real / size
-        by_wander = (by_size - size * gain_slopes[:, None] / gains) / gains / _GAIN_TOLERANCE
-        wander = (size / gains - 1) / _GAIN_TOLERANCE
-        of_left = _robust_slopes(left[weight > 0], by_left[:, weight > 0])
-        of_wander = _robust_slopes(wander[rows], by_wander[:, rows])
-        return np.hstack([of_left.real, of_left.imag, of_wander, np.eye(len(z))]).T
+        wander = ((size / gains - 1) / _GAIN_TOLERANCE)[rows]
+        by_wander = (by_size - size * by_gains[:, None] / gains) / gains / _GAIN_TOLERANCE
+        data = _robust(left[inside])
+        by_data = _robust_slopes(left[inside], by_left[:, inside])
+        of_wander = _robust_slopes(wander, by_wander[:, rows])
+        return (
+            np.concatenate([data.real, data.imag, _robust(wander), z]),
+            np.hstack([by_data.real, by_data.imag, of_wander, np.eye(len(z))]).T,
+        )
 
-    bounds = np.array([[p.lower, p.upper] for p in parameters])
-    bounds = (bounds - center[:, None]) / std[:, None]
-    lower, upper = np.vstack([bounds, np.tile([-8.0, 8.0], (len(used), 1))]).T
-    initial = []
+    bounds = (bounds_of(parameters) - center) / std
+    bounds = np.hstack([bounds, np.tile([[-8.0], [8.0]], len(used))])
+    found = []
     for modulus, stiffness in starts:
         moves = {"modulus": modulus, "stiffness": stiffness}
         shift = np.array([moves.get(parameter.kind, 0.0) for parameter in parameters])
-        model = responses(center + shift)
+        model = responses_at(plate, rig, parameters, center + shift)[:, driven]
         ratio = np.log(np.maximum(size / row_rms(np.where(rows[:, :, None], model, np.nan)), 1e-6))
-        first = np.concatenate([shift / std, [np.median(ratio[rows[:, e], e]) for e in used]])
-        initial.append(np.clip(first, lower + 1e-6, upper - 1e-6))
-    found = [
-        least_squares(
-            residuals,
-            guess,
-            jacobian,
-            bounds=(lower, upper),
-            x_scale="jac",
-            max_nfev=_STEPS,
-            xtol=1e-5,
-            ftol=1e-5,
-        )
-        for guess in initial
-    ]
+        levels = [np.median(ratio[rows[:, e], e]) for e in used]
+        found.append(search(linearised, np.concatenate([shift / std, levels]), bounds))
     best = best_by(found, lambda each: -float(each.cost))
     x = center + std * best.x[:count]
     gains = np.full(values.shape[1], np.nan)
     gains[used] = np.exp(_GAIN_STD * best.x[count:])
     fitted = rig_with(rig, parameters, x)
-    model = responses(x)
+    model = responses_at(plate, rig, parameters, x)[:, driven]
     _, residual = project_gains(
         model, values, weight, expected=np.nan_to_num(gains, nan=1.0), tolerance=_GAIN_TOLERANCE
     )
-    share = (model_error * np.abs(residual))[weight > 0]
+    share = (model_error * np.abs(residual))[inside]
     return Match(
         fitted,
         parameters,

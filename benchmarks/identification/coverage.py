@@ -9,8 +9,8 @@ from benchmarks.identification.thin_plate import Reals
 from model.identification.derivatives import jacobian
 from model.identification.forward import Sensor
 from model.identification.identify import Identification
-from model.identification.parameters import space_of
 from model.identification.posterior import THEORY, relevant
+from model.identification.stages import Setting
 
 _WITHIN = 1.96
 _REGION = 5.991  # of two normal numbers
@@ -62,24 +62,18 @@ def fields_held(
     plate, model = found.before.plate, found.fitted.problem.model
     points = _PLACES * [plate.length, plate.width]
     pads = [Sensor(f"point {n}", x=x, y=y) for n, (x, y) in enumerate(points.tolist())]
-    sensors = [*model.sensors, *pads]
-    count = len(found.posterior.space.indices("mode_shifts"))
-    names = [sensor.name for sensor in sensors]
-    space = space_of(found.before, names, found.priors, masses=model.mass_count, mode_count=count)
-    own = [space.index(name) for name in found.posterior.space.names]
-    x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
-    x[own] = found.posterior.x
-    covariance[np.ix_(own, own)] = found.posterior.covariance
+    setting = Setting(found.before, model.free, found.fitted.problem.measurement)
     tones = frequencies[1::4]
-    wider = replace(model, sensors=sensors, frequencies=tones, space=space, last_places={})
-    at = wider.at(x)
+    wider = replace(setting.model(model.mass_count, more=pads), frequencies=tones)
+    known = found.posterior.within(wider.space)
+    at = wider.at(known.x)
     J = jacobian(at)[:, len(model.sensors) :]
     own_fields = at.responses[:, len(model.sensors) :]
     nothing = np.zeros((0, 4))
     true = np.array([plates.felt(kind, seed, float(f), points, points, nothing) for f in tones])
     error = own_fields - true
     parts = np.stack([J.real, J.imag], axis=-2)
-    spread = parts @ covariance @ parts.swapaxes(-1, -2)
+    spread = parts @ known.covariance @ parts.swapaxes(-1, -2)
     both = np.stack([error.real, error.imag], axis=-1)
     solved = np.linalg.solve(spread, both[..., None])[..., 0]
     return np.asarray((both * solved).sum(axis=-1)).ravel()

@@ -19,7 +19,7 @@ from model.counting import counted
 from model.errors import InputError
 
 if TYPE_CHECKING:
-    from model.diagnosis.observation import Observation
+    from model.calibration.responses import Responses
     from model.identification.measured_plate import MeasuredPlate
     from model.rig.rig import Rig
 
@@ -122,7 +122,7 @@ def check(
 
 def _measured(
     rig_file: Path, urls: list[str], *, level: float | None, is_untouched: bool, is_shown: bool
-) -> "tuple[Rig, MeasuredPlate, Observation]":
+) -> "tuple[Rig, MeasuredPlate, Responses]":
     """Measure the plate by the sensors of its amplifiers."""
     from controller.diagnosis.plate_observation import observation_of
 
@@ -132,13 +132,11 @@ def _measured(
     return rig, plate, observation_of(plate.measurement, rig)
 
 
-def _read(measured: Path, rig_file: Path, *, mesh: str | None) -> "tuple[Rig, Observation]":
+def _read(measured: Path, rig_file: Path, *, mesh: str | None) -> "tuple[Rig, Responses]":
     """Read what was measured from a file."""
     from model.calibration.responses import responses_of
     from model.calibration.responses_file import read_functions
-    from model.diagnosis.observation import Observation
     from model.rig.file import load_rig
 
     rig = load_rig(rig_file, mesh=mesh)
-    responses = responses_of(read_functions(measured), rig)
-    return rig, Observation(**vars(responses), has_phases=True)
+    return rig, responses_of(read_functions(measured), rig)

@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
@@ -38,18 +39,36 @@ class MeasuredFunction:
 class Responses:
     """Measured responses of a rig's plate, NaN where not measured.
 
-    sensors (s,) names; points (s, 2) [m]; frequencies (f,) [Hz]; values (f, eras, s) [1/s²].
+    sensors (s,) names; points (s, 2) [m]; frequencies (f,) [Hz]; values (f, eras, s) [1/s²];
+    has_phases: whether phases are relative to the drive; otherwise only phases between sensors are
+    known, and no polarity.
     """
 
     sensors: tuple[str, ...]
     points: FloatArray
     frequencies: FloatArray
     values: ComplexArray
+    has_phases: bool = True
 
     @property
     def count(self) -> int:
         """Number of measured values."""
         return int(np.isfinite(self.values).sum())
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Mask of the ERAs that were driven (e,)."""
+        return np.asarray(np.isfinite(self.values).any(axis=(0, 2)))
+
+    def without(self, sensors: NDArray[np.bool_]) -> "Responses":
+        """Remove some of the sensors (s,)."""
+        kept = ~sensors
+        return replace(
+            self,
+            sensors=tuple(name for name, keep in zip(self.sensors, kept, strict=True) if keep),
+            points=self.points[kept],
+            values=self.values[:, :, kept],
+        )
 
 
 def responses_of(functions: Sequence[MeasuredFunction], rig: Rig) -> Responses:

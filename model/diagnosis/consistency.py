@@ -7,7 +7,7 @@ would leave free, and names it.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,6 @@ from model.calibration.responses import Responses
 from model.calibration.variable_projection import project_gains, row_rms
 from model.choice import best_by
 from model.diagnosis.assignment import ShapeMatch, match_shapes
-from model.diagnosis.observation import Observation
 from model.diagnosis.plate_match import MAX_FIT_ERROR, Match, match_plate
 from model.diagnosis.verdict import Verdict, diagnose
 from model.errors import InputError
@@ -76,12 +75,8 @@ def check_consistency(rig: Rig, responses: Responses) -> Verdict:
     rows = np.unique(
         np.linspace(0, len(responses.frequencies) - 1, _MAX_FREQUENCIES).round().astype(int)
     )
-    observation = Observation(
-        responses.sensors,
-        responses.points,
-        responses.frequencies[rows],
-        responses.values[rows],
-        has_phases=True,
+    observation = replace(
+        responses, frequencies=responses.frequencies[rows], values=responses.values[rows]
     )
     if not observation.measured.any():
         raise InputError("no channel was driven; drive each in turn and measure again")
@@ -101,7 +96,7 @@ def check_consistency(rig: Rig, responses: Responses) -> Verdict:
 
 
 def _check_quantity(
-    rig: Rig, plate: ParametricPlate, shapes: ShapeMatch, observation: Observation
+    rig: Rig, plate: ParametricPlate, shapes: ShapeMatch, observation: Responses
 ) -> None:
     """Raise InputError where gains of all channels are those of another quantity or unit."""
     parameters = parameters_of(rig)
@@ -139,7 +134,7 @@ def _check_quantity(
 
 
 def _check_phases_and_places(
-    rig: Rig, plate: ParametricPlate, shapes: ShapeMatch, observation: Observation
+    rig: Rig, plate: ParametricPlate, shapes: ShapeMatch, observation: Responses
 ) -> None:
     """Raise InputError for conjugated phases, and for sensors at each other's places."""
     starts = tuple(dict.fromkeys([(0.0, 0.0), shapes.start]))
@@ -170,7 +165,7 @@ def _check_phases_and_places(
         )
 
 
-def _exchanged(observation: Observation, model: ComplexArray) -> list[tuple[str, str]]:
+def _exchanged(observation: Responses, model: ComplexArray) -> list[tuple[str, str]]:
     """Pairs of a sensor and the one at whose place it is, from responses (f, e, s) of the model."""
     values = observation.values
     weight = np.isfinite(values) / row_rms(values)[:, :, None]

@@ -1,6 +1,7 @@
 """Detection of dead channels and unusable sensors."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,6 @@ from model.arrays import ComplexArray
 from model.calibration.calibration_screening import silent_sensors
 from model.calibration.responses import Responses
 from model.diagnosis.assignment import match_shapes
-from model.diagnosis.observation import Observation
 from model.diagnosis.plate_match import MAX_FIT_ERROR, Match
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -22,7 +22,7 @@ _SENSOR_SCALE = (0.7, 1.4)
 LEAST_SENSORS, _LEAST_FREQUENCIES = 3, 4
 
 
-def dead_channels(rig: Rig, plate: ParametricPlate, observation: Observation) -> NDArray[np.bool_]:
+def dead_channels(rig: Rig, plate: ParametricPlate, observation: Responses) -> NDArray[np.bool_]:
     """Mask (e,) of driven channels with a response far below the model's."""
     share = np.abs(observation.values / plate.responses(rig))
     dead = np.zeros(len(rig.eras), dtype=bool)
@@ -32,7 +32,7 @@ def dead_channels(rig: Rig, plate: ParametricPlate, observation: Observation) ->
 
 
 def shapeless_channels(
-    rig: Rig, plate: ParametricPlate, observation: Observation
+    rig: Rig, plate: ParametricPlate, observation: Responses
 ) -> NDArray[np.bool_]:
     """Mask of weak channels without the shape of an ERA, whose response is noise (e,)."""
     model = plate.responses(rig)
@@ -46,20 +46,18 @@ def shapeless_channels(
 
 
 def usable_sensors(
-    observation: Observation, dead: NDArray[np.bool_]
-) -> tuple[Observation, tuple[tuple[str, str], ...]]:
+    observation: Responses, dead: NDArray[np.bool_]
+) -> tuple[Responses, tuple[tuple[str, str], ...]]:
     """Remove sensors without a signal from any live channel; return their names, too."""
     values = observation.values[:, ~dead]
     if not np.isfinite(values).any():
         return observation, ()
-    silent = silent_sensors(
-        Responses(observation.sensors, observation.points, observation.frequencies, values)
-    )
+    silent = silent_sensors(replace(observation, values=values))
     names = [name for name, out in zip(observation.sensors, silent, strict=True) if out]
     return observation.without(silent), tuple((name, "reads nothing") for name in names)
 
 
-def check_enough(observation: Observation, removed: Sequence[tuple[str, str]]) -> None:
+def check_enough(observation: Responses, removed: Sequence[tuple[str, str]]) -> None:
     """Raise InputError if too few sensors or frequencies are left; removed: sensors."""
     count, frequencies = len(observation.sensors), len(observation.frequencies)
     if count < LEAST_SENSORS or frequencies < _LEAST_FREQUENCIES:
@@ -71,9 +69,7 @@ def check_enough(observation: Observation, removed: Sequence[tuple[str, str]]) -
         )
 
 
-def off_scale(
-    observation: Observation, values: ComplexArray, match: Match
-) -> list[tuple[str, str]]:
+def off_scale(observation: Responses, values: ComplexArray, match: Match) -> list[tuple[str, str]]:
     """Sensors with a scale unlike that of the others, and why, if the plate fits."""
     if match.median_error > MAX_FIT_ERROR:
         return []

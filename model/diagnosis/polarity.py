@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import ComplexArray
-from model.diagnosis.observation import Observation
+from model.calibration.responses import Responses
 
 _MIN_COHERENCE = 0.6  # length of the mean of unit phasors of a reliable phase
 
@@ -23,7 +23,7 @@ class ChannelPhase:
     confidence: float = 0.0
 
 
-def phases_of_drive(observation: Observation, predicted: ComplexArray) -> list[ChannelPhase]:
+def phases_of_drive(observation: Responses, predicted: ComplexArray) -> list[ChannelPhase]:
     """Phases relative to the drive; predicted (f, e, s), NaN for channels to be skipped."""
     found = []
     for channel in range(predicted.shape[1]):

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
+from model.calibration.responses import Responses
 from model.choice import best_by
 from model.diagnosis.assignment import ShapeMatch, match_responses, match_shapes
 from model.diagnosis.causes import Explanation, explain
@@ -19,7 +20,6 @@ from model.diagnosis.diagnosis_screening import (
     shapeless_channels,
     usable_sensors,
 )
-from model.diagnosis.observation import Observation
 from model.diagnosis.plate_difference import PlateDifference, plate_difference
 from model.diagnosis.plate_match import MAX_FIT_ERROR, MODEL_ERROR, Match, match_plate
 from model.diagnosis.polarity import ChannelPhase, phases_of_drive
@@ -90,9 +90,7 @@ class Verdict:
         return self.plate_matches and self.wiring_matches
 
 
-def diagnose(
-    rig: Rig, observation: Observation, *, max_deviation: float = MAX_DEVIATION
-) -> Verdict:
+def diagnose(rig: Rig, observation: Responses, *, max_deviation: float = MAX_DEVIATION) -> Verdict:
     """Compare a measurement with the rig's prediction.
 
     max_deviation: of a parameter of the plate, in standard deviations of its prior.
@@ -206,7 +204,7 @@ def _best_match(
     return match, drives, error
 
 
-def _phases(observation: Observation, match: Match, dead: NDArray[np.bool_]) -> list[ChannelPhase]:
+def _phases(observation: Responses, match: Match, dead: NDArray[np.bool_]) -> list[ChannelPhase]:
     if not observation.has_phases:
         return [ChannelPhase()] * len(dead)
     predicted = np.where(dead[None, :, None], np.nan, match.predicted)
@@ -216,7 +214,7 @@ def _phases(observation: Observation, match: Match, dead: NDArray[np.bool_]) -> 
 def _channel(
     rig: Rig,
     number: int,
-    observation: Observation,
+    observation: Responses,
     shapes: ShapeMatch,
     drives: Sequence[int],
     match: Match,

@@ -8,7 +8,6 @@ from model.arrays import ComplexArray, FloatArray
 from model.choice import best_of
 from model.identification.derivatives import jacobian
 from model.identification.forward import Sensor
-from model.identification.parameters import space_of
 from model.identification.posterior import Posterior, relevant
 from model.identification.stages import Fitted, Setting
 
@@ -78,18 +77,16 @@ def _best(
         for y in _SHARES
     ]
     sensors = [*model.sensors, *more]
-    names = [sensor.name for sensor in sensors]
-    count = len(posterior.space.indices("mode_shifts"))
-    space = space_of(rig, names, setting.priors, masses=model.mass_count, mode_count=count)
     tones = np.arange(limits.frequency_min, limits.frequency_max + 1e-9, _STEP)
-    wider = replace(model, sensors=sensors, frequencies=tones, space=space, last_places={})
-    own = np.array([space.index(name) for name in posterior.space.names])
-    covariance, x, wanted = np.diag(space.uncertain.astype(float)), *np.zeros((2, space.size))
-    covariance[np.ix_(own, own)] = posterior.covariance
-    x[own], wanted[own] = posterior.x, row
-    at = wider.at(x)
+    wider = replace(setting.model(model.mass_count, more=more), frequencies=tones, free=model.free)
+    space = wider.space
+    own = [space.index(name) for name in posterior.space.names]
+    known, combination, unknown = posterior.within(space), np.zeros(space.size), space.std > 0
+    combination[own], unknown[own] = row, False
+    covariance = known.covariance + np.diag(unknown.astype(float))
+    at = wider.at(known.x)
     scale = _NOISE * np.sqrt((np.abs(at.responses) ** 2).mean(axis=(0, 2), keepdims=True))
-    direction = covariance @ (wanted * space.std)
+    direction = covariance @ (combination * space.std)
     gains = _gains(jacobian(at) / scale[..., None], covariance, direction)
     f, s, e = np.unravel_index(best_of(gains.ravel()), gains.shape)
     return rig.eras[e].name, float(tones[f]), sensors[s]

@@ -1,7 +1,6 @@
 """Identification of a rig by responses measured in place."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 from model.errors import InputError
 from model.identification.advice import unknowns
@@ -10,10 +9,8 @@ from model.identification.identified_rig import rig_with
 from model.identification.measurement import Measurement
 from model.identification.plausible import check_gains
 from model.identification.posterior import Posterior
-from model.identification.priors import Priors
 from model.identification.stages import Fitted, Setting, chi2, fit_in_stages
 from model.identification.values import Values
-from model.quantities import with_error
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
@@ -36,7 +33,7 @@ class Identification:
     measurement, their uncertainty; values: of the
     parameters, gains of sensors among them; posterior: their distribution; chi2: squared residuals
     per value; held_out: how well unseen tones are predicted, None where there are too few;
-    seed: of the draws.
+    seed: of the contacts that a promise draws.
     """
 
     before: Rig
@@ -52,32 +49,6 @@ class Identification:
     def is_explained(self) -> bool:
         """Whether the model explains the measurement, so that answers may rely on it."""
         return self.chi2 <= MAX_CHI2
-
-    @property
-    def priors(self) -> Priors:
-        """What was known of the parameters before."""
-        lag = self.fitted.problem.measurement.drives_lag
-        return Priors.of(self.before.uncertainty, drives_lag=lag)
-
-    def draws(self, count: int) -> list[Rig]:
-        """Rigs within the posterior distribution, with the uncertainty of fingers and drives."""
-        space = self.posterior.space
-        found = (
-            Values.of(self.before, space, x) for x in self.posterior.draws(count, seed=self.seed)
-        )
-        return [rig_with(self.before, values, self.rig.uncertainty) for values in found]
-
-    @cached_property
-    def rows(self) -> list[str]:
-        """One line for each parameter: its value less the rig's and the standard deviation."""
-        space, posterior = self.posterior.space, self.posterior
-        return [
-            f"{name}: {with_error(std * x, after, sign='+')} (before ± {std:.2g})"
-            for name, std, x, after in zip(
-                space.names, space.std, posterior.x, posterior.std, strict=True
-            )
-            if std > 0
-        ]
 
 
 def identify(
@@ -96,18 +67,13 @@ def identify(
     on, with the tone and the sensor that would show it.
     """
     _check(rig, measurement)
-    setting = Setting(
-        rig,
-        solved_for(rig, float(measurement.tones[-1])),
-        Priors.of(rig.uncertainty, drives_lag=measurement.drives_lag),
-        measurement,
-    )
+    setting = Setting(rig, solved_for(rig, float(measurement.tones[-1])), measurement)
     fitted = fit_in_stages(setting)
     values = Values.of(rig, fitted.space, fitted.best.x)
     misfit = chi2(fitted)
     is_explained = misfit <= MAX_CHI2
     if is_explained:
-        check_gains(rig, measurement, values, setting.priors)
+        check_gains(rig, measurement, values, fitted.space)
     posterior = Posterior.of(fitted.space, fitted.best)
     unknown = unknowns(setting, fitted, posterior)
     if unknown:

@@ -11,7 +11,7 @@ plate as it was.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Self
 
@@ -25,10 +25,10 @@ from model.identification.identified_rig import rig_with
 from model.identification.identify import Identification, solved_for
 from model.identification.kalman import State, update
 from model.identification.noise import NoiseLevel
-from model.identification.parameters import FINGER_PARTS, MODE_SHIFTS, Space, space_of
+from model.identification.parameters import FINGER, FINGER_PARTS, MODE_SHIFTS, Space, space_of
 from model.identification.posterior import THEORY
-from model.identification.priors import Priors
 from model.identification.settled import SettledPattern, Touched
+from model.identification.stages import Setting
 from model.identification.values import Values
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
@@ -100,13 +100,12 @@ class Known:
     @classmethod
     def of(cls, found: Identification) -> Self:
         """What an identification has shown."""
-        model = _with_spare_mass(found)
-        space = model.space
-        own = [space.index(name) for name in found.posterior.space.names]
-        x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
-        x[own] = found.posterior.x
-        covariance[np.ix_(own, own)] = found.posterior.covariance
-        state = State(x, covariance)
+        problem = found.fitted.problem
+        setting = Setting(found.before, problem.model.free, problem.measurement)
+        # A spare mass weighs nothing so far.
+        model = setting.model(problem.model.mass_count + 1)
+        known = found.posterior.within(model.space)
+        state = State(known.x, known.covariance)
         return cls(found.before, found.rig.uncertainty, model, state, found.is_explained)
 
     @classmethod
@@ -117,14 +116,14 @@ class Known:
         """
         free = solved_for(rig, rig.limits.frequency_max)
         # Counted in the deviations of a plate that was not measured, which steps are limited by.
-        priors, own = Priors.of(widest(rig.uncertainty)), Priors.of(rig.uncertainty)
         count = len(lowest_elastic(free.modes.eigenvalues, MODE_SHIFTS))
-        names = [each.name for each in sensors]
-        space = space_of(rig, names, priors, masses=1, mode_count=count)
-        stated = space_of(rig, names, own, masses=1, mode_count=count)
+        space, stated = (
+            space_of(rig, [each.name for each in sensors], known, masses=1, mode_count=count)
+            for known in (widest(rig.uncertainty), rig.uncertainty)
+        )
         model = ForwardModel(rig, sensors, np.array([rig.limits.frequency_max]), space, free)
         std = np.divide(stated.std, space.std, out=np.zeros(space.size), where=space.uncertain)
-        std[space.of(*_NOT_STATED)] = own.thickness / priors.thickness
+        std[space.of(*_NOT_STATED)] = std[space.index("thickness")]
         std[space.groups["masses"]] = 0.0
         state = State(np.zeros(space.size), np.diag(std**2))
         return cls(rig, rig.uncertainty, model, state)
@@ -141,7 +140,6 @@ class LivePlate:
         """Whether its identification explains the plate; otherwise there are only alarms."""
         self._model = known.model
         self._state = known.state
-        self._priors = Priors.of(known.before.uncertainty)
         self._time: float | None = None
         self._alarm = Alarm()
         self._places = places_on(known.before.plate.length, known.before.plate.width)
@@ -183,7 +181,7 @@ class LivePlate:
 
     def take(self, pattern: SettledPattern) -> Report:
         """Take a settled pattern: update the state, or hold it and explain what happened."""
-        touched = Touched.of(self._model, pattern, self._priors.finger, noise=self._noise.relative)
+        touched = Touched.of(self._model, pattern, FINGER, noise=self._noise.relative)
         drifted = self._drifted(pattern.time)
         if self._held:
             self._held.append(touched)
@@ -206,7 +204,7 @@ class LivePlate:
         if self.can_update and not self.has_changed and not self._alarm.is_odd:
             self._state, self._time = after.state, pattern.time
             self._noise.take(after)
-        fingers = np.exp(self._priors.finger * after.fingers.reshape(-1, len(FINGER_PARTS)))
+        fingers = np.exp(FINGER * after.fingers.reshape(-1, len(FINGER_PARTS)))
         return Report(after.nis, after.count, False, False, None, fingers)
 
     def _go_back(self, suspect: list[Taken]) -> None:
@@ -273,16 +271,3 @@ def widest(uncertainty: Uncertainty) -> Uncertainty:
             for each in fields(Uncertainty)
         }
     )
-
-
-def _with_spare_mass(found: Identification) -> ForwardModel:
-    """The model of an identification with one mass more, which weighs nothing so far."""
-    model = found.fitted.problem.model
-    space = space_of(
-        found.before,
-        [sensor.name for sensor in model.sensors],
-        found.priors,
-        masses=model.mass_count + 1,
-        mode_count=len(found.posterior.space.indices("mode_shifts")),
-    )
-    return replace(model, space=space, last_places={})

@@ -1,5 +1,6 @@
 """The vector of parameters x, in prior standard deviations, and the values that it stands for."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray
-from model.identification.priors import Priors
 from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
 from model.structure.plate import MAX_LOSS_EXPONENT
 
 MODE_SHIFTS = 12
@@ -17,6 +18,20 @@ MODE_SHIFTS = 12
 
 FINGER_PARTS = ("contact mass", "pulp", "phalanx", "joint")
 """Groups of a finger's load that vary on their own."""
+
+# Standard deviations of what a rig's `uncertainty` does not state: of logarithms, in rad, kg and m.
+_MODULUS = 0.02
+_DAMPING_EACH = 0.2  # of one ERA beside that of all
+_LOSS_EXPONENT = 0.3  # of the loss factor's power of frequency
+_SENSOR_GAIN, _SENSOR_PHASE = 0.05, math.radians(5)
+_BOLT_MASS = 0.5e-3
+_PLACE = 1.5e-3  # of an ERA, on each axis
+_MASS = 2e-3
+_MODE_SHIFT, _MODE_LOSS = 0.01, 0.5  # of an eigenvalue omega², of the loss factor of a mode
+_INERTIA, _DRAG = 1 / 0.7**2, 1 / 0.7  # of a resonance at 700 Hz with a damping ratio of 0.5
+
+FINGER = 0.5
+"""Standard deviation of the logarithm of each group of a finger's load."""
 
 _AT_EDGE = 1e-6  # m
 
@@ -69,69 +84,68 @@ class Space:
 def space_of(
     rig: Rig,
     sensors: Sequence[str],
-    priors: Priors,
+    uncertainty: Uncertainty,
     *,
+    drives_lag: bool = False,
     masses: int = 0,
     fingers: int = 0,
     mode_count: int = MODE_SHIFTS,
 ) -> Space:
     """Parameters of a rig with sensors by name, with additional masses and fingers on it.
 
-    mode_count: elastic modes of the model, of which the lowest may shift.
+    uncertainty: of the rig; a modulus is known where the thickness is, the damping of each ERA and
+    mode where that of all is. drives_lag: whether bases follow what is played with a lag that
+    nothing states; mode_count: elastic modes of the model, of which the lowest may shift.
     """
     plate, eras = rig.plate, [era.name for era in rig.eras]
     builder = _Builder()
     add = builder.add
-    add("thickness", ["thickness"], priors.thickness)
-    add("modulus", ["modulus"], priors.modulus)
-    add("stiffness", [f"stiffness {name}" for name in eras], priors.stiffness)
-    damped = priors.damping if any(era.damping for era in rig.eras) else 0.0
-    add("damping", ["damping"], damped)
-    each = [priors.damping_each if era.damping else 0.0 for era in rig.eras]
-    add("damping_each", [f"damping {name}" for name in eras], each)
-    lossy = plate.loss_factor > 0
-    add("loss", ["loss factor"], priors.loss * lossy)
+    add("thickness", ["thickness"], uncertainty.thickness)
+    add("modulus", ["modulus"], _MODULUS if uncertainty.thickness else 0.0)
+    add("stiffness", [f"stiffness {name}" for name in eras], uncertainty.stiffness)
+    damping = math.log(uncertainty.damping)
+    damped = [float(damping > 0 and era.damping > 0) for era in rig.eras]
+    add("damping", ["damping"], damping * max(damped))
+    add("damping_each", [f"damping {name}" for name in eras], _DAMPING_EACH * np.array(damped))
+    lossy = float(damping > 0 and plate.loss_factor > 0)
+    add("loss", ["loss factor"], damping * lossy)
     exponents = np.array([-MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT]) - plate.loss_exponent
-    low, high = exponents / (priors.loss_exponent or 1.0)
-    add("loss_exponent", ["loss exponent"], priors.loss_exponent * lossy, lower=low, upper=high)
-    add("gain", [f"gain {name}" for name in eras], priors.gain)
-    add("phase", [f"phase {name}" for name in eras], priors.phase)
-    for kind in ("inertia", "drag"):
-        # A measured gain has them in it.
-        lagging = [0.0 if era.gains else getattr(priors, kind) for era in rig.eras]
-        add(kind, [f"{kind} of drive {name}" for name in eras], lagging, lower=0.0)
-    add("sensor_gain", [f"gain of sensor {name}" for name in sensors], priors.sensor_gain)
-    add("sensor_phase", [f"phase of sensor {name}" for name in sensors], priors.sensor_phase)
-    least = [-era.bolt_mass / (priors.bolt_mass or 1.0) for era in rig.eras]
-    add("bolt_mass", [f"bolt mass {name}" for name in eras], priors.bolt_mass, lower=least)
+    low, high = exponents / _LOSS_EXPONENT
+    add("loss_exponent", ["loss exponent"], _LOSS_EXPONENT * lossy, lower=low, upper=high)
+    add("gain", [f"gain {name}" for name in eras], uncertainty.gain)
+    add("phase", [f"phase {name}" for name in eras], math.radians(uncertainty.phase_deg))
+    # A measured gain has the lag of its drive in it.
+    lagging = np.array([float(drives_lag and not era.gains) for era in rig.eras])
+    for kind, std in (("inertia", _INERTIA), ("drag", _DRAG)):
+        add(kind, [f"{kind} of drive {name}" for name in eras], std * lagging, lower=0.0)
+    add("sensor_gain", [f"gain of sensor {name}" for name in sensors], _SENSOR_GAIN)
+    add("sensor_phase", [f"phase of sensor {name}" for name in sensors], _SENSOR_PHASE)
+    least = [-era.bolt_mass / _BOLT_MASS for era in rig.eras]
+    add("bolt_mass", [f"bolt mass {name}" for name in eras], _BOLT_MASS, lower=least)
     sides = np.array([plate.length, plate.width])
     places = np.array([(era.x, era.y) for era in rig.eras])
-    in_stds = priors.place or 1.0
     add(
         "place",
         [f"{axis} of {name}" for name in eras for axis in "xy"],
-        priors.place,
-        lower=(-places / in_stds).ravel(),
-        upper=((sides - places) / in_stds).ravel(),
+        _PLACE,
+        lower=(-places / _PLACE).ravel(),
+        upper=((sides - places) / _PLACE).ravel(),
     )
     # About the middle of the plate.
-    reach = priors.mass_place * sides
-    each_mass = np.array([priors.mass, *reach])
-    bounds = sides / 2 / (reach if priors.mass_place else 1.0)
     add(
         "masses",
         [f"{of}mass {n}" for n in range(1, masses + 1) for of in ("", "x of ", "y of ")],
-        np.tile(each_mass, masses),
-        lower=np.tile([0.0, *-bounds], masses),
-        upper=np.tile([np.inf, *bounds], masses),
+        np.tile([_MASS, *sides / 3], masses),
+        lower=np.tile([0.0, -1.5, -1.5], masses),
+        upper=np.tile([np.inf, 1.5, 1.5], masses),
     )
     modes = range(1, min(mode_count, MODE_SHIFTS) + 1)
-    add("mode_shifts", [f"stiffness of mode {number}" for number in modes], priors.mode_shift)
-    add("mode_losses", [f"loss of mode {number}" for number in modes], priors.mode_loss * lossy)
+    add("mode_shifts", [f"stiffness of mode {number}" for number in modes], _MODE_SHIFT)
+    add("mode_losses", [f"loss of mode {number}" for number in modes], _MODE_LOSS * lossy)
     add(
         "fingers",
         [f"{part} of finger {n}" for n in range(1, fingers + 1) for part in FINGER_PARTS],
-        priors.finger,
+        FINGER,
     )
     return builder.space()
 

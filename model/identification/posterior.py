@@ -41,17 +41,18 @@ class Posterior:
         covariance[np.ix_(free, free)] = linalg.inv(best.information[np.ix_(free, free)])
         return cls(space, best.x, covariance)
 
+    def within(self, space: Space) -> "Posterior":
+        """The same in a space with further parameters, which are 0 and without variance."""
+        own = [space.index(name) for name in self.space.names]
+        x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
+        x[own] = self.x
+        covariance[np.ix_(own, own)] = self.covariance
+        return Posterior(space, x, covariance)
+
     @cached_property
     def std(self) -> FloatArray:
         """Standard deviation of each parameter in its unit (p,)."""
         return np.asarray(self.space.std * np.sqrt(np.diagonal(self.covariance)))
-
-    def draws(self, count: int, *, seed: int) -> FloatArray:
-        """Draw parameters (count, p) within their bounds."""
-        values, vectors = linalg.eigh(self.covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0))
-        numbers = np.random.default_rng(seed).standard_normal((count, len(self.x)))
-        return np.clip(self.x + numbers @ root.T, self.space.lower, self.space.upper)
 
     def std_of(self, combinations: FloatArray) -> FloatArray:
         """Standard deviations of linear combinations (m, p) of parameters in their units, (m,)."""

@@ -5,6 +5,7 @@ thicknesses; then one additional mass, sought where it would explain most; then 
 noise as measured. A second mass only where the first leaves something that it explains.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,11 +15,10 @@ from model.arrays import FloatArray
 from model.choice import NEARLY, best_by, best_first, ranked_by
 from model.identification.derivatives import by_mass_at
 from model.identification.fit import Linearised, Problem, solve
-from model.identification.forward import ForwardModel
+from model.identification.forward import ForwardModel, Sensor
 from model.identification.identified_rig import plate_with
 from model.identification.measurement import Measurement
 from model.identification.parameters import Space, inwards, space_of
-from model.identification.priors import Priors
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig
 
@@ -53,15 +53,22 @@ class Setting:
 
     rig: Rig
     free: FreePlate
-    priors: Priors
     measurement: Measurement
 
-    def model(self, masses: int) -> ForwardModel:
-        """The rig with a number of additional masses at the tones that were measured."""
-        sensors = self.measurement.sensors
-        names = [sensor.name for sensor in sensors]
-        elastic = int((self.free.modes.eigenvalues > 0).sum())
-        space = space_of(self.rig, names, self.priors, masses=masses, mode_count=elastic)
+    def model(self, masses: int, *, more: Sequence[Sensor] = ()) -> ForwardModel:
+        """The rig with a number of additional masses at the tones that were measured.
+
+        more: further sensors beside those of the measurement.
+        """
+        sensors = (*self.measurement.sensors, *more)
+        space = space_of(
+            self.rig,
+            [sensor.name for sensor in sensors],
+            self.rig.uncertainty,
+            drives_lag=self.measurement.drives_lag,
+            masses=masses,
+            mode_count=int((self.free.modes.eigenvalues > 0).sum()),
+        )
         return ForwardModel(self.rig, sensors, self.measurement.tones, space, self.free)
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from long_form import shortly
+from model.calibration.responses import Responses
 from model.diagnosis import causes
 from model.diagnosis.diagnosis_report import as_json, channel_table, verdict_rows
-from model.diagnosis.observation import Observation
 from model.diagnosis.verdict import Verdict, diagnose
 from model.errors import InputError
 from model.fem.mesh import Mesh
@@ -71,10 +71,10 @@ def noise_like(values: np.ndarray, share: float, rng: np.random.Generator) -> np
     return np.asarray(share * size * white / np.sqrt(2))
 
 
-def observe(places: np.ndarray, values: np.ndarray, *, has_phases: bool = True) -> Observation:
+def observe(places: np.ndarray, values: np.ndarray, *, has_phases: bool = True) -> Responses:
     """Sensors P1, P2, ... at these places."""
     names = tuple(f"P{number}" for number in range(1, len(places) + 1))
-    return Observation(names, places, FREQUENCIES, values, has_phases)
+    return Responses(names, places, FREQUENCIES, values, has_phases)
 
 
 def states(verdict: Verdict) -> dict[str, tuple[str, ...]]:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from model.diagnosis.diagnosis_report import as_json
-from model.diagnosis.observation import Observation
 from model.diagnosis.verdict import Verdict, diagnose
 from model.rig.rig import Rig
 from paper_plate import make_paper_rig
@@ -21,7 +20,7 @@ def verdict_on(rig: Rig, *, loss: float, stiffness: float) -> Verdict:
     plate = replace(rig.plate, loss_factor=loss * rig.plate.loss_factor)
     truth = replace(rig, plate=plate, eras=eras)
     responses = measured(truth, frequencies=FREQUENCIES, noise=0.005)
-    return diagnose(rig, Observation(**vars(responses), has_phases=True))
+    return diagnose(rig, responses)
 
 
 def test_plate_with_more_loss_and_less_stiffness_has_a_verdict_of_its_own() -> None:

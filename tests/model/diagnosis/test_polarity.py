@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from model.diagnosis.observation import Observation
+from model.calibration.responses import Responses
 from model.diagnosis.polarity import phases_of_drive
 
 
@@ -17,7 +17,7 @@ def test_phases_of_drive_inverts_beyond_a_quarter_turn(degrees: float, sign: int
     rng = np.random.default_rng(0)
     predicted = rng.standard_normal((5, 1, 4)) + 1j * rng.standard_normal((5, 1, 4))
     turned = predicted * np.exp(1j * math.radians(degrees))
-    observation = Observation(
+    observation = Responses(
         tuple("ABCD"), np.zeros((4, 2)), np.arange(5.0), turned, has_phases=True
     )
     (phase,) = phases_of_drive(observation, predicted)

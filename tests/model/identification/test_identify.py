@@ -86,12 +86,6 @@ def test_other_units_and_signs_are_refused(
         identify(rig, wrong)
 
 
-def test_draws_differ_from_the_rig_and_are_the_same_each_time(found: Identification) -> None:
-    """Two draws of one seed, and none of them the rig itself."""
-    assert found.draws(2) == found.draws(2)
-    assert found.draws(1)[0] != found.rig
-
-
 def test_contrast_is_promised_from_the_held_out_error(found: Identification) -> None:
     """Identified answers give more than those of the rig as written; a larger error promises less.
 

@@ -7,7 +7,6 @@ from benchmarks.identification.hidden import Hidden, draw
 from long_form import shortly
 from model.identification.forward import Sensor
 from model.identification.measurement import Measurement
-from model.identification.priors import Priors
 from model.identification.stages import Fitted, Setting, chi2, fit_in_stages
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import example_rig_path, load_rig
@@ -24,7 +23,7 @@ def identified(hidden: Hidden, *, rounds: int = 4) -> Fitted:
     values = np.where(played[:, None], values, np.nan)
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
     measurement = Measurement.of(sensors, FREQUENCIES, values)
-    return fit_in_stages(Setting(rig, free, Priors.of(rig.uncertainty), measurement))
+    return fit_in_stages(Setting(rig, free, measurement))
 
 
 @pytest.mark.parametrize("seed", shortly([1, 2], [1]))

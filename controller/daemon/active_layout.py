@@ -1,39 +1,22 @@
 """The surface layout in force, replaceable while the control loop runs."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import EffectsResult, PlayParams, PlayResult
 from controller.api.schema import EffectDescription
-from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.loop.intent import HapticIntent
 from controller.loop.table_query import MAX_DB_SL, common_band, why_held_back
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.contacts import Contact
 from model.arrays import FloatArray
 
 PLAY_RADIUS = 0.020
 """Largest distance [m] from the position of a requested effect to the finger that feels it."""
 
 
-class ActiveLayout:
-    """Plays the effects of a layout, and effects requested by name."""
-
-    def __init__(self, layout: SurfaceLayout) -> None:
-        self._player = EffectPlayer(layout)
-
-    def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
-        """Return which contacts shall feel what at a time [s]; see `IntentSource`."""
-        return self._player.intent(contacts, now)
-
-    def replace(self, layout: SurfaceLayout) -> None:
-        """Replace the layout; effects of a press are not repeated for fingers that rest."""
-        self._player = EffectPlayer(layout, already_pressed=self._player.fingers)
-
-    def effect_of(self, key: ContactKey) -> str | None:
-        """The effect that plays for a contact, or None."""
-        return self._player.effect_of(key)
+class ActiveLayout(EffectPlayer):
+    """Plays the effects of a layout, and those that clients of the API request by name."""
 
     def effects(self) -> EffectsResult:
         """Describe the effects that can be requested by name."""
@@ -45,11 +28,11 @@ class ActiveLayout:
                     description=(type(effect).__doc__ or "").partition("\n")[0],
                     parameters=effect.model_dump(mode="json"),
                 )
-                for name, effect in sorted(self._player.layout.effects.items())
+                for name, effect in sorted(self.layout.effects.items())
             ]
         )
 
-    def play(
+    def play_nearest(
         self,
         params: PlayParams,
         contacts: Iterable[Contact],
@@ -62,9 +45,9 @@ class ActiveLayout:
         frequencies [Hz]: of the table. Raises RpcError for an unknown effect, a level above its
         own, and a position without a contact within `PLAY_RADIUS`.
         """
-        effect = self._player.layout.effects.get(params.effect)
+        effect = self.layout.effects.get(params.effect)
         if effect is None:
-            known = ", ".join(sorted(self._player.layout.effects))
+            known = ", ".join(sorted(self.layout.effects))
             raise RpcError(
                 ErrorCode.REFUSED,
                 f"unknown effect {params.effect!a}",
@@ -92,8 +75,8 @@ class ActiveLayout:
                 where="x_m",
                 remedy="touch the plate there, or send a touch over the API",
             )
-        self._player.play(params.effect, nearest, now, level_db_sl=params.level_db_sl)
+        self.play(params.effect, nearest, now, level_db_sl=params.level_db_sl)
         band = effect.tuned_band
-        before = self._player.bands_before(nearest.key)
+        before = self.bands_before(nearest.key)
         played, is_shared = common_band([*before, band], frequencies)
         return PlayResult(held_back=None if is_shared else why_held_back(band, played, frequencies))

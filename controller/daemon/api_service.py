@@ -249,7 +249,7 @@ class ApiService:
         machine = self._supervisor.machine
         if machine.state is not _ENABLED or machine.is_degraded:
             raise _wrong_state(machine)
-        result = self._layout.play(
+        result = self._layout.play_nearest(
             params,
             self._publisher.view.contacts,
             frequencies=self._table.frequencies,

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import logging
 import signal
-import sys
 from collections.abc import Callable, Mapping
 from functools import partial
 
@@ -12,10 +11,9 @@ from controller.api.server import ApiServer
 from controller.daemon.active_layout import ActiveLayout
 from controller.daemon.api_service import ApiService
 from controller.daemon.api_views import amplifier_statuses
-from controller.daemon.child_processes import ChildProcesses
 from controller.daemon.config import DaemonConfig
 from controller.daemon.config_reader import read_in_child
-from controller.daemon.dashboard_token import write_token
+from controller.daemon.dashboard_process import gateway_options, keep_gateway
 from controller.daemon.fault_dumps import FaultDumps
 from controller.daemon.log import LogThread
 from controller.daemon.message_recorder import MessageRecorder
@@ -151,7 +149,7 @@ class Daemon:
             is_busy=lambda: self._controller.is_preparing,
             clock=clock.now,
         )
-        self._children = ChildProcesses()
+        self._gateway: asyncio.Task[None] | None = None
 
     async def run(self, lock: SocketLock) -> None:
         """Open, serve until terminated, silence the amplifiers and close.
@@ -171,7 +169,9 @@ class Daemon:
                 self._supervisor.run(self._controller), name="control loop"
             )
             self._inputs.start(self._config.touch)
-            self._start_children()
+            if self._dashboard is not None:
+                options = gateway_options(self._dashboard, self._config.socket)
+                self._gateway = asyncio.create_task(keep_gateway(options), name="gateway")
             shutdown = asyncio.create_task(self._shutdown.wait())
             started = asyncio.create_task(self._supervisor.started.wait())
             await asyncio.wait({running, shutdown, started}, return_when=asyncio.FIRST_COMPLETED)
@@ -244,8 +244,13 @@ class Daemon:
                     await asyncio.wait({task})
             self._log.listener = None
             learning = () if self._learning is None else (self._learning.close(),)
-            closing = (self._inputs.close(), self._children.close(), self._server.close())
-            for found in await asyncio.gather(*learning, *closing, return_exceptions=True):
+            gateway = () if self._gateway is None else (self._gateway,)
+            for task in gateway:
+                task.cancel()
+            closing = (self._inputs.close(), self._server.close())
+            for found in await asyncio.gather(
+                *learning, *closing, *gateway, return_exceptions=True
+            ):
                 if isinstance(found, Exception) and not isinstance(found, OSError):
                     _logger.error("closing failed", exc_info=found)
             self._publisher.hub.close()
@@ -254,16 +259,6 @@ class Daemon:
         """Follow amplifiers whose lines have been opened."""
         self._recorder.follow(amplifiers)
         self._supervisor.connected(amplifiers)
-
-    def _start_children(self) -> None:
-        socket = str(self._config.socket)
-        if self._dashboard is not None:
-            options = ["--socket", socket, "--listen", self._dashboard]
-            if not sys.stdout.isatty():  # the gateway would print its token into a log
-                token_file = write_token(self._config.socket.with_name("dashboard-token"))
-                _logger.info("dashboard: token in %s", token_file)
-                options += ["--token-file", str(token_file)]
-            self._children.start("controller.cli", "gateway", *options)
 
     def _deliver(self, frame: TouchFrame) -> None:
         """Pass touches to the control loop; ignore them while it is not running."""

@@ -90,15 +90,17 @@ class RateLimitFilter(logging.Filter):
         return True
 
 
-class LogThread:
+class LogThread(logging.Handler):
     """Writes the log until it is closed; `lost` counts lines that could not be written.
 
     file: appended to; None for standard error. A failing file is reopened for every line, one that
-    was renamed or removed before the next line. listener: called with every record in the thread
-    that logs it.
+    was renamed or removed before the next line. listener: called with records from level info on in
+    the thread that logs them.
     """
 
     def __init__(self, file: Path | None) -> None:
+        super().__init__()
+        self.setFormatter(JsonFormatter())
         self.lost = 0
         self.listener: Callable[[logging.LogRecord], None] | None = None
         self._file = file
@@ -106,15 +108,18 @@ class LogThread:
         self._thread = threading.Thread(target=self._write_all, name="log", daemon=True)
         self._thread.start()
 
-    def put(self, line: str) -> None:
-        """Queue a line; never blocks."""
+    def emit(self, record: logging.LogRecord) -> None:
+        """Queue the line of a record; never blocks."""
         try:
-            self._lines.put_nowait(line)
-        except queue.Full:
+            self._lines.put_nowait(self.format(record))
+            if self.listener is not None and record.levelno >= logging.INFO:
+                self.listener(record)
+        except Exception:  # a full queue, or a failing log, must not stop the program
             self.lost += 1
 
     def close(self) -> None:
         """Write the queued lines, within a time limit."""
+        super().close()
         try:
             self._lines.put(None, timeout=_CLOSE_TIMEOUT)
         except queue.Full:
@@ -158,31 +163,12 @@ class LogThread:
                 stream.close()
 
 
-class LogHandler(logging.Handler):
-    """Formats records and queues them for the thread."""
-
-    def __init__(self, thread: LogThread) -> None:
-        super().__init__()
-        self._thread = thread
-        self.setFormatter(JsonFormatter())
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Queue one record."""
-        try:
-            self._thread.put(self.format(record))
-            if self._thread.listener is not None and record.levelno >= logging.INFO:
-                self._thread.listener(record)
-        except Exception:  # a failing log must not stop the program
-            self._thread.lost += 1
-
-
 def start_log(file: Path | None, *, level: str) -> LogThread:
     """Send all records of this process from a level on to a file, or to standard error."""
     thread = LogThread(file)
-    handler = LogHandler(thread)
-    handler.addFilter(RateLimitFilter())
+    thread.addFilter(RateLimitFilter())
     root = logging.getLogger()
-    root.handlers[:] = [handler]
+    root.handlers[:] = [thread]
     root.setLevel(level.upper())
     logging.raiseExceptions = False
     return thread

@@ -1,7 +1,7 @@
 """From contacts to a haptic intent by a surface layout: which finger feels which effect."""
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from controller.effects.band import Band
@@ -45,18 +45,12 @@ class EffectPlayer:
 
     A finger feels its newest play; when that is over, the one before continues. Only the fingers of
     highest priority are driven, as many as the layout allows; ties go to the newest. All others are
-    quiet. A play without a sensation at the moment (no detent passed, no
-    movement) does not count.
-
-    already_pressed: fingers whose press another layout has played: for them only effects for motion
-    or without an end start.
+    quiet. A play without a sensation at the moment (no detent passed, no movement) does not count.
     """
 
-    def __init__(
-        self, layout: SurfaceLayout, *, already_pressed: Iterable[ContactKey] = ()
-    ) -> None:
+    def __init__(self, layout: SurfaceLayout) -> None:
         self.layout = layout
-        self._already_pressed = set(already_pressed)
+        self._already_pressed: set[ContactKey] = set()  # under another layout
         self._fingers: dict[ContactKey, _Finger] = {}
         self._number = 0
 
@@ -89,10 +83,14 @@ class EffectPlayer:
             until=min(ends, default=None),
         )
 
-    @property
-    def fingers(self) -> Collection[ContactKey]:
-        """Fingers on the plate at the last call of `intent`."""
-        return self._fingers.keys() | self._already_pressed
+    def replace(self, layout: SurfaceLayout) -> None:
+        """Play another layout from now on; fingers that rest feel no press of it.
+
+        For them only effects for motion or without an end start.
+        """
+        self.layout = layout
+        self._already_pressed |= self._fingers.keys()
+        self._fingers.clear()
 
     def effect_of(self, key: ContactKey) -> str | None:
         """Return the name of the effect that plays for a finger, None for none."""

@@ -17,7 +17,7 @@ from controller.api.client_protocol import Notification
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
-from controller.daemon.log import LogHandler, LogThread
+from controller.daemon.log import LogThread
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from model.rig.file import load_rig
@@ -111,7 +111,6 @@ async def daemon_at(
     config = load_daemon_config(write_daemon(folder, dict(far.urls), more, changes=changes))
     lock = SocketLock(config.socket)
     log = LogThread(folder / "log")
-    handler = LogHandler(log)
     # Daemon, amplifier and test share a process, which a busy machine delays; here the watchdog is
     # the longest of the protocol, since no test of this bench lets it expire.
     daemon = Daemon(
@@ -123,7 +122,7 @@ async def daemon_at(
         watchdog=2.0,
     )
     task = asyncio.create_task(daemon.run(lock))
-    logging.getLogger().addHandler(handler)
+    logging.getLogger().addHandler(log)
     try:
         await until(lambda: config.socket.is_socket() or task.done())
         if task.done():
@@ -134,7 +133,7 @@ async def daemon_at(
         try:
             await asyncio.wait_for(task, PATIENCE)
         finally:
-            logging.getLogger().removeHandler(handler)
+            logging.getLogger().removeHandler(log)
             log.close()
             lock.release()
 

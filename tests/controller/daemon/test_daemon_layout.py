@@ -122,7 +122,7 @@ def test_play_is_held_back_while_another_frequency_plays(
     fingers = [Contact(ContactKey("a", n), 0.1 * n, 0.1, since=0.0) for n in (1, 2)]
     active.intent(fingers, 0.0)
     held_back = [
-        active.play(
+        active.play_nearest(
             PlayParams(effect=name, x_m=finger.x, y_m=finger.y, level_db_sl=None),
             fingers,
             frequencies=np.array([80.0, 120.0, 250.0]),

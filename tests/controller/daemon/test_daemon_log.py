@@ -15,7 +15,7 @@ import pytest
 
 from controller.daemon.fault_dumps import write_dump
 from controller.daemon.latency import LatencyStatistics
-from controller.daemon.log import JsonFormatter, LogHandler, LogThread, RateLimitFilter
+from controller.daemon.log import JsonFormatter, LogThread, RateLimitFilter
 from controller.daemon.message_recorder import MessageRecord, MessageRecorder
 from controller.daemon.service_manager import ServiceManager
 from controller_bench import BenchLines, FarEnd
@@ -82,7 +82,7 @@ def test_log_loses_lines_only_while_disk_is_full(logger: logging.Logger, tmp_pat
     file = tmp_path / "log"
     file.symlink_to("/dev/full")
     thread = LogThread(file)
-    logger.addHandler(LogHandler(thread))
+    logger.addHandler(thread)
     for _ in range(10):
         logger.warning("lost")
     wait_until(lambda: thread.lost == 10)
@@ -106,7 +106,7 @@ def test_log_does_not_block_while_disk_hangs(
 
     monkeypatch.setattr(sys, "stderr", Hanging())
     thread = LogThread(None)
-    logger.addHandler(LogHandler(thread))
+    logger.addHandler(thread)
     logger.warning("first")
     assert hangs.wait(20)
     for _ in range(3000):
@@ -120,7 +120,7 @@ def test_log_listener_gets_records_from_info_on(logger: logging.Logger, tmp_path
     """The file gets all of them."""
     thread = LogThread(tmp_path / "log")
     logger.setLevel(logging.DEBUG)
-    logger.addHandler(LogHandler(thread))
+    logger.addHandler(thread)
     heard: list[str] = []
     thread.listener = lambda record: heard.append(record.getMessage())
     logger.debug("detail")
@@ -135,7 +135,7 @@ def test_log_is_reopened_after_rotation(logger: logging.Logger, tmp_path: Path) 
     """Lines after it are in a new file, which only its owner may read."""
     file, rotated = tmp_path / "log", tmp_path / "log.1"
     thread = LogThread(file)
-    logger.addHandler(LogHandler(thread))
+    logger.addHandler(thread)
     logger.warning("before")
     wait_until(lambda: file.exists() and file.read_text("utf-8"))
     file.rename(rotated)

@@ -10,6 +10,7 @@ import pytest
 
 from controller.api.jsonrpc import ErrorCode
 from controller.cli.daemon import show_status
+from controller.daemon.dashboard_process import gateway_options
 from controller.gateway.settings import read_token
 from controller.loop.decision import ENDED
 from controller.loop.intent import NO_CONTACTS
@@ -272,21 +273,11 @@ async def test_reload_applies_a_layout_alone(tmp_path: Path) -> None:
         assert await reload((f"{level}20", f"{level}21")) == 21
 
 
-async def test_daemon_keeps_dashboard_token_out_of_its_output(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Not on a terminal, the gateway reads it from a file of the owner instead of printing it."""
-    started: list[tuple[str, ...]] = []
-    monkeypatch.setattr(
-        "controller.daemon.daemon.ChildProcesses.start",
-        lambda children, *arguments: started.append(arguments),
-    )
-    async with running_daemon(tmp_path) as bench:
-        bench.daemon._dashboard = "127.0.0.1:0"
-        bench.daemon._start_children()
-        ((*_, option, file),) = started
-        assert option == "--token-file"
-        assert len(read_token(Path(file))) >= 32  # which refuses a file that others may read
+def test_gateway_keeps_its_token_out_of_a_log(tmp_path: Path) -> None:
+    """Not on a terminal, it reads it from a file of the owner instead of printing it."""
+    *_, option, file = gateway_options("127.0.0.1:0", tmp_path / "era.sock")
+    assert option == "--token-file"
+    assert len(read_token(Path(file))) >= 32  # which refuses a file that others may read
 
 
 async def test_daemon_refuses_amplifier_with_another_serial_number(tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from controller.gateway.settings import Settings
 
 SUBPROTOCOL = "era-haptics.v1"
 _TOKEN_SUBPROTOCOL = "era-haptics.token."  # noqa: S105 (a prefix, not a token)
-MAX_BODY = 1 << 16
 _POLICY_VIOLATION = 1008
 
 Refusal: TypeAlias = tuple[int, str]  # HTTP status and reason
@@ -70,9 +69,8 @@ class Access:
         origins = headers.getlist("origin")
         if origins and not self._is_allowed_origin(origins, hosts[0]):
             return 403, "this Origin is not allowed; see --allow-origin"
-        if headers.get("sec-fetch-site") == "cross-site" and not (
-            origins or _is_navigation(headers)
-        ):
+        is_link = headers.get("sec-fetch-mode") == "navigate"  # which the user followed
+        if headers.get("sec-fetch-site") == "cross-site" and not (origins or is_link):
             return 403, "cross-site requests are not allowed"
         if scope.get("method") == "OPTIONS":  # without effect
             return None
@@ -80,8 +78,6 @@ class Access:
             return None
         if not self._has_token(headers):
             return 401, "the token is missing or wrong; open the URL that the gateway printed"
-        if _to_int(headers.get("content-length", "0")) > MAX_BODY:
-            return 413, f"the body must have at most {MAX_BODY} bytes"
         return None
 
     def _is_allowed_host(self, host: str) -> bool:
@@ -118,16 +114,6 @@ class Access:
         return len(tokens) == 1 and hmac.compare_digest(  # in constant time
             tokens[0].encode(), self._settings.token.encode()
         )
-
-
-def _is_navigation(headers: Headers) -> bool:
-    """Whether the user followed a link to the page."""
-    return headers.get("sec-fetch-mode") == "navigate"
-
-
-def _to_int(text: str) -> int:
-    """A header's integer; anything else counts as too large."""
-    return int(text) if text.isascii() and text.isdecimal() and len(text) < 10 else 1 << 62
 
 
 def _with_headers(send: Send) -> Send:

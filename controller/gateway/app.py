@@ -21,7 +21,7 @@ from controller.api.client_protocol import Unreachable, read_result
 from controller.api.jsonrpc import ErrorCode, RpcError, error_line, unknown_method
 from controller.api.methods import StatusResult
 from controller.api.rate_limit import RateLimiter
-from controller.gateway.access import MAX_BODY, SUBPROTOCOL, Access
+from controller.gateway.access import SUBPROTOCOL, Access
 from controller.gateway.bridge import bridge, client_name
 from controller.gateway.field import DrawnField
 from controller.gateway.link import KeptLink
@@ -29,6 +29,7 @@ from controller.gateway.metrics import exposition
 from controller.gateway.openapi import HTTP_METHODS, HTTP_STATUS, openapi
 from controller.gateway.settings import Settings
 
+MAX_BODY = 1 << 16  # bytes
 MAX_SESSIONS = 24  # WebSockets; the daemon has 32 connections, and some for stops
 MAX_OPENING_RATE, OPENING_BURST = 15.0, 48.0  # 1/s; of a host's connections to the daemon, and in
 # a burst: fewer than the daemon accepts of one process
@@ -47,13 +48,14 @@ class Gateway:
         self._daemon = settings.socket
         self._session_count = 0
         self._rates: dict[str, RateLimiter] = {}  # of connections to the daemon, by host
-        self._openapi = json.dumps(openapi()).encode()
+        self._status = KeptLink()  # for the metrics
+        self._reading = asyncio.Lock()
         self.app = Starlette(
             routes=[
                 Mount(
                     "/api/v1",
                     routes=[
-                        Route("/openapi.json", self._describe),
+                        Route("/openapi.json", JSONResponse(openapi())),
                         Route("/{method}", self._call, methods=["POST"]),
                         WebSocketRoute("/ws", self._serve),
                     ],
@@ -73,15 +75,13 @@ class Gateway:
             exception_handlers={HTTPException: _http_error},
         )
 
-    async def _describe(self, _: Request) -> Response:
-        return Response(self._openapi, media_type="application/json")
-
-    async def _metrics(self, request: Request) -> Response:
-        """Read the daemon's status for Prometheus."""
+    async def _metrics(self, _: Request) -> Response:
+        """Read the daemon's status for Prometheus, over one connection: it needs no token."""
         try:
-            reply = await self._request(request, "status", b"{}")
-            status = read_result(reply["result"], StatusResult)
-        except (KeyError, RpcError, Unreachable):
+            async with self._reading:
+                reply = await self._status.request(self._daemon, "metrics", "status", b"{}")
+            status = read_result(json.loads(reply)["result"], StatusResult)
+        except (KeyError, Unreachable):
             status = None
         return Response(exposition(status), media_type=CONTENT_TYPE_LATEST)
 
@@ -147,11 +147,14 @@ async def _body(request: Request) -> bytes:
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media not in ("application/json", ""):
         raise HTTPException(415, "the content type must be application/json")
+    too_large = HTTPException(413, f"the body must have at most {MAX_BODY} bytes")
+    if int(request.headers.get("content-length", "0")) > MAX_BODY:  # checked to be a number
+        raise too_large
     body = b""
     async for chunk in request.stream():
         body += chunk
         if len(body) > MAX_BODY:
-            raise HTTPException(413, f"the body must have at most {MAX_BODY} bytes")
+            raise too_large
     if body and not media:  # an empty body needs no type
         raise HTTPException(415, "the content type must be application/json")
     return body.replace(b"\n", b"\r") or b"{}"  # both are spaces, and neither is within a text

@@ -1,5 +1,6 @@
 """The OpenAPI description of the gateway, from the API's message models."""
 
+import operator
 from typing import Any
 
 from pydantic.json_schema import models_json_schema
@@ -48,9 +49,10 @@ def openapi() -> dict[str, Any]:
     """The description, OpenAPI 3.1."""
     params = {method.params for method in HTTP_METHODS.values()}
     results = {method.result for method in HTTP_METHODS.values()} | {ErrorBody}
+    by_name = operator.attrgetter("__name__")
     references, definitions = models_json_schema(
-        [(model, "validation") for model in sorted(params, key=_name)]
-        + [(model, "serialization") for model in sorted(results, key=_name)],
+        [(model, "validation") for model in sorted(params, key=by_name)]
+        + [(model, "serialization") for model in sorted(results, key=by_name)],
         ref_template="#/components/schemas/{model}",
     )
     return {
@@ -74,10 +76,6 @@ def openapi() -> dict[str, Any]:
             "schemas": definitions["$defs"],
         },
     }
-
-
-def _name(model: type[Message]) -> str:
-    return model.__name__
 
 
 def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:

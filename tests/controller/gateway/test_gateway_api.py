@@ -342,8 +342,9 @@ def test_websocket_message_in_two_fragments_is_one(gateway: GatewayProcess) -> N
 def test_stop_and_disarm_are_served_to_a_host_that_connects_too_often(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:
-    """Of all others, which are refused; this is the last test, for it is such a host."""
+    """Others are refused; reading metrics needs none. The last test, for it is such a host."""
     wait_for(lambda: call(gateway, "status")[0] == 429)
     daemon.calls.clear()
     assert [call(gateway, method)[0] for method in ("stop", "disarm")] == [200, 200]
     assert daemon.methods == ["stop", "disarm"]
+    assert b"\nera_up 1.0\n" in http(gateway, "/metrics", method="GET", body=b"", token=()).body

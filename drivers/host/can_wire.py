@@ -43,7 +43,8 @@ class CanWire:
 
     def __init__(self, bitrate: int, *, sequence: int, delay: float = 0.0) -> None:
         self.counters = WireCounters()
-        self.busy = 0.0
+        self.busy = self.takes = 0.0
+        self.is_kept = True
         self.delay = delay
         self._frame_time = frame_time(bitrate)
         self._sequence = sequence
@@ -75,6 +76,7 @@ class CanWire:
         self._requested = address
         self._replies = Assembler(self.counters)
         self.counters.frames_out += len(frames)
+        self.takes = len(frames) * self._frame_time
         return pack_frames(frames)
 
     def received(self, data: bytes) -> list[Arrival]:

@@ -39,6 +39,8 @@ def problem_of(
     playback.advance(now - ledger.lag)
     if len(status["levels"]) != playback.channels:
         return f"levels must be {playback.channels}, got {len(status['levels'])}"
+    if len(status["tokens"]) != ledger.capabilities["layers"]:
+        return f"layers must be {ledger.capabilities['layers']}, got {len(status['tokens'])}"
     is_steady = playback.next_due - 2 * ledger.lag > now
     if is_steady:  # else a layer may have ended, or not yet
         expected = playback.tokens

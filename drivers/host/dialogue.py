@@ -23,6 +23,8 @@ _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENABLED = STATES["OPERATION_ENABLED"]
 _STATUS = MESSAGES["GetStatus"].reply
 _SILENCING = ("Stop", "Disarm", "Silence")
+_CHANGING = ("Arm", "Disarm", "Stop", "Clear")
+_EVENT_WORDS = 11  # of a frame of its own, which precedes the reply to what changes the state
 _logger = logging.getLogger(__name__)
 
 
@@ -58,7 +60,7 @@ class Dialogue:
         """When [s] a set or silence was sent last."""
         self.committed = 0
         """Token of the set that it committed last, 0 for none since it was armed."""
-        self.feeding = Feeding(line.wire.delay)
+        self.feeding = Feeding(line.wire.delay, line.wire.is_kept)
         self.counts = LinkStatistics()
         self.silence_cause: str | None = None
         """Why it is degraded: it did not reply to a request, and may still play."""
@@ -101,7 +103,8 @@ class Dialogue:
         if name not in self._times:
             can = self.capabilities
             size = (can["channels"], can["layers"]) if can else WIDEST
-            words = request_words(name), reply_words(name, *size)
+            event = _EVENT_WORDS if name in _CHANGING else 0
+            words = request_words(name), reply_words(name, *size) + event
             self._times[name] = self.line.wire.exchange_time(*words)
         return self._times[name]
 
@@ -110,23 +113,23 @@ class Dialogue:
         """Counts of its requests, and of all frames on its line."""
         return replace(self.counts, **vars(self.line.wire.counters))
 
-    def note_sent(self, name: str, values: Values, now: float) -> None:
-        """Note a request that may have reached it."""
+    def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
+        """Note a request that is sent now and may reach it, at a time [s] unless it is delayed."""
         if name == "Hello":
             return
         if MESSAGES[name].feeds and (name == "Arm" or values["session"] == self.session):
             if name == "Silence" and self.silence_cause is not None:
                 self.feeding.unheard(_RAMP.from_wire(values["ramp"]), now)
             else:
-                self.feeding.sent(now)
+                self.feeding.sent(now, arrives)
         elif name in ("Stop", "Disarm"):
             self.feeding.fades(_RAMP.from_wire(values["ramp"]))
+            self.silences += 1
         if name == "Arm":
             self.may_be_armed = True
         admitted = self._admitted
         if name in _SILENCING or name == "Arm":
             self._admitted = None
-            self.silences += name in ("Stop", "Disarm")
             if name == "Silence":
                 self.played_at = now
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:

@@ -11,18 +11,20 @@ SILENCING = 0.005 + REACTION
 
 @dataclass
 class Feeding:
-    """What may have fed and what surely did, and the watchdog [s]; delay [s]: of the line.
+    """What may have fed and what surely did, and the watchdog [s]; delay, is_kept: of the wire.
 
     may: when the last request that may have fed went out. plays: the last such that does not also
-    silence it: how long the amplifier may play follows from it. fade [s]: longest ramp since, of a
-    silence without reply, a stop or a disarm. since, confirmed_at: when the last request that
-    surely did went out, and its reply came.
+    silence it, arrives: when it arrives unless it is delayed: how long the amplifier may play
+    follows from it. fade [s]: longest ramp since, of a silence without reply, a stop or a disarm.
+    since, confirmed_at: when the last request that surely did went out, and its reply came.
     """
 
     delay: float = 0.0
+    is_kept: bool = False
     watchdog: float = 0.0
     may: float = -math.inf
     plays: float = -math.inf
+    arrives: float = -math.inf
     fade: float = 0.0
     since: float = -math.inf
     confirmed_at: float = -math.inf
@@ -30,11 +32,12 @@ class Feeding:
     @property
     def may_play_until(self) -> float:
         """When the watchdog must have silenced the amplifier [s]."""
-        return self._arrived(self.plays) + self.watchdog + self.fade + SILENCING
+        return self._arrival + self.watchdog + self.fade + SILENCING
 
-    def sent(self, now: float) -> None:
-        """Note a request that may feed and let it play on, sent at a time [s]."""
+    def sent(self, now: float, arrives: float) -> None:
+        """Note a request that may feed and let it play on, sent at a time and due at another [s]."""
         self.may = self.plays = now
+        self.arrives = arrives
         self.fade = 0.0
 
     def unheard(self, ramp: float, now: float) -> None:
@@ -56,13 +59,18 @@ class Feeding:
         if sent_at > self.plays:
             self.plays, self.fade = sent_at, 0.0
 
-    def _arrived(self, sent_at: float) -> float:
-        """When a request that was sent at a time [s] has arrived at the latest [s].
+    @property
+    def _arrival(self) -> float:
+        """When the last request that lets it play on has arrived at the latest [s].
 
         One without reply may still be under way; what is confirmed came before its reply, and not
-        always in the time of the line: a busy machine may have kept it.
+        always in the time of the line: a busy machine may have kept it. What an adapter has kept
+        comes at any time, all at once: it has no effect after the watchdog.
         """
-        return self.confirmed_at if sent_at <= self.since else sent_at + self.delay
+        if self.plays <= self.since:
+            return self.confirmed_at
+        latest = self.arrives + self.delay
+        return max(latest, self.confirmed_at + self.watchdog) if self.is_kept else latest
 
     def problem(self, left: float, sent_at: float, now: float) -> str | None:
         """Describe an impossible time that is left [s] in a reply to a request; None if possible.

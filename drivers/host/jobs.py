@@ -48,7 +48,8 @@ class Job:
     """A request from its queueing to its result; member: None for a broadcast.
 
     make: values of each attempt, in its turn; raises CommandRefused. attempts: left. start: of a
-    commit that goes out together with those of other lines. had_no_reply: to an earlier attempt.
+    commit that goes out together with those of other lines. delays: of this process, while its
+    reply is awaited. had_no_reply: to an earlier attempt.
     """
 
     member: "Dialogue | None"
@@ -65,7 +66,8 @@ class Job:
     not_before: float = 0.0
     sent_at: float = 0.0
     due: float = 0.0
-    looks: int = 0
+    delays: int = 0
+    is_last_look: bool = False
     had_no_reply: bool = False
 
     def has_waited(self, now: float) -> bool:

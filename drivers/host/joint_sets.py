@@ -13,7 +13,7 @@ from drivers.host.dialogue import Staged
 from drivers.host.jobs import Priority
 from drivers.host.joint_start import JointStart
 from drivers.host.line import Line
-from drivers.host.members import Members, seen
+from drivers.host.members import Members
 from drivers.host.token_gaps import INTERVAL, close_gaps
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
@@ -90,17 +90,19 @@ class JointSets:
         if len(by_line) > 1:
             start = JointStart(len(by_line), until=min([one.until for one in staged]))
         requests: dict[Amplifier, Awaitable[Values]] = {}
+        broadcasts: list[Awaitable[Values]] = []
         for line, sharing in by_line.items():
             if len(sharing) == 1:
                 requests[sharing[0]] = sharing[0].commit(token, start=start)
                 continue
             make = partial(_commit_of, sharing, token)
             sent = line.submit(None, Priority.SET, "Commit", {}, make=make, start=start)
-            sent.add_done_callback(seen)
+            broadcasts.append(sent)
             for amplifier in sharing:
-                requests[amplifier] = _status_of(amplifier, token)
-        statuses = await self._members.all([requests[each] for each in several])
-        for amplifier, status, one in zip(several, statuses, staged, strict=True):
+                requests[amplifier] = _status_of(amplifier, token, sent)
+        # With the broadcasts: one that waits is not sent where this is given up.
+        statuses = await self._members.all([*(requests[each] for each in several), *broadcasts])
+        for amplifier, status, one in zip(several, statuses, staged, strict=False):
             _check_plays(amplifier.name, status, one)
 
     async def _played(
@@ -147,8 +149,8 @@ def _check_plays(name: str, status: Values, staged: Staged) -> None:
         is_lasting = False
         for command in one.commands:
             is_lasting = is_lasting or (command.level > 0 and not one.after)
-        if is_lasting and status["tokens"][one.layer] != staged.token:
-            got = status["tokens"][one.layer]
+        got = dict(enumerate(status["tokens"])).get(one.layer)
+        if is_lasting and got != staged.token:
             raise CommandRefused(
                 f"amplifier {name}: token of layer {one.layer} must be {staged.token}, got {got}"
             )
@@ -164,7 +166,10 @@ async def _achieved(amplifier: Amplifier, staged: Staged) -> tuple[LayerSet, ...
     return tuple([await amplifier.read_achieved(one) for one in staged.layers])
 
 
-async def _status_of(amplifier: Amplifier, token: int) -> Values:
-    """Read the status after a broadcast, and commit again where that was lost."""
+async def _status_of(amplifier: Amplifier, token: int, sent: Awaitable[Values]) -> Values:
+    """Read the status after a broadcast that was sent, and commit again where that was lost."""
     status = await amplifier.read_status(Priority.SET)
-    return status if status["token"] == token else await amplifier.commit(token)
+    if status["token"] == token:
+        return status
+    await sent
+    return await amplifier.commit(token)

@@ -17,6 +17,7 @@ from drivers.host.joint_start import JointStart
 from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT
 from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 from drivers.protocol.records import Values
+from drivers.protocol.table import REACTION
 from drivers.trace import Direction
 
 if TYPE_CHECKING:
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
 
 GRACE = 0.008  # s; how long a stop waits for the reply to another request
 BUSY_PAUSE = 0.005  # s; before a request goes again to a busy amplifier
+_LOOK_INTERVAL = 0.01  # s; in which a delay of this process is noticed
 _LATE = 0.005  # s; a timer later than this means that this process was delayed
-_LOOKS = 4  # at the port for a reply, where this process was delayed
+_DELAYS = 4  # of this process that prolong the wait for one reply
 _COMMIT_WORDS = 2
 _NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")
 SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
@@ -61,6 +63,7 @@ class Line:
         self.time = self._loop.time
         """The clock of the line [s]."""
         self._is_pumping = False
+        self._sent_until = 0.0  # s; before, what was sent is still on its way
         self._free_at = 0.0  # s; before, a reply may still take the line
 
     def submit(
@@ -115,6 +118,7 @@ class Line:
             job = self._current
             if job is None:
                 continue
+            self._sent_until = 0.0  # what is replied to has arrived
             if isinstance(arrival, More):
                 if self._must_yield(job):
                     self._current = None
@@ -123,10 +127,17 @@ class Line:
                     continue
                 try:
                     self._send(arrival.data, f"{job.name}, read")
+                except LinkTimeout as error:
+                    self._current = None
+                    self.wire.withdraw()
+                    self._blocked(job, error)
+                    continue
                 except LinkError as error:
                     self.lose(str(error))
                     return
-                job.due, job.looks = max(job.due, self._loop.time() + job.timeout), 0
+                # Each of the two responses may begin late.
+                job.due = max(job.due + REACTION, self._loop.time() + job.timeout)
+                job.delays, job.is_last_look = 0, False
                 continue
             self._current = None
             self._end(job, arrival)
@@ -209,31 +220,47 @@ class Line:
                 job.result.set_result({})
                 return
             longer = job.member.next_request(job.name, job.values)
-            self._write(job.member.address, job.name, job.values, now)
+            try:
+                begins = self._write(job.member.address, job.name, job.values, now)
+            except LinkTimeout as error:
+                self._blocked(job, error)
+                return
             if self.loss is not None:  # by what the port did
                 raise LinkError(self.loss)
-            job.due = now + longer + job.timeout
+            job.due = begins + longer + job.timeout
             if longer and job.attempts == ATTEMPTS:
                 job.attempts -= 1  # a slow wire: as long as on others until it counts as degraded
             job.attempts -= 1
-            job.looks = 0
+            job.delays, job.is_last_look = 0, False
             self._current = job
         except Exception as error:  # no caller may wait for ever
             self._fail(job, error)
 
-    def _write(self, address: int, name: str, values: Values, now: float) -> None:
-        """Send a request, the only way out, and note it for all that it reaches."""
+    def _write(self, address: int, name: str, values: Values, now: float) -> float:
+        """Send a request, the only way out, and note it for all that it reaches.
+
+        Returns when [s] it begins: behind what is still on its way.
+        """
         data = self.wire.request(address, name, values)
+        begins = max(now, self._sent_until)
         for member in self.members.values():
             if address in (0, member.address):
-                member.note_sent(name, values, now)
+                member.note_sent(name, values, now, begins + self.wire.takes)
         self._send(data, name if address == 0 else f"{name} to {address}")
+        return begins
 
     def _send(self, data: bytes, what: str) -> None:
         if trace.is_active():
             trace.frame(Direction.OUT, data, self.name, lambda: what)
-        self._free_at = self._loop.time() + self.wire.busy
+        begins = max(self._loop.time(), self._sent_until)
+        self._sent_until, self._free_at = begins + self.wire.takes, begins + self.wire.busy
         self._port.write(data)
+
+    def _blocked(self, job: Job, error: LinkTimeout) -> None:
+        """End a request that the port has not taken: the amplifier counts as degraded."""
+        if job.member is not None:
+            job.member.silence_cause = str(error)
+        self._fail(job, error)
 
     def _refused(self, job: Job, member: "Dialogue", nak: Nak) -> None:
         member.counts.refusals += 1
@@ -286,29 +313,39 @@ class Line:
     def _schedule(self) -> None:
         """Have the timer look again by the next time that matters; it is never cancelled."""
         if self._current is not None:
-            due = self._current.due
+            due = min(self._current.due, self._loop.time() + _LOOK_INTERVAL)
         elif not self._queue.jobs or (due := self._queue.next_due(self._loop.time())) <= 0.0:
             return
         if self._timer is None or self._timer.when() > due:
             if self._timer is not None:
                 self._timer.cancel()
-            self._timer = self._loop.call_at(due, self._look)
+            self._timer = self._loop.call_at(due, self._look, due)
 
-    def _look(self) -> None:
-        """Give up the request on the line if it is due, once the port was read once more."""
+    def _look(self, planned: float) -> None:
+        """Give up the request on the line if it is due, once the port was read once more.
+
+        planned [s]: when it should have been called. By what it is late this process was delayed,
+        and the reply has as much time left as it had then.
+        """
         self._timer = None
         now = self._loop.time()
         job = self._current
-        if job is None or now < job.due:
+        if job is None:
             self.pump()
             return
-        was_delayed = now - job.due > _LATE
-        job.looks += 1
+        since = max(planned, job.sent_at)
+        if now - since > _LATE and job.delays < _DELAYS:
+            job.delays += 1
+            left = 0.0 if self._must_yield(job) else job.due - since
+            job.due = now + max(left, _LATE)
+        if now < job.due:
+            self._schedule()
+            return
         self._port.poll()
         if self._current is not job:
             return
-        if job.looks == 1 or (was_delayed and job.looks < _LOOKS):
-            job.due = now + (_LATE if was_delayed else 0.0)
+        if not job.is_last_look:
+            job.due, job.is_last_look = now, True
             self._schedule()
             return
         self._current = None

@@ -73,7 +73,8 @@ class ModbusWire:
         self.counters = WireCounters()
         self.silence = max(_GAP * _BITS / baud, _SHORTEST_GAP) if baud else 0.0
         self.delay = delay
-        self.busy = 0.0
+        self.busy = self.takes = 0.0
+        self.is_kept = False
         self._baud = baud
         self._is_rtu = is_rtu
         self._number = number
@@ -143,6 +144,7 @@ class ModbusWire:
         self.counters.frames_out += 1
         transaction = 0 if self._is_rtu else self._number
         adu = build_adu(transfer, unit=unit, transaction=transaction, is_rtu=self._is_rtu)
+        self.takes = self._time(len(adu.frame)) + self.silence
         if self._is_rtu:
             response = adu.size + _FRAME_SIZE
             self.busy = self._time(len(adu.frame) + response) + 2 * self.silence

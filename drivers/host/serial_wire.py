@@ -41,7 +41,8 @@ class SerialWire:
 
     def __init__(self, baud: int, *, sequence: int) -> None:
         self.counters = WireCounters()
-        self.busy = 0.0
+        self.busy = self.takes = 0.0
+        self.is_kept = False
         self.delay = 0.0 if baud else NETWORK_DELAY
         self._byte_time = _BITS / baud if baud else 0.0
         self._sequence = sequence
@@ -60,7 +61,9 @@ class SerialWire:
             frame = Frame(message.number, address, self._sequence, payload, VERSION)
         self._pending = None if address == BROADCAST else frame
         self.counters.frames_out += 1
-        return encode_frame(frame)
+        data = encode_frame(frame)
+        self.takes = self._byte_time * len(data)
+        return data
 
     def received(self, data: bytes) -> list[Arrival]:
         """Return what these bytes complete."""

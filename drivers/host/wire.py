@@ -179,10 +179,12 @@ class Wire(Protocol):
     counters: WireCounters
     delay: float
     """By which a frame may arrive later than its bits take [s]: `NETWORK_DELAY` over a network."""
-
-    @property
-    def busy(self) -> float:
-        """For how long what was sent last and its reply take a line in turn [s]; 0 on others."""
+    is_kept: bool
+    """Whether a frame is sent again until somebody takes it, as by an adapter on a CAN bus."""
+    takes: float
+    """How long what was sent last takes to arrive [s]; 0 over a network."""
+    busy: float
+    """For how long what was sent last and its reply take a line in turn [s]; 0 on others."""
 
     def request(self, address: int, name: str, values: Values) -> bytes:
         """Return the bytes of a request, which is on the wire from now on; address 0: of all."""

@@ -61,9 +61,11 @@ class DevicePort(ABC):
         if self.descriptor is None:
             return
         try:
-            self.received(self.read_watched())
+            data = self.read_watched()
         except self.failures as error:
             self.lose(error)
+            return
+        self.received(data)  # whatever fails in that is no loss of the port
 
     def received(self, data: bytes) -> None:
         """Hand over what has come."""

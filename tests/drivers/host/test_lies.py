@@ -14,7 +14,7 @@ import pytest
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import PACKED, pack_frames
 from drivers.contents import Layer, Tone
-from drivers.errors import DriverError, LinkDegraded
+from drivers.errors import CommandRefused, DriverError, LinkDegraded
 from drivers.host.group import Group
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import MESSAGES
@@ -26,6 +26,7 @@ LOUD = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
 STATUS = {
     **{"state": (0, 255), "latch": (3, 0), "watchdog_left": (4, 65535), "temperature": (5, 32767)},
     **{"channels": (8, 200 << 8 | 8), "no channels": (8, 8), "levels": (9, 65535)},
+    "layers": (8, 2 << 8 | 7),
 }
 """Word and value of what each status says."""
 CAPABILITIES = {
@@ -113,7 +114,20 @@ async def test_status_that_cannot_be_ends_in_silence(
             await group.beat()
         assert not group.is_armed
     stopped = (await group.stop())["a"]
-    assert not stopped.is_confirmed
+    assert stopped.is_confirmed is (lie == "layers")  # all levels are there
+    await stops_truthfully(group, end)
+
+
+@in_virtual_time
+async def test_status_without_the_layer_of_a_set_does_not_confirm_it(
+    wire: str, altered: Callable[[str, int, int], None]
+) -> None:
+    """Seven layers of eight, and the set is of the last one: all is stopped."""
+    group, end = await armed(wire)
+    altered("GetStatus", *STATUS["layers"])
+    with pytest.raises(CommandRefused, match="token of layer 7 must be"):
+        await group.apply({"a": [Layer(7, (Tone(0, 100.0, 0.5),), 0.001)]})
+    assert not group.is_armed
     await stops_truthfully(group, end)
 
 

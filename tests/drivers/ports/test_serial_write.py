@@ -72,6 +72,23 @@ async def test_closed_port_is_a_link_error(ends: tuple[serial.Serial, int]) -> N
     await watched.wait_closed()
 
 
+async def test_error_of_whoever_takes_the_data_is_no_loss(ends: tuple[serial.Serial, int]) -> None:
+    """A LinkError is an OSError, as those of a port that is gone."""
+    port, far = ends
+    losses: list[str] = []
+
+    def fail(data: bytes) -> None:
+        raise LinkError("of another line")
+
+    watched = SerialPort(port, "/dev/ttyUSB9", fail, losses.append)
+    os.write(far, b"reply")
+    with pytest.raises(LinkError, match="of another line"):
+        watched.poll()
+    assert not losses
+    watched.close()
+    await watched.wait_closed()
+
+
 async def test_port_without_a_descriptor_is_written_by_a_thread() -> None:
     """A port that takes nothing for seconds does not block the caller."""
     entered, taken = threading.Semaphore(0), threading.Semaphore(0)

@@ -43,10 +43,12 @@ class Adapter(can.BusABC):
 
 
 @asynccontextmanager
-async def opened() -> AsyncIterator[tuple[BusPort, Adapter, list[str]]]:
-    """A port, its adapter, and its losses."""
+async def opened(
+    heard: Callable[[bytes], None] = lambda data: None, *, is_watched: bool = True
+) -> AsyncIterator[tuple[BusPort, Adapter, list[str]]]:
+    """A port, its adapter, and its losses; heard: called with what it receives."""
     adapter, losses = Adapter(), list[str]()
-    port = BusPort(adapter, True, "can0", lambda data: None, losses.append)
+    port = BusPort(adapter, is_watched, "can0", heard, losses.append)
     try:
         yield port, adapter, losses
     finally:
@@ -138,6 +140,24 @@ async def test_failed_send_is_a_loss() -> None:
         with pytest.raises(LinkError) as failed:
             port.write(pack_frames(STOP))
         assert losses == [str(failed.value)]
+
+
+async def test_reader_thread_hands_over_frames_in_order_until_the_adapter_is_gone() -> None:
+    """Frames that came before are handed over first; the thread ends, and the loss is told once."""
+    heard: list[bytes] = []
+    async with opened(heard.append, is_watched=False) as (port, adapter, losses):
+        port.poll()  # left to the thread
+        frames = [CanFrame(0x181, bytes([number])) for number in range(3)]
+        adapter.incoming += [
+            *(can.Message(arbitration_id=0x181, is_extended_id=False, data=f.data) for f in frames),
+            can.Message(arbitration_id=0x40, is_error_frame=True),
+        ]
+        await until(lambda: bool(losses))
+        assert heard == [pack_frames([frame]) for frame in frames]
+        assert port._thread is not None
+        port._thread.join(10.0)
+        assert not port._thread.is_alive()
+    assert len(losses) == 1
 
 
 def _unplugged(msg: can.Message, timeout: float | None = None) -> None:

@@ -12,6 +12,7 @@ from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from drivers.errors import LinkError
 from drivers.opening import Lines
+from drivers.ports.serial_port import SerialPort
 from drivers.wires import socketcand
 from drivers.wires.known import address_of
 from drivers.wires.text_port import TextPort
@@ -128,6 +129,27 @@ async def test_slcan_is_closed_then_opened_at_its_bit_rate_and_closed_at_the_end
         os.close(master)
         os.close(slave)
     assert text == SLCAN_SPOKEN
+
+
+async def test_slcan_port_that_does_not_take_its_commands_is_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It was opened for this program alone: else it could not be opened again."""
+    master, slave = os.openpty()
+    url = f"can+slcan://{os.ttyname(slave)}#5"
+
+    def fail(port: SerialPort, data: bytes) -> None:
+        raise LinkError("gone")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SerialPort, "write", fail)
+        with pytest.raises(LinkError, match="gone"):
+            await address_of(url).open_port(lambda data: None, lambda cause: None)
+    port = await address_of(url).open_port(lambda data: None, lambda cause: None)
+    port.close()
+    await port.wait_closed()
+    os.close(master)
+    os.close(slave)
 
 
 async def test_line_that_was_cut_off_is_ended_before_the_next_frame() -> None:

@@ -201,7 +201,7 @@ def _relay(
             asyncio.get_running_loop().add_signal_handler(number, ended.set)
         async with relays(endpoints, names, checker) as ends:
             for endpoint, end in zip(endpoints, ends, strict=True):
-                print(f"{endpoint.url}: {end}", file=to, flush=True)
+                print(endpoint.url, end, sep="  ", file=to, flush=True)
             await ended.wait()
 
     asyncio.run(run())

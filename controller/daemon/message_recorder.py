@@ -56,7 +56,8 @@ class RecordedWire:
     def __init__(
         self, inner: Wire, line: str, names: Mapping[int, str], recorder: MessageRecorder
     ) -> None:
-        self.counters, self.delay = inner.counters, inner.delay
+        self.counters, self.delay, self.is_kept = inner.counters, inner.delay, inner.is_kept
+        self.takes, self.busy = inner.takes, inner.busy
         self._inner = inner
         self._line = line
         self._names = names
@@ -67,11 +68,14 @@ class RecordedWire:
         """Return the bytes of a request; see `Wire`."""
         self._peer = self._names.get(address, self._line)
         self._record(self._peer, "out", name, values)
-        return self._inner.request(address, name, values)
+        data = self._inner.request(address, name, values)
+        self.takes, self.busy = self._inner.takes, self._inner.busy
+        return data
 
     def received(self, data: bytes) -> list[Arrival]:
         """Return what these bytes complete; see `Wire`."""
         arrivals = self._inner.received(data)
+        self.takes, self.busy = self._inner.takes, self._inner.busy
         for arrival in arrivals:
             name = type(arrival).__name__
             match arrival:
@@ -97,11 +101,6 @@ class RecordedWire:
     def exchange_time(self, words: int, reply: int) -> float:
         """See `Wire.exchange_time`."""
         return self._inner.exchange_time(words, reply)
-
-    @property
-    def busy(self) -> float:
-        """See `Wire.busy`."""
-        return self._inner.busy
 
     def _record(self, link: str, direction: str, message: str, content: object = "") -> None:
         """Record a message; a stop depends on no record."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from drivers.errors import CommandError, CommandRefused, FrameError, LinkError
+from drivers.errors import CommandError, CommandRefused, DriverError, FrameError, LinkError
 
 if TYPE_CHECKING:
     from drivers.conformance import CheckResult
@@ -98,7 +98,14 @@ def discover(
     result, problems = _run(discovered(url or [], probes=probe, slcan=slcan), trace)
     if json_:
         print(json.dumps(result))
-        return
+    else:
+        _show_discovered(result, problems)
+    for problem in problems.values():  # the first decides, as where one URL is given
+        kind = next(kind for kind in EXIT_STATUS if isinstance(problem, kind))
+        raise typer.Exit(EXIT_STATUS[kind])
+
+
+def _show_discovered(result: dict[str, Any], problems: dict[str, DriverError]) -> None:
     for row in result["places"]:
         print(f"{row['place']}  {row['description']}")
         if row["remedy"]:
@@ -111,10 +118,7 @@ def discover(
         print("  ".join(amplifier.values()))
     reached = [amplifier["url"] for amplifier in result["amplifiers"]]
     reached += [heard for row in result["places"] for heard in row["heard"]]
-    if not reached:
-        print("no amplifier found")
-        return
-    print(f"Next: era amp identify {shlex.quote(reached[0])}")
+    print(f"Next: era amp identify {shlex.quote(reached[0])}" if reached else "no amplifier found")
 
 
 def _add_plain(name: str, about: str) -> None:
@@ -272,7 +276,7 @@ def _act(
     if json_:
         print(json.dumps(result))
         return result
-    rows = {key: value for key, value in result.items() if key != "sensors"}
+    rows = {k: value for k, value in result.items() if k != "sensors" and value is not None}
     width = max(map(len, rows))
     for key, value in rows.items():
         print(f"{key:{width}}  {in_words(value)}")

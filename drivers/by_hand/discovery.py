@@ -26,7 +26,7 @@ async def identify_all(urls: Iterable[str]) -> Found:
 
 async def discover(
     urls: Sequence[str], *, probes: bool, slcan: bool
-) -> tuple[dict[str, Any], dict[str, str]]:
+) -> tuple[dict[str, Any], dict[str, DriverError]]:
     """List ports, interfaces and the amplifiers on them; returns that, and problems by URL.
 
     urls: identified too; probes: every port is sent identify requests; slcan: CAN adapters on
@@ -46,7 +46,7 @@ async def discover(
         if not isinstance(identity, DriverError)
     ]
     rows = [_row(place, found) for place in places]
-    problems = {url: str(found[url]) for url in urls if isinstance(found[url], DriverError)}
+    problems = {url: who for url in urls if isinstance(who := found[url], DriverError)}
     return {"places": rows, "amplifiers": amplifiers}, problems
 
 

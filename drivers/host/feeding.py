@@ -35,7 +35,7 @@ class Feeding:
         return self._arrival + self.watchdog + self.fade + SILENCING
 
     def sent(self, now: float, arrives: float) -> None:
-        """Note a request that may feed and let it play on, sent at a time and due at another [s]."""
+        """Note a request that may feed and let it play on: when it was sent, and arrives [s]."""
         self.may = self.plays = now
         self.arrives = arrives
         self.fade = 0.0

@@ -154,7 +154,7 @@ async def test_witness_relays_a_wire_until_interrupted(
         assert process.stdout is not None
         line = await asyncio.wait_for(process.stdout.readline(), TIMEOUT)
         prlimit(process.pid, RLIMIT_FSIZE, (room, RLIM_INFINITY))
-        url = line.decode().split(": ")[1].strip()
+        url = line.decode().split()[1]
         lines = Lines()
         amplifier = await lines.amplifier(url, GuardLimits(40.0, 500.0, 1.0), name="main")
         await amplifier.open()

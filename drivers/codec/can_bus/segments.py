@@ -25,8 +25,6 @@ LIFE = 0.1
 """Time without a frame [s] after which an incomplete message and the last number are forgotten."""
 _FIRST, _EACH = 2, 3  # words
 _PACKED = struct.Struct("<HB8s")
-PACKED = _PACKED.size
-"""Bytes of a packed frame."""
 
 
 class Message(NamedTuple):

@@ -134,3 +134,20 @@ def test_discover_lists_amplifiers_of_urls() -> None:
     """Each with its identity."""
     (found,) = result_of("discover", URL, "--no-probe")["amplifiers"]
     assert (found["url"], found["serial_number"]) == (URL, "SIM-main")
+
+
+@pytest.mark.parametrize(("url", "status"), [("foo", 2), ("serial:///dev/no-such-port", 3)])
+def test_discover_fails_where_a_named_url_has_no_amplifier(url: str, status: int) -> None:
+    """Exit status 2 for one that is none, 3 for one that cannot be reached; others are listed."""
+    result = invoke("discover", url, URL, "--no-probe")
+    assert result.exit_code == status
+    assert f"{url}: " in result.stdout
+    assert "SIM-main" in result.stdout
+    listed = invoke("discover", url, URL, "--no-probe", "--json")
+    assert listed.exit_code == status
+    assert [each["url"] for each in json.loads(listed.stdout)["amplifiers"]] == [URL]
+
+
+def test_what_is_unknown_is_not_shown() -> None:
+    """A stop that is confirmed has no time for which it may play."""
+    assert "None" not in invoke("stop", URL).stdout

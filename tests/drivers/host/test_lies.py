@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from drivers.codec.can_bus.canopen import CanFrame
-from drivers.codec.can_bus.segments import PACKED, pack_frames
+from drivers.codec.can_bus.segments import pack_frames
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, DriverError, LinkDegraded
 from drivers.host.group import Group
@@ -22,6 +22,7 @@ from sim.far_ends import serial_amplifiers
 from virtual_loop import in_virtual_time, run_virtual
 from words_line import KINDS, Alter, MemoryLine, unaltered
 
+PACKED = len(pack_frames([CanFrame(0, b"")]))
 LOUD = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
 STATUS = {
     **{"state": (0, 255), "latch": (3, 0), "watchdog_left": (4, 65535), "temperature": (5, 32767)},

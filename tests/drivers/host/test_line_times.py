@@ -102,8 +102,10 @@ async def test_time_of_a_broadcast_is_no_time_of_the_next_reply(name: str) -> No
         return
     paced.collisions, paced.reaction = 0, 0.0079  # a stop waits for 8 ms
     applying = asyncio.ensure_future(group.apply({each: [layer(0, tone())] for each in "ab"}))
-    while end.sent[-2][1] != "0:6":
+    for _ in range(1000):
         await asyncio.sleep(0.0005)
+        if end.sent[-2][1] == "0:6":
+            break
     stopped = await group.stop()
     assert all(each.is_confirmed for each in stopped.values())
     with pytest.raises(DriverError):
@@ -247,11 +249,11 @@ def test_commit_of_a_set_that_is_given_up_is_not_sent(kind: str) -> None:
             group.apply({each: [Layer(0, (tone(level=0.3),), 0.001)] for each in "ab"})
         )
         end.outward = lambda name, data: [(0.02 if name == "GetStatus" else 0.0002, data)]
-        reading = None
-        while reading is None:
+        for _ in range(1000):
             await asyncio.sleep(0.0001)
-            if [each for _, each in end.sent][-2:].count("2:5"):
-                reading = asyncio.ensure_future(group.amplifiers["a"].read_status())
+            if end.sent[-1][1] == "2:5":
+                break
+        reading = asyncio.ensure_future(group.amplifiers["a"].read_status())
         await asyncio.sleep(0.005)
         end.sent.clear()
         group.abort_exchange()

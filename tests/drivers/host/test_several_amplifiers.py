@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import pytest
 
-from drivers.codec.can_bus.segments import PACKED
+from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from drivers.errors import LinkError
 from sim.amplifier.contract import Amplifier
 from virtual_loop import in_virtual_time
@@ -44,16 +44,15 @@ async def test_frames_of_two_nodes_that_mix_are_told() -> None:
     waiting: list[bytes] = []
 
     def mixed(name: str, data: bytes) -> list[tuple[float, bytes]]:
-        if len(data) == PACKED:  # of one frame
+        if len(unpack_frames(data)) == 1:
             return unaltered(name, data)
         waiting.append(data)
         if len(waiting) < 2:
             return []
-        frames = [
-            [each[at : at + PACKED] for at in range(0, len(each), PACKED)] for each in waiting
-        ]
+        pairs = zip(*map(unpack_frames, waiting), strict=True)
+        mixed_up = pack_frames(frame for pair in pairs for frame in pair)
         waiting.clear()
-        return [(0.0002, b"".join(map(b"".join, zip(*frames, strict=True))))]
+        return [(0.0002, mixed_up)]
 
     line.outward = mixed
     with pytest.raises(LinkError, match="several amplifiers reply at address 1"):

@@ -48,8 +48,9 @@ class Job:
     """A request from its queueing to its result; member: None for a broadcast.
 
     make: values of each attempt, in its turn; raises CommandRefused. attempts: left. start: of a
-    commit that goes out together with those of other lines. delays: of this process, while its
-    reply is awaited. had_no_reply: to an earlier attempt.
+    commit that goes out together with those of other lines. longer: than on a fast wire its reply
+    may take [s]. delays: of this process, while its reply is awaited. had_no_reply: to an earlier
+    attempt.
     """
 
     member: "Dialogue | None"
@@ -66,6 +67,7 @@ class Job:
     not_before: float = 0.0
     sent_at: float = 0.0
     due: float = 0.0
+    longer: float = 0.0
     delays: int = 0
     is_last_look: bool = False
     had_no_reply: bool = False

@@ -17,7 +17,6 @@ from drivers.host.joint_start import JointStart
 from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT
 from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 from drivers.protocol.records import Values
-from drivers.protocol.table import REACTION
 from drivers.trace import Direction
 
 if TYPE_CHECKING:
@@ -136,7 +135,7 @@ class Line:
                     self.lose(str(error))
                     return
                 # Each of the two responses may begin late.
-                job.due = max(job.due + REACTION, self._loop.time() + job.timeout)
+                job.due = max(job.due, self._loop.time() + job.longer + job.timeout)
                 job.delays, job.is_last_look = 0, False
                 continue
             self._current = None
@@ -219,7 +218,7 @@ class Line:
                 self._write(0, job.name, job.values, now)
                 job.result.set_result({})
                 return
-            longer = job.member.next_request(job.name, job.values)
+            job.longer = job.member.next_request(job.name, job.values)
             try:
                 begins = self._write(job.member.address, job.name, job.values, now)
             except LinkTimeout as error:
@@ -227,8 +226,8 @@ class Line:
                 return
             if self.loss is not None:  # by what the port did
                 raise LinkError(self.loss)
-            job.due = begins + longer + job.timeout
-            if longer and job.attempts == ATTEMPTS:
+            job.due = begins + job.longer + job.timeout
+            if job.longer and job.attempts == ATTEMPTS:
                 job.attempts -= 1  # a slow wire: as long as on others until it counts as degraded
             job.attempts -= 1
             job.delays, job.is_last_look = 0, False

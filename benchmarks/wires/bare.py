@@ -18,10 +18,9 @@ from drivers.host.can_wire import CanWire
 from drivers.host.serial_wire import SerialWire
 from drivers.protocol.records import Values
 from drivers.protocol.table import MESSAGES
+from drivers.wires.can_bus import SlcanAddress, SocketcandAddress
 from drivers.wires.modbus import ModbusAddress
 from drivers.wires.serial_line import SerialAddress
-from drivers.wires.slcan import SlcanAddress
-from drivers.wires.socketcand import SocketcandAddress
 
 _BOX, _REPLY_AT = 256, 128  # registers of a message, and from there to its reply
 _REPLY_HEAD = 2  # tag, result

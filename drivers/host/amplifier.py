@@ -9,11 +9,16 @@ from drivers import clock
 from drivers.contents import Layer, is_silence
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout, Preempted
 from drivers.host.budget import COMMIT_DELAY
-from drivers.host.comparison import MAX_CONTRADICTIONS, achieved_problem, is_stopping, name_of
+from drivers.host.comparison import (
+    MAX_CONTRADICTIONS,
+    achieved_problem,
+    check_capabilities,
+    check_identity,
+    is_stopping,
+    name_of,
+)
 from drivers.host.dialogue import Dialogue, Staged
-from drivers.host.identification import check_capabilities, check_identity
-from drivers.host.jobs import Priority
-from drivers.host.joint_start import JointStart
+from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
 from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT, STOP_RAMP

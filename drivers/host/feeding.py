@@ -30,9 +30,25 @@ class Feeding:
     confirmed_at: float = -math.inf
 
     @property
+    def lost_from(self) -> float:
+        """When the watchdog has silenced it, and one that does not reply is lost [s].
+
+        A request without reply may still be under way; what is confirmed came before its reply, and
+        not always in the time of the line: a busy machine may have kept it.
+        """
+        is_confirmed = self.plays <= self.since
+        arrival = self.confirmed_at if is_confirmed else self.arrives + self.delay
+        return arrival + self.watchdog + self.fade + SILENCING
+
+    @property
     def may_play_until(self) -> float:
-        """When the watchdog must have silenced the amplifier [s]."""
-        return self._arrival + self.watchdog + self.fade + SILENCING
+        """When the watchdog must have silenced it, even where it is fed once more [s].
+
+        What an adapter has kept comes at any time, all at once: after the watchdog without effect.
+        """
+        if not self.is_kept or self.plays <= self.since:
+            return self.lost_from
+        return max(self.lost_from, self.confirmed_at + 2 * self.watchdog + self.fade + SILENCING)
 
     def sent(self, now: float, arrives: float) -> None:
         """Note a request that may feed and let it play on: when it was sent, and arrives [s]."""
@@ -58,19 +74,6 @@ class Feeding:
         self.since, self.confirmed_at = sent_at, now
         if sent_at > self.plays:
             self.plays, self.fade = sent_at, 0.0
-
-    @property
-    def _arrival(self) -> float:
-        """When the last request that lets it play on has arrived at the latest [s].
-
-        One without reply may still be under way; what is confirmed came before its reply, and not
-        always in the time of the line: a busy machine may have kept it. What an adapter has kept
-        comes at any time, all at once: it has no effect after the watchdog.
-        """
-        if self.plays <= self.since:
-            return self.confirmed_at
-        latest = self.arrives + self.delay
-        return max(latest, self.confirmed_at + self.watchdog) if self.is_kept else latest
 
     def problem(self, left: float, sent_at: float, now: float) -> str | None:
         """Describe an impossible time that is left [s] in a reply to a request; None if possible.

@@ -19,11 +19,9 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import DISARM_RAMP, WATCHDOG, Amplifier, Stopped
-from drivers.host.heartbeats import Heartbeats
 from drivers.host.jobs import Priority
 from drivers.host.joint_sets import JointSets, Played
-from drivers.host.members import Members, is_lost, retried
-from drivers.host.stopping import Stopping
+from drivers.host.members import Heartbeats, Members, Stopping, is_lost, retried
 from drivers.host.timing import STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values
 from drivers.protocol.table import QUANTITIES, STATES

@@ -1,4 +1,8 @@
-"""Sets of several amplifiers: staged on all of them, then committed at one moment, or on none."""
+"""Sets of several amplifiers: staged on all of them, then committed at one moment, or on none.
+
+A token is newer than another by less than half of 2^16 (RFC 1982): an amplifier that was left out
+of 40 000 sets would take the next one for an older one. It commits one that changes nothing before.
+"""
 
 import asyncio
 from collections.abc import Awaitable, Iterable, Mapping, Sequence
@@ -10,11 +14,9 @@ from drivers.errors import CommandRefused, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.comparison import name_of
 from drivers.host.dialogue import Staged
-from drivers.host.jobs import Priority
-from drivers.host.joint_start import JointStart
+from drivers.host.jobs import JointStart, Priority
 from drivers.host.line import Line
 from drivers.host.members import Members
-from drivers.host.token_gaps import INTERVAL, close_gaps
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import STATES
@@ -173,3 +175,40 @@ async def _status_of(amplifier: Amplifier, token: int, sent: Awaitable[Values]) 
         return status
     await sent
     return await amplifier.commit(token)
+
+
+INTERVAL = 1 << 12
+"""Tokens after which the gaps are looked at again."""
+_MAX_GAP = 1 << 14
+_SPAN = 1 << 16
+
+
+async def close_gaps(amplifiers: Iterable[Amplifier], token: int) -> int:
+    """Have amplifiers whose token is far behind one commit a set that changes nothing.
+
+    Returns the token of that set, or the one that was given. Raises what `Amplifier.stage` raises.
+    """
+    behind = [each for each in amplifiers if _is_behind(each, token)]
+    unchanged = [(each, layer) for each in behind if (layer := _unchanged(each)) is not None]
+    if not unchanged:
+        return token
+    token = token_after(token)
+    await asyncio.gather(*(each.stage(token, [layer], now=True) for each, layer in unchanged))
+    return token
+
+
+def _is_behind(amplifier: Amplifier, token: int) -> bool:
+    committed = amplifier.committed  # 0: any is newer
+    return committed > 0 and (token - committed) % _SPAN > _MAX_GAP
+
+
+def _unchanged(amplifier: Amplifier) -> Layer | None:
+    """Return a layer that is silent, or renewed without end; None if all end soon by themselves."""
+    playback = amplifier.ledger.playback
+    playing = playback.tokens
+    for number in range(amplifier.capabilities["layers"]):
+        if number not in playing:
+            return Layer(number)
+        if playback.is_endless(number):
+            return Layer(number, renew=True)
+    return None

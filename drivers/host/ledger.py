@@ -14,8 +14,7 @@ from drivers.contents import Layer
 from drivers.errors import CommandRefused
 from drivers.host.bounds import all_bounds, plain_bounds, worst
 from drivers.host.budget import COMMIT_DELAY, Budget, Vibration
-from drivers.host.limits import RATE_CEILING, wire_limits
-from drivers.host.rounding import TOLERANCE, Rounding
+from drivers.host.limits import RATE_CEILING, TOLERANCE, Rounding, wire_limits
 from drivers.playback import playback_of
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet

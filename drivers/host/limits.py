@@ -1,11 +1,20 @@
-"""Limits in force, in integers of the wire: the least of rig, amplifier, channels and ceilings."""
+"""What a set may contain: limits in force, and layers as the wire rounds them, in integers.
+
+Limits are the least of rig, amplifier, channels and ceilings. Levels, frequencies and phases are
+rounded to the nearest step, ramps and steps upward, and `valid_for` never to 0, which means without
+end; what the wire cannot have, or limits forbid, is refused.
+"""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import index
 
-from drivers.errors import CommandError
+from drivers.contents import Layer, Shape, Tone
+from drivers.errors import CommandError, CommandRefused
 from drivers.protocol.quantity import WireQuantity
 from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
 from registry.limits import GuardLimits
 
@@ -71,3 +80,123 @@ def wire_limits(configured: GuardLimits, capabilities: Values) -> WireLimits:
 def _whole_steps(value: float, quantity: WireQuantity) -> int:
     """Round a value down to a step of the wire."""
     return math.floor(value * quantity.per_unit + _SLACK)
+
+
+TOLERANCE = 1 + 1e-9
+"""Factor by which a sum of floats may exceed a limit."""
+_LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
+_RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
+_STEP, _FREQUENCY = QUANTITIES["envelope_step"], QUANTITIES["frequency"]
+_VALID_FOR_MAX = _VALID_FOR.high
+
+
+class Rounding:
+    """Rounds layers for one amplifier. limits: in force; capabilities: values of its record."""
+
+    def __init__(self, limits: WireLimits, capabilities: Values) -> None:
+        self._limits, self._can = limits, capabilities
+        self._channels: int = capabilities["channels"]
+        self._layers: int = capabilities["layers"]
+        self._ramp_max = _RAMP.from_wire(capabilities["ramp_max"])
+        self._level_max = limits.level / _LEVEL.per_unit
+
+    def layers(self, layers: Sequence[Layer]) -> tuple[LayerSet, ...]:
+        """Return layers in integers of the wire; raises CommandRefused with channel and reason."""
+        rounded: list[LayerSet] = []
+        numbers: list[int] = []
+        for layer in layers:
+            rounded.append(self._layer(layer))
+            numbers.append(rounded[-1].layer)
+        if not numbers or len(set(numbers)) < len(numbers):
+            raise CommandRefused(f"a set must have each layer once, at least one, got {numbers}")
+        return tuple(rounded)
+
+    def _layer(self, layer: Layer) -> LayerSet:
+        number, ramp, valid_for = index(layer.number), layer.ramp, layer.valid_for
+        if not 0 <= number < self._layers:
+            raise CommandRefused(f"layer must be 0 to {self._layers - 1}, got {number!r}")
+        if not 0 <= ramp <= self._ramp_max:  # nor NaN
+            raise CommandRefused(f"ramp must be 0 to {self._ramp_max:g} s, got {ramp!r} s")
+        if not 0 <= valid_for <= _VALID_FOR_MAX:
+            text = f"valid_for must be 0 to {_VALID_FOR_MAX:g} s, got {valid_for!r} s"
+            raise CommandRefused(text)
+        if layer.renew and (layer.tones or layer.after):
+            raise CommandRefused("renew must be without tones and after")
+        if layer.after and not layer.tones:
+            raise CommandRefused("after must be with tones")
+        commands: list[Command] = []
+        channels: set[int] = set()
+        for tone in layer.tones:
+            command = self._command(tone)
+            if command.channel in channels:
+                raise _refused(tone.channel, "must occur once in a layer")
+            channels.add(command.channel)
+            commands.append(command)
+        return LayerSet(
+            number,
+            min(math.ceil(ramp * _RAMP.per_unit - _SLACK), self._can["ramp_max"]),
+            max(round(valid_for * _VALID_FOR.per_unit), 1) if valid_for else 0,
+            tuple(commands),
+            bool(layer.after),
+            bool(layer.renew),
+        )
+
+    def _command(self, tone: Tone) -> Command:
+        """Return the command of a tone; few calls, since every set has some."""
+        limits, channel, level, onset = self._limits, index(tone.channel), tone.level, tone.onset
+        if not 0 <= channel < self._channels:
+            text = f"channel must be 0 to {self._channels - 1}, got {channel!r}"
+            raise CommandRefused(text, channel=channel)
+        if not 0 <= level <= self._level_max * TOLERANCE:  # nor NaN
+            raise self._level_refused(channel, "level", level)
+        if not (math.isfinite(tone.frequency) and math.isfinite(tone.phase)):
+            values = f"{tone.frequency!r} Hz and {tone.phase!r} degrees"
+            raise _refused(channel, f"frequency and phase must be finite numbers, got {values}")
+        frequency = round(tone.frequency * _FREQUENCY.per_unit)
+        if level == 0 and onset is None:
+            frequency = limits.frequency_min
+        if not limits.frequency_min <= frequency <= limits.frequency_max:
+            low, high = map(_FREQUENCY.from_wire, (limits.frequency_min, limits.frequency_max))
+            text = f"frequency must be {low:g} to {high:g} Hz, got {tone.frequency:g} Hz"
+            raise _refused(channel, text)
+        phase = round(tone.phase * _PHASE.per_unit)
+        if not _PHASE.minimum <= phase <= _PHASE.maximum:
+            phase = _PHASE.to_wire(float(tone.phase))
+        return Command(
+            channel,
+            frequency,
+            min(round(level * _LEVEL.per_unit), limits.level),
+            phase,
+            bool(tone.keep_phase),
+            bool(tone.skip_ending),
+            None if onset is None else self._envelope(onset, channel),
+            None if tone.ending is None else self._envelope(tone.ending, channel),
+        )
+
+    def _level_refused(self, channel: int, name: str, level: float) -> CommandRefused:
+        return _refused(channel, f"{name} must be 0 to {self._level_max:g}, got {level!r}")
+
+    def _envelope(self, shape: Shape, channel: int) -> Envelope:
+        can = self._can
+        low, high = (
+            _STEP.from_wire(can[name]) for name in ("envelope_step_min", "envelope_step_max")
+        )
+        if not low <= shape.step <= high:
+            text = f"step of an envelope must be {low:g} to {high:g} s, got {shape.step!r} s"
+            raise _refused(channel, text)
+        if len(shape.knots) > can["knots"]:
+            text = f"knots of an envelope must be at most {can['knots']}, got {len(shape.knots)}"
+            raise _refused(channel, text)
+        knots = tuple(self._knot(knot, channel) for knot in shape.knots)
+        return Envelope(math.ceil(shape.step * _STEP.per_unit - _SLACK), knots)
+
+    def _knot(self, knot: complex, channel: int) -> tuple[int, int]:
+        level = abs(knot)
+        if not 0 <= level <= self._level_max * TOLERANCE:
+            raise self._level_refused(channel, "level of a knot", level)
+        phase = _PHASE.to_wire(math.degrees(math.atan2(knot.imag, knot.real)))
+        return min(round(level * _LEVEL.per_unit), self._limits.level), phase
+
+
+def _refused(channel: int, text: str) -> CommandRefused:
+    return CommandRefused(f"channel {channel}: {text}", channel=channel)

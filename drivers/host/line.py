@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from drivers import trace
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
-from drivers.host.jobs import Job, JobQueue, Priority
-from drivers.host.joint_start import JointStart
+from drivers.host.jobs import Job, JobQueue, JointStart, Priority
 from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT
 from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 from drivers.protocol.records import Values

@@ -1,13 +1,22 @@
-"""The amplifiers of a group: which reply, which are lost, and requests to all of them at once."""
+"""The amplifiers of a group: which reply, which are lost; requests, heartbeats, stops of all.
+
+Heartbeats show as well that amplifiers still play what they should. A watchdog that runs down, and
+starts anew with each of them, shows that it would silence the amplifier: so its status is read just
+before it is fed. One that does not reply is not fed.
+"""
 
 import asyncio
+import logging
 import math
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from drivers import clock
 from drivers.errors import LinkError, LinkTimeout, Preempted
-from drivers.host.amplifier import Amplifier
+from drivers.host.amplifier import Amplifier, Stopped
+from drivers.host.jobs import Priority
+from drivers.host.line import Line
 from drivers.protocol.records import Values
 
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
@@ -46,7 +55,7 @@ class Members:
     def lost_from(self) -> float:
         """When [s] the next beat stops all, since one that does not reply must be silent."""
         mute = [each for each in self.amplifiers.values() if each.silence_cause is not None]
-        return min((each.feeding.may_play_until for each in mute), default=math.inf)
+        return min((each.feeding.lost_from for each in mute), default=math.inf)
 
     @property
     def last_sent_at(self) -> float:
@@ -113,7 +122,7 @@ class Members:
 
 def is_lost(amplifier: Amplifier) -> bool:
     """Whether it cannot be reached: its line is gone, or it is mute beyond its watchdog."""
-    is_over = clock.now() >= amplifier.feeding.may_play_until
+    is_over = clock.now() >= amplifier.feeding.lost_from
     return amplifier.line.loss is not None or (amplifier.silence_cause is not None and is_over)
 
 
@@ -147,3 +156,117 @@ def seen(sent: "asyncio.Future[Values]") -> None:
     """Retrieve an error that nobody awaits: what each amplifier says afterwards decides."""
     if not sent.cancelled():
         sent.exception()
+
+
+_MAX_STATUS_LOAD = 0.05  # of the line's time, for statuses that show whether the watchdog runs down
+
+
+class Heartbeats:
+    """Heartbeats of the amplifiers of a group."""
+
+    def __init__(self, members: Members) -> None:
+        self._members = members
+        self._running_read_at: dict[str, float] = {}
+        self._readings: dict[str, asyncio.Future[Values]] = {}  # of amplifiers that do not reply
+
+    async def beat(self) -> None:
+        """Feed the watchdog of every amplifier that replies, and read the status of the others.
+
+        Raises LinkTimeout where one is lost, Preempted where they are armed no longer, and what
+        the requests raise.
+        """
+        amplifiers = self._members.amplifiers.values()
+        for amplifier in amplifiers:  # before the others are waited for: they are stopped then
+            if is_lost(amplifier):
+                self._members.lose()
+                raise LinkTimeout(amplifier.line.loss or amplifier.silence_cause)
+        before = self._members.silences
+        await self._members.all([self._beat(each, before) for each in amplifiers])
+
+    async def _beat(self, amplifier: Amplifier, before: int) -> None:
+        name = amplifier.name
+        if amplifier.silence_cause is None:
+            # A status just before the watchdog is fed, unless the wire is too slow for that.
+            pause = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
+            if (now := clock.now()) - self._running_read_at.get(name, 0.0) >= pause:
+                self._running_read_at[name] = now
+                await amplifier.read_status(Priority.HEARTBEAT)
+            self._members.check_none_since(before)
+            await amplifier.ping()
+        elif name not in self._readings or self._readings[name].done():
+            reading = asyncio.ensure_future(amplifier.read_status(Priority.READING))
+            reading.add_done_callback(seen)
+            self._readings[name] = reading
+
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass
+class _Stop:
+    """A stop of one amplifier; is_sent: whether its first request has gone out."""
+
+    task: "asyncio.Future[Stopped] | None" = None
+    is_sent: bool = False
+
+    def sent(self) -> None:
+        """Note that its request has gone out: later ones need a stop of their own."""
+        self.is_sent = True
+
+
+class Stopping:
+    """Stops amplifiers, by name. All requests that come before a stop has gone out share it.
+
+    Those of one line get a broadcast first, so that none waits for the reply of another.
+    """
+
+    def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
+        self._amplifiers = amplifiers
+        self._stops: dict[str, _Stop] = {}
+        self._broadcasts: dict[Line, asyncio.Future[Values]] = {}
+
+    async def stop(
+        self, ramp: float, *, waits_for: Sequence[str] | None = None
+    ) -> dict[str, Stopped]:
+        """Stop all along a ramp [s]; return what became of those of some names, None for all.
+
+        Never raises an Exception.
+        """
+        tasks = {name: self._stop(name, ramp) for name in self._amplifiers}  # begin a moment later
+        for line in {each.line for each in self._amplifiers.values()}:
+            if len(line.members) > 1:
+                try:
+                    self._broadcast(line, ramp)
+                except Exception:  # each amplifier is stopped by itself as well
+                    _logger.exception("%s: the broadcast of a stop failed", line.name)
+        names = [*tasks] if waits_for is None else [*waits_for]
+        results = await asyncio.gather(
+            *(asyncio.shield(tasks[name]) for name in names), return_exceptions=True
+        )
+        return {
+            name: self._outcome(name, result) for name, result in zip(names, results, strict=True)
+        }
+
+    def _broadcast(self, line: Line, ramp: float) -> None:
+        queued = self._broadcasts.get(line)
+        if queued is None or queued.done():
+            first = next(iter(self._amplifiers.values()))
+            values = {"ramp": first.wire_ramp(ramp)}
+            sent = line.submit(None, Priority.STOP, "Stop", values)
+            sent.add_done_callback(seen)
+            self._broadcasts[line] = sent
+
+    def _stop(self, name: str, ramp: float) -> "asyncio.Future[Stopped]":
+        current = self._stops.get(name)
+        running = None if current is None or current.is_sent else current.task
+        if running is not None and not running.done():
+            return running
+        stop = self._stops[name] = _Stop()
+        stop.task = asyncio.ensure_future(self._amplifiers[name].stop(ramp, on_sent=stop.sent))
+        return stop.task
+
+    def _outcome(self, name: str, result: Stopped | BaseException) -> Stopped:
+        if isinstance(result, Stopped):
+            return result
+        until = self._amplifiers[name].feeding.may_play_until
+        return Stopped(False, until, f"{type(result).__name__}: {result}")

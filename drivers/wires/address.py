@@ -1,4 +1,4 @@
-"""What the URL of an amplifier says, whatever its wire: its line, and its number there."""
+"""What the URL of an amplifier says, whatever its wire, and ports that change or delay bytes."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -40,3 +40,27 @@ class WireAddress(ABC):
         on_data: called with what is received, as the wire takes it; on_loss: called once, with the
         cause.
         """
+
+
+class PortAbove:
+    """What a port on another one, below, leaves as it is; see `Port`."""
+
+    below: Port
+    """Set once it is open."""
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether it has not taken all bytes yet."""
+        return self.below.is_blocked
+
+    def poll(self) -> None:
+        """Hand over what has come and was not read yet."""
+        self.below.poll()
+
+    def close(self) -> None:
+        """Close it; no callback is called afterwards."""
+        self.below.close()
+
+    async def wait_closed(self) -> None:
+        """Wait until it is closed."""
+        await self.below.wait_closed()

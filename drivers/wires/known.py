@@ -8,11 +8,9 @@ from collections.abc import Callable
 
 from drivers.errors import CommandError
 from drivers.wires.address import WireAddress
+from drivers.wires.can_bus import PythonCanAddress, SlcanAddress, SocketcandAddress
 from drivers.wires.modbus import ModbusAddress
-from drivers.wires.python_can import PythonCanAddress
 from drivers.wires.serial_line import SerialAddress
-from drivers.wires.slcan import SlcanAddress
-from drivers.wires.socketcand import SocketcandAddress
 from registry.plugins import Derived, PluginRegistry
 
 _WIRES: PluginRegistry[Callable[[str], WireAddress]] = PluginRegistry(

@@ -1,16 +1,79 @@
-"""Modbus: modbus+tcp://HOST:PORT/UNIT and modbus+rtu:///dev/ttyS1?baud=115200#UNIT."""
+"""Modbus: modbus+tcp://HOST:PORT/UNIT and modbus+rtu:///dev/ttyS1?baud=115200#UNIT.
 
+RTU goes over a port that keeps the line silent before each frame.
+"""
+
+import asyncio
+import contextlib
 import random
 from collections.abc import Callable
 from dataclasses import replace
+from typing import final
 
+from drivers.errors import LinkError
 from drivers.hardware import Port
 from drivers.host.modbus_wire import ModbusWire
 from drivers.host.wire import NETWORK_DELAY
 from drivers.ports.opening import open_port
 from drivers.urls import ADDRESS, ADDRESS_MAX, RTU_BAUD, AmplifierUrl
-from drivers.wires.address import WireAddress
-from drivers.wires.silent_port import SilentPort
+from drivers.wires.address import PortAbove, WireAddress
+
+_FRAME_MAX = 256  # bytes
+_BROADCAST = b"\0"
+
+
+@final
+class SilentPort(PortAbove):
+    """A port that sends a frame once the line was silent for a time [s]; implements `Port`.
+
+    byte_time [s]; on_data: called with what is received. A frame waits at most for the longest
+    other one, so that noise does not keep a stop waiting. Of those that wait a newer one replaces
+    the older: its request was given up. Broadcasts stay, which have no reply to wait for.
+    """
+
+    def __init__(self, silence: float, byte_time: float, on_data: Callable[[bytes], None]) -> None:
+        self._silence, self._byte_time, self._on_data = silence, byte_time, on_data
+        self._loop = asyncio.get_running_loop()
+        self._free_from = self._loop.time() + silence
+        self._waiting: list[tuple[float, bytes]] = []  # until when [s] at most, frame
+        self._timer: asyncio.TimerHandle | None = None
+
+    def write(self, data: bytes) -> None:
+        """Send a frame as soon as the line was silent; raises LinkError."""
+        latest = self._loop.time() + _FRAME_MAX * self._byte_time + self._silence
+        kept = [each for each in self._waiting if each[1].startswith(_BROADCAST)]
+        self._waiting = [*kept, (latest, data)]
+        self._send()
+
+    def close(self) -> None:
+        """Close it; what waits is not sent."""
+        self._waiting.clear()
+        super().close()
+
+    def received(self, data: bytes) -> None:
+        """Take what was received, and count it as noise on the line."""
+        self._free_from = max(self._free_from, self._loop.time() + self._silence)
+        self._on_data(data)
+
+    def _send(self) -> None:
+        """Send what may go now; the timer sends the rest."""
+        while self._waiting:
+            latest, frame = self._waiting[0]
+            due = min(self._free_from, latest)
+            now = self._loop.time()
+            if now < due:
+                if self._timer is None:
+                    self._timer = self._loop.call_at(due, self._due)
+                return
+            del self._waiting[0]
+            self._free_from = now + len(frame) * self._byte_time + self._silence
+            self.below.write(frame)
+
+    def _due(self) -> None:
+        self._timer = None
+        with contextlib.suppress(LinkError):  # the loss of the port is reported by itself
+            self._send()
+
 
 _TCP_FORM = "modbus+tcp://HOST:PORT/UNIT (behind a gateway: ?baud=19200, that of its line)"
 _RTU_FORM = "modbus+rtu:///dev/ttyS1?baud=115200#UNIT or modbus+rtu://HOST:PORT#UNIT"

@@ -10,7 +10,7 @@ from armed_group import grouped, layer, losing, tone, with_group
 from drivers.contents import Shape
 from drivers.errors import CommandRefused, DriverError
 from drivers.host.group import Group
-from drivers.host.joint_start import JointStart
+from drivers.host.jobs import JointStart
 from drivers.host.sensors import read_measured
 from drivers.protocol.records import Refusal, Values
 from sim.amplifier.contract import Amplifier as FarEnd

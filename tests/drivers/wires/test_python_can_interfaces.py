@@ -7,8 +7,8 @@ import pytest
 from can.interfaces import BACKENDS
 
 from drivers.errors import CommandError, LinkError
+from drivers.wires.can_bus import PythonCanAddress
 from drivers.wires.known import address_of
-from drivers.wires.python_can import PythonCanAddress
 
 OWN = ("slcan", "socketcan", "socketcand")
 CHANNELS = {

@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 
 from drivers.host.modbus_wire import ModbusWire
-from drivers.wires.silent_port import SilentPort
+from drivers.wires.modbus import SilentPort
 from virtual_loop import in_virtual_time
 
 BYTE = 11 / 19_200  # s

@@ -13,9 +13,9 @@ from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from drivers.errors import LinkError
 from drivers.opening import Lines
 from drivers.ports.serial_port import SerialPort
-from drivers.wires import socketcand
+from drivers.wires import can_bus
+from drivers.wires.can_bus import TextPort
 from drivers.wires.known import address_of
-from drivers.wires.text_port import TextPort
 from registry.limits import GuardLimits
 
 FRAME = CanFrame(0x185, bytes.fromhex("0102030405060708"))
@@ -92,7 +92,7 @@ async def test_server_that_does_not_open_the_bus_is_told(
     replies: tuple[bytes, ...], problem: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An error, a closed connection, or no reply at all: with the remedy."""
-    monkeypatch.setattr(socketcand, "_GREETING_TIMEOUT", 0.2)
+    monkeypatch.setattr(can_bus, "_GREETING_TIMEOUT", 0.2)
     async with server(*replies) as url:
         with pytest.raises(LinkError, match=rf"(?s){problem}.*check address and port"):
             await open_port(url, lambda data: None)

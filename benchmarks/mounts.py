@@ -12,7 +12,7 @@ from model.fem.mesh import Mesh, element_of
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import load_rig
 from model.spectral.mesh import SpectralMesh
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 
 PLATE = load_rig(RIG).plate
 FREQUENCIES = np.array([110.0, 250.0, 400.0])

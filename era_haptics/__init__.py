@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from model.rig.file import load_rig as load_rig
     from model.rig.rig import Rig as Rig
     from model.rig.uncertainty import Uncertainty as Uncertainty
-    from model.structure.fingertip import Fingertip as Fingertip
+    from model.structure.attachments import Fingertip as Fingertip
     from model.table.file import load_table as load_table
     from model.table.file import save_table as save_table
     from model.table.pattern import Pattern as Pattern
@@ -80,7 +80,7 @@ _NAMES = {
     "model.rig.file": "example_rig_path load_rig",
     "model.rig.rig": "Rig",
     "model.rig.uncertainty": "Uncertainty",
-    "model.structure.fingertip": "Fingertip",
+    "model.structure.attachments": "Fingertip",
     "model.table.file": "load_table save_table",
     "model.table.pattern": "Pattern",
     "model.table.request": "Answer Finger Request",

@@ -21,7 +21,7 @@ from model.design.support import DEFAULT_LOWEST
 from model.errors import InputError
 from model.processes import on_processes
 from model.rig.rig import Rig
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.support import MIN_RIGID_BODY_FREQUENCY
 
 

@@ -16,7 +16,7 @@ from model.reduction.reduced_plate import (
     supported_modes,
 )
 from model.rig.rig import Rig
-from model.structure.point_load import footprints_of
+from model.structure.attachments import footprints_of
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.question import Question
 from model.vibration.excitation import Excitation, Tone

@@ -21,8 +21,8 @@ from model.calibration.responses_file import write_responses_csv, write_response
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.structure.attachments import footprints_of
 from model.structure.plate import Plate
-from model.structure.point_load import footprints_of
 from model.transients.base_motion import Term
 from sim.plant.accelerometer import Accelerometer, positions, readings
 from sim.plant.felt import fit_tones

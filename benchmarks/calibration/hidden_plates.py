@@ -25,7 +25,7 @@ from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import PlateMatrices, assemble, direct_acceleration
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad
+from model.structure.attachments import PointLoad
 
 MESH = (6, 5)  # within 0.1 % of converged, with strips
 STRIP = 3e-3  # m, twice the plate's thickness

@@ -15,7 +15,7 @@ from benchmarks.contrast.data_set import BenchmarkPlate, ContactSet, DataSet, da
 from model.finger.perception import decibels
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import footprints_of
+from model.structure.attachments import footprints_of
 from model.table.build import build_table
 from model.table.exact_plates import draw_plates, felt_on
 from model.table.pattern import ONSET_RAMP

@@ -31,7 +31,7 @@ from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import sensation_level
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from model.structure.fingertip import fingertip_loads
+from model.structure.attachments import fingertip_loads
 from model.table.file import load_table
 from model.table.question import Question
 from model.vibration.excitation import Excitation

@@ -9,7 +9,7 @@ from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters, SensorChannels
 from benchmarks.desk_plate.truth import Truth
 from model.arrays import FloatArray
-from model.structure.fingertip import FingertipLoad, fingertip_loads
+from model.structure.attachments import FingertipLoad, fingertip_loads
 from sim.sensors.sensor_file import WiredSensor
 
 _LOOPED = 0.9  # of what a cable from an output to an input brings back

@@ -18,8 +18,7 @@ from scipy import linalg
 from benchmarks.desk_plate.truth import Truth
 from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
-from model.structure.fingertip import FingertipLoad
-from model.structure.point_load import footprints_of
+from model.structure.attachments import FingertipLoad, footprints_of
 
 FREQUENCY_MAX = 1000.0
 """Hz; of the response, modes are kept to twice that."""

@@ -12,8 +12,8 @@ from model.arrays import Complex64Array
 from model.ensemble.attached_plate import AttachedPlate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
+from model.structure.attachments import PointLoad
 from model.structure.plate import LOSS_FREQUENCY
-from model.structure.point_load import PointLoad
 from model.table.build import build_table
 from model.table.question import Question
 from model.table.table import LocalizationTable

@@ -34,7 +34,7 @@ from model.identification.in_service import LivePlate, Report
 from model.identification.measurement import Measurement
 from model.identification.settled import SettledPattern
 from model.rig.file import load_rig
-from model.structure.fingertip import Fingertip
+from model.structure.attachments import Fingertip
 from model.table.live_table import table_following
 from model.table.table import LocalizationTable
 

@@ -28,7 +28,7 @@ from model.identification.identify import identify
 from model.identification.measurement import Measurement
 from model.identification.settled import SettledPattern
 from model.rig.file import load_rig
-from model.structure.fingertip import Fingertip
+from model.structure.attachments import Fingertip
 from model.table.build import build_table
 from model.table.timing import Timing
 

@@ -15,9 +15,7 @@ from model.finger.fingertip import fingertip_points
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.file import load_rig
 from model.rig.rig import Channel, Rig
-from model.structure.actuator import Era
-from model.structure.fingertip import Fingertip, FingertipLoad
-from model.structure.point_load import footprints_of
+from model.structure.attachments import Era, Fingertip, FingertipLoad, footprints_of
 from model.transients.base_motion import raised_cosine
 from sim.bench.bench import Bench
 from sim.plant.plant import SAMPLE_RATE, Plant

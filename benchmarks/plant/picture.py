@@ -19,8 +19,7 @@ from model.arrays import FloatArray
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from model.structure.fingertip import Fingertip, FingertipLoad
-from model.structure.point_load import footprints_of
+from model.structure.attachments import Fingertip, FingertipLoad, footprints_of
 from model.transients.base_motion import raised_cosine
 from sim.plant.plant import Plant
 

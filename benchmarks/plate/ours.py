@@ -8,7 +8,7 @@ from model.reduction import truncation
 from model.reduction.free_plate import solve_free_plate
 from model.rig.meshes import mesh_of
 from model.spectral import functions
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 
 NAME = "era-haptics"
 

@@ -22,7 +22,7 @@ from model.finger.perception import contrast_db
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
-from model.structure.point_load import footprints_of
+from model.structure.attachments import footprints_of
 from model.table.build import build_table
 from model.table.question import Question
 from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped

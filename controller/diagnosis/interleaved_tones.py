@@ -12,7 +12,7 @@ import numpy as np
 
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import footprints_of
+from model.structure.attachments import footprints_of
 from model.transients.time_response import plate_in_time
 
 WINDOW = 0.2  # s; of a reading: 1 % of noise is enough, and shorter ones hear more of it

@@ -17,7 +17,7 @@ from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import decibels, detection_threshold
-from model.structure.fingertip import fingertip_loads
+from model.structure.attachments import fingertip_loads
 from model.table.effect_level import EffectLevels
 from model.table.pulse_gains import robust_over_effect_db
 from model.table.table import LocalizationTable

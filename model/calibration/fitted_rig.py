@@ -16,7 +16,7 @@ from model.calibration.parameters import Parameter, rig_with
 from model.calibration.variable_projection import project_gains
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
-from model.structure.actuator import Gain
+from model.structure.attachments import Gain
 from model.vibration.parametric_plate import parametric_plate
 
 _CLEAR = 3.0  # standard errors of a place

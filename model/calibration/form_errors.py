@@ -28,8 +28,8 @@ from model.reduction.place_slopes import place_slopes
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.spectral.shape_stiffness import stiffness_slopes
+from model.structure.attachments import attached_stiffness, footprints_of
 from model.structure.modal_elasticity import ModalElasticity
-from model.structure.point_load import attached_stiffness, footprints_of
 
 # Tolerances: standard deviations.
 ERA_PLACE = 1.5e-3  # m, along each side

@@ -8,7 +8,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig
-from model.structure.actuator import Era, damping_from_ratio
+from model.structure.attachments import Era, damping_from_ratio
 from model.vibration.parametric_plate import ParametricPlate
 
 # Prior standard deviations: data sheets give moduli, thicknesses and springs, and little on losses.

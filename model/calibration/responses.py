@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 
 # Tolerances of a ruler [m]: of an ERA's position, and of a sensor beyond the plate's edge.
 _ERA_TOLERANCE = 5e-3

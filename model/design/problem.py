@@ -12,7 +12,7 @@ from model.design.contacts import ContactRule
 from model.design.support import DEFAULT_LOWEST, MIN_SUPPORTING, shortfall
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.table.table import default_drive_frequencies
 from model.version import NUMERICS_VERSION
 

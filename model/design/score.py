@@ -27,8 +27,7 @@ from model.finger.fingertip import FIVE_POINTS, fingertips_on
 from model.finger.perception import STRONG_DB_SL, detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
-from model.structure.actuator import Era
-from model.structure.point_load import attached_stiffness, drive_forces, full_strokes
+from model.structure.attachments import Era, attached_stiffness, drive_forces, full_strokes
 
 LEVEL_RESERVE = 1.2
 """Factor on the wanted level for what nine of ten plates need beyond the plate as modelled."""

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from model.rig.rig import Rig
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.support import rigid_body_frequencies, static_loads
 
 DEFAULT_LOWEST = 20.0

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from model.arrays import FloatArray
 from model.choice import NEARLY
 from model.drive_modes.forms import Weights
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.vibration.excitation import Excitation, Tone
 
 ROUNDING = 1e-6  # of single precision

@@ -15,12 +15,17 @@ import numpy as np
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
 from model.rig.uncertainty import Uncertainty
-from model.structure.actuator import Era
+from model.structure.attachments import (
+    Era,
+    Fingertip,
+    PointLoad,
+    attached_stiffness,
+    drive_forces,
+    full_strokes,
+)
 from model.structure.dispersion import Dispersion
-from model.structure.fingertip import Fingertip
 from model.structure.modal_elasticity import ModalElasticity
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad, attached_stiffness, drive_forces, full_strokes
 
 LEAST_THICKNESS = 0.1
 """Of plates that deviate, relative to the modelled one."""

@@ -17,16 +17,16 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.mesh import DOF_PER_NODE, Mesh, check_frequencies
-from model.structure.actuator import Era
-from model.structure.modal_elasticity import check_of_theory, loss_factors
-from model.structure.plate import Plate
-from model.structure.point_load import (
+from model.structure.attachments import (
+    Era,
     Load,
     PointLoad,
     attached_stiffness,
     drive_forces,
     footprints_of,
 )
+from model.structure.modal_elasticity import check_of_theory, loss_factors
+from model.structure.plate import Plate
 
 RIGID_BODY_MODES = 3  # of a free plate: up and down, and two tilts
 

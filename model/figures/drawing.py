@@ -13,7 +13,7 @@ from model.arrays import FloatArray
 from model.files.array_file import whole_or_nothing
 from model.files.replacing import check_picture_name
 from model.rig.rig import Rig
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.plate import Plate
 from model.vibration.excitation import G
 from model.vibration.maps import PlateMap

@@ -31,7 +31,7 @@ from model.finger.grid import Grid
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.layouts import FOUR_ERA_LAYOUTS, EraLayout, alike, diagonal_pair, edge_pair
 from model.rig.rig import Rig
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.plate import Plate
 from model.vibration.excitation import G, Tone
 from model.vibration.maps import plate_map

@@ -25,10 +25,9 @@ from model.identification.parameters import Space
 from model.identification.values import Values
 from model.reduction.free_plate import FreePlate
 from model.rig.rig import Rig
-from model.structure.fingertip import Fingertip
+from model.structure.attachments import Fingertip, attached_stiffness, footprints_of
 from model.structure.modal_elasticity import ModalElasticity, lowest_elastic
 from model.structure.plate import LOSS_FREQUENCY
-from model.structure.point_load import attached_stiffness, footprints_of
 
 
 @dataclass(frozen=True)

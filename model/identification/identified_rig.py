@@ -8,9 +8,8 @@ import numpy as np
 from model.identification.values import Values
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
-from model.structure.actuator import Era, Gain
+from model.structure.attachments import Era, Gain, PointLoad
 from model.structure.plate import LOSS_FREQUENCY, Plate
-from model.structure.point_load import PointLoad
 
 _LEAST_MASS = 1e-5  # kg; less is none
 _GAIN_STEP = 10.0  # Hz, of a drive that lags; linear between them is right to a thousandth

@@ -3,7 +3,7 @@
 Modes of the free plate up to twice the highest frequency come from one factorisation for each
 symmetry class; the contribution of the truncated modes (`model.reduction.truncation`) takes a few
 more solves with the same factors for each point of attachment, cached. Solutions for points are
-then a low-rank correction (`model.structure.point_load`): for each frequency a system as small as
+then a low-rank correction (`model.structure.attachments`): for each frequency a system as small as
 their number, independent of the mesh.
 """
 
@@ -23,11 +23,8 @@ from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
 from model.reduction.spectral_modes import SpectralModes, spectral_modes
 from model.reduction.truncation import truncation_weights
 from model.spectral.mesh import PlateMesh
-from model.structure.actuator import Era
-from model.structure.footprint import as_footprints
-from model.structure.modal_elasticity import ModalElasticity, loss_factors
-from model.structure.plate import Plate
-from model.structure.point_load import (
+from model.structure.attachments import (
+    Era,
     Load,
     attached_stiffness,
     coupled_forces,
@@ -35,6 +32,9 @@ from model.structure.point_load import (
     footprints_of,
     on_diagonal,
 )
+from model.structure.footprint import as_footprints
+from model.structure.modal_elasticity import ModalElasticity, loss_factors
+from model.structure.plate import Plate
 
 FreeModes: TypeAlias = SpectralModes | FiniteElementModes
 """Modes phi of a free plate up to a cut-off, and all truncated ones together by their sums.

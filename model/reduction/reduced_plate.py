@@ -39,13 +39,11 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.spectral.mesh import PlateMesh
-from model.structure.actuator import Era
+from model.structure.attachments import Era, Fingertip, FingertipLoad, PointLoad, footprints_of
 from model.structure.dispersion import Dispersion
-from model.structure.fingertip import Fingertip, FingertipLoad
 from model.structure.footprint import as_footprints
 from model.structure.modal_elasticity import ModalElasticity, loss_factors
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad, footprints_of
 from model.structure.support import check_supported
 
 RESIDUAL_VECTORS = 3  # for each attachment

@@ -19,7 +19,7 @@ from model.rig.parts import (
 )
 from model.rig.rig import Channel, Rig
 from model.rig.sections import RigSection
-from model.structure.point_load import PointLoad
+from model.structure.attachments import PointLoad
 
 
 def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:

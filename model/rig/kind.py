@@ -19,7 +19,7 @@ from model.rig.file import example_rig_path, rig_of
 from model.rig.parts import limits_of
 from model.rig.rig import Rig
 from model.rig.sections import LimitsSection, RigSection
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.laminate_section import slide_frequency
 from model.structure.support import support_problem
 

@@ -13,7 +13,7 @@ import numpy as np
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.errors import InputError
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.plate import Plate
 
 Place = tuple[float, float]

@@ -13,11 +13,9 @@ from model.rig.sections import (
     UncertaintySection,
 )
 from model.rig.uncertainty import Uncertainty
-from model.structure.actuator import Era, damping_from_ratio
+from model.structure.attachments import Era, Fingertip, PointLoad, damping_from_ratio
 from model.structure.equivalent import equivalent_plate
-from model.structure.fingertip import Fingertip
 from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
-from model.structure.point_load import PointLoad
 from registry.limits import GuardLimits
 
 

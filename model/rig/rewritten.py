@@ -14,7 +14,7 @@ from model.config.editing import edited_text
 from model.errors import InputError
 from model.rig.file import rig_of
 from model.rig.rig import Rig
-from model.structure.actuator import Gain
+from model.structure.attachments import Gain
 from model.structure.plate import Material
 
 _PER_LINE = 4

@@ -12,10 +12,8 @@ from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import DEFAULT_THRESHOLD
 from model.rig.uncertainty import Uncertainty
 from model.spectral.mesh import PlateMesh
-from model.structure.actuator import Era
-from model.structure.fingertip import Fingertip
+from model.structure.attachments import Era, Fingertip, PointLoad
 from model.structure.plate import Laminate, Plate
-from model.structure.point_load import PointLoad
 from registry.limits import GuardLimits
 
 # m; two bolts cannot be closer

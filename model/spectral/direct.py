@@ -15,12 +15,8 @@ from model.spectral.functions import CLASSES, deflections_by_class
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralPlate
-from model.structure.actuator import Era
-from model.structure.equivalent import short_wave_plate
-from model.structure.footprint import as_footprints
-from model.structure.modal_elasticity import check_of_theory, loss_factors
-from model.structure.plate import Plate
-from model.structure.point_load import (
+from model.structure.attachments import (
+    Era,
     Load,
     attached_stiffness,
     coupled_forces,
@@ -28,6 +24,10 @@ from model.structure.point_load import (
     footprints_of,
     on_diagonal,
 )
+from model.structure.equivalent import short_wave_plate
+from model.structure.footprint import as_footprints
+from model.structure.modal_elasticity import check_of_theory, loss_factors
+from model.structure.plate import Plate
 
 
 def direct_spectral_acceleration(

@@ -6,9 +6,8 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.structure.actuator import Era
+from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad
 
 GRAVITY = 9.81  # m/s²
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from model.arrays import Float32Array, FloatArray, IntArray
 from model.finger.perception import decibels, detection_threshold
-from model.structure.fingertip import Fingertip, fingertip_loads
+from model.structure.attachments import Fingertip, fingertip_loads
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, ONSET_RAMP, Pattern
 from model.table.pulse_gains import PulseGains, PulseResponses, pulse_gains
 from model.table.question import Question

@@ -15,9 +15,14 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.ensemble.measures import Felt, Fingertips, felt
 from model.rig.uncertainty import Uncertainty
-from model.structure.fingertip import FingertipLoad, fingertip_loads
+from model.structure.attachments import (
+    FingertipLoad,
+    attached_stiffness,
+    coupled_forces,
+    dynamic_stiffness,
+    fingertip_loads,
+)
 from model.structure.modal_elasticity import ModalElasticity
-from model.structure.point_load import attached_stiffness, coupled_forces, dynamic_stiffness
 from model.table.question import Point, Question
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes

@@ -23,10 +23,8 @@ from model.finger.grid import Grid
 from model.finger.perception import check_has_threshold
 from model.rig.meshes import mesh_from_dict
 from model.rig.uncertainty import Uncertainty
-from model.structure.actuator import Era
-from model.structure.fingertip import Fingertip
+from model.structure.attachments import Era, Fingertip, PointLoad
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad
 from model.table.raster import Raster
 from model.table.table import LocalizationTable
 

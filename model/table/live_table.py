@@ -12,7 +12,7 @@ import numpy as np
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.structure.point_load import footprints_of
+from model.structure.attachments import footprints_of
 from model.table.table import LocalizationTable
 
 _SAME_PLACE = 1e-9  # m

@@ -9,8 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
-from model.structure.actuator import Era
-from model.structure.point_load import PointLoad
+from model.structure.attachments import Era, PointLoad
 from model.table.many_answers import Ask, Contrasts
 from model.table.question import Point, Question
 from model.table.table import LocalizationTable

@@ -25,7 +25,7 @@ from model.ensemble.draws import Drawing
 from model.ensemble.measures import Felt, percentile, percentile_of_sorted
 from model.errors import InputError
 from model.finger.perception import decibels
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.table.fingers_on_plate import (
     CENTRE_AND_FOUR,
     MAX_FINGERS_BY_POINT,

@@ -13,7 +13,7 @@ from model.errors import InputError
 from model.finger import MAX_CONTACTS
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import STRONG_DB_SL
-from model.structure.fingertip import check_loads
+from model.structure.attachments import check_loads
 from model.structure.plate import Plate
 from model.table.question import MAX_LEVEL_DB_SL, MIN_LEVEL_DB_SL, Point
 from model.vibration.excitation import Excitation

@@ -32,11 +32,9 @@ from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import physics_fingerprint
 from model.rig.uncertainty import Uncertainty
 from model.spectral.mesh import PlateMesh
-from model.structure.actuator import Era
+from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loads
 from model.structure.dispersion import Dispersion
-from model.structure.fingertip import Fingertip, fingertip_loads
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad
 from model.table.fingers_on_plate import MAX_FINGERS_BY_POINT, FingersOnPlate
 from model.table.fingertip_shapes import FingertipReader, FingertipShapes
 from model.table.pattern import ONSET_RAMP, Pattern

@@ -17,8 +17,8 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig, canonical_json
 from model.spectral.mesh import PlateMesh
+from model.structure.attachments import footprints_of
 from model.structure.dispersion import Dispersion
-from model.structure.point_load import footprints_of
 from model.structure.support import check_supported
 from model.table.file import FORMAT_VERSION, MAX_BYTES
 from model.table.raster import Raster

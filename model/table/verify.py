@@ -27,8 +27,7 @@ from model.finger.perception import contrast_db, decibels, detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig
-from model.structure.fingertip import fingertip_loads
-from model.structure.point_load import footprints_of
+from model.structure.attachments import fingertip_loads, footprints_of
 from model.table.exact_plates import draw_plates, felt_on
 from model.table.pattern import Pattern
 from model.table.question import Question

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.vibration.excitation import Excitation
 
 

@@ -19,7 +19,7 @@ from functools import lru_cache
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.structure.fingertip import Fingertip
+from model.structure.attachments import Fingertip
 from model.transients.base_motion import rise
 from model.transients.time_response import PlateInTime
 

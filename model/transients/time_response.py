@@ -24,9 +24,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.reduction.reduced_plate import ReducedPlate, modal_matrices
-from model.structure.actuator import Era
-from model.structure.fingertip import FingertipLoad
-from model.structure.point_load import PointLoad, footprints_of
+from model.structure.attachments import Era, FingertipLoad, PointLoad, footprints_of
 from model.transients.base_motion import BaseMotions
 
 

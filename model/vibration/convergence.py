@@ -21,9 +21,8 @@ from model.reduction.spectral_modes import SpectralModes
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
 from model.spectral.mesh import PlateMesh, SpectralMesh
-from model.structure.actuator import Era
+from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad
 from model.vibration.natural_modes import natural_modes
 
 MAP_FREQUENCIES = (110.0, 250.0)

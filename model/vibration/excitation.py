@@ -13,7 +13,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from model.fem.plate import RIGID_BODY_MODES, assemble, modes
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.spectral.mesh import PlateMesh, SpectralMesh
+from model.structure.attachments import PointLoad, footprints_of
 from model.structure.modal_elasticity import ModalElasticity
-from model.structure.point_load import PointLoad, footprints_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,10 +17,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.fem.mesh import check_frequencies
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
-from model.structure.dispersion import Dispersion
-from model.structure.modal_elasticity import ModalElasticity
-from model.structure.plate import Plate
-from model.structure.point_load import (
+from model.structure.attachments import (
     Load,
     attached_stiffness,
     coupled_forces,
@@ -28,6 +25,9 @@ from model.structure.point_load import (
     footprints_of,
     on_diagonal,
 )
+from model.structure.dispersion import Dispersion
+from model.structure.modal_elasticity import ModalElasticity
+from model.structure.plate import Plate
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,10 +23,8 @@ from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.structure.actuator import Era
-from model.structure.fingertip import FingertipLoad, check_loads
+from model.structure.attachments import Era, FingertipLoad, PointLoad, check_loads, footprints_of
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Motion
 from sim.amplifier.contract import Amplifier
 from sim.bench.placement import Placement

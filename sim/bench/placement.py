@@ -6,7 +6,7 @@ Solving a large plate takes a tenth of a second, in which its amplifiers must go
 import threading
 from collections.abc import Callable, Mapping
 
-from model.structure.fingertip import FingertipLoad
+from model.structure.attachments import FingertipLoad
 from sim.plant.fingers import Position
 from sim.plant.loaded_plates import LoadedPlate
 

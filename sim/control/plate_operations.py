@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from model.errors import InputError
-from model.structure.point_load import PointLoad
+from model.structure.attachments import PointLoad
 from sim.control.context import SimulationContext
 from sim.control.values import Operation, Request, Response, is_number, parse_number
 from sim.plant.imperfections import PlateErrors

@@ -17,9 +17,7 @@ from model.errors import InputError
 from model.rig.meshes import mesh_of
 from model.rig.rig import Channel, Rig
 from model.spectral.mesh import PlateMesh
-from model.structure.actuator import Era
-from model.structure.fingertip import Fingertip
-from model.structure.point_load import PointLoad
+from model.structure.attachments import Era, Fingertip, PointLoad
 from model.transients.base_motion import Motion, Term
 from model.vibration.convergence import finer_mesh
 

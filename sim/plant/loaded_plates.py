@@ -14,9 +14,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import ReducedPlate
-from model.structure.actuator import Era
-from model.structure.fingertip import FingertipLoad
-from model.structure.point_load import PointLoad
+from model.structure.attachments import Era, FingertipLoad, PointLoad
 from model.transients.time_response import PlateInTime, plate_in_time
 
 Footprint: TypeAlias = tuple[float, float, float]

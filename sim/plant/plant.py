@@ -13,9 +13,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import ReducedPlate
-from model.structure.actuator import Era
-from model.structure.fingertip import FingertipLoad
-from model.structure.point_load import PointLoad
+from model.structure.attachments import Era, FingertipLoad, PointLoad
 from model.transients.base_motion import BaseMotions, Motion
 from model.transients.time_response import ForcedVibration
 from sim.plant.loaded_plates import LoadedPlate, LoadedPlateCache, carried_state

@@ -20,7 +20,7 @@ from model.finger.perception import (
 )
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
-from model.structure.fingertip import fingertip_loads
+from model.structure.attachments import fingertip_loads
 from model.table.pattern import ONSET_RAMP
 from model.table.question import Question
 from model.transients.base_motion import Envelopes, ramped_onset, shaped

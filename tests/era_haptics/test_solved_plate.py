@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import era_haptics as era
-from model.structure.point_load import PointLoad
+from model.structure.attachments import PointLoad
 from model.vibration.maps import plate_map
 from paper_plate import make_paper_rig
 

@@ -14,8 +14,7 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import felt_part
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
-from model.structure.fingertip import fingertip_loads
-from model.structure.point_load import footprints_of
+from model.structure.attachments import fingertip_loads, footprints_of
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.timing import Timing

@@ -25,7 +25,7 @@ from drivers.protocol.table import NO_CHANNEL, QUANTITIES
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
 from model.table.pattern import Pattern
 from model.table.question import Question

@@ -10,7 +10,7 @@ from model.finger.fingertip import FIVE_POINTS, fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
-from model.structure.point_load import attached_stiffness, drive_forces
+from model.structure.attachments import attached_stiffness, drive_forces
 
 GAINS = Uncertainty(0.05, 5.0, 0.0, 0.0, 1.0, 0.0)
 """Errors of the gains only, 5 % and 5 degrees."""

@@ -23,7 +23,7 @@ from model.fem.mesh import Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.rig.meshes import mesh_of
 from model.spectral.mesh import SpectralMesh
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
 from model.vibration.convergence import estimate_error
 

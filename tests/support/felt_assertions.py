@@ -19,8 +19,7 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import contrast_db, felt_part, mean_level_db_sl
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
-from model.structure.fingertip import FingertipLoad
-from model.structure.point_load import footprints_of
+from model.structure.attachments import FingertipLoad, footprints_of
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from model.structure.point_load import footprints_of
+from model.structure.attachments import footprints_of
 from sim.plant.plant import Plant
 
 

@@ -2,7 +2,7 @@
 
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
-from model.structure.actuator import Era, damping_from_ratio
+from model.structure.attachments import Era, damping_from_ratio
 from model.structure.plate import Material, Plate
 from registry.limits import GuardLimits
 

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import footprints_of
+from model.structure.attachments import footprints_of
 from model.transients.time_response import PlateInTime, plate_in_time
 from paper_plate import make_paper_rig
 

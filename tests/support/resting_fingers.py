@@ -1,6 +1,6 @@
 """Fingers that rest on the plate, by id."""
 
-from model.structure.fingertip import Fingertip, FingertipLoad
+from model.structure.attachments import Fingertip, FingertipLoad
 
 FINGERTIP = Fingertip(
     stiffness=1000.0,

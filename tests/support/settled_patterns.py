@@ -9,7 +9,7 @@ from benchmarks.identification.thin_plate import Mounted
 from benchmarks.setting import random_contacts
 from model.identification.forward import RestingFinger
 from model.identification.settled import SettledPattern
-from model.structure.fingertip import Fingertip
+from model.structure.attachments import Fingertip
 
 FREQUENCIES = np.linspace(40.0, 500.0, 27)
 SECONDS = 12.0  # between patterns

@@ -14,8 +14,7 @@ from scipy import linalg, sparse
 from model.arrays import ComplexArray, FloatArray
 from model.fem.mesh import Mesh
 from model.fem.plate import PlateMatrices, assemble
-from model.structure.actuator import Era
-from model.structure.fingertip import FingertipLoad
+from model.structure.attachments import Era, FingertipLoad
 from model.structure.plate import Plate
 
 Motion = Callable[[float], tuple[float, float]]

@@ -24,7 +24,7 @@ from memory_machine import MemoryMachine, live_in_memory
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
 from model.table.pattern import Pattern
 from model.table.question import Question

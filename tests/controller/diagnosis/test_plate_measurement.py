@@ -24,8 +24,7 @@ from model.identification.forward import Sensor
 from model.identification.identify import identify
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
-from model.structure.fingertip import Fingertip
-from model.structure.point_load import PointLoad
+from model.structure.attachments import Fingertip, PointLoad
 from model.table.build import build_table
 from model.table.question import Question
 from model.vibration.direct import direct_responder

@@ -15,7 +15,7 @@ from drivers.protocol.records import Values
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
 from model.transients.base_motion import BaseEnvelope
 from registry.limits import GuardLimits

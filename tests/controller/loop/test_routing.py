@@ -11,7 +11,7 @@ from drivers.protocol.sets import Command, LayerSet
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
 from model.vibration.excitation import Excitation, Tone
 from registry.limits import GuardLimits

@@ -20,7 +20,7 @@ from model.calibration.form_errors import form_model
 from model.calibration.parameters import parameters_of
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad
+from model.structure.attachments import PointLoad
 from model.vibration.parametric_plate import parametric_plate
 
 FREQUENCIES = np.arange(50.0, 491.0, 40.0)

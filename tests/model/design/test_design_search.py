@@ -18,7 +18,7 @@ from model.design.search import LayoutSearch
 from model.design.support import shortfall
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.support import static_loads
 
 

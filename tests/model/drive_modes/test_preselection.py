@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 
 from model.drive_modes import preselection
 from model.drive_modes.preselection import KEPT, MISSING, preselect
-from model.structure.point_load import PointLoad
+from model.structure.attachments import PointLoad
 from model.table.build import build_table
 from model.table.question import Question
 from model.table.table import LocalizationTable

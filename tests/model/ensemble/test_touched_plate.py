@@ -17,8 +17,7 @@ from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import FINGERTIP_RADIUS, FIVE_POINTS
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.uncertainty import Uncertainty
-from model.structure.fingertip import FingertipLoad
-from model.structure.point_load import PointLoad, footprints_of
+from model.structure.attachments import FingertipLoad, PointLoad, footprints_of
 from paper_plate import LENGTH, WIDTH
 from paper_table import smooth_rig
 

@@ -6,8 +6,7 @@ import numpy as np
 
 from model.fem.plate import assemble, direct_acceleration
 from model.reduction.free_plate import solve_free_plate
-from model.structure.actuator import Era
-from model.structure.point_load import footprints_of
+from model.structure.attachments import Era, footprints_of
 
 
 def test_direct_acceleration_of_a_rigid_plate_equals_mass_on_springs(coarse_rig):

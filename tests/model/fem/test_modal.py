@@ -7,7 +7,7 @@ from long_form import shortly
 from model.errors import InputError
 from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import assemble, modes
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.plate import Plate
 from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 

@@ -15,10 +15,9 @@ from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
+from model.structure.attachments import Fingertip, FingertipLoad, Load, PointLoad
 from model.structure.equivalent import equivalent_plate
-from model.structure.fingertip import Fingertip, FingertipLoad
 from model.structure.plate import Bond, Laminate, Layer, Material
-from model.structure.point_load import Load, PointLoad
 
 FREQUENCIES = np.array([60.0, 140.0, 222.0, 350.0, 480.0])
 PAD = Sensor("pad", x=0.1, y=0.07)

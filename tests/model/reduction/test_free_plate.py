@@ -12,9 +12,8 @@ from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import assemble, direct_acceleration, modes
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.spectral.mesh import SpectralMesh
-from model.structure.actuator import Era
+from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Laminate, Layer, Plate
-from model.structure.point_load import PointLoad
 from paper_plate import ALUMINIUM, LENGTH, WIDTH
 
 # Even and odd counts of elements, low and high order, with strips along the edges and without.

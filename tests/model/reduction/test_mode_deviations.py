@@ -12,8 +12,8 @@ from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
+from model.structure.attachments import footprints_of
 from model.structure.plate import LOSS_FREQUENCY, Plate
-from model.structure.point_load import footprints_of
 from model.table.build import build_table
 from model.vibration.parametric_plate import parametric_plate
 

@@ -6,9 +6,8 @@ import pytest
 from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import assemble, direct_acceleration
 from model.reduction.reduced_plate import reduce_plate
-from model.structure.actuator import Era
+from model.structure.attachments import Era, footprints_of
 from model.structure.plate import Plate
-from model.structure.point_load import footprints_of
 from paper_plate import ALUMINIUM, LENGTH, WIDTH
 
 PLATE = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)

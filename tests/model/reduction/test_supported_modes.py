@@ -7,8 +7,7 @@ import numpy as np
 from model.fem.mesh import Mesh
 from model.reduction.reduced_plate import SupportedModes, reduce_plate, supported_modes
 from model.rig.rig import Rig
-from model.structure.actuator import damping_from_ratio
-from model.structure.point_load import footprints_of
+from model.structure.attachments import damping_from_ratio, footprints_of
 from paper_plate import make_paper_rig
 
 # Founding paper, in-house column of Table 2 [Hz].

@@ -13,7 +13,7 @@ from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from model.structure.point_load import footprints_of
+from model.structure.attachments import footprints_of
 from model.transients.base_motion import BaseMotions, Term
 from model.transients.time_response import plate_in_time
 

@@ -10,7 +10,7 @@ from model.rig.layouts import (
     diagonal_pair,
     edge_pair,
 )
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from paper_plate import LENGTH, WIDTH, make_paper_rig
 
 

@@ -9,10 +9,9 @@ from model.rig.kind import RIG
 from model.rig.meshes import parse_mesh
 from model.rig.rig import Channel
 from model.rig.uncertainty import Uncertainty
-from model.structure.fingertip import Fingertip
+from model.structure.attachments import Fingertip, PointLoad
 from model.structure.materials import material
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad
 
 # A line per value, so that every problem has a line of its own.
 GOOD = """\

@@ -13,7 +13,7 @@ from model.rig.file import parse_rig
 from model.spectral.air_motion import air_motion
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralPlate
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.plate import HEAT_RATIO, PRESSURE, VISCOSITY, AirGap, Material, Plate
 from model.vibration.direct import direct_responder
 from model.vibration.natural_modes import natural_modes

@@ -16,10 +16,9 @@ from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.file import load_rig
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import Band, SpectralPlate
-from model.structure.actuator import Era
+from model.structure.attachments import Era, footprints_of
 from model.structure.equivalent import equivalent_plate
 from model.structure.plate import AirGap, Bond, Laminate, Layer, Material, Plate
-from model.structure.point_load import footprints_of
 from model.table.build import build_table
 from model.table.file import load_table, save_table
 from model.vibration.direct import direct_responder

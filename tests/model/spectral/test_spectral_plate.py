@@ -19,9 +19,8 @@ from model.spectral.functions import CLASSES
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralPlate
-from model.structure.actuator import Era
+from model.structure.attachments import Era, PointLoad, footprints_of
 from model.structure.plate import Material, Plate
-from model.structure.point_load import PointLoad, footprints_of
 from model.vibration.natural_modes import natural_modes
 from paper_plate import make_paper_rig
 

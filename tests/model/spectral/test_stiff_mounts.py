@@ -10,7 +10,7 @@ from scipy.integrate import trapezoid
 from model.fem.mesh import Mesh, element_of
 from model.reduction.free_plate import solve_free_plate
 from model.spectral.mesh import SpectralMesh
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from paper_plate import make_paper_rig
 
 PLATE = make_paper_rig(12, 9).plate

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.structure.fingertip import Fingertip
+from model.structure.attachments import Fingertip
 
 HERTZ = np.array([60.0, 100.0, 250.0])
 

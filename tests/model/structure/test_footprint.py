@@ -9,9 +9,8 @@ import pytest
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
-from model.structure.actuator import Era
+from model.structure.attachments import Era, PointLoad, footprints_of
 from model.structure.footprint import mean_over
-from model.structure.point_load import PointLoad, footprints_of
 from model.transients.base_motion import Term
 from model.vibration.direct import direct_responder
 from paper_plate import make_paper_rig

@@ -6,10 +6,9 @@ from dataclasses import replace
 import pytest
 
 from model.errors import InputError
-from model.structure.actuator import Era
+from model.structure.attachments import Era, PointLoad
 from model.structure.materials import material
 from model.structure.plate import Layer, Material, Plate
-from model.structure.point_load import PointLoad
 from paper_plate import make_paper_rig
 
 GLASS = Material("glass", 70e9, 2500.0, 0.2)

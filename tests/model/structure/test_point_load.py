@@ -4,9 +4,8 @@ import numpy as np
 
 from model.fem.mesh import Mesh
 from model.reduction.free_plate import solve_free_plate
-from model.structure.actuator import Era
+from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Plate
-from model.structure.point_load import PointLoad
 from paper_plate import ALUMINIUM, LENGTH, WIDTH
 
 

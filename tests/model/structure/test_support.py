@@ -7,9 +7,8 @@ import pytest
 from model.errors import InputError
 from model.reduction.reduced_plate import reduce_plate, supported_modes
 from model.rig.file import example_rig_path, load_rig
-from model.structure.actuator import Era
+from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Material, Plate
-from model.structure.point_load import PointLoad
 from model.structure.support import check_supported, rigid_body_frequencies, support_problem
 
 PLATE = Plate(0.3, 0.2, 0.002, Material("aluminium", E=70e9, rho=2700.0, nu=0.33))

@@ -11,7 +11,7 @@ from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold
 from model.rig.uncertainty import Uncertainty
-from model.structure.fingertip import FingertipLoad
+from model.structure.attachments import FingertipLoad
 from model.table.build import build_table
 from model.table.exact_plates import Plates, draw_plates, felt_on
 from model.table.question import Question

@@ -8,7 +8,7 @@ import pytest
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad
+from model.structure.attachments import PointLoad
 from model.table.build import build_table
 from model.table.live_table import table_following
 from model.table.question import Question

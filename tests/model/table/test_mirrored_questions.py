@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.structure.point_load import PointLoad
+from model.structure.attachments import PointLoad
 from model.table.many_answers import ask_here
 from model.table.mirrored_questions import ask_once, mirror_images
 from model.table.weak_cells import pair_questions

@@ -7,7 +7,7 @@ from model.drive_modes.sources import all_combinations, magnitudes_of_sources, s
 from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold
-from model.structure.fingertip import FingertipLoad
+from model.structure.attachments import FingertipLoad
 from model.table.question import Question
 from model.vibration.excitation import tone_amplitudes
 from paper_table import contact_sets, smooth_rig, smooth_table

@@ -11,7 +11,7 @@ from scipy.io import loadmat
 
 from model.errors import InputError
 from model.finger.grid import Grid
-from model.structure.point_load import PointLoad
+from model.structure.attachments import PointLoad
 from model.table import export
 from model.table.export import export_csv, export_mat
 from model.table.file import save_table

@@ -8,8 +8,7 @@ import pytest
 
 from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.structure.fingertip import FingertipLoad
-from model.structure.point_load import PointLoad
+from model.structure.attachments import FingertipLoad, PointLoad
 from model.table.build import build_in_parts
 from model.table.file import load_table, save_table
 from model.table.verify import AnswerCheck, verify_table

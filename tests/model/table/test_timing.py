@@ -8,7 +8,7 @@ import pytest
 
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.uncertainty import Uncertainty
-from model.structure.point_load import footprints_of
+from model.structure.attachments import footprints_of
 from model.table.build import build_table
 from model.table.query import query_batch
 from model.table.question import Question

@@ -8,7 +8,7 @@ import pytest
 from model.drive_modes.forms import Weights
 from model.drive_modes.tones import excitation_of
 from model.reduction.reduced_plate import reduce_plate
-from model.structure.point_load import footprints_of
+from model.structure.attachments import footprints_of
 from model.table.pattern import ONSET_RAMP
 from model.table.question import Question
 from model.transients.base_motion import ramped_onset

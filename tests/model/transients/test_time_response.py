@@ -7,7 +7,7 @@ import pytest
 
 from model.errors import InputError
 from model.reduction.reduced_plate import ReducedPlate
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.materials import material
 from model.structure.plate import Plate
 from model.transients.time_response import plate_in_time

@@ -8,7 +8,7 @@ import pytest
 from extrapolated import extrapolated_slopes
 from model.rig.rig import Rig
 from model.spectral.mesh import SpectralMesh
-from model.structure.point_load import PointLoad
+from model.structure.attachments import PointLoad
 from model.vibration.parametric_plate import ParametricPlate, parametric_plate
 from paper_plate import make_paper_rig
 

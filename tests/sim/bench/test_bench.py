@@ -11,8 +11,7 @@ from model.arrays import FloatArray
 from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import fingertip_points
 from model.rig.rig import Rig
-from model.structure.fingertip import Fingertip, FingertipLoad
-from model.structure.point_load import PointLoad
+from model.structure.attachments import Fingertip, FingertipLoad, PointLoad
 from plate_in_time import apart
 from sim.bench.bench import Bench
 

@@ -12,7 +12,7 @@ import pytest
 from bench_driving import keep_alive, play
 from drivers.contents import Tone
 from model.rig.rig import Rig
-from model.structure.fingertip import Fingertip
+from model.structure.attachments import Fingertip
 from sim.bench.bench import Bench
 from sim.bench.placement import Placement
 from sim.control.context import SimulationContext

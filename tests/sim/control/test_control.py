@@ -16,7 +16,7 @@ from bench_driving import play
 from drivers.contents import Tone
 from drivers.errors import LinkError
 from model.rig.rig import Rig
-from model.structure.point_load import PointLoad
+from model.structure.attachments import PointLoad
 from sim.bench.bench import Bench
 from sim.control.context import SimulationContext
 from sim.control.operations import carry_out

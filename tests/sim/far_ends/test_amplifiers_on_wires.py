@@ -14,7 +14,7 @@ from memory_machine import live_in_memory
 from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import fingertip_points
 from model.rig.rig import Rig
-from model.structure.fingertip import Fingertip, FingertipLoad
+from model.structure.attachments import Fingertip, FingertipLoad
 from plate_in_time import apart
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultKind, FaultWindow

@@ -11,7 +11,7 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import contrast_db, felt_part
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import footprints_of
+from model.structure.attachments import footprints_of
 from model.table.build import build_table
 from model.table.pattern import Pattern
 from model.table.question import Question

@@ -14,7 +14,7 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
 from model.rig.uncertainty import Uncertainty
-from model.structure.fingertip import Fingertip
+from model.structure.attachments import Fingertip
 from plate_in_time import lock_in
 from resting_fingers import FINGERTIP
 from sim.bench.bench import Bench

@@ -10,7 +10,7 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_plate
-from model.structure.actuator import Era
+from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
 from model.transients.base_motion import Term
 from sim.plant.plant import Plant

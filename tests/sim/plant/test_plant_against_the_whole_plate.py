@@ -12,9 +12,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.fem.plate import assemble, direct_acceleration
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.structure.actuator import Era
-from model.structure.fingertip import FingertipLoad
-from model.structure.point_load import footprints_of
+from model.structure.attachments import Era, FingertipLoad, footprints_of
 from model.transients.base_motion import Term
 from paper_plate import make_paper_rig
 from plate_in_time import apart, lock_in

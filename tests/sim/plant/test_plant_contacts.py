@@ -12,8 +12,7 @@ from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_plate
 from model.rig.rig import Rig
-from model.structure.fingertip import FingertipLoad
-from model.structure.point_load import footprints_of
+from model.structure.attachments import FingertipLoad, footprints_of
 from model.transients.base_motion import Term
 from resting_fingers import FINGERTIP, resting
 from sim.plant.plant import Plant

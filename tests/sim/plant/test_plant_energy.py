@@ -11,8 +11,7 @@ from driven_bases import BASES
 from finger_energy import held_by_fingers, power_lost_in_fingers
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
 from model.rig.rig import Rig
-from model.structure.fingertip import FingertipLoad
-from model.structure.point_load import footprints_of
+from model.structure.attachments import FingertipLoad, footprints_of
 from paper_plate import make_paper_rig
 from resting_fingers import resting
 from sim.plant.plant import Plant

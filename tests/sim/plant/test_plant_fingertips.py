@@ -10,8 +10,7 @@ from scipy import linalg
 from model.arrays import FloatArray
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.structure.fingertip import FingertipLoad
-from model.structure.point_load import footprints_of
+from model.structure.attachments import FingertipLoad, footprints_of
 from model.transients.base_motion import Term
 from plate_in_time import apart, lock_in
 from resting_fingers import FINGERTIP, resting

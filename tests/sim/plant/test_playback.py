@@ -12,8 +12,7 @@ from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold, mean_level_db_sl
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.structure.fingertip import Fingertip, FingertipLoad
-from model.structure.point_load import footprints_of
+from model.structure.attachments import Fingertip, FingertipLoad, footprints_of
 from model.table.question import Question
 from model.transients.base_motion import BaseEnvelope, shaped
 from model.transients.measures import Transients

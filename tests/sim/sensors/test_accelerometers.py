@@ -9,7 +9,7 @@ from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
-from model.structure.point_load import footprints_of
+from model.structure.attachments import footprints_of
 from model.transients.base_motion import Term
 from sim.plant.accelerometer import Accelerometer, positions, readings
 from sim.plant.plant import Plant

@@ -1,0 +1,308 @@
+"""What is attached to the plate at points: actuators (ERAs), masses, and fingertips.
+
+An ERA is a spring, a damper and a bolt between the plate and a base that moves. Pressed on the
+plate, a fingertip is a contact mass that moves with it, and a spring and a damper (the pulp) to the
+phalanx, which a joint holds. The phalanx is not at rest: at 60, 100 and 250 Hz the real part of the
+dynamic stiffness is 69, -87 and -358 N/m where a phalanx at rest gives 972, 921 and 507. How well
+the values are known: docs/concepts/people.md.
+
+The plate on its attachments is a low-rank correction of the free plate (Woodbury identity).
+"""
+
+import cmath
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from itertools import pairwise
+from typing import TypeAlias
+
+import numpy as np
+
+from model.arguments import expect_at_least
+from model.arrays import ComplexArray, FloatArray
+from model.errors import InputError
+
+Gain: TypeAlias = tuple[float, float, float]
+"""Frequency [Hz], magnitude, phase [rad]."""
+
+
+@dataclass(frozen=True)
+class Era:
+    """One ERA under the plate; its base moves y(t) = amplitude sin(omega t + phase).
+
+    x, y: position of its bolt [m]; stiffness k_b [N/m]; damping c [N s/m]; bolt_mass m_b [kg];
+    stroke: the largest base amplitude [m]; foot [m]: radius of the disc on which it acts, 0 for a
+    point. An ERA that is not driven still supports and damps.
+    gains: measured complex gain of its base, at ascending frequencies; empty for a gain of 1.
+    """
+
+    name: str
+    x: float
+    y: float
+    stiffness: float
+    damping: float
+    bolt_mass: float
+    stroke: float
+    gains: tuple[Gain, ...] = ()
+    foot: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        for key in ("x", "y", "stiffness", "damping", "bolt_mass", "stroke", "foot"):
+            if not math.isfinite(getattr(self, key)):
+                raise InputError(f"ERA {self.name}: {key} must be finite, got {getattr(self, key)}")
+        for key in ("stiffness", "stroke"):
+            if getattr(self, key) <= 0:
+                raise InputError(
+                    f"ERA {self.name}: {key} must be above zero, got {getattr(self, key)}"
+                )
+        for key in ("damping", "bolt_mass", "foot"):
+            if getattr(self, key) < 0:
+                raise InputError(
+                    f"ERA {self.name}: {key} must not be negative, got {getattr(self, key)}"
+                )
+        # A file gives lists; only tuples can be compared and hashed with the rest.
+        gains = tuple((float(f), float(size), float(phase)) for f, size, phase in self.gains)
+        object.__setattr__(self, "gains", gains)
+        for frequency, size, phase in gains:
+            if not (math.isfinite(frequency + size + phase) and frequency > 0 and size > 0):
+                raise InputError(
+                    f"ERA {self.name}: gains must be finite and above zero, got {size} with phase "
+                    f"{phase} at {frequency} Hz"
+                )
+        for (low, *_), (high, *_) in pairwise(gains):
+            if low >= high:
+                raise InputError(
+                    f"ERA {self.name}: frequencies of gains must ascend, got {high} Hz after "
+                    f"{low} Hz"
+                )
+
+    def gain(self, frequencies: FloatArray) -> ComplexArray:
+        """Complex gain at frequencies [Hz], of their shape; 1 without measured gains.
+
+        Linear between measured frequencies, constant outside. At negative frequencies, as in the
+        lower sideband of a fast ramp, the conjugate: the base's motion is real.
+        """
+        if not self.gains:
+            return np.ones(np.shape(frequencies), dtype=complex)
+        measured = [frequency for frequency, _, _ in self.gains]
+        values = np.array([cmath.rect(size, phase) for _, size, phase in self.gains])
+        found = np.interp(np.abs(frequencies), measured, values)
+        return np.asarray(np.where(np.asarray(frequencies) < 0, found.conj(), found))
+
+
+def damping_from_ratio(
+    ratio: float, *, stiffness: float, plate_mass: float, era_count: int
+) -> float:
+    """Damping c = 2 zeta sqrt(k_b m_plate / n_eras) [N s/m], referred to the plate's mass."""
+    return 2 * ratio * math.sqrt(stiffness * plate_mass / era_count)
+
+
+MIN_LOAD, MAX_LOAD = 0.1, 10.0
+"""Of a contact relative to the rig's fingertip; beyond, no finger is meant."""
+
+
+@dataclass(frozen=True)
+class Fingertip:
+    """Load of one fingertip.
+
+    stiffness [N/m], damping [N s/m]: of the pulp; contact_mass [kg]: moves with the plate;
+    phalanx_mass [kg], joint_stiffness [N/m], joint_damping [N s/m]: of the bone behind the pulp and
+    of the joint that holds it to the rest plane. The defaults are those of a finger that presses
+    lightly.
+    """
+
+    stiffness: float = 1000.0
+    damping: float = 2.0
+    contact_mass: float = 0.0002
+    phalanx_mass: float = 0.005
+    joint_stiffness: float = 500.0
+    joint_damping: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Refuse values not finite or negative, no damping of the pulp, and no phalanx."""
+        for key in (field.name for field in fields(self)):
+            expect_at_least(getattr(self, key), 0.0, what=f"fingertip: {key}")
+        for key, unit in (("damping", "N s/m"), ("phalanx_mass", "kg")):
+            if getattr(self, key) == 0:
+                raise InputError(f"fingertip: {key} must be above 0 {unit}, got 0")
+
+    def dynamic_stiffness(self, omega: FloatArray | ComplexArray) -> ComplexArray:
+        """Force on the plate per displacement of the contact at omega [rad/s], of its shape [N/m].
+
+        A complex omega is that of exp(i omega t).
+        D = -omega² m_c + Z_p Z_b / (Z_p + Z_b), with Z_p = k + i omega c of the pulp and
+        Z_b = k_j + i omega c_j - omega² m_p of the phalanx on its joint.
+        """
+        w = np.asarray(omega)
+        pulp = self.stiffness + 1j * w * self.damping
+        phalanx = self.joint_stiffness + 1j * w * self.joint_damping - w**2 * self.phalanx_mass
+        return np.asarray(pulp * phalanx / (pulp + phalanx) - w**2 * self.contact_mass)
+
+    def scaled(self, factor: float) -> "Fingertip":
+        """The fingertip with a contact larger by a factor: its pulp and contact mass scale.
+
+        Phalanx and joint stay, and so does the ratio of damping to stiffness of the pulp.
+        """
+        return replace(
+            self,
+            stiffness=factor * self.stiffness,
+            damping=factor * self.damping,
+            contact_mass=factor * self.contact_mass,
+        )
+
+    def multiplied(self, factor: float) -> "Fingertip":
+        """The fingertip with a dynamic stiffness larger by a factor at every frequency."""
+        return Fingertip(**{key: factor * value for key, value in asdict(self).items()})
+
+
+@dataclass(frozen=True)
+class FingertipLoad:
+    """A fingertip that rests on the plate at x, y [m]; it acts at a point."""
+
+    x: float
+    y: float
+    fingertip: Fingertip
+
+    @property
+    def foot(self) -> float:
+        """Radius of the disc on which it acts [m]: 0, a point."""
+        return 0.0
+
+    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """Dynamic stiffness [N/m] at omega [rad/s], of the same shape."""
+        return self.fingertip.dynamic_stiffness(omega)
+
+
+def check_loads(loads: Iterable[float]) -> None:
+    """Raise InputError for a load, relative to a fingertip, that no finger has."""
+    for load in loads:
+        if not MIN_LOAD <= load <= MAX_LOAD:  # False for NaN
+            raise InputError(
+                f"load must be between {MIN_LOAD:g} and {MAX_LOAD:g} times the rig's fingertip, "
+                f"got {load}"
+            )
+
+
+def fingertip_loads(
+    fingertip: Fingertip | None,
+    contacts: Sequence[tuple[float, float]],
+    loads: Sequence[float] = (),
+) -> list[FingertipLoad]:
+    """Fingertips that rest at contacts [m]; none where they are weightless.
+
+    loads: of each relative to the fingertip, empty for 1.
+    """
+    if fingertip is None:
+        return []
+    tips = [fingertip.scaled(load) for load in loads] or [fingertip] * len(contacts)
+    return [FingertipLoad(*at, tip) for at, tip in zip(contacts, tips, strict=True)]
+
+
+@dataclass(frozen=True)
+class PointLoad:
+    """A spring [N/m] and a damper [N s/m] to the ground, and a mass [kg], at x, y [m].
+
+    foot [m]: radius of the disc on which it acts, 0 for a point. It follows the mean deflection;
+    its rotary inertia is not modelled.
+    """
+
+    x: float
+    y: float
+    stiffness: float = 0.0
+    damping: float = 0.0
+    mass: float = 0.0
+    foot: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse values that are not finite, and loads that add energy."""
+        for key in ("x", "y", "stiffness", "damping", "mass", "foot"):
+            value = getattr(self, key)
+            if not math.isfinite(value):
+                raise InputError(f"point load: {key} must be finite, got {value}")
+            if key not in ("x", "y") and value < 0:
+                raise InputError(f"point load: {key} must not be negative, got {value}")
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Its values by name, without stiffness and damping where both are zero."""
+        mass = {"x": self.x, "y": self.y, "mass": self.mass, "foot": self.foot}
+        mount = {"stiffness": self.stiffness, "damping": self.damping}
+        return mass | mount if any(mount.values()) else mass
+
+    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """D = k + i omega c - omega² m [N/m], of the shape of omega [rad/s]."""
+        return np.asarray(self.stiffness + 1j * omega * self.damping - omega**2 * self.mass)
+
+    @classmethod
+    def of_era(cls, era: Era) -> "PointLoad":
+        """An ERA at rest, as a load of the plate."""
+        return cls(era.x, era.y, era.stiffness, era.damping, era.bolt_mass, era.foot)
+
+
+Load: TypeAlias = PointLoad | FingertipLoad
+"""A passive load of the plate."""
+
+
+def footprints_of(*attached: Iterable[Era | Load]) -> FloatArray:
+    """Footprints x, y, radius [m] of ERAs and loads, one group after the other, (n, 3)."""
+    places = [[each.x, each.y, each.foot] for group in attached for each in group]
+    return np.array(places, dtype=float).reshape(-1, 3)
+
+
+def dynamic_stiffness(
+    stiffness: FloatArray | float,
+    damping: FloatArray | float,
+    mass: FloatArray | float,
+    omega: FloatArray | float,
+) -> ComplexArray:
+    """D = k + i omega c - omega² m [N/m]; the arguments broadcast against each other."""
+    k, c, m, w = (np.asarray(value, dtype=float) for value in (stiffness, damping, mass, omega))
+    return np.asarray(k + 1j * w * c - w**2 * m)
+
+
+def attached_stiffness(
+    eras: Sequence[Era], loads: Sequence[Load], omega: FloatArray
+) -> ComplexArray:
+    """Dynamic stiffness [N/m] of ERAs and loads at omega (f,) [rad/s], (f, eras + loads)."""
+    parameters = [(era.stiffness, era.damping, era.bolt_mass) for era in eras]
+    stiffness, damping, mass = np.array(parameters, dtype=float).reshape(-1, 3).T
+    at_eras = dynamic_stiffness(stiffness, damping, mass, omega[:, None])
+    return np.column_stack([at_eras, *(load.dynamic_stiffness(omega) for load in loads)])
+
+
+def base_stiffness(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
+    """Force on the plate per displacement of an ERA's base, k_b + i omega c [N/m], (f, eras)."""
+    stiffness = np.array([era.stiffness for era in eras], dtype=float)
+    damping = np.array([era.damping for era in eras], dtype=float)
+    return dynamic_stiffness(stiffness, damping, 0.0, omega[:, None])
+
+
+def drive_forces(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
+    """Force of each ERA at full stroke, its own gain included [N], (f, eras) (paper Eq. 25)."""
+    return np.asarray(base_stiffness(eras, omega) * full_strokes(eras, omega))
+
+
+def full_strokes(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
+    """Amplitude of each ERA's base at full stroke, its own gain included [m], (f, eras)."""
+    strokes = np.array([era.stroke for era in eras])
+    gains = np.array([era.gain(omega / (2 * np.pi)) for era in eras], dtype=complex)
+    return np.asarray(strokes * gains.reshape(len(eras), len(omega)).T)
+
+
+def coupled_forces(
+    receptance: ComplexArray, dynamic_stiffness: ComplexArray, applied: ComplexArray
+) -> ComplexArray:
+    """Forces F on the free plate [N], from those applied at its attachments: (I + D R) F = P.
+
+    receptance R (..., n, n) [m/N]: of the free plate between its attachments; dynamic_stiffness
+    (..., n) [N/m]: the diagonal of D; applied P (..., n, m) [N]. An attachment reacts with -D times
+    its displacement R F.
+    """
+    system = np.eye(receptance.shape[-1]) + dynamic_stiffness[..., None] * receptance
+    return np.asarray(np.linalg.solve(system, applied))
+
+
+def on_diagonal(values: ComplexArray, *, rows: int) -> ComplexArray:
+    """One column for each value (..., m): zero but for the value in its own row, (..., rows, m)."""
+    return np.asarray(np.eye(rows, values.shape[-1]) * values[..., None, :])

@@ -24,7 +24,7 @@ _QUEUE_INTERVAL = 0.002  # s
 class Channel(asyncio.Protocol):
     """A connection, made by `open`; any number of requests may be pending.
 
-    hello: result of `hello`; lost: None while it is open.
+    lost: None while it is open.
     """
 
     def __init__(
@@ -35,7 +35,6 @@ class Channel(asyncio.Protocol):
         on_lost: Callable[[], object],
     ) -> None:
         self.path = path
-        self.hello: Any = None
         self.lost: Unreachable | None = None
         self._on_event = on_event
         self._on_lost = on_lost
@@ -58,8 +57,7 @@ class Channel(asyncio.Protocol):
         channel = cls(path, on_event=on_event, on_lost=on_lost)
         try:
             await channel._connect()
-            channel.hello = await channel.request("hello", params)
-            check_version(channel.hello, path)
+            check_version(await channel.request("hello", params), path)
         except BaseException:
             channel.close()
             raise

@@ -139,6 +139,7 @@ class Connection(asyncio.BufferedProtocol):
             self.has_spoken = True
             if len(self._input) > _MAX_READ_AHEAD and self._transport is not None:
                 self._transport.pause_reading()
+        if self.has_lines:
             self._on_lines(self)
 
     def eof_received(self) -> bool:

@@ -8,7 +8,6 @@ number of keys are bounded before anything is parsed.
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
@@ -113,8 +112,8 @@ _RequestId: TypeAlias = (
 _REQUEST_ID: TypeAdapter[Id] = TypeAdapter(_RequestId, config=ConfigDict(strict=True))
 
 
-class _Envelope(BaseModel):
-    """Members of a request."""
+class Request(BaseModel):
+    """One request; without `expects_response` it gets none, not even an error."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -123,23 +122,18 @@ class _Envelope(BaseModel):
     params: dict[str, Any] = Field(default_factory=dict)
     id: _RequestId = None
 
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """One request; without `expects_response` it gets none, not even an error."""
-
-    method: str
-    params: dict[str, Any]
-    id: Id
-    expects_response: bool
+    @property
+    def expects_response(self) -> bool:
+        """Whether it has an id; null is one."""
+        return "id" in self.model_fields_set
 
 
 def read_request(line: bytes) -> Request:
     """Read one line; raises InvalidRequest."""
     document = parse_json(line)
-    unknown = _first_unknown(_Envelope, document) if isinstance(document, dict) else None
+    unknown = _first_unknown(Request, document) if isinstance(document, dict) else None
     try:
-        envelope = _Envelope.model_validate(document if unknown is None else {unknown: None})
+        return Request.model_validate(document if unknown is None else {unknown: None})
     except ValidationError as error:
         raise InvalidRequest(
             ErrorCode.INVALID_REQUEST,
@@ -147,7 +141,6 @@ def read_request(line: bytes) -> Request:
             remedy='send {"jsonrpc": "2.0", "id": 1, "method": ..., "params": {...}}; no batches',
             id=_readable_id(document),
         ) from error
-    return Request(envelope.method, envelope.params, envelope.id, "id" in document)
 
 
 def read_params(model: type[_MessageT], request: Request) -> _MessageT:

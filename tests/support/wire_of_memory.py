@@ -12,6 +12,7 @@ class Wire(asyncio.Transport):
         super().__init__()
         self.waiting = b""
         self.is_aborted = False
+        self.is_read = True
 
     def lines(self) -> list[dict[str, Any]]:
         """Take the lines that were written, as JSON."""
@@ -23,7 +24,8 @@ class Wire(asyncio.Transport):
         return self.is_aborted
 
     def resume_reading(self) -> None:
-        """Do nothing."""
+        """Note it."""
+        self.is_read = True
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         """Keep the data as unread."""
@@ -37,7 +39,8 @@ class Wire(asyncio.Transport):
         """Do nothing."""
 
     def pause_reading(self) -> None:
-        """Do nothing."""
+        """Note it."""
+        self.is_read = False
 
     def abort(self) -> None:
         """Close."""

@@ -56,6 +56,22 @@ def test_connection_closes_when_unread_responses_exceed_256_kib() -> None:
     assert (len(wire.waiting), wire.is_aborted) == (1 << 20, False)
 
 
+async def test_input_of_a_client_is_bounded() -> None:
+    """Nothing is read while 64 KiB wait to be served; no line is, beside 64 stops on their way."""
+    served = ServedApi()
+    client, wire = served.client()
+    client.pending = {asyncio.ensure_future(asyncio.sleep(3600)) for _ in range(64)}
+    client.data_received(request("stop") * 2000)
+    await served.settle()
+    assert (served.names, wire.is_read) == ([], False)
+    client.pending.pop().cancel()
+    client.data_received(b"\n")
+    await served.settle()
+    assert (served.names, wire.is_read) == (["stop"] * 2000, True)
+    for each in client.pending:
+        each.cancel()
+
+
 def test_client_that_does_not_read_loses_notifications_then_the_connection() -> None:
     """Unread output stays bounded, the next event counts the lost ones, then it is closed."""
     now = 0.0

@@ -128,6 +128,7 @@ async def test_daemon_sends_exactly_the_documented_keys(tmp_path: Path) -> None:
         async with asyncio.timeout(60):
             await call("hello", client="me")
             await call("subscribe", topics=topics, rate_hz=60.0)
+            assert received == set()  # the reply comes before the first event
             await call("effects")
             await call("arm", owner="me", lease_s=5.0)
             for touches, awaited in ((down, "pattern"), ([], "silence")):

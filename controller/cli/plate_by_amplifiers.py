@@ -1,7 +1,7 @@
 """Measuring the plate on the table by the amplifiers of its rig, as commands do."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,12 +61,11 @@ def measured_by_amplifiers(
     """
     import asyncio
 
-    from controller.cli.amplifier_urls import urls_of
     from controller.diagnosis.plate_measurement import PlateSelfMeasurement
     from drivers.opening import Lines
     from model.commands.options import progress_bar
 
-    at = urls_of(rig, urls)
+    at = _urls_of(rig, urls)
 
     async def measure() -> "MeasuredPlate":
         with ExitStack() as shown:
@@ -77,6 +76,24 @@ def measured_by_amplifiers(
             return found.as_measured
 
     return asyncio.run(measure())
+
+
+def _urls_of(rig: "Rig", texts: Sequence[str]) -> dict[str, str]:
+    """Return the URL of each amplifier by name; texts: NAME=URL, or a URL where there is one.
+
+    Raises InputError for an amplifier that the rig does not have.
+    """
+    found = dict(rig.amplifiers)
+    for text in texts:
+        name, equals, url = text.partition("=")
+        if len(found) == 1 and "://" in name:
+            (name,), equals, url = found, "=", text
+        if not equals or name not in found:
+            raise InputError(
+                f"--url must be NAME=URL with one of {', '.join(rig.amplifiers)}, got {text}"
+            )
+        found[name] = url
+    return found
 
 
 def measured_line(rig: "Rig", measured: "MeasuredPlate") -> str:

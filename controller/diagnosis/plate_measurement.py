@@ -7,9 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from controller.diagnosis.common_start import start_together
 from controller.diagnosis.interleaved_tones import Interleaved, Step, interleaved
-from controller.diagnosis.plate_sensors import PlateSensor, PlateSensors, plate_sensors
+from controller.diagnosis.plate_sensors import (
+    PlateSensor,
+    PlateSensors,
+    plate_sensors,
+    start_together,
+)
 from controller.diagnosis.tone_player import TonePlayer
 from controller.loop.routing import Drive
 from drivers import clock

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -70,6 +71,21 @@ async def plate_sensors(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> PlateS
         used += own
         unused += rest
     return PlateSensors(tuple(used), tuple(unused))
+
+
+def start_together(one: Amplifier, other: Amplifier) -> bool:
+    """Whether phases of two amplifiers count from one moment: that of a broadcast commit."""
+    return one.line is other.line
+
+
+def check_common_start(amplifiers: Mapping[str, Amplifier]) -> None:
+    """Raise CommandError unless all open amplifiers, by name, start together."""
+    for (name, one), (other_name, other) in pairwise(amplifiers.items()):
+        if not start_together(one, other):
+            raise CommandError(
+                f"amplifiers {name} and {other_name} must start together to be measured while "
+                "they play, got separate wires; put them on one bus"
+            )
 
 
 def _of_amplifier(

@@ -2,8 +2,7 @@
 
 from typing import Annotated, ClassVar
 
-from controller.effects.effect import Effect, EffectRun
-from controller.effects.steady import MAX_DURATION, MIN_DURATION, SteadyRun
+from controller.effects.effect import MAX_DURATION, MIN_DURATION, Effect, EffectRun, SteadyRun
 from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity

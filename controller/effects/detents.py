@@ -3,8 +3,7 @@
 import math
 from typing import Annotated, ClassVar, Literal
 
-from controller.effects.effect import Effect, EffectRun, NoSensation, Sensation
-from controller.effects.steady import MIN_DURATION
+from controller.effects.effect import MIN_DURATION, Effect, EffectRun, NoSensation, Sensation
 from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity

@@ -4,9 +4,8 @@ import math
 from typing import Annotated, ClassVar
 
 from controller.effects.detents import Notches
-from controller.effects.effect import Effect, EffectRun, NoSensation, Sensation
+from controller.effects.effect import MIN_DURATION, Effect, EffectRun, NoSensation, Sensation
 from controller.effects.region import Region
-from controller.effects.steady import MIN_DURATION
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import ANGLE, TIME

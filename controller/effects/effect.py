@@ -22,6 +22,12 @@ MIN_DB_SL, MAX_DB_SL = -20.0, 60.0
 _DB_SL = Quantity(RATIO, at_least=MIN_DB_SL, at_most=MAX_DB_SL)
 
 
+MIN_DURATION = 0.020
+"""The plate needs about 20 ms to respond (docs/concepts/transients.md); less is not felt [s]."""
+
+MAX_DURATION = 10.0
+
+
 def _level(value: object) -> object:
     if value == NEIGHBOURS:
         return NEIGHBOURS
@@ -66,6 +72,22 @@ class EffectRun(ABC):
 
         Called in order of time: at every change of the contact and when `until` is reached.
         """
+
+
+@dataclass(frozen=True)
+class SteadyRun(EffectRun):
+    """A level for one pulse, None for as long as the finger stays."""
+
+    level_db_sl: float | None
+    pulse: Pulse | None
+
+    def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
+        """Return the level until the end of the pulse."""
+        if self.pulse is None:
+            return Sensation(self.level_db_sl)
+        if now >= self.pulse.end:
+            return None
+        return Sensation(self.level_db_sl, until=self.pulse.end, pulse=self.pulse)
 
 
 class Effect(TunedSection, ABC):

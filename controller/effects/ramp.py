@@ -5,13 +5,14 @@ from typing import Annotated, ClassVar
 
 from controller.effects.effect import (
     MAX_DB_SL,
+    MAX_DURATION,
     MIN_DB_SL,
+    MIN_DURATION,
     Effect,
     EffectRun,
     NoSensation,
     Sensation,
 )
-from controller.effects.steady import MAX_DURATION, MIN_DURATION
 from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity

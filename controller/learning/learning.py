@@ -13,8 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from controller.diagnosis.common_start import check_common_start
-from controller.diagnosis.plate_sensors import PlateSensor, plate_sensors
+from controller.diagnosis.plate_sensors import PlateSensor, check_common_start, plate_sensors
 from controller.learning.answers_in_use import AnswersInUse
 from controller.learning.estimator_process import (
     DEFAULT_TIMEOUTS,

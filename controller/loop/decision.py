@@ -225,7 +225,7 @@ class Decider:
         """Return silence in place of the last decision, which a ledger has refused."""
         decision = replace(
             decision,
-            set=self.silence(FADE_RAMP),
+            set=PlateSet(ramp=FADE_RAMP),
             pattern=None,
             refusal=str(error),
             retry_at=error.until,
@@ -298,10 +298,6 @@ class Decider:
         self._selected = selection
         return decision
 
-    def silence(self, ramp: float) -> PlateSet:
-        """Return what lets every channel fall silent along a ramp [s]."""
-        return PlateSet(ramp=ramp)
-
     def _select(self, contacts: tuple[Contact, ...], now: float) -> Selection:
         """Query the intent, and the table for it."""
         self._intent_due = None
@@ -328,12 +324,12 @@ class Decider:
     def _end(self, contacts: tuple[Contact, ...], now: float, *, has_failed: bool) -> PlateSet:
         """Return what ends the playback: along endings only under fingers that stay."""
         if not contacts:
-            return self.silence(RELEASE_RAMP)
+            return PlateSet(ramp=RELEASE_RAMP)
         decision = self._playing.decision
         has_endings = decision is not None and decision.set is not None and decision.set.has_endings
         if has_endings and not has_failed and now >= self._playing.settled_at:
             return self._builder.build_end()
-        return self.silence(FADE_RAMP)
+        return PlateSet(ramp=FADE_RAMP)
 
     def _confirmed_until(self, selection: Selection) -> float:
         """Return when [s] the first target is lifted unless a frame arrives."""

@@ -7,6 +7,7 @@ contacts that it is for.
 import math
 from dataclasses import dataclass
 
+from controller.loop.intent import Pulse
 from controller.loop.selection import Selection
 from controller.sources.contacts import MAX_CONTACT_TIMEOUT
 
@@ -57,23 +58,23 @@ def valid_for(selection: Selection, *, confirmed_until: float, now: float) -> fl
     The amplifiers end a pulse; the last one, where several play.
     """
     unlimited = min(max(confirmed_until - now + _MARGIN, _MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
-    pulses = [target.pulse for _, target in selection.targets]
-    left = [
-        pulse.duration if pulse.started_at is None else max(pulse.end - now, _MIN_LEFT)
-        for pulse in pulses
-        if pulse is not None
-    ]
-    return min(unlimited, max(left)) if left and len(left) == len(pulses) else unlimited
+    return min(unlimited, max(_all_left(selection, now), default=math.inf))
 
 
 def first_lasts(selection: Selection, now: float) -> float:
     """Return how long [s] from a time [s] the first pulse lasts; infinite without any."""
-    pulses = [target.pulse for _, target in selection.targets]
-    return min(
-        (
-            pulse.duration if pulse.started_at is None else pulse.end - now
-            for pulse in pulses
-            if pulse is not None
-        ),
-        default=math.inf,
-    )
+    return min(_all_left(selection, now), default=math.inf)
+
+
+def _all_left(selection: Selection, now: float) -> list[float]:
+    """Return how long [s] each target is driven from a time [s]."""
+    return [_left(target.pulse, now) for _, target in selection.targets]
+
+
+def _left(pulse: Pulse | None, now: float) -> float:
+    """Return how long [s] a pulse lasts from a time [s]; infinite for none."""
+    if pulse is None:
+        return math.inf
+    if pulse.started_at is None:
+        return pulse.duration
+    return max(pulse.end - now, _MIN_LEFT)

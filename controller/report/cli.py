@@ -34,8 +34,7 @@ def report(
 
     Values of unknown keys, hosts, serial numbers and comments are hidden; look before you send it.
     """
-    from controller.report.collect import collect
-    from controller.report.zip_file import write_zip
+    from controller.report.collect import collect, write_zip
 
     for path in configs or ():
         if not path.exists():

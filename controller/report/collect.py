@@ -1,11 +1,13 @@
-"""Collects the contents of a bug report: versions, configuration, daemon status, fault dumps."""
+"""Collects a bug report into a file: versions, configuration, daemon status, fault dumps."""
 
 import json
+import os
 import platform
 import sys
+import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, distribution, entry_points, requires, version
+from importlib.metadata import PackageNotFoundError, entry_points, requires, version
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.daemon.config import is_daemon_document
 from controller.daemon.fault_dumps import DUMP_PATTERN
-from controller.report.shown import installed_from, shown
+from controller.report.shown import shown
 from drivers.errors import LinkError
 from model.config.document import read_document
 from model.errors import InputError
@@ -61,6 +63,30 @@ def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> Repo
     )
 
 
+def write_zip(path: Path, report: Report) -> None:
+    """Write a new file of mode 0600, completely or not at all.
+
+    Raises InputError if it exists already or cannot be created, OSError if writing fails.
+    """
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError as error:
+        raise InputError(f"{path}: file exists already; choose another with -o") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot write: {error.strerror}") from error
+    try:
+        with (
+            os.fdopen(descriptor, "wb") as stream,
+            zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive,
+        ):
+            for name, text in report.files.items():
+                archive.writestr(name, text)
+            archive.writestr("missing.txt", "".join(f"{line}\n" for line in report.missing))
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+
+
 def versions() -> dict[str, Any]:
     """Versions of Python, the system, era-haptics and its dependencies, and all plug-ins."""
     dependencies = {}
@@ -77,9 +103,6 @@ def versions() -> dict[str, Any]:
     }
     return {
         "era-haptics": version("era-haptics"),
-        "installed_from": installed_from(
-            json.loads(distribution("era-haptics").read_text("direct_url.json") or "null")
-        ),
         "python": sys.version,
         "system": platform.platform(),
         "machine": platform.machine(),

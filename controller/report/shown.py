@@ -4,7 +4,6 @@ Free text, as in causes and names, is not searched: whoever sends a report looks
 """
 
 import re
-from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -86,12 +85,3 @@ def _keys(*models: Any) -> frozenset[str]:
                 found.add(field.alias or name)
                 pending.append(field.annotation)
     return frozenset(found)
-
-
-def installed_from(direct_url: Mapping[str, Any] | None) -> str:
-    """Where a package was installed from, without its address."""
-    if direct_url is None:
-        return "an index"
-    if "vcs_info" in direct_url:
-        return "a repository"
-    return "a checkout" if direct_url.get("dir_info", {}).get("editable") else "a file or folder"

@@ -7,8 +7,8 @@ typedef struct {
     float gain_variance, ridge;
     const float *points, *fine_points, *weights; /* (k p, r); (fine, r); (k p) */
     const float *error;        /* (f, n) */
-    /* Found: (rows, k p, n) h; (rows, fine, n); (rows, k, n, n) R */
-    float *fields, *fine_fields, *power;
+    /* Found: (rows, k p, n) h; (rows, fine, n); (rows, k, n, n) R, and without what is as modelled */
+    float *fields, *fine_fields, *power, *uncertain;
 } forms;
 
 /* Values of work space. */
@@ -16,7 +16,7 @@ size_t contact_forms_space(const plates *on, const forms *of) {
     size_t n = on->n, b = on->b, k = on->k, a = b + k, at = k * of->p;
     size_t points = (size_t)of->fine > at ? (size_t)of->fine : at;
     return touched_space(on) + points * a + at * a + 4 * at * n + of->fine * n + a * n + b * n +
-           4 * n + 2 * n * n + k * n + (4 * of->p + n + k) * n + k * n * n + k * n;
+           4 * n + 2 * n * n + k * n + (4 * of->p + n + k) * n + (2 * k + 1) * n * n + k * n;
 }
 
 /* Times the force of each ERA, of accelerations (p, n) by forces. */
@@ -41,8 +41,8 @@ void contact_forms(const plates *on, const forms *of, int first, int count, cons
     value *h = t + at * a, *fine = h + 4 * at * n, *moved = fine + of->fine * n, *without = moved + a * n;
     value *drives = without + b * n, *strokes = drives + n, *by_damping = strokes + n;
     value *by_stiffness = by_damping + n, *damped = by_stiffness + n, *changes = damped + n * n;
-    value *X = changes + j * n, *R = X + (4 * p + j) * n;
-    lanes *error = (lanes *)(R + k * n * n);
+    value *X = changes + j * n, *R = X + (4 * p + j) * n, *U = R + k * n * n, *modelled = U + k * n * n;
+    lanes *error = (lanes *)(modelled + n * n);
     load(drives, on->drives, n, rows);
     load(strokes, on->strokes, n, rows);
     load(by_damping, on->by_damping, n, rows);
@@ -89,11 +89,11 @@ void contact_forms(const plates *on, const forms *of, int first, int count, cons
     /* Forms of the mean over each fingertip, of the rows at its points and of what is uncertain. */
     for (size_t finger = 0; finger < k; finger++) {
         value *form = R + finger * n * n, *to = X;
-        for (size_t i = finger * p; i < (finger + 1) * p; i++) {
-            lanes share = filled(sqrtf(of->weights[i]));
-            for (int part = 0; part < parts; part++)
+        for (int part = 0; part < parts; part++)
+            for (size_t i = finger * p; i < (finger + 1) * p; i++) {
+                lanes share = filled(sqrtf(of->weights[i]));
                 for (size_t e = 0; e < n; e++) *to++ = scaled(h[(part * at + i) * n + e], share);
-        }
+            }
         for (size_t s = 0; s < j; s++) {
             lanes share = {0};
             for (size_t i = finger * p; i < (finger + 1) * p; i++)
@@ -101,7 +101,13 @@ void contact_forms(const plates *on, const forms *of, int first, int count, cons
             share = root(share);
             for (size_t e = 0; e < n; e++) *to++ = scaled(changes[s * n + e], share);
         }
-        gram(form, X, parts * p + j, n);
+        gram(modelled, X, p, n);
+        gram(form, X + p * n, (parts - 1) * p + j, n);
+        for (size_t u = 0; u < n; u++)
+            for (size_t v = u; v < n; v++) {
+                form[u * n + v].re += modelled[u * n + v].re;
+                form[u * n + v].im += modelled[u * n + v].im;
+            }
         lanes trace = {0};
         for (size_t e = 0; e < n; e++) {
             lanes size = {0};
@@ -115,6 +121,15 @@ void contact_forms(const plates *on, const forms *of, int first, int count, cons
             for (size_t v = 0; v < e; v++)
                 form[e * n + v] = (value){form[v * n + e].re, -form[v * n + e].im};
         }
+        value *rest = U + finger * n * n;
+        for (size_t u = 0; u < n; u++)
+            for (size_t v = u; v < n; v++) {
+                value own = form[u * n + v], without = modelled[u * n + v];
+                rest[u * n + v] = (value){own.re - without.re, own.im - without.im};
+                rest[v * n + u] = (value){own.re - without.re, without.im - own.im};
+            }
+        for (size_t u = 0; u < n; u++) rest[u * n + u].im = ZERO.im;
     }
+    store(of->uncertain + 2 * (size_t)first * k * n * n, U, k * n * n, count);
     store(of->power + 2 * (size_t)first * k * n * n, R, k * n * n, count);
 }

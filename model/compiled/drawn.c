@@ -43,13 +43,13 @@ INLINE void felt(const drawn *on, size_t tone, size_t base, size_t from, size_t 
         force[j].re = loss[0] * by_loss + damping[0] * by_damping + own[0] * by_own + drive[0] * re - drive[1] * im;
         force[j].im = loss[1] * by_loss + damping[1] * by_damping + own[1] * by_own + drive[0] * im + drive[1] * re;
     }
-    const float *h[LANES];
+    int rows[LANES];
     for (size_t l = 0; l < LANES; l++)
-        h[l] = on->at_nodes + 2 * (tone * (1 + on->nodes) + 1 + on->node[from + (l < count ? l : 0)]) * points;
+        rows[l] = tone * (1 + on->nodes) + 1 + on->node[from + (l < count ? l : 0)];
+    load(found, on->at_nodes, points, rows);
     for (size_t i = 0; i < points; i++) {
-        value nominal;
-        for (size_t l = 0; l < LANES; l++) nominal.re[l] = h[l][2 * i], nominal.im[l] = h[l][2 * i + 1];
-        found[i] = (value){nominal.re + lost[2 * i] * by_loss, nominal.im + lost[2 * i + 1] * by_loss};
+        found[i].re += lost[2 * i] * by_loss;
+        found[i].im += lost[2 * i + 1] * by_loss;
     }
     for (size_t i = 0; i < points; i += 4) {
         const float *row[4];

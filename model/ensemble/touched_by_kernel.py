@@ -46,7 +46,7 @@ class _Forms(ctypes.Structure):
         *((name, c_int) for name in ("p", "fine", "others")),
         *((name, c_float) for name in ("gain_variance", "ridge")),
         *((name, c_void_p) for name in ("points", "fine_points", "weights", "error")),
-        *((name, c_void_p) for name in ("fields", "fine_fields", "power")),
+        *((name, c_void_p) for name in ("fields", "fine_fields", "power", "uncertain")),
     )
 
 
@@ -101,7 +101,7 @@ class TouchedByKernel(TouchedPlate):
             as_given(each)
             for each in (points, points if fine is None else fine, weights, error_power)
         ]
-        sizes = ((f, k, p, n), (f, k, fine_count, n), (f, k, n, n))
+        sizes = ((f, k, p, n), (f, k, fine_count, n), (f, k, n, n), (f, k, n, n))
         found = [np.empty(size, dtype=np.complex64) for size in sizes]
         of = _Forms(
             *(p, k * fine_count, plate.thickness > 0, plate.gain_variance, RIDGE),
@@ -113,7 +113,7 @@ class TouchedByKernel(TouchedPlate):
         for first in range(0, f, self.kernels.lanes):
             count = min(self.kernels.lanes, f - first)
             library.contact_forms(on, ctypes.byref(of), first, count, _at(at), work)
-        return LoadedContacts(found[0], None if fine is None else found[1], found[2])
+        return LoadedContacts(found[0], None if fine is None else found[1], found[2], found[3])
 
     def felt(
         self,

@@ -39,12 +39,13 @@ class LoadedContacts:
     """What k fingertips have of the ERAs at f frequencies.
 
     fields: (f, k, p, n) h [m/s²] at points; fine_fields: (f, k, fine, n) at others, None unless
-    wanted; power: (f, k, n, n) R.
+    wanted; power: (f, k, n, n) R; uncertain: (f, k, n, n) R without h* h^T.
     """
 
     fields: Complex64Array
     fine_fields: Complex64Array | None
     power: Complex64Array
+    uncertain: Complex64Array
 
     def at(self, frequencies: IntArray) -> "LoadedContacts":
         """Some of the frequencies, by index (n,)."""
@@ -53,6 +54,7 @@ class LoadedContacts:
             self.fields.take(frequencies, axis=0),
             None if fine is None else fine.take(frequencies, axis=0),
             self.power.take(frequencies, axis=0),
+            self.uncertain.take(frequencies, axis=0),
         )
 
 
@@ -164,18 +166,19 @@ class TouchedPlate:
         deformed = stretched[:, uncertain] * by_one[:, :, None]
         reach = power_of(by_force[:, :, uncertain]).reshape(f, k, p, -1)
         mean = weights[:, None]
-        outer = (deformed.conj()[..., None] * deformed[:, :, None]).reshape(f, n + k, -1)
-        power += ((mean @ reach)[:, :, 0] @ outer).reshape(f, k, n, n)
+        by_attachment = outer(deformed).reshape(f, n + k, -1)
+        power += ((mean @ reach)[:, :, 0] @ by_attachment).reshape(f, k, n, n)
         size = (mean @ power_of(h).reshape(f, k, p, n))[:, :, 0]
         diagonal = power.reshape(f, k, -1)[..., :: n + 1]
         values = diagonal.real + plate.gain_variance * size + error_power[rows, None]
         diagonal[:] = values + RIDGE / n * values.sum(axis=-1, keepdims=True)
         found = h.reshape(f, k, p, n)
+        uncertain = power - gram(found * np.sqrt(weights)[:, :, None])
         if fine is None:
-            return LoadedContacts(found, None, power)
+            return LoadedContacts(found, None, power, uncertain)
         by_fine, _ = self.sources(rows, modelled, fine.reshape(-1, r))
         at_fine = (by_fine[:, :, :n] * forces).reshape(f, k, -1, n)
-        return LoadedContacts(found, at_fine, power)
+        return LoadedContacts(found, at_fine, power, uncertain)
 
     def changes(
         self,
@@ -292,6 +295,11 @@ def real_product(values: Complex64Array, matrix: Float32Array) -> Complex64Array
 def gram(rows: Complex64Array) -> Complex64Array:
     """Forms of the sum over rows (..., rows, n): (..., n, n)."""
     return np.asarray(rows.conj().swapaxes(-1, -2) @ rows)
+
+
+def outer(rows: Complex64Array) -> Complex64Array:
+    """Forms conj(h) h^T of rows h (..., n): (..., n, n)."""
+    return np.asarray(rows.conj()[..., :, None] * rows[..., None, :])
 
 
 def power_of(values: Complex64Array) -> Float32Array:

@@ -21,9 +21,9 @@ from model.drive_modes.forms import Weights
 from model.drive_modes.tones import excitation_of
 from model.errors import InputError
 from model.finger.perception import decibels
+from model.table.combinations import Stream
 from model.table.contents import (
     Chosen,
-    Stream,
     choose_contents,
     contrasts,
     felt_amplitudes,

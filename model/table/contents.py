@@ -22,6 +22,7 @@ from model.choice import best_first
 from model.drive_modes.forms import Weights
 from model.drive_modes.phased import PHASED
 from model.ensemble.measures import percentile
+from model.table.combinations import Candidates, Stream, best_combination
 from model.table.fingers_on_plate import MAX_FINGERS_BY_POINT, DriveResponses, FingersOnPlate
 from model.table.pattern_choice import JUDGING_DRAWS, PROMISED_DRAWS, PROMISED_PERCENTILE
 
@@ -29,23 +30,8 @@ MIN_CANDIDATES, ROWS_BY_POINT = 4, 16
 """Candidates of a content by the mean over fingertips and as many by their points; frequencies that
 are searched by point."""
 
-MAX_COMBINATIONS, PRUNING_STEP = 200, 4
-"""Combinations of candidates that are kept for the next content and the choice, by some draws."""
-
 _TINY = 1e-20
 _NEARLY_HIGHEST = 0.99
-
-
-@dataclass(frozen=True, eq=False)
-class Stream:
-    """A content for fingers, by index, at a level.
-
-    rows: of the frequencies that it may have, for each band (one unless bands may be exchanged).
-    """
-
-    targets: tuple[int, ...]
-    level_db_sl: float
-    rows: tuple[IntArray, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,16 +47,6 @@ class Chosen:
     weights: Complex64Array
     power: Float32Array
     is_apart: bool
-
-
-@dataclass(frozen=True, eq=False)
-class _Candidates:
-    """Candidates (m,) of all contents: of which stream and band, row, weights (m, n)."""
-
-    streams: IntArray
-    bands: IntArray
-    rows: IntArray
-    weights: Complex64Array
 
 
 def choose_contents(
@@ -95,7 +71,7 @@ def choose_contents(
         gain = 10 ** (stream.level_db_sl / 20) / np.maximum(percentile(own[of]), _TINY)
         own[of] *= gain[:, None]
         loudest[of] *= gain[:, None, None] ** 2
-    best, is_apart = _best_combination(
+    best, is_apart = best_combination(
         candidates, streams, quiet, own, loudest, frequencies, apart_hz
     )
     return tones_chosen(fingers, candidates.rows[best], candidates.weights[best], is_apart=is_apart)
@@ -208,7 +184,7 @@ def _candidates(
     quiet: Sequence[int],
     frequencies: FloatArray,
     apart_hz: float,
-) -> _Candidates:
+) -> Candidates:
     """The best drives of each content in each band, apart from each other."""
     every = {*quiet}.union(*(stream.targets for stream in streams))
     count = MIN_CANDIDATES + len(streams) // 2
@@ -220,7 +196,7 @@ def _candidates(
                 for at in _apart(score, frequencies[rows], count, apart_hz):
                     found.append((number, band, int(rows[at]), weights[at]))
     streams_of, bands, at_rows, chosen = zip(*found, strict=True)
-    return _Candidates(np.array(streams_of), np.array(bands), np.array(at_rows), np.array(chosen))
+    return Candidates(np.array(streams_of), np.array(bands), np.array(at_rows), np.array(chosen))
 
 
 def _search(
@@ -251,71 +227,10 @@ def _search(
 def _apart(score: Float32Array, frequencies: FloatArray, count: int, apart_hz: float) -> list[int]:
     """Indices of the two best scores, and of the best ones that are apart from all of these."""
     found: list[int] = []
+    scores, hertz = score.tolist(), frequencies.tolist()
     for at in best_first(score).tolist():
-        if score[at] <= 0 or len(found) == count:
+        if scores[at] <= 0 or len(found) == count:
             break
-        near = np.abs(frequencies[found] - frequencies[at]) < apart_hz
-        if len(found) < 2 or not near.any():
+        if len(found) < 2 or all(abs(hertz[each] - hertz[at]) >= apart_hz for each in found):
             found.append(at)
     return found
-
-
-def _best_combination(
-    candidates: _Candidates,
-    streams: Sequence[Stream],
-    quiet: Sequence[int],
-    own: Float32Array,
-    loudest: Float32Array,
-    frequencies: FloatArray,
-    apart_hz: float,
-) -> tuple[IntArray, bool]:
-    """A candidate of each content (K,), and whether their frequencies are apart.
-
-    own (m, d), loudest (m, k, d): amplitude and power of the candidates, at the contents' levels.
-    Of all that exchange bands and are apart, else of all that exchange bands.
-    """
-    hertz, may_exchange = frequencies[candidates.rows], len(streams[0].rows) > 1
-    for gap in (apart_hz, 0.0):
-        combinations = np.flatnonzero(candidates.streams == 0)[:, None]
-        for number in range(1, len(streams)):
-            own_candidates = np.flatnonzero(candidates.streams == number)
-            combinations = np.concatenate(
-                [
-                    np.repeat(combinations, len(own_candidates), axis=0),
-                    np.tile(own_candidates, len(combinations))[:, None],
-                ],
-                axis=1,
-            )
-            last, before = combinations[:, -1:], combinations[:, :-1]
-            allowed = (np.abs(hertz[last] - hertz[before]) >= gap).all(axis=1)
-            if may_exchange:
-                allowed &= (candidates.bands[last] != candidates.bands[before]).all(axis=1)
-            combinations = combinations[allowed]
-            if len(combinations) > MAX_COMBINATIONS:
-                some = own[:, ::PRUNING_STEP], loudest[:, :, ::PRUNING_STEP]
-                worst = _worst(combinations, streams, quiet, *some)
-                combinations = combinations[best_first(worst)[:MAX_COMBINATIONS]]
-        if len(combinations):
-            worst = _worst(combinations, streams, quiet, own, loudest)
-            return combinations[best_first(worst)[0]], gap == apart_hz
-    raise AssertionError("contents with as many bands must have a combination")
-
-
-def _worst(
-    combinations: IntArray,
-    streams: Sequence[Stream],
-    quiet: Sequence[int],
-    own: Float32Array,
-    loudest: Float32Array,
-) -> FloatArray:
-    """Power ratio at the worst finger on nine of ten plates, of combinations (c, j): (c,)."""
-    levels, total = own[combinations] ** 2, loudest[combinations].sum(axis=1)
-    worst = np.full((len(combinations), own.shape[1]), np.inf, dtype=np.float32)
-    for j, at in enumerate(combinations.T):
-        if combinations.shape[1] > 1:
-            for finger in streams[j].targets:
-                others_power = np.maximum(total[:, finger] - loudest[at, finger], _TINY)
-                worst = np.minimum(worst, levels[:, j] / others_power)
-    for finger in quiet:
-        worst = np.minimum(worst, levels.min(axis=1) / np.maximum(total[:, finger], _TINY))
-    return percentile(worst.astype(float))

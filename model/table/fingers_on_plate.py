@@ -14,7 +14,7 @@ from model.ensemble.draws import Drawing, draw
 from model.ensemble.measures import Felt, Fingertips, felt, felt_at
 from model.ensemble.plate_on_eras import MODELLED, PlateOnEras
 from model.ensemble.touched_by_kernel import touch
-from model.ensemble.touched_plate import LoadedContacts, Sensed, TouchedPlate, gram
+from model.ensemble.touched_plate import LoadedContacts, Sensed, TouchedPlate, gram, outer
 from model.table.fingertip_shapes import FingertipShapes
 from model.table.pulse_gains import PulseResponses
 from model.table.question import Question
@@ -114,8 +114,7 @@ class FingersOnPlate:
         mean = (weights[:, None] @ fields)[:, :, 0]
         by_target = np.asarray(mean.swapaxes(0, 1) * gains[:, None, None])
         # What the field differs over a target is no uncertainty of its level.
-        few = gram(fields * np.sqrt(weights[:, :, None]))
-        expected = contacts.power.take(targets, axis=1) - few + gram(mean[:, :, None])
+        expected = contacts.uncertain.take(targets, axis=1) + outer(mean)
         power = expected.swapaxes(0, 1) * (gains**2)[:, None, None, None]
         quiet = (
             contacts.power.take(self.quiet, axis=1)
@@ -197,9 +196,8 @@ class FingersOnPlate:
         """
         n = forms.era_count
         at_points = self._fine_fields[np.ix_(rows, np.arange(len(self.quiet)), points)]
-        power = self.contacts.power[np.ix_(rows, self.quiet)]
-        uncertain = power - gram(self._few_fields.take(rows, axis=0))
-        quiet = uncertain[:, :, None] + gram(at_points[:, :, :, None])
+        uncertain = self.contacts.uncertain[np.ix_(rows, self.quiet)]
+        quiet = uncertain[:, :, None] + outer(at_points)
         return replace(forms, quiet=quiet.reshape(len(rows), -1, n, n), few=None, fine=None)
 
     def respond(self, drives: Sequence[Weights]) -> "DriveResponses":

@@ -20,12 +20,23 @@ MAX_IDLE = 128  # connections that have not sent a complete request
 REQUEST_TIMEOUT = 5.0  # s; for a complete request
 UNREAD_TIMEOUT = 5.0  # s; for reading a response over HTTP
 MAX_UNREAD = 1 << 18  # bytes per WebSocket; bounds pongs; other frames wait until it reads
+MAX_HEAD = 1 << 16  # bytes; of a request over HTTP
 MAX_FRAGMENTS = 64  # per message; a browser sends 64 KiB in one or two
 MAX_CONTROL_RATE = 100.0  # 1/s; pings and pongs of one WebSocket; one in ten seconds is needed
 CLOSE_TIMEOUT = 1.0  # s; for a WebSocket to close after its last frame
 _SLICE = 1 << 12  # bytes that are processed between checks of the bounds
 _BLANK_LINE = re.compile(rb"\n\r?\n")
 _BARE_OR_FOLDED = re.compile(rb"(?<!\r)\n|\n[ \t]")
+
+
+class _UnambiguousHttp(h11.Connection):
+    """HTTP whose heads of requests no proxy may take for others."""
+
+    def next_event(self) -> Any:
+        """The next event; raises RemoteProtocolError, which is answered by 400."""
+        if self.their_state is h11.IDLE and _is_ambiguous(self.trailing_data[0]):
+            raise h11.RemoteProtocolError("ambiguous head")
+        return super().next_event()
 
 
 class HttpConnection(H11Protocol):
@@ -37,6 +48,7 @@ class HttpConnection(H11Protocol):
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
+        self.conn = _UnambiguousHttp(h11.SERVER, MAX_HEAD)
         self._unread: asyncio.TimerHandle | None = None
         # Of all connections of the server, whose state is one dictionary.
         self._idle: dict[HttpConnection, asyncio.TimerHandle] = self.app_state.setdefault(
@@ -51,10 +63,7 @@ class HttpConnection(H11Protocol):
         self._start_idle()
 
     def handle_events(self) -> None:
-        """Refuse an ambiguous head of a request; stop the idle timer at a complete request."""
-        if self.conn.their_state is h11.IDLE and _is_ambiguous(self.conn.trailing_data[0]):
-            self.send_400_response("Ambiguous HTTP request received.")
-            return
+        """Stop the idle timer at a complete request."""
         try:
             super().handle_events()
         except h11.LocalProtocolError:  # invalid data in the body of a request already answered

@@ -178,14 +178,9 @@ def error_line(id: Id, error: RpcError) -> bytes:
     content = {
         "code": int(error.code),
         "message": str(error)[:_MAX_ERROR_TEXT],
-        "data": error_data(error),
+        "data": error.data.model_dump(exclude=None if error.data.amplifiers else {"amplifiers"}),
     }
     return json.dumps({"jsonrpc": "2.0", "id": id, "error": content}).encode() + b"\n"
-
-
-def error_data(error: RpcError) -> dict[str, Any]:
-    """The data of an error as JSON."""
-    return error.data.model_dump(exclude=None if error.data.amplifiers else {"amplifiers"})
 
 
 def read_error(error: Mapping[str, Any]) -> RpcError:

@@ -10,7 +10,7 @@ import pytest_asyncio
 import dashboard_pictures
 from chromium import Browser, Page, open_browser
 from controller.api.schema import DaemonStateName
-from controller.api.topics import StateEvent
+from controller.api.topics import LayoutEvent, StateEvent
 from controller.gateway.app import MAX_SESSIONS
 from daemon_bench import running_daemon, until_state
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard
@@ -81,7 +81,8 @@ async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Pat
 async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> None:
     """Which amplifiers a stop did not silence: beside the button and in the list of events.
 
-    Until a stop is confirmed. The end of the daemon after a loss is an event of its own.
+    Until a stop is confirmed. The end of the daemon after a loss is an event of its own. Regions
+    are those of the layout in use.
     """
     problem = "document.querySelector('#problem').innerText"
     states: list[tuple[DaemonStateName, str]] = [
@@ -91,6 +92,9 @@ async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> No
     ]
     with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
         await open_dashboard(tab, gateway, DESKTOP)
+        knob = {"name": "knob", "shape": "circle", "x_m": 0.1, "y_m": 0.1, "radius_m": 0.03}
+        daemon.publish("layout", LayoutEvent(layout={"regions": [knob]}))
+        await tab.until("document.querySelectorAll('.region').length === 1")
         daemon.silence = UNCONFIRMED
         await tab.click("#stop")
         shown = await tab.until(problem, lambda text: "side" in text)

@@ -10,7 +10,7 @@ from model.errors import InputError
 _SILENT_ERA = 0.02  # of what the others do
 _SILENT_SENSOR = 0.005  # of the loudest sensor, in the median over frequencies and ERAs
 _DEAD_SCALE = 0.1  # of the others' scale
-_LEAST_SENSORS = 3
+LEAST_SENSORS = 3
 _DEAD_COHERENCE = 0.5  # with what the fitted plate does at the sensor
 
 
@@ -36,11 +36,11 @@ def silent_sensors(responses: Responses) -> NDArray[np.bool_]:
 
 def check_enough_sensors(alive: NDArray[np.bool_], responses: Responses) -> None:
     """Raise InputError unless enough sensors (s,) have a signal."""
-    if alive.sum() < _LEAST_SENSORS:
+    if alive.sum() < LEAST_SENSORS:
         dead = [n for n, live in zip(responses.sensors, alive, strict=True) if not live]
         without = f" ({', '.join(dead)} without a signal)" if dead else ""
         raise InputError(
-            f"at least {_LEAST_SENSORS} sensors must have a signal, better eight or more, got "
+            f"at least {LEAST_SENSORS} sensors must have a signal, better eight or more, got "
             f"{alive.sum()}{without}"
         )
 

@@ -18,28 +18,24 @@ sigma of the noise, z all that is searched: scales that sensors have in common a
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import OptimizeResult, least_squares, nnls
+from scipy.optimize import nnls
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.form_errors import SENSOR_SCALE, FormModel
+from model.calibration.least_squares import Loss, search
 from model.calibration.parameters import Parameter, bounds_of
 from model.calibration.variable_projection import project_gains, projection_slopes, row_rms
 from model.rig.rig import Rig
-
-_Loss: TypeAlias = Literal["linear", "soft_l1"]
 
 _MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
 _PEAK = 3.0  # times the median of a row; twice that is rare on a plate
 _ROUNDS = 8
 _SETTLED = 0.1  # of the noise between two rounds
 _LEAST_LEFT = 0.1  # of a value's noise: residuals with less tell nothing of it
-_STEPS = 60  # of one search; a plate that fits takes ten
 _HOLD = 1e3  # by which a mean of scales is held
 _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
 
@@ -163,7 +159,7 @@ def first_fit(problem: Problem, x: FloatArray) -> Fit:
         kept = _without_worst(raw / noise[:, :, None], used)
         is_settled = number > 0 and bool((kept == used).all())
         used = kept
-        loss: _Loss = "linear" if is_settled else "soft_l1"
+        loss: Loss = "linear" if is_settled else "soft_l1"
         found = _search(problem, found.z, used / noise[:, :, None], loss=loss)
         if is_settled:
             break
@@ -190,47 +186,8 @@ def solve(problem: Problem, start: Fit) -> Fit:
     return _result(problem, _search(problem, z, used / noise[:, :, None]), noise, used)
 
 
-def search(
-    linearised: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
-    start: FloatArray,
-    bounds: FloatArray,
-    *,
-    loss: _Loss = "linear",
-) -> OptimizeResult:
-    """Least squares of residuals (m,) with derivatives (m, n), from a start (n,) within bounds.
-
-    bounds (2, n).
-    """
-    last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
-
-    def both(y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        key = y.tobytes()
-        if key not in last:
-            last.clear()
-            last[key] = linearised(y)
-        return last[key]
-
-    def residuals(y: FloatArray) -> FloatArray:
-        return both(y)[0]
-
-    def jacobian(y: FloatArray) -> FloatArray:
-        return both(y)[1]
-
-    return least_squares(
-        residuals,
-        np.clip(start, bounds[0] + 1e-9, bounds[1] - 1e-9),
-        jacobian,
-        bounds=(bounds[0], bounds[1]),
-        loss=loss,
-        x_scale="jac",
-        max_nfev=_STEPS,
-        xtol=1e-7,
-        ftol=1e-8,
-    )
-
-
 def _search(
-    problem: Problem, start: FloatArray, weight: FloatArray, *, loss: _Loss = "linear"
+    problem: Problem, start: FloatArray, weight: FloatArray, *, loss: Loss = "linear"
 ) -> _Found:
     searched, inside = problem.searched, weight > 0
     tolerances, targets = problem.tolerances(start)

@@ -1,17 +1,15 @@
 """Detection of dead channels and unusable sensors."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray
-from model.calibration.calibration_screening import silent_sensors
+from model.calibration.calibration_screening import check_enough_sensors, silent_sensors
 from model.calibration.responses import Responses
 from model.diagnosis.assignment import match_shapes
 from model.diagnosis.plate_match import MAX_FIT_ERROR, Match
-from model.errors import InputError
 from model.rig.rig import Rig
 from model.vibration.parametric_plate import ParametricPlate
 
@@ -19,7 +17,6 @@ _DEAD = 0.03  # of the response that the rig predicts
 _FAINT = 0.3  # of it: dead if its shape is not that of an ERA either
 _NO_SHAPE = 0.6  # MAC
 _SENSOR_SCALE = (0.7, 1.4)
-LEAST_SENSORS, _LEAST_FREQUENCIES = 3, 4
 
 
 def dead_channels(rig: Rig, plate: ParametricPlate, observation: Responses) -> NDArray[np.bool_]:
@@ -48,25 +45,17 @@ def shapeless_channels(
 def usable_sensors(
     observation: Responses, dead: NDArray[np.bool_]
 ) -> tuple[Responses, tuple[tuple[str, str], ...]]:
-    """Remove sensors without a signal from any live channel; return their names, too."""
+    """Remove sensors without a signal from any live channel; return their names, too.
+
+    Raises InputError if too few are left.
+    """
     values = observation.values[:, ~dead]
     if not np.isfinite(values).any():
         return observation, ()
     silent = silent_sensors(replace(observation, values=values))
+    check_enough_sensors(~silent, observation)
     names = [name for name, out in zip(observation.sensors, silent, strict=True) if out]
     return observation.without(silent), tuple((name, "reads nothing") for name in names)
-
-
-def check_enough(observation: Responses, removed: Sequence[tuple[str, str]]) -> None:
-    """Raise InputError if too few sensors or frequencies are left; removed: sensors."""
-    count, frequencies = len(observation.sensors), len(observation.frequencies)
-    if count < LEAST_SENSORS or frequencies < _LEAST_FREQUENCIES:
-        without = f" ({', '.join(name for name, _ in removed)} without a signal)" if removed else ""
-        raise InputError(
-            f"a diagnosis needs at least {LEAST_SENSORS} sensors, better eight, and "
-            f"{_LEAST_FREQUENCIES} frequencies, got {count} sensors{without} and {frequencies} "
-            "frequencies"
-        )
 
 
 def off_scale(observation: Responses, values: ComplexArray, match: Match) -> list[tuple[str, str]]:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.fit import search
+from model.calibration.least_squares import search
 from model.calibration.parameters import (
     Parameter,
     bounds_of,

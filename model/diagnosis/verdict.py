@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
+from model.calibration.calibration_screening import LEAST_SENSORS
 from model.calibration.responses import Responses
 from model.choice import best_by
 from model.diagnosis.assignment import ShapeMatch, match_responses, match_shapes
 from model.diagnosis.causes import Explanation, explain
 from model.diagnosis.diagnosis_screening import (
-    LEAST_SENSORS,
-    check_enough,
     dead_channels,
     off_scale,
     shapeless_channels,
@@ -29,6 +28,7 @@ from model.vibration.parametric_plate import ParametricPlate, parametric_plate
 
 WEAK, STRONG = 0.7, 1.4  # gain of a channel: 3 dB either way
 MAX_DEVIATION = 3.0  # standard deviations of a parameter's prior
+_LEAST_FREQUENCIES = 4
 _MIN_CONFIDENCE = 0.99  # in another ERA than the rig's
 _MIN_COST_REDUCTION = 20.0  # by another wiring than the rig's
 _MAX_PHASE_ERROR = 45.0  # degrees
@@ -98,11 +98,15 @@ def diagnose(rig: Rig, observation: Responses, *, max_deviation: float = MAX_DEV
     """
     if not observation.measured.any():
         raise InputError("no channel was driven; drive each in turn and measure again")
+    if len(observation.frequencies) < _LEAST_FREQUENCIES:
+        raise InputError(
+            f"a diagnosis needs at least {_LEAST_FREQUENCIES} frequencies, got "
+            f"{len(observation.frequencies)}"
+        )
     plate = parametric_plate(rig, observation.points, observation.frequencies)
     dead = dead_channels(rig, plate, observation)
     sensors = observation.sensors
     observation, removed = usable_sensors(observation, dead)
-    check_enough(observation, removed)
     plate = plate.at(np.isin(sensors, observation.sensors))
     values = observation.values.copy()
     dead = dead | shapeless_channels(rig, plate, observation)

@@ -1,19 +1,18 @@
-"""The most likely parameters of measured responses: Levenberg and Marquardt's method."""
+"""The most likely parameters of measured responses."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from model.arrays import FloatArray
+from model.calibration.least_squares import search
 from model.identification.derivatives import jacobian
 from model.identification.forward import ForwardModel
 from model.identification.measurement import Measurement
 
-_FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e-7, 1e8
-_CONVERGED = 1e-3  # of the cost, whose changes by one standard deviation are 1
+_CONVERGED = 1e-7  # of the cost, whose changes by one standard deviation are 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,24 +55,14 @@ class Problem:
         own = self.measurement.std
         return own if self.extra_noise is None else np.hypot(own, self.extra_noise)
 
-    def residuals(self, x: FloatArray) -> FloatArray:
-        """Model less measurement in standard deviations, real parts first, (2 n,)."""
-        m = self.measurement
-        found = self.model.at(x).responses[m.rows, m.at, m.eras]
-        return _parts((found - m.values) / self.std)
-
-    def cost(self, x: FloatArray) -> float:
-        """Sum of squares of residuals and parameters."""
-        residuals = self.residuals(x)
-        return float(residuals @ residuals + x @ x)
-
     def linearised(self, x: FloatArray) -> Linearised:
         """Residuals and their derivatives."""
         m = self.measurement
         plate = self.model.at(x)
         J = jacobian(plate)[m.rows, m.at, m.eras] / self.std[:, None]
         found = (plate.responses[m.rows, m.at, m.eras] - m.values) / self.std
-        return Linearised(x, _parts(found), np.concatenate([J.real, J.imag]))
+        residuals = np.concatenate([found.real, found.imag])
+        return Linearised(x, residuals, np.concatenate([J.real, J.imag]))
 
 
 def solve(
@@ -81,38 +70,18 @@ def solve(
 ) -> Linearised:
     """Minimise the cost over the free parameters (p,) within their bounds, from a start (p,)."""
     space = problem.model.space
-    x = np.clip(start, space.lower, space.upper)
-    now = problem.linearised(x)
-    damping = _FIRST_DAMPING
-    for _ in range(iterations):
-        # Parameters at a bound that they would pass stay there for this step.
-        gradient = now.gradient
-        held = (x <= space.lower) & (gradient > 0) | (x >= space.upper) & (gradient < 0)
-        moving = np.flatnonzero(free & ~held)
-        H = now.information[np.ix_(moving, moving)]
-        accepted = None
-        while damping < _MAX_DAMPING:
-            damped = H + damping * np.diag(np.diag(H))
-            step = linalg.solve(damped, -gradient[moving], assume_a="pos")
-            tried = x.copy()
-            tried[moving] += step
-            tried = np.clip(tried, space.lower, space.upper)
-            cost = problem.cost(tried)
-            if cost < now.cost:
-                accepted = tried
-                break
-            if np.abs(step).max() < 1e-6:
-                return now
-            damping *= 8
-        if accepted is None:
-            return now
-        gained = now.cost - cost
-        damping = max(damping / 10, _MIN_DAMPING)
-        x, now = accepted, problem.linearised(accepted)
-        if gained < _CONVERGED:
-            return now
-    return now
+    searched = np.flatnonzero(free)
 
+    def full(y: FloatArray) -> FloatArray:
+        x = np.clip(start, space.lower, space.upper)
+        x[searched] = y
+        return x
 
-def _parts(values: NDArray[np.complex128]) -> FloatArray:
-    return np.concatenate([values.real, values.imag])
+    def linearised(y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        now = problem.linearised(full(y))
+        prior = np.eye(len(searched))
+        return np.append(now.residuals, y), np.vstack([now.jacobian[:, searched], prior])
+
+    bounds = np.array([space.lower, space.upper])[:, searched]
+    found = search(linearised, start[searched], bounds, steps=iterations, tolerance=_CONVERGED)
+    return problem.linearised(full(found.x))

@@ -9,7 +9,7 @@ import pytest
 
 from extrapolated import extrapolated_slopes
 from model.arrays import ComplexArray, FloatArray
-from model.calibration import fit
+from model.calibration import fit, least_squares
 from model.calibration.form_errors import form_model
 from model.calibration.parameters import parameters_of
 from model.calibration.variable_projection import project_gains, projection_slopes
@@ -108,7 +108,7 @@ def test_jacobians_of_searches_are_exact(
     searched: Callable[[], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By every argument at the first start of each size, to 1e-6 of the column's largest."""
-    solver: Callable[..., Any] = vars(fit)["least_squares"]
+    solver: Callable[..., Any] = vars(least_squares)["least_squares"]
     checked: set[int] = set()
 
     def checking(
@@ -125,6 +125,6 @@ def test_jacobians_of_searches_are_exact(
             checked.add(len(start))
         return solver(residuals, start, jacobian, **options)
 
-    monkeypatch.setattr(fit, "least_squares", checking)
+    monkeypatch.setattr(least_squares, "least_squares", checking)
     searched()
     assert checked

@@ -272,10 +272,10 @@ def test_diagnose_finds_all_channels_dead_when_nothing_moves(coarse_rig, built):
 def test_diagnose_refuses_too_few_sensors_or_frequencies(coarse_rig, built):
     """Two sensors, three frequencies, or no channel at all."""
     places, values = built
-    with pytest.raises(InputError, match="got 2 sensors"):
+    with pytest.raises(InputError, match=r"at least 3 sensors .* got 2"):
         diagnose(coarse_rig, observe(places[:2], values[:, :, :2]))
     few = replace(observe(places, values[:3]), frequencies=FREQUENCIES[:3])
-    with pytest.raises(InputError, match="and 3 frequencies"):
+    with pytest.raises(InputError, match="got 3"):
         diagnose(coarse_rig, few)
     with pytest.raises(InputError, match="driven"):
         diagnose(coarse_rig, observe(places, np.full_like(values, np.nan)))

@@ -15,8 +15,7 @@ from model.spectral.modes import Band, SpectralPlate
 from model.structure.equivalent import bending, equivalent_plate
 from model.structure.laminate_section import wavenumber_of
 from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
-from model.vibration.direct import direct_responder
-from model.vibration.natural_modes import natural_modes
+from model.vibration.natural_modes import direct_responder, natural_modes
 
 PANEL = load_rig(RIG.parent / "glass_panel.yaml")
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)

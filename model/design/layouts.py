@@ -12,8 +12,7 @@ from model.arrays import FloatArray
 from model.config.document import read_document
 from model.config.sections import Section, Validation
 from model.design.area import PointSection
-from model.design.problem import DesignProblem
-from model.design.support import MIN_SUPPORTING
+from model.design.problem import MIN_SUPPORTING, DesignProblem
 from model.errors import InputError
 from model.rig.layouts import named_layouts
 

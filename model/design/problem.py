@@ -1,6 +1,10 @@
-"""What is sought: a number of ERAs, where they may stand, and the contacts they serve."""
+"""What is sought: a number of ERAs, where they may stand, and the contacts they serve.
+
+A layout supports the plate by its lowest rigid-body mode, and with weight on every ERA.
+"""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -9,12 +13,35 @@ import numpy as np
 from model.arrays import FloatArray, IntArray
 from model.design.area import EDGE, Area, candidates_of
 from model.design.contacts import ContactRule
-from model.design.support import DEFAULT_LOWEST, MIN_SUPPORTING, shortfall
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.structure.attachments import Era
+from model.structure.support import rigid_body_frequencies, static_loads
 from model.table.table import default_drive_frequencies
 from model.version import NUMERICS_VERSION
+
+DEFAULT_LOWEST = 20.0
+"""Lowest natural frequency [Hz] of the plate on its ERAs: it sags by 0.6 mm under its weight."""
+
+MIN_SUPPORTING = 3
+"""ERAs, and other mounts, that can support a plate."""
+
+_ROUNDING = 1e-9  # share of the mean load below which a pull is none: an ERA may carry nothing
+
+
+def shortfall(rig: Rig, eras: Sequence[Era], *, lowest: float) -> float:
+    """How far ERAs are from supporting a rig's plate, 0 if they do.
+
+    lowest [Hz]: least rigid-body frequency. No mount may be pulled upwards by the plate's weight,
+    so that the centre of mass is within them and the plate does not tip.
+    """
+    frequency = float(rigid_body_frequencies(rig.plate, eras, loads=rig.masses)[0])
+    if frequency < 1e-3:
+        return 2.0
+    loads = static_loads(rig.plate, eras, loads=rig.masses)
+    pulled = -float(loads.min() / loads.mean())
+    return max(0.0, 1 - frequency / lowest) + (pulled if pulled > _ROUNDING else 0.0)
+
 
 CANDIDATES = {True: 48, False: 80}
 """Candidates along the edge, and over an area."""

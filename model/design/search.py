@@ -14,9 +14,8 @@ from model.arrays import FloatArray, IntArray
 from model.choice import best_by
 from model.design import problem as design_problem
 from model.design.area import ANYWHERE, area_of
-from model.design.problem import DesignProblem
+from model.design.problem import MIN_SUPPORTING, DesignProblem
 from model.design.score import Mounts, Places, Scorer
-from model.design.support import MIN_SUPPORTING
 from model.errors import InputError
 
 MAX_SWEEPS = 4

@@ -4,6 +4,7 @@ Bounds are wide: they catch values in the wrong unit.
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from typing import Annotated, Any, Literal
@@ -83,38 +84,23 @@ def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
     return bounds
 
 
-def _gains(rows: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
-    for frequency, size, phase in rows:
-        if not (0 < frequency < 1e5 and 1e-3 <= size <= 1e3 and -360 <= phase <= 360):
-            raise ValueError(
-                "must be rows of [frequency in Hz, magnitude 0.001 to 1000, phase -360 to 360 "
-                f"degrees], got [{frequency:g}, {size:g}, {phase:g}]"
-            )
-    if any(low[0] >= high[0] for low, high in pairwise(rows)):
-        raise ValueError("frequencies must ascend; sort the rows by the first number")
-    return rows
+def _rows(
+    columns: str, least: Sequence[float], most: Sequence[float], *, ascending: bool = True
+) -> AfterValidator:
+    """Check of rows of numbers between bounds, by default sorted by the first of them."""
 
+    def checked(rows: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
+        for row in rows:
+            if not all(
+                low <= each <= high for low, each, high in zip(least, row, most, strict=True)
+            ):
+                got = ", ".join(f"{each:g}" for each in row)
+                raise ValueError(f"must be rows of [{columns}], got [{got}]")
+        if ascending and any(low[0] >= high[0] for low, high in pairwise(rows)):
+            raise ValueError("frequencies must ascend; sort the rows by the first number")
+        return rows
 
-def _modes(rows: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    for frequency, loss in rows:
-        if not (0.8 <= frequency <= 1.25 and 0.01 <= loss <= 100):
-            raise ValueError(
-                "must be rows of [natural frequency 0.8 to 1.25, loss factor 0.01 to 100] relative "
-                f"to the plate's theory, got [{frequency:g}, {loss:g}]"
-            )
-    return rows
-
-
-def _moduli(rows: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
-    for frequency, factor, loss in rows:
-        if not (0 < frequency < 1e5 and 1e-3 <= factor <= 1e3 and 0 <= loss <= 2):
-            raise ValueError(
-                "must be rows of [frequency in Hz, factor of E 0.001 to 1000, loss factor 0 to 2], "
-                f"got [{frequency:g}, {factor:g}, {loss:g}]"
-            )
-    if any(low[0] >= high[0] for low, high in pairwise(rows)):
-        raise ValueError("frequencies must ascend; sort the rows by the first number")
-    return rows
+    return AfterValidator(checked)
 
 
 def _threshold(name: str) -> str:
@@ -126,6 +112,20 @@ def _threshold(name: str) -> str:
     return name
 
 
+_GAINS = _rows(
+    "frequency in Hz, magnitude 0.001 to 1000, phase -360 to 360 degrees",
+    (1e-6, 1e-3, -360),
+    (1e5, 1e3, 360),
+)
+_MODULI = _rows(
+    "frequency in Hz, factor of E 0.001 to 1000, loss factor 0 to 2", (1e-6, 1e-3, 0), (1e5, 1e3, 2)
+)
+_MODES = _rows(
+    "natural frequency 0.8 to 1.25, loss factor 0.01 to 100, relative to the plate's theory",
+    (0.8, 0.01),
+    (1.25, 100),
+    ascending=False,
+)
 GainRow = Annotated[tuple[float, float, float], Strict(strict=False)]  # a list in the file
 ModeRow = Annotated[tuple[float, float], Strict(strict=False)]
 Identifier = Annotated[str, AfterValidator(_identifier)]
@@ -155,10 +155,9 @@ class LayerSection(Section):
     material: MaterialOrName
     thickness: Thickness
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] | None = None
-    by_frequency: (
-        Annotated[list[GainRow], Field(min_length=2, max_length=200), AfterValidator(_moduli)]
-        | None
-    ) = None
+    by_frequency: Annotated[list[GainRow], Field(min_length=2, max_length=200), _MODULI] | None = (
+        None
+    )
 
 
 class AirGapSection(Section):
@@ -191,9 +190,7 @@ class PlateSection(Section):
     air_gap: AirGapSection | None = None
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, below=1)] = 0.01
     loss_exponent: Annotated[float, Quantity(RATIO, at_least=-2, at_most=2)] = 0.0
-    modes: Annotated[
-        list[ModeRow], Field(max_length=64, default_factory=list), AfterValidator(_modes)
-    ]
+    modes: Annotated[list[ModeRow], Field(max_length=64, default_factory=list), _MODES]
 
 
 class EraSection(Section):
@@ -215,7 +212,7 @@ class EraSection(Section):
     bolt_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=10)] = 0.0
     stroke: Annotated[float, Quantity(LENGTH, above=0, at_most=0.01)] = 100e-6
     foot: Foot = 0.0
-    gains: Annotated[list[GainRow], Field(max_length=2000), AfterValidator(_gains)] | None = None
+    gains: Annotated[list[GainRow], Field(max_length=2000), _GAINS] | None = None
     amplifier: Identifier | None = None
     channel: Annotated[int, Field(ge=0, le=255)] | None = None
 

@@ -36,8 +36,8 @@ from model.table.weak_cells import are_apart
 from model.transients.base_motion import ramped_onset
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
-from model.vibration.direct import Responder, direct_responder
 from model.vibration.excitation import Excitation, base_amplitudes, tone_amplitudes
+from model.vibration.natural_modes import Responder, direct_responder
 
 CONTENT_TOLERANCE = 1e-4
 """Relative L2 error of the content; the paper's plate has some 1e-5, on its coarsest mesh 2e-5."""

@@ -9,8 +9,8 @@ from model.counting import counted
 from model.errors import InputError
 from model.reduction.free_plate import FreePlate
 from model.rig.rig import Rig
-from model.vibration.direct import direct_responder
 from model.vibration.excitation import Excitation, find_nulls, peak_acceleration, tone_fields
+from model.vibration.natural_modes import direct_responder
 
 MAX_POINTS = 1_000_000
 """More would be finer than any screen, at some hundred bytes of memory each."""

@@ -1,21 +1,24 @@
-"""Natural frequencies and mode shapes of a rig's plate, for any support and mesh."""
+"""A plate on any mesh: natural modes for any support, and its response solved directly."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 from scipy import linalg
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.mesh import Mesh
-from model.fem.plate import RIGID_BODY_MODES, assemble, modes
+from model.fem.plate import RIGID_BODY_MODES, assemble, direct_acceleration, modes
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
+from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import PlateMesh, SpectralMesh
 from model.structure.attachments import PointLoad, footprints_of
 from model.structure.modal_elasticity import ModalElasticity
+from model.structure.plate import Plate
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,3 +102,17 @@ def _modes_with(reduced: ReducedPlate, attached: list[PointLoad]) -> tuple[Float
 
 def _shapes(reduced: ReducedPlate, coordinates: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(reduced.at(points) @ coordinates)
+
+
+Responder: TypeAlias = Callable[..., ComplexArray]
+"""Acceleration [m/s²] of each ERA alone at full stroke, (f, eras, p).
+
+Of ERAs, frequencies (f,) [Hz], points (p, 2) [m], and loads by name.
+"""
+
+
+def direct_responder(plate: Plate, mesh: PlateMesh) -> Responder:
+    """Direct solution of a plate on a mesh, the check of its reduction."""
+    if isinstance(mesh, Mesh):
+        return partial(direct_acceleration, assemble(plate, mesh))
+    return partial(direct_spectral_acceleration, plate, mesh)

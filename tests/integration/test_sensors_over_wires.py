@@ -16,7 +16,7 @@ from drivers.protocol.table import FEATURES
 from long_form import shortly
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
-from model.vibration.direct import direct_responder
+from model.vibration.natural_modes import direct_responder
 from sim.amplifier.contract import Amplifier as SimulatedAmplifier
 from sim.plant.accelerometer import Accelerometer
 from sim.sensors.accelerometers import Accelerometers

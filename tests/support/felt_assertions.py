@@ -25,7 +25,7 @@ from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from model.transients.base_motion import BaseEnvelope, shaped
-from model.vibration.direct import direct_responder
+from model.vibration.natural_modes import direct_responder
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
 from touch_stream import Situation, Stream

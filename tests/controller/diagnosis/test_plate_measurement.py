@@ -27,7 +27,7 @@ from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, PointLoad
 from model.table.build import build_table
 from model.table.question import Question
-from model.vibration.direct import direct_responder
+from model.vibration.natural_modes import direct_responder
 from rig_on_wire import FarSide, far_side
 from sim.amplifier.contract import Amplifier
 from sim.bench import bench

@@ -13,9 +13,8 @@ from model.design.area import Area, area_of, candidates_of, everywhere
 from model.design.contacts import ContactRule, anywhere
 from model.design.judge import judge
 from model.design.layouts import layouts_of
-from model.design.problem import DesignProblem
+from model.design.problem import DesignProblem, shortfall
 from model.design.search import LayoutSearch
-from model.design.support import shortfall
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.structure.attachments import Era

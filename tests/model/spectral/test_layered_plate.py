@@ -21,8 +21,7 @@ from model.structure.equivalent import equivalent_plate
 from model.structure.plate import AirGap, Bond, Laminate, Layer, Material, Plate
 from model.table.build import build_table
 from model.table.file import load_table, save_table
-from model.vibration.direct import direct_responder
-from model.vibration.natural_modes import natural_modes
+from model.vibration.natural_modes import direct_responder, natural_modes
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "glass_panel.yaml"
 COVER = Material("cover", E=71.5e9, rho=2420.0, nu=0.21)

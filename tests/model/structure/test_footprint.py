@@ -12,7 +12,7 @@ from model.reduction.reduced_plate import reduce_plate
 from model.structure.attachments import Era, PointLoad, footprints_of
 from model.structure.footprint import mean_over
 from model.transients.base_motion import Term
-from model.vibration.direct import direct_responder
+from model.vibration.natural_modes import direct_responder
 from paper_plate import make_paper_rig
 from sim.plant.plant import Plant
 

@@ -16,7 +16,7 @@ from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import fingertip_loads
-from model.vibration.direct import direct_responder
+from model.vibration.natural_modes import direct_responder
 from sim.sensors.sensor_file import WiredSensor, read_sensors
 
 RATE = 48_000.0

@@ -30,8 +30,8 @@ from model.table.file import save_table
 from model.table.promise_at_sensors import Promise, promises
 from model.table.table import LocalizationTable
 from model.table.table_check import CheckSettings
-from model.vibration.direct import direct_responder
 from model.vibration.excitation import tone_amplitudes
+from model.vibration.natural_modes import direct_responder
 from sim.measuring import table_check
 from sim.measuring.sound_card import SoundCard
 from sim.sensors.sensor_file import read_sensors

@@ -12,7 +12,6 @@ from drivers.by_hand.reaching import (
     keep_alive,
     random_session,
     reached,
-    request,
     round_trip,
     wire_rows,
 )
@@ -59,7 +58,7 @@ async def status(url: str) -> dict[str, Any]:
     """Read status, faults and link timing."""
     async with identified(url) as amplifier:
         now = await amplifier.read_status()
-        faults = await request(amplifier, "GetFaults", {})
+        faults = await amplifier.request("GetFaults", {})
         measured = [
             {"voltage_v": voltage, "current_a": current}
             for voltage, current in await read_measured(amplifier)
@@ -150,7 +149,7 @@ async def _stop(amplifier: Amplifier) -> str:
     """Stop an amplifier at once, then until that is confirmed; returns why it is not."""
     cause = ""
     with contextlib.suppress(DriverError):
-        await request(amplifier, "Stop", {"ramp": amplifier.wire_ramp(STOP_RAMP)}, Priority.STOP)
+        await amplifier.request("Stop", {"ramp": amplifier.wire_ramp(STOP_RAMP)}, Priority.STOP)
     try:
         await amplifier.identify()
     except DriverError as error:  # its channels are unknown, but the stop goes on
@@ -185,7 +184,7 @@ async def set_address(url: str, address: int, serial_number: str | None) -> dict
 
 async def _set_address(amplifier: Amplifier, address: int, serial_number: str) -> None:
     values = {"address": address, "serial_number": serial_number}
-    await request(amplifier, "SetAddress", values)
+    await amplifier.request("SetAddress", values)
 
 
 async def clear(url: str) -> dict[str, Any]:
@@ -222,7 +221,7 @@ async def drive(
         try:
             await amplifier.arm(random_session(), watchdog)
             await amplifier.stage(_TOKEN, [layer], now=True)
-            achieved = await request(amplifier, "GetAchieved", {"layer": layer.number})
+            achieved = await amplifier.request("GetAchieved", {"layer": layer.number})
             await keep_alive(amplifier, duration, watchdog / 5)
         finally:
             # An amplifier that cannot be reached is stopped by its watchdog.

@@ -15,7 +15,7 @@ from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import Any, TypeVar
 
-from drivers.by_hand.reaching import keep_alive, random_session, reached, request
+from drivers.by_hand.reaching import keep_alive, random_session, reached
 from drivers.by_hand.rows import capability_rows, fault_rows, status_rows
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused
@@ -23,12 +23,11 @@ from drivers.host.amplifier import WATCHDOG
 from drivers.host.dialogue import Staged
 from drivers.host.sensors import Reading, Sensor, measure_tones, read_sensors
 from drivers.host.timing import HEARTBEAT
-from drivers.protocol.table import STATES
+from drivers.protocol.table import ENABLED
 from drivers.protocol.tokens import token_after
 from registry.limits import GuardLimits
 
 _RAMP = 0.02  # s; long enough that neither start nor end of a vibration clicks
-_ENABLED = STATES["OPERATION_ENABLED"]
 
 _T = TypeVar("_T")
 
@@ -103,7 +102,7 @@ class BlockingAmplifier:
 
     def faults(self) -> list[dict[str, Any]]:
         """Read latched and past faults, newest first, with the keys of `era amp status`."""
-        return fault_rows(self._wait(request(self._amplifier, "GetFaults", {})))
+        return fault_rows(self._wait(self._amplifier.request("GetFaults", {})))
 
     def heartbeat(self) -> dict[str, Any]:
         """Feed the watchdog; CommandRefused if the amplifier is no longer armed."""
@@ -142,7 +141,7 @@ class BlockingAmplifier:
         return await self._amplifier.stage(self._token, [layer], now=True)
 
     async def _measured(self, frequencies: Sequence[float], window: float) -> Reading:
-        is_armed = (await self._amplifier.read_status())["state"] == _ENABLED
+        is_armed = (await self._amplifier.read_status())["state"] == ENABLED
         measuring = asyncio.ensure_future(measure_tones(self._amplifier, frequencies, window))
         try:
             while is_armed and not measuring.done():

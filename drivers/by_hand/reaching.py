@@ -9,11 +9,9 @@ from typing import Any
 
 from drivers import clock
 from drivers.host.amplifier import Amplifier
-from drivers.host.jobs import Priority
 from drivers.host.limits import FREQUENCY_FLOOR
 from drivers.host.timing import TAKEN_WORDS, set_words, shortest_watchdog
 from drivers.opening import Lines
-from drivers.protocol.records import Values
 from drivers.protocol.table import QUANTITIES
 from registry.limits import GuardLimits
 
@@ -46,13 +44,6 @@ async def identified(url: str, *, serial_number: str | None = None) -> AsyncIter
     async with reached(url, serial_number=serial_number) as amplifier:
         await amplifier.identify()
         yield amplifier
-
-
-async def request(
-    amplifier: Amplifier, name: str, values: Values, priority: Priority = Priority.OTHER
-) -> Values:
-    """Send a request that needs nothing of the ledger."""
-    return await amplifier.line.submit(amplifier, priority, name, values)
 
 
 async def keep_alive(amplifier: Amplifier, duration: float, interval: float) -> None:

@@ -25,6 +25,7 @@ from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT, STOP_RAMP
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import (
+    ENABLED,
     FAULTS,
     QUANTITIES,
     STATES,
@@ -41,8 +42,7 @@ LISTENING = 0.3  # s; to an amplifier that is found armed
 SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
-_ENABLED = STATES["OPERATION_ENABLED"]
-_ENERGISED = (STATES["SWITCHED_ON"], _ENABLED)
+_ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class Amplifier(Dialogue):
         Raises LinkError for another amplifier or version, or another host that drives it.
         """
         status = await self.identify()
-        if status["state"] == _ENABLED:
+        if status["state"] == ENABLED:
             await self._listen_for_another_host(status)
             await self.disarm(STOP_RAMP)
 
@@ -98,14 +98,14 @@ class Amplifier(Dialogue):
         """
         self._are_several = False
         try:
-            identity = await self._request("Hello", {}, Priority.OTHER, timeout=timeout)
+            identity = await self.request("Hello", {}, Priority.OTHER, timeout=timeout)
             await asyncio.sleep(SECOND_REPLY)
         except LinkTimeout:
             self._check_alone()
             raise
         self._check_alone()
         check_identity(identity, self.name, self._serial_number)
-        can = await self._request("GetCaps", {}, Priority.OTHER, timeout=timeout)
+        can = await self.request("GetCaps", {}, Priority.OTHER, timeout=timeout)
         check_capabilities(can, self.name, is_output=self._is_output)
         if self._ledger is None:
             self._ledger = Ledger(self.limits, can)
@@ -157,7 +157,7 @@ class Amplifier(Dialogue):
         self.session, self.feeding.watchdog = session, watchdog
         self._contradictions = self._misachieved = 0
         self.ledger.forget()
-        if status["state"] != _ENABLED:
+        if status["state"] != ENABLED:
             raise CommandRefused(
                 f"amplifier {self.name} must be OPERATION_ENABLED after Arm, got "
                 f"{name_of(STATES, status['state'])}, fault {name_of(FAULTS, status['fault'])}; "
@@ -222,7 +222,7 @@ class Amplifier(Dialogue):
 
         Raises CommandRefused where it contradicts the set, as that of the last one did.
         """
-        values = await self._request("GetAchieved", {"layer": one.layer}, Priority.SET)
+        values = await self.request("GetAchieved", {"layer": one.layer}, Priority.SET)
         commands = tuple(
             Command(each["channel"], each["frequency"], each["level"], each["phase"])
             for each in values["commands"]
@@ -241,17 +241,17 @@ class Amplifier(Dialogue):
     async def silence(self, ramp: float) -> Values:
         """Let all layers fall silent along a ramp [s]; it stays armed."""
         values = {"session": self.session, "ramp": self.wire_ramp(ramp)}
-        return await self._request("Silence", values, Priority.SILENCE)
+        return await self.request("Silence", values, Priority.SILENCE)
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> None:
         """Ramp [s] to silence, then switch the high voltage off; read back until it is silent.
 
         Raises CommandRefused if it is not silent soon after the ramp, or still armed.
         """
-        status = await self._request("Disarm", {"ramp": self.wire_ramp(ramp)}, Priority.SILENCE)
+        status = await self.request("Disarm", {"ramp": self.wire_ramp(ramp)}, Priority.SILENCE)
         end = clock.now() + ramp + CONFIRM_TIMEOUT
         while status["state"] in _ENERGISED or not self.is_silent(status):
-            if clock.now() > end or status["state"] == _ENABLED:
+            if clock.now() > end or status["state"] == ENABLED:
                 raise CommandRefused(f"amplifier {self.name} is not silent after a disarm")
             await asyncio.sleep(_INTERVAL)
             status = await self.read_status(Priority.SILENCE)
@@ -259,18 +259,14 @@ class Amplifier(Dialogue):
 
     async def ping(self) -> Values:
         """Feed the watchdog; returns the status. Raises CommandRefused if it is not armed."""
-        status = await self._request("Ping", {"session": self.session}, Priority.HEARTBEAT)
-        if status["state"] != _ENABLED:
-            fault = name_of(FAULTS, status["fault"])
-            raise CommandRefused(
-                f"amplifier {self.name} is no longer armed, fault {fault}; once the cause is gone, "
-                "clear and arm again"
-            )
+        status = await self.request("Ping", {"session": self.session}, Priority.HEARTBEAT)
+        if status["state"] != ENABLED:
+            raise self.disarmed(status)
         return status
 
     async def read_status(self, priority: Priority = Priority.OTHER) -> Values:
         """Read the status, which feeds nothing."""
-        return await self._request("GetStatus", {}, priority)
+        return await self.request("GetStatus", {}, priority)
 
     async def clear(self, latch: int | None = None) -> Values:
         """Acknowledge the stop or fault with this latch, None for the newest that was shown.
@@ -284,7 +280,7 @@ class Amplifier(Dialogue):
             latch = status["latch"] if has_restarted else shown
         if before != self.silences:
             raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
-        return await self._request("Clear", {"latch": latch}, Priority.CLEAR)
+        return await self.request("Clear", {"latch": latch}, Priority.CLEAR)
 
     async def stop(
         self,
@@ -334,17 +330,22 @@ class Amplifier(Dialogue):
             cause = cause or f"silence was not reported within {timeout:g} s"
         return Stopped(False, self.feeding.may_play_until, self.line.loss or cause)
 
-    async def _request(
-        self, name: str, values: Values, priority: Priority, *, timeout: float = REPLY_TIMEOUT
+    async def request(
+        self,
+        name: str,
+        values: Values,
+        priority: Priority = Priority.OTHER,
+        *,
+        timeout: float = REPLY_TIMEOUT,
     ) -> Values:
-        """Send a request and return the values of its reply."""
+        """Send a request that needs nothing of the ledger; returns the values of its reply."""
         return await self.line.submit(self, priority, name, values, timeout=timeout)
 
     async def _listen_for_another_host(self, status: Values) -> None:
         """Wait for a watchdog that rises unasked; raises LinkError."""
         end = clock.now() + LISTENING
         left = status["watchdog_left"]
-        while clock.now() < end and status["state"] == _ENABLED:
+        while clock.now() < end and status["state"] == ENABLED:
             await asyncio.sleep(LISTENING / 10)
             status = await self.read_status()
             self.check_other_host()

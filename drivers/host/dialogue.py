@@ -14,13 +14,12 @@ from drivers.host.timing import FAST, SET_WORDS, STOP_RAMP, TAKEN_WORDS
 from drivers.host.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import FAULTS, MESSAGES, QUANTITIES, STATES
+from drivers.protocol.table import ENABLED, FAULTS, MESSAGES, QUANTITIES
 from drivers.protocol.tokens import is_newer_token
 from drivers.statistics import LinkStatistics
 
 _SAME_MOMENT = 0.01  # s; statuses that are closer show a contradiction once
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
-_ENABLED = STATES["OPERATION_ENABLED"]
 _STATUS = MESSAGES["GetStatus"].reply
 _SILENCING = ("Stop", "Disarm", "Silence")
 _CHANGING = ("Arm", "Disarm", "Stop", "Clear")
@@ -197,13 +196,8 @@ class Dialogue:
                 f"{self.silence_cause}. The amplifier may play its last set until its watchdog has "
                 "passed; nothing new is played until it replies"
             )
-        if name != "Arm" and self.status is not None and self.status["state"] != _ENABLED:
-            fault = name_of(FAULTS, self.status["fault"])
-            raise CommandRefused(
-                f"amplifier {self.name} is no longer armed, fault {fault}; once the cause is gone, "
-                "clear and arm again",
-                is_disarmed=True,
-            )
+        if name != "Arm" and self.status is not None and self.status["state"] != ENABLED:
+            raise self.disarmed(self.status)
         return longer
 
     def while_admitted(self, token: int, values: Values) -> Values:
@@ -241,7 +235,7 @@ class Dialogue:
             self._ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
             return
         self._confirm(status["token"], now)
-        if not self.session or name in ("Arm", "Clear") or status["state"] != _ENABLED:
+        if not self.session or name in ("Arm", "Clear") or status["state"] != ENABLED:
             return
         fed = MESSAGES[name].feeds
         problem = problem_of(status, self._ledger, self.feeding, sent_at=sent_at, now=now, fed=fed)
@@ -266,6 +260,14 @@ class Dialogue:
         return CommandRefused(
             f"amplifier {self.name} contradicts its requests: {problem}; look for a derated or "
             "broken channel, an exchanged cable or firmware, then clear and arm again"
+        )
+
+    def disarmed(self, status: Values) -> CommandRefused:
+        """Return the error of what plays or feeds, once a status shows that it is not armed."""
+        return CommandRefused(
+            f"amplifier {self.name} is no longer armed, fault {name_of(FAULTS, status['fault'])}; "
+            "once the cause is gone, clear and arm again",
+            is_disarmed=True,
         )
 
     def _driven_by_another(self) -> LinkError:

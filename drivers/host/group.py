@@ -24,11 +24,10 @@ from drivers.host.joint_sets import JointSets, Played
 from drivers.host.members import Heartbeats, Members, Stopping, is_lost, retried
 from drivers.host.timing import STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values
-from drivers.protocol.table import QUANTITIES, STATES
+from drivers.protocol.table import ENABLED, QUANTITIES
 
 _T = TypeVar("_T")
 _SESSION, _TOKEN = QUANTITIES["session"], QUANTITIES["token"]
-_ENABLED = STATES["OPERATION_ENABLED"]
 _logger = logging.getLogger(__name__)
 
 
@@ -114,7 +113,7 @@ class Group(Members):
             if self.is_armed:
                 statuses = await self._read(Priority.ARM)
                 self.check_none_since(before)
-                if all(each["state"] == _ENABLED for each in statuses.values()):
+                if all(each["state"] == ENABLED for each in statuses.values()):
                     return
                 self._leave_armed()
                 before = self.silences

@@ -19,10 +19,8 @@ from drivers.host.line import Line
 from drivers.host.members import Members
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import STATES
+from drivers.protocol.table import ENABLED, STATES
 from drivers.protocol.tokens import token_after
-
-_ENABLED = STATES["OPERATION_ENABLED"]
 
 
 @dataclass(frozen=True)
@@ -156,7 +154,7 @@ def _check_plays(name: str, status: Values, staged: Staged) -> None:
             raise CommandRefused(
                 f"amplifier {name}: token of layer {one.layer} must be {staged.token}, got {got}"
             )
-    if status["token"] != staged.token or status["state"] != _ENABLED:
+    if status["token"] != staged.token or status["state"] != ENABLED:
         raise CommandRefused(
             f"amplifier {name}: token must be {staged.token} while armed, got {status['token']} in "
             f"state {name_of(STATES, status['state'])}"

@@ -78,7 +78,7 @@ async def read_sensors(amplifier: Amplifier) -> tuple[Sensor, ...]:
         return ()
     found: list[Sensor] = []
     while True:
-        listed = await _request(amplifier, "GetSensors", {"first": len(found)})
+        listed = await amplifier.request("GetSensors", {"first": len(found)}, Priority.READING)
         found += [_sensor(each) for each in listed["sensors"]]
         if len(found) > listed["all"]:
             raise FrameError(f"sensors must be {listed['all']}, got {len(found)}; {_VIOLATION}")
@@ -91,7 +91,7 @@ async def read_measured(amplifier: Amplifier) -> list[tuple[float, float]]:
     """Read voltage [V] and current [A] of each channel; empty if it does not measure them."""
     if not has_feature(amplifier.capabilities, "electrical"):
         return []
-    rows = (await _request(amplifier, "GetMeasured", {}))["channels"]
+    rows = (await amplifier.request("GetMeasured", {}, Priority.READING))["channels"]
     voltages = [_Q["channel_voltage"].from_wire(row["channel_voltage"]) for row in rows]
     currents = [_Q["channel_current"].from_wire(row["channel_current"]) for row in rows]
     return list(zip(voltages, currents, strict=True))
@@ -112,7 +112,7 @@ async def start_reading(
         "tones": len(frequencies),
         "frequencies": [_Q["frequency"].to_wire(each) for each in frequencies],
     }
-    started = _reading(await _request(amplifier, "Measure", values))
+    started = _reading(await amplifier.request("Measure", values, Priority.READING))
     _check_same(started, number=number, tones=len(frequencies))
     return started
 
@@ -144,7 +144,7 @@ async def finish_reading(amplifier: Amplifier, started: Reading) -> Reading:
             )
         await asyncio.sleep(found.left + _MARGIN)
         found = await _same_reading(amplifier, started, 0)
-    count = (await _request(amplifier, "GetSensors", {"first": 0}))["all"]
+    count = (await amplifier.request("GetSensors", {"first": 0}, Priority.READING))["all"]
     sensors = found.sensors
     while len(sensors) < count:
         more = (await _same_reading(amplifier, started, len(sensors))).sensors
@@ -171,7 +171,7 @@ def check_tones(frequencies: Sequence[float], window: float) -> None:
 
 async def _same_reading(amplifier: Amplifier, started: Reading, first: int) -> Reading:
     """Read the reading that was started, its sensors from one on."""
-    found = _reading(await _request(amplifier, "GetReading", {"first": first}))
+    found = _reading(await amplifier.request("GetReading", {"first": first}, Priority.READING))
     _check_same(found, number=started.number, tones=started.tones)
     return found
 
@@ -187,10 +187,6 @@ def _check_same(found: Reading, *, number: int, tones: int) -> None:
         raise FrameError(
             f"reading {number} must have {tones} tones, got {found.tones}; {_VIOLATION}"
         )
-
-
-async def _request(amplifier: Amplifier, name: str, values: Values) -> Values:
-    return await amplifier.line.submit(amplifier, Priority.READING, name, values)
 
 
 def _sensor(values: Values) -> Sensor:

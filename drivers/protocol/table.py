@@ -43,6 +43,8 @@ STATES: Mapping[str, int] = {
         )
     )
 }
+ENABLED: Final = STATES["OPERATION_ENABLED"]
+"""The state in which an amplifier plays: armed."""
 LATCHED: Final = tuple(
     STATES[name] for name in ("QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT")
 )

@@ -78,9 +78,9 @@ class RandomGroup:
             layers = {name: self._layers() for name in names}
             await self.group.apply(layers)
         elif chosen < 0.7:
-            await host._request("GetAchieved", {"layer": self._number()}, Priority.OTHER)
+            await host.request("GetAchieved", {"layer": self._number()}, Priority.OTHER)
         elif chosen < 0.75:
-            await host._request("GetFaults", {}, Priority.OTHER)
+            await host.request("GetFaults", {}, Priority.OTHER)
         elif chosen < 0.8:
             await self.group.silence(self._ramp())
         elif chosen < 0.84:

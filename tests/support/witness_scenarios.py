@@ -1,7 +1,6 @@
 """What is played before the witness: an ordinary day, and days on which something is wrong."""
 
 import hand_written as hand
-from drivers.by_hand import reaching
 from model.vibration.excitation import Tone
 from witnessed_chain import ALONE, STROKE, Chain
 
@@ -98,12 +97,12 @@ async def arc(chain: Chain) -> None:
     for _ in range(5):
         await chain.rest(0.02)
         await chain.amplifier.read_status()
-    await reaching.request(chain.amplifier, "GetFaults", {})
+    await chain.amplifier.request("GetFaults", {})
     await chain.touch(rest=0.1)
     await chain.operate("clear", rest=0.05)
     await chain.amplifier.identify()
     chain.trip()
-    await reaching.request(chain.amplifier, "GetFaults", {})
+    await chain.amplifier.request("GetFaults", {})
 
 
 async def stranger(chain: Chain) -> None:

@@ -46,7 +46,7 @@ class Day:
         tones = (Tone(0, 100.0, 0.5), Tone(1, 100.0, 0.3, 90.0))
         await self.apply(Layer(0, tones, 0.01, 0.3), rest=0.2)
         await self.apply(Layer(0, (), 0.01, 0.3, renew=True), rest=0.15)
-        await self.host._request("GetAchieved", {"layer": 0}, Priority.OTHER)
+        await self.host.request("GetAchieved", {"layer": 0}, Priority.OTHER)
         swelling = Tone(0, 150.0, 0.2, onset=SWELL, ending=SWELL)
         await self.apply(Layer(1, (swelling,), 0.005), rest=0.1)
         await self.apply(Layer(1, (Tone(0, 150.0, 0.2, onset=SLOW),), 0.005), rest=0.02)
@@ -75,7 +75,7 @@ class Day:
         await self.host.read_status()
         await asyncio.sleep(0.02)
         await self.host.read_status()
-        await self.host._request("GetFaults", {}, Priority.OTHER)
+        await self.host.request("GetFaults", {}, Priority.OTHER)
         await self.group.stop()
         await self.again()
 

@@ -112,7 +112,7 @@ class UncertainPlayback:
         self._mark(before, (due - half, due + half))
 
     def possible(self, start: float, end: float) -> Iterator["UncertainPlayback"]:
-        """Yield what may play between two times: before and after what may be due then."""
+        """Yield what may play between two times: before and after what may be due, in turn."""
         self.advance(start)
         state = self
         yield state
@@ -144,10 +144,13 @@ class UncertainPlayback:
         return self._marks.get(id(way)) or _Mark(way)
 
     def radius(self, way: Transition, start: float, end: float) -> float:
-        """Return by how much an amplitude may differ from that in the middle of an interval."""
+        """Return by how much an amplitude may differ from that in the middle of an interval.
+
+        Its transition has begun by then.
+        """
         _, half, radius = self._mark_of(way)
-        center = way.at((start + end) / 2)
-        since, until = start - half, end + half
+        center = _reached(way, (start + end) / 2)
+        since, until = max(start - half, way.start), max(end + half, way.start)
         moments = (way.start + way.step * (index + 1) for index in range(len(way.knots)))
         between = [knot for at, knot in zip(moments, way.knots, strict=True) if since < at < until]
         reach = max(abs(each - center) for each in (way.at(since), *between, way.at(until)))
@@ -173,7 +176,7 @@ class UncertainPlayback:
             highest += high
         for at, mark in self._ghosts:
             if at == channel and mark.way.end + mark.half > start:
-                ghost = abs(mark.way.at(start - mark.half)) + mark.radius
+                ghost = abs(_reached(mark.way, start - mark.half)) + mark.radius
                 lowest, highest = lowest - ghost, highest + ghost
         return max(lowest, 0.0), highest
 
@@ -192,7 +195,7 @@ class UncertainPlayback:
         for origin, voices in by_origin.items():
             center, radius = 0j, 0.0
             for voice in voices:
-                amplitude = voice.transition.at((start + end) / 2)
+                amplitude = _reached(voice.transition, (start + end) / 2)
                 reach = self.radius(voice.transition, start, end)
                 highest += abs(amplitude) + reach
                 center += amplitude
@@ -206,3 +209,8 @@ class UncertainPlayback:
         # Tones of one frequency that began at different times may cancel.
         highs = sum(center + radius for center, radius in discs)
         return max(2 * center - highs for center, _ in discs), highest
+
+
+def _reached(way: Transition, time: float) -> complex:
+    """Return the amplitude at a time, or at the start of a transition that has begun sooner."""
+    return way.at(max(time, way.start))

@@ -31,7 +31,7 @@ _FALLING = {"SWITCHED_ON": ("SWITCHED_ON", OFF), "FAULT": ("FAULT_REACTION_ACTIV
 _TRIP, FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until a trip, of a fault, until a state shows
 _LASTING = 3.0  # s; what ends after it is not awaited
 _LATE = 0.002  # s; by which a set may begin later
-_TOLERANCE = 0.002  # of full level
+_TOLERANCE = 0.0015  # of full level
 _MAX_STEPS = 4  # halves, beside one of each voice
 _FULL = QUANTITIES["level"].per_unit
 

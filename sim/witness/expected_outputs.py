@@ -53,6 +53,7 @@ class ExpectedOutputs:
         # Until when what a layer plays is not known [s].
         self._unknown = [-math.inf] * QUANTITIES["layer_count"].maximum
         self._before: Sequence[float] = ()  # levels of channels before the last commit
+        self._last_due = -math.inf
         self._uncertain_until = -math.inf  # fades may have been cut short
         self._highest = 0.0  # of the sums of a channel since the last status, at most
 
@@ -68,18 +69,27 @@ class ExpectedOutputs:
         """What plays, with each commit in the middle of its interval."""
         return self._plays.playback
 
+    def _advance(self, time: float) -> None:
+        """End layers and start what waits, where that must have happened by a time."""
+        due = self.playback.next_due
+        self._plays.advance(time - self._slack)
+        if self.playback.next_due != due:
+            self._last_due = due
+
     def play(self, layers: Sequence[LayerSet], token: int, when: Interval, *, exact: bool) -> None:
         """Play a set from some time between two on."""
         begin, end = when
-        self._plays.advance(begin - self._slack)
+        self._advance(begin)
         self._before = [*map(self.playback.settled, range(self.playback.channels))]
         for one in layers:
-            is_kept = one.renew or any(each.keep_phase for each in one.commands)
-            if is_kept and self._plays.is_ambiguous(when, [one]):
-                self._unknown[one.layer] = math.inf
+            number, ends = one.layer, self.playback.end_of(one.layer)
+            half = self._plays.half[number]
+            is_ending = begin - half <= ends <= end + half
+            if is_ending and (one.renew or any(each.keep_phase for each in one.commands)):
+                self._unknown[number] = math.inf
             elif not one.renew and not one.after:
                 fade = end + _MAX_ENDING + _RAMP.from_wire(one.ramp)
-                self._unknown[one.layer] = min(self._unknown[one.layer], fade)
+                self._unknown[number] = min(self._unknown[number], fade)
         self._plays.commit(layers, token, when)
         self.cause, self.is_exact = "a set", exact and self.is_exact
         for channel, each in enumerate(self.playback.all_voices):
@@ -90,7 +100,7 @@ class ExpectedOutputs:
 
     def silence(self, when: Interval, ramp: float, cause: str) -> None:
         """Silence all channels along a ramp [s], from some time between two on."""
-        self._plays.advance(when[0] - self._slack)
+        self._advance(when[0])
         self._plays.silence(when, ramp)
         self._unknown = [min(until, when[1] + ramp) for until in self._unknown]
         self.cause = cause
@@ -107,9 +117,16 @@ class ExpectedOutputs:
 
         None ends or starts by itself near these.
         """
-        self._plays.advance(begin - self._slack)
+        half = self._lag
+        self._advance(begin)
         is_known = all(until < begin for until in self._unknown)
-        return is_known and not self._plays.is_ambiguous((begin - self._slack, end + self._slack))
+        is_due = self.playback.next_due <= end + half or self._last_due >= begin - half
+        vanish = any(  # onsets that lead to silence
+            not voice.has_ended and begin - half <= voice.silent_from <= end + half
+            for voices in self.playback.all_voices
+            for voice in voices
+        )
+        return is_known and not is_due and not vanish
 
     def _bounds(self, channel: int, begin: float, end: float) -> Interval:
         """Return the least and the largest sum of a channel between two times."""

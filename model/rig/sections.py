@@ -85,14 +85,14 @@ def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
 
 
 def _rows(
-    columns: str, least: Sequence[float], most: Sequence[float], *, ascending: bool = True
+    columns: str, lowest: Sequence[float], highest: Sequence[float], *, ascending: bool = True
 ) -> AfterValidator:
     """Check of rows of numbers between bounds, by default sorted by the first of them."""
 
     def checked(rows: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
         for row in rows:
             if not all(
-                low <= each <= high for low, each, high in zip(least, row, most, strict=True)
+                low <= each <= high for low, each, high in zip(lowest, row, highest, strict=True)
             ):
                 got = ", ".join(f"{each:g}" for each in row)
                 raise ValueError(f"must be rows of [{columns}], got [{got}]")

@@ -1,0 +1,268 @@
+"""Ports: opened, written without waiting, and lost."""
+
+import asyncio
+import errno
+import os
+import pty
+import socket
+import subprocess
+import sys
+import threading
+import tty
+from collections.abc import Iterator
+from unittest.mock import Mock
+
+import pytest
+import serial
+
+from drivers.errors import LinkError, LinkTimeout
+from drivers.hardware import Port
+from drivers.ports import opening, tcp
+from drivers.ports.serial_port import SerialPort
+from drivers.ports.tcp import open_connection
+from drivers.urls import Place
+
+
+@pytest.mark.parametrize(
+    ("device", "parity"), [("/dev/ttyUSB9", serial.PARITY_ODD), ("/dev/pts/9", serial.PARITY_NONE)]
+)
+def test_device_is_opened_alone_with_low_latency_and_its_settings(
+    monkeypatch: pytest.MonkeyPatch, device: str, parity: str
+) -> None:
+    """A pseudo-terminal has no parity."""
+    made = Mock()
+    monkeypatch.setattr(opening.serial, "Serial", made)
+    opening._open_device(Place(device, baud=19_200, parity="O", stop=2))
+    made.return_value.set_low_latency_mode.assert_called_once_with(True)
+    settings = {key: made.call_args.kwargs[key] for key in ("baudrate", "parity", "stopbits")}
+    assert settings == {"baudrate": 19_200, "parity": parity, "stopbits": 2}
+    assert made.call_args.kwargs["exclusive"]
+
+
+async def test_port_that_fails_amid_its_opening_is_released(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is opened exclusively: else this program could not open it again."""
+    far, near = os.openpty()
+    name = os.ttyname(near)
+
+    async def open_it() -> Port:
+        return await opening.open_port(
+            Place(name, baud=9600), lambda data: None, lambda cause: None
+        )
+
+    def fail(port: serial.Serial) -> None:
+        raise OSError(errno.EIO, "gone")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(serial.Serial, "reset_input_buffer", fail)
+        with pytest.raises(LinkError, match="gone"):
+            await open_it()
+    port = await open_it()
+    port.close()
+    await port.wait_closed()
+    os.close(near)
+    os.close(far)
+
+
+TIMEOUT = 5.0  # s; for what is expected
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[serial.Serial, int]]:
+    """A port, and the descriptor at its other end."""
+    far, near = pty.openpty()
+    tty.setraw(near)
+    port = serial.Serial(os.ttyname(near), timeout=0)
+    yield port, far
+    port.close()
+    os.close(near)
+    os.close(far)
+
+
+async def read_until(far: int, end: bytes) -> bytes:
+    """Read from the other end until these bytes."""
+    os.set_blocking(far, False)
+    got = b""
+    async with asyncio.timeout(TIMEOUT):
+        while not got.endswith(end):
+            try:
+                got += os.read(far, 1 << 16)
+            except BlockingIOError:
+                await asyncio.sleep(0)
+    return got
+
+
+async def test_blocked_port_takes_the_newest_frame(ends: tuple[serial.Serial, int]) -> None:
+    """Unsent bytes of an older one are dropped; the newest follows without another call."""
+    port, far = ends
+    watched = SerialPort(port, "/dev/ttyUSB9", lambda data: None, lambda what: None)
+    watched.write(b"a" * (1 << 20))
+    assert watched.is_blocked
+    watched.write(b"b" * (1 << 20))
+    watched.write(b"stop")
+    got = await read_until(far, b"stop")
+    assert got.count(b"b") < 1 << 20
+    assert got.count(b"a") < 1 << 20
+    assert not watched.is_blocked
+    watched.close()
+    await watched.wait_closed()
+
+
+async def test_closed_port_is_a_link_error(ends: tuple[serial.Serial, int]) -> None:
+    """And the loss is reported once."""
+    port, far = ends
+    losses: list[str] = []
+    watched = SerialPort(port, "/dev/ttyUSB9", lambda data: None, losses.append)
+    watched.write(b"a" * (1 << 20))
+    os.close(os.dup(far))
+    os.dup2(os.open(os.devnull, os.O_RDWR), far)  # hangs up
+    with pytest.raises(LinkError, match="check the cable"):
+        watched.write(b"stop")
+    assert len(losses) == 1
+    watched.close()
+    await watched.wait_closed()
+
+
+async def test_error_of_whoever_takes_the_data_is_no_loss(ends: tuple[serial.Serial, int]) -> None:
+    """A LinkError is an OSError, as those of a port that is gone."""
+    port, far = ends
+    losses: list[str] = []
+
+    def fail(data: bytes) -> None:
+        raise LinkError("of another line")
+
+    watched = SerialPort(port, "/dev/ttyUSB9", fail, losses.append)
+    os.write(far, b"reply")
+    with pytest.raises(LinkError, match="of another line"):
+        watched.poll()
+    assert not losses
+    watched.close()
+    await watched.wait_closed()
+
+
+async def test_port_without_a_descriptor_is_written_by_a_thread() -> None:
+    """A port that takes nothing for seconds does not block the caller."""
+    entered, taken = threading.Semaphore(0), threading.Semaphore(0)
+    written: list[bytes] = []
+    losses: asyncio.Queue[str] = asyncio.Queue()
+
+    class Device:
+        in_waiting = 0
+
+        def fileno(self) -> int:
+            raise OSError("no descriptor")
+
+        def read(self, size: int) -> bytes:
+            return b""
+
+        def cancel_read(self) -> None:
+            """Do nothing."""
+
+        def close(self) -> None:
+            """Do nothing."""
+
+        def write(self, data: bytes) -> None:
+            entered.release()
+            assert taken.acquire(timeout=TIMEOUT)
+            written.append(data)
+            if data == b"stop":
+                raise ConnectionResetError("gone")
+
+    port = SerialPort(Device(), "COM3", lambda data: None, losses.put_nowait)  # type: ignore[arg-type]
+    port.write(b"one")
+    assert await asyncio.to_thread(entered.acquire, timeout=TIMEOUT)
+    for data in (b"two", b"stop"):
+        assert port.is_blocked
+        port.write(data)
+    taken.release(2)
+    assert "serial line COM3 was lost (gone)" in await asyncio.wait_for(losses.get(), TIMEOUT)
+    assert written == [b"one", b"stop"]
+    await port.wait_closed()
+
+
+MEGABYTE = 1 << 20
+
+
+async def test_connection_timeout_has_a_remedy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The connection is neither accepted nor refused."""
+    monkeypatch.setattr(tcp, "_CONNECT_TIMEOUT", 0.0)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port = listening.getsockname()[1]
+        with pytest.raises(LinkError, match=rf"127.0.0.1:{port}: .*check the address"):
+            await open_connection("127.0.0.1", port, lambda _: None, lambda _: None)
+
+
+async def test_first_address_that_accepts_is_used(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The amplifier listens on the second address only, such as IPv4."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port = listening.getsockname()[1]
+        found = [(0, 0, 0, "", (address, 0)) for address in ("127.0.0.2", "127.0.0.1")]
+        monkeypatch.setattr(tcp.socket, "getaddrinfo", lambda *args, **kwargs: found)
+        connection = await open_connection("amplifier.test", port, lambda _: None, lambda _: None)
+        taken, _ = listening.accept()
+        taken.close()
+        connection.close()
+        await connection.wait_closed()
+        await asyncio.sleep(0)
+
+
+async def test_connection_gives_up_what_is_not_taken_within_a_second() -> None:
+    """RFC 5482: the kernel's option, in milliseconds; frames are sent at once."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port = listening.getsockname()[1]
+        connection = await open_connection("127.0.0.1", port, lambda _: None, lambda _: None)
+        taken, _ = listening.accept()
+        endpoint = connection._transport.get_extra_info("socket")  # type: ignore[attr-defined]
+        options = (socket.TCP_USER_TIMEOUT, socket.TCP_NODELAY)
+        assert [endpoint.getsockopt(socket.IPPROTO_TCP, each) for each in options] == [1000, 1]
+        taken.close()
+        connection.close()
+        await connection.wait_closed()
+
+
+async def test_link_local_address_keeps_its_zone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """RFC 4007."""
+    of_name = ("fe80::1", 0, 0, 3), ("fd00::1", 0, 0, 0), ("192.0.2.1", 0)
+    found = [(0, 0, 0, "", address) for address in of_name]
+    monkeypatch.setattr(tcp.socket, "getaddrinfo", lambda *args, **kwargs: found)
+    assert await tcp._addresses("amplifier.test") == ["fe80::1%3", "fd00::1", "192.0.2.1"]
+
+
+def test_unresolved_name_does_not_delay_the_end_of_the_program() -> None:
+    """Even if the name server does not reply."""
+    program = """
+import asyncio, socket, threading
+from drivers.ports import tcp
+from drivers.errors import LinkError
+
+socket.getaddrinfo = lambda *args, **kwargs: threading.Event().wait()
+tcp._CONNECT_TIMEOUT = 0.05
+try:
+    asyncio.run(tcp.open_connection("amplifier.test", 502, lambda _: None, lambda _: None))
+except LinkError as problem:
+    print(problem)
+"""
+    ran = subprocess.run(
+        [sys.executable, "-c", program], check=True, timeout=60, capture_output=True, text=True
+    )
+    assert "amplifier.test:502: no connection" in ran.stdout
+
+
+async def test_blocked_connection_is_a_timeout_before_memory_fills() -> None:
+    """Closing discards unsent data."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port = listening.getsockname()[1]
+        connection = await open_connection("127.0.0.1", port, lambda _: None, lambda _: None)
+        connection.write(bytes(64 * MEGABYTE))
+        with pytest.raises(LinkTimeout, match="check the network"):
+            connection.write(b"x")
+        connection.close()
+        await connection.wait_closed()
+        await asyncio.sleep(0)  # the transport reports the end

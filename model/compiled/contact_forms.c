@@ -1,22 +1,22 @@
-/* Expected powers at fingertips: `model.ensemble.contact_forms` in C, whose symbols are used. */
+/* Expected powers at groups of points: `model.ensemble.contact_forms` in C, whose symbols are used. */
 #include "fingers.h"
 
 typedef struct {
-    int p, fine;               /* points of each finger; fine points, of all fingers */
+    int groups, p, fine;       /* groups of points; points of each; fine points, of all */
     int others;                /* whether plates of other thickness count */
     float gain_variance, ridge;
-    const float *points, *fine_points, *weights; /* (k p, r); (fine, r); (k p) */
+    const float *points, *fine_points, *weights; /* (groups p, r); (fine, r); (groups p) */
     const float *error;        /* (f, n) */
-    /* Found: (rows, k p, n) h; (rows, fine, n); (rows, k, n, n) R, and without what is as modelled */
+    /* Found: (rows, groups p, n) h; (rows, fine, n); (rows, groups, n, n) R, and without what is as modelled */
     float *fields, *fine_fields, *power, *uncertain;
 } forms;
 
 /* Values of work space. */
 size_t contact_forms_space(const plates *on, const forms *of) {
-    size_t n = on->n, b = on->b, k = on->k, a = b + k, at = k * of->p;
+    size_t n = on->n, b = on->b, k = on->k, a = b + k, groups = of->groups, at = groups * of->p;
     size_t points = (size_t)of->fine > at ? (size_t)of->fine : at;
     return touched_space(on) + points * a + at * a + 4 * at * n + of->fine * n + a * n + b * n +
-           4 * n + 2 * n * n + k * n + (4 * of->p + n + k) * n + (2 * k + 1) * n * n + k * n;
+           4 * n + 2 * n * n + k * n + (4 * of->p + n + k) * n + (2 * groups + 1) * n * n + n;
 }
 
 /* Times the force of each ERA, of accelerations (p, n) by forces. */
@@ -28,7 +28,8 @@ INLINE void drive(value *h, const value *drives, size_t p, size_t n) {
 /* At frequencies (count) from first on. */
 void contact_forms(const plates *on, const forms *of, int first, int count, const int *frequencies,
                    value *work) {
-    const size_t n = on->n, b = on->b, k = on->k, a = b + k, p = of->p, at = k * p, j = n + k;
+    const size_t n = on->n, b = on->b, k = on->k, a = b + k, j = n + k;
+    const size_t p = of->p, groups = of->groups, at = groups * p;
     const int parts = of->others ? 4 : 2;
     int rows[LANES], cases[LANES];
     for (int l = 0; l < LANES; l++) {
@@ -41,7 +42,8 @@ void contact_forms(const plates *on, const forms *of, int first, int count, cons
     value *h = t + at * a, *fine = h + 4 * at * n, *moved = fine + of->fine * n, *without = moved + a * n;
     value *drives = without + b * n, *strokes = drives + n, *by_damping = strokes + n;
     value *by_stiffness = by_damping + n, *damped = by_stiffness + n, *changes = damped + n * n;
-    value *X = changes + j * n, *R = X + (4 * p + j) * n, *U = R + k * n * n, *modelled = U + k * n * n;
+    value *X = changes + j * n, *R = X + (4 * p + j) * n, *U = R + groups * n * n;
+    value *modelled = U + groups * n * n;
     lanes *error = (lanes *)(modelled + n * n);
     load(drives, on->drives, n, rows);
     load(strokes, on->strokes, n, rows);
@@ -86,17 +88,17 @@ void contact_forms(const plates *on, const forms *of, int first, int count, cons
             other[i] = scaled((value){other[i].re - h[i].re, other[i].im - h[i].im}, filled(sqrtf(0.5f)));
     }
 
-    /* Forms of the mean over each fingertip, of the rows at its points and of what is uncertain. */
-    for (size_t finger = 0; finger < k; finger++) {
-        value *form = R + finger * n * n, *to = X;
+    /* Forms of the mean over each group, of the rows at its points and of what is uncertain. */
+    for (size_t group = 0; group < groups; group++) {
+        value *form = R + group * n * n, *to = X;
         for (int part = 0; part < parts; part++)
-            for (size_t i = finger * p; i < (finger + 1) * p; i++) {
+            for (size_t i = group * p; i < (group + 1) * p; i++) {
                 lanes share = filled(sqrtf(of->weights[i]));
                 for (size_t e = 0; e < n; e++) *to++ = scaled(h[(part * at + i) * n + e], share);
             }
         for (size_t s = 0; s < j; s++) {
             lanes share = {0};
-            for (size_t i = finger * p; i < (finger + 1) * p; i++)
+            for (size_t i = group * p; i < (group + 1) * p; i++)
                 share += of->weights[i] * power(t[i * a + (s < n ? s : b + s - n)]);
             share = root(share);
             for (size_t e = 0; e < n; e++) *to++ = scaled(changes[s * n + e], share);
@@ -111,7 +113,7 @@ void contact_forms(const plates *on, const forms *of, int first, int count, cons
         lanes trace = {0};
         for (size_t e = 0; e < n; e++) {
             lanes size = {0};
-            for (size_t i = finger * p; i < (finger + 1) * p; i++)
+            for (size_t i = group * p; i < (group + 1) * p; i++)
                 size += of->weights[i] * power(h[i * n + e]);
             form[e * n + e].re += of->gain_variance * size + error[e];
             trace += form[e * n + e].re;
@@ -121,7 +123,7 @@ void contact_forms(const plates *on, const forms *of, int first, int count, cons
             for (size_t v = 0; v < e; v++)
                 form[e * n + v] = (value){form[v * n + e].re, -form[v * n + e].im};
         }
-        value *rest = U + finger * n * n;
+        value *rest = U + group * n * n;
         for (size_t u = 0; u < n; u++)
             for (size_t v = u; v < n; v++) {
                 value own = form[u * n + v], without = modelled[u * n + v];
@@ -130,6 +132,6 @@ void contact_forms(const plates *on, const forms *of, int first, int count, cons
             }
         for (size_t u = 0; u < n; u++) rest[u * n + u].im = ZERO.im;
     }
-    store(of->uncertain + 2 * (size_t)first * k * n * n, U, k * n * n, count);
-    store(of->power + 2 * (size_t)first * k * n * n, R, k * n * n, count);
+    store(of->uncertain + 2 * (size_t)first * groups * n * n, U, groups * n * n, count);
+    store(of->power + 2 * (size_t)first * groups * n * n, R, groups * n * n, count);
 }

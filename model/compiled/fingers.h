@@ -18,13 +18,14 @@ typedef struct {
     value *T, *g, *Y;        /* (b, r), (r), (b, b) */
     value *at;               /* (k, b) accelerations of the fingers by a force at each attachment, without them */
     value *resting, *P, *D;  /* (k, b) the same with them; (k, k) (1 + G D)^-1, (k) */
+    value *G;                /* (k, k) displacement of the fingers by a force at each, without the others */
     value *row;              /* room for (b + r) */
     lanes minus_omega2;
 } touched;
 
 INLINE size_t touched_space(const plates *on) {
     size_t b = on->b, k = on->k, r = on->r;
-    return b * r + r + b * b + 2 * k * b + k * k + k + b + r;
+    return b * r + r + b * b + 2 * k * b + 2 * k * k + k + b + r;
 }
 
 /* P = (1 + G D)^-1 of G, one finger after the other: none gives energy, the plate is damped. */
@@ -68,14 +69,16 @@ INLINE void by_fingers(value *restrict G, const float *points, size_t p, const v
 SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const int *cases, value *work) {
     const size_t b = on->b, k = on->k, r = on->r;
     to->T = work, to->g = to->T + b * r, to->Y = to->g + r, to->at = to->Y + b * b;
-    to->resting = to->at + k * b, to->P = to->resting + k * b, to->D = to->P + k * k, to->row = to->D + k;
+    to->resting = to->at + k * b, to->P = to->resting + k * b, to->D = to->P + k * k, to->G = to->D + k;
+    to->row = to->G + k * k;
     load(to->T, on->by_force, b * r, cases);
     load(to->g, on->receptance, r, cases);
     load(to->Y, on->coupling, b * b, cases);
     load(to->D, on->stiffness, k, rows);
     load_real(&to->minus_omega2, on->minus_omega2, 1, rows);
     multiply(to->at, on->centres, to->T, k, r, b);
-    by_fingers(to->P, on->centres, k, to->at, to, on);
+    by_fingers(to->G, on->centres, k, to->at, to, on);
+    memcpy(to->P, to->G, k * k * sizeof(value));
     invert(to->P, to->D, k);
     product(to->resting, to->P, k, to->at, k, k, b);
     return to->row + b + r;
@@ -86,9 +89,12 @@ SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const 
 SHARED void to_points(value *restrict found, size_t width, const float *points, size_t p, const touched *of,
                       const plates *on, value *room) {
     const size_t b = on->b, k = on->k, of_fingers = width > b ? width - b : 0, fields = width - of_fingers;
-    value *X = room, *G = X + p * b;
-    multiply(X, points, of->T, p, on->r, b);
-    by_fingers(G, points, p, X, of, on);
+    const value *X = of->at, *G = of->G; /* at the centres */
+    if (points != on->centres) {
+        X = room, G = room + p * b;
+        multiply(room, points, of->T, p, on->r, b);
+        by_fingers(room + p * b, points, p, X, of, on);
+    }
     for (size_t i = 0; i < p; i++) {
         value *own = found + i * width;
         for (size_t j = 0; j < of_fingers; j++) {

@@ -70,16 +70,47 @@ INLINE lanes root(lanes a) { /* 0 for what rounding made negative */
 
 static const value ZERO;
 
+#if LANES == 4
+#define LOW 0, 4, 1, 5
+#define HIGH 2, 6, 3, 7
+#elif LANES == 8
+#define LOW 0, 8, 1, 9, 2, 10, 3, 11
+#define HIGH 4, 12, 5, 13, 6, 14, 7, 15
+#else
+#define LOW 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23
+#define HIGH 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31
+#endif
+#ifdef __clang__
+#define mixed(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+#define mixed(a, b, ...) __builtin_shuffle(a, b, (mask){__VA_ARGS__})
+#endif
+
+/* Exchange rows and columns: each step deals all values out like cards of two halves. */
+INLINE void transpose(lanes *rows) {
+    for (int step = 1; step < LANES; step *= 2) {
+        lanes next[LANES];
+        for (int i = 0; i < LANES / 2; i++) {
+            lanes a = rows[i], b = rows[i + LANES / 2];
+            next[2 * i] = mixed(a, b, LOW), next[2 * i + 1] = mixed(a, b, HIGH);
+        }
+        memcpy(rows, next, sizeof next);
+    }
+}
+
 /* Load rows of an array (f, width) of complex values. */
 SHARED void load(value *restrict to, const float *from, size_t width, const int *rows) {
-    for (size_t start = 0; start < width; start += 32) /* what stays in the nearest cache */
+    size_t i = 0;
+    for (; i + LANES / 2 <= width; i += LANES / 2) {
+        lanes some[LANES];
+        for (size_t l = 0; l < LANES; l++) memcpy(some + l, from + 2 * (width * rows[l] + i), sizeof *some);
+        transpose(some);
+        memcpy(to + i, some, sizeof some);
+    }
+    for (; i < width; i++)
         for (size_t l = 0; l < LANES; l++) {
-            const float *at = from + 2 * width * rows[l];
-            float *re = (float *)to + l, *im = re + LANES;
-            for (size_t i = start; i < width && i < start + 32; i++) {
-                re[2 * LANES * i] = at[2 * i];
-                im[2 * LANES * i] = at[2 * i + 1];
-            }
+            const float *at = from + 2 * (width * rows[l] + i);
+            to[i].re[l] = at[0], to[i].im[l] = at[1];
         }
 }
 
@@ -91,14 +122,18 @@ INLINE void load_real(lanes *restrict to, const float *from, size_t width, const
 
 /* Store the first count lanes as rows of an array (count, width) of complex values. */
 SHARED void store(float *to, const value *restrict from, size_t width, size_t count) {
-    for (size_t l = 0; l < count; l++) {
-        float *at = to + 2 * width * l;
-        const float *re = (const float *)from + l, *im = re + LANES;
-        for (size_t i = 0; i < width; i++) {
-            at[2 * i] = re[2 * LANES * i];
-            at[2 * i + 1] = im[2 * LANES * i];
-        }
+    size_t i = 0;
+    for (; i + LANES / 2 <= width; i += LANES / 2) {
+        lanes some[LANES];
+        memcpy(some, from + i, sizeof some);
+        transpose(some);
+        for (size_t l = 0; l < count; l++) memcpy(to + 2 * (width * l + i), some + l, sizeof *some);
     }
+    for (; i < width; i++)
+        for (size_t l = 0; l < count; l++) {
+            float *at = to + 2 * (width * l + i);
+            at[0] = from[i].re[l], at[1] = from[i].im[l];
+        }
 }
 
 /* Store the first count lanes as rows of an array (count, width) of real values. */

@@ -10,35 +10,11 @@ INLINE void cases_of(int *at_rows, int *at_cases, const plates *on, const int *r
 }
 
 /* Values of work space, for p points. */
-size_t touched_sources_space(const plates *on, size_t p) {
-    size_t n = on->n, b = on->b, a = b + on->k;
-    return touched_space(on) + 2 * p * a + a * n + b * n + n;
-}
-
-/* In cases of frequencies and thicknesses (count): by_force (count, p, b + k), accelerations at points
- * (p, r) by a force at each attachment and finger; moved (count, b + k, n), their motion by each ERA. */
-void touched_sources(const plates *on, int first, int count, const int *rows, const int *nodes, int p,
-                     const float *points, value *work, float *by_force, float *moved) {
-    const size_t n = on->n, b = on->b, a = b + on->k;
-    int at_rows[LANES], at_cases[LANES];
-    cases_of(at_rows, at_cases, on, rows, nodes, first, count);
-    touched of;
-    value *found = put_fingers(&of, on, at_rows, at_cases, work), *room = found + p * a;
-    value *all = room + p * a, *without = all + a * n, *drives = without + b * n;
-    load(drives, on->drives, n, at_rows);
-    load(without, on->moved, b * n, at_cases);
-    to_points(found, a, points, p, &of, on, room);
-    with_fingers_moved(all, without, &of, drives, on);
-    store(by_force + 2 * (size_t)first * p * a, found, p * a, count);
-    store(moved + 2 * first * a * n, all, a * n, count);
-}
-
-/* Values of work space, for p points. */
 size_t touched_fields_space(const plates *on, size_t p) {
     return touched_space(on) + on->r + on->k + p + 2 * on->n + on->b;
 }
 
-/* found (count, p): accelerations in cases by ERAs at weights (count, n), else as above. */
+/* found (count, p): accelerations in cases by ERAs at weights (count, n). */
 void touched_fields(const plates *on, int first, int count, const int *rows, const int *nodes, int p,
                     const float *points, value *work, const float *weights, float *found) {
     const size_t n = on->n, b = on->b, k = on->k, r = on->r;

@@ -9,20 +9,20 @@ import numpy as np
 from model.arrays import IntArray
 from model.choice import best_first
 from model.drive_modes.forms import Forms
+from model.drive_modes.phased import PHASED
 
 KEPT, MISSING = 16, 4
 """Frequencies kept, a multiple of what kernels take at once, and how many may miss the level."""
 
 
 def preselect(forms: Forms) -> IntArray:
-    """Indices of the frequencies to search for one target, ascending."""
-    target = forms.targets[0].conj()
-    R = np.add.reduce(forms.quiet, axis=1) / np.float32(forms.quiet.shape[1])
-    w = np.linalg.solve(R, target[..., None])[..., 0]
-    value = np.maximum(np.vecdot(target, w).real, 0)
-    amplitude = value / np.maximum.reduce(np.abs(w), axis=1)
-    order = best_first(np.sqrt(value))
-    reaches = amplitude[order] >= np.float32(forms.wanted) * forms.threshold[order]
+    """Indices of the frequencies to search for one target, ascending.
+
+    Of forms whose one quiet form is the mean over the quiet fingers, without a margin of the level.
+    """
+    found = PHASED.search_all(forms)
+    order = best_first(found.bound)
+    reaches = found.score[order] > 0
     # Those that would be better than the best, were they loud enough.
     first = int(reaches.argmax()) if reaches.any() else len(order)
     missing = order[:first][:MISSING]

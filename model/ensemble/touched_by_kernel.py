@@ -43,7 +43,7 @@ class _Plates(ctypes.Structure):
 
 class _Forms(ctypes.Structure):
     _fields_ = (
-        *((name, c_int) for name in ("p", "fine", "others")),
+        *((name, c_int) for name in ("groups", "p", "fine", "others")),
         *((name, c_float) for name in ("gain_variance", "ridge")),
         *((name, c_void_p) for name in ("points", "fine_points", "weights", "error")),
         *((name, c_void_p) for name in ("fields", "fine_fields", "power", "uncertain")),
@@ -68,16 +68,6 @@ class TouchedByKernel(TouchedPlate):
 
     kernels: Kernels
 
-    def sources(
-        self, rows: IntArray, nodes: IntArray, points: Float32Array
-    ) -> tuple[Complex64Array, Complex64Array]:
-        """As of `TouchedPlate`."""
-        a = self.on.plate.stiffness.shape[1] + len(self.centres)
-        by_force = np.empty((len(rows), len(points), a), dtype=np.complex64)
-        moved = np.empty((len(rows), a, self.on.plate.era_count), dtype=np.complex64)
-        self._run("touched_sources", rows, nodes, points, by_force, moved)
-        return by_force, moved
-
     def fields(
         self, rows: IntArray, nodes: IntArray, weights: Complex64Array, points: Float32Array
     ) -> Complex64Array:
@@ -95,16 +85,16 @@ class TouchedByKernel(TouchedPlate):
         fine: Float32Array | None = None,
     ) -> LoadedContacts:
         """As of `TouchedPlate`."""
-        plate, n, f, (k, p, _) = self.on.plate, self.on.plate.era_count, len(rows), points.shape
+        plate, n, f, (g, p, _) = self.on.plate, self.on.plate.era_count, len(rows), points.shape
         fine_count = 0 if fine is None else fine.shape[1]
         given = [
             as_given(each)
             for each in (points, points if fine is None else fine, weights, error_power)
         ]
-        sizes = ((f, k, p, n), (f, k, fine_count, n), (f, k, n, n), (f, k, n, n))
+        sizes = ((f, g, p, n), (f, g, fine_count, n), (f, g, n, n), (f, g, n, n))
         found = [np.empty(size, dtype=np.complex64) for size in sizes]
         of = _Forms(
-            *(p, k * fine_count, plate.thickness > 0, plate.gain_variance, RIDGE),
+            *(g, p, g * fine_count, plate.thickness > 0, plate.gain_variance, RIDGE),
             *(each.ctypes.data for each in (*given, *found)),
         )
         library, on = self.kernels.library, ctypes.byref(self._plates)

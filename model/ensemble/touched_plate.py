@@ -36,26 +36,16 @@ RIDGE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class LoadedContacts:
-    """What k fingertips have of the ERAs at f frequencies.
+    """What g fingertips, or other groups of points, have of the ERAs at f frequencies.
 
-    fields: (f, k, p, n) h [m/s²] at points; fine_fields: (f, k, fine, n) at others, None unless
-    wanted; power: (f, k, n, n) R; uncertain: (f, k, n, n) R without h* h^T.
+    fields: (f, g, p, n) h [m/s²] at points; fine_fields: (f, g, fine, n) at others, None unless
+    wanted; power: (f, g, n, n) R; uncertain: (f, g, n, n) R without h* h^T.
     """
 
     fields: Complex64Array
     fine_fields: Complex64Array | None
     power: Complex64Array
     uncertain: Complex64Array
-
-    def at(self, frequencies: IntArray) -> "LoadedContacts":
-        """Some of the frequencies, by index (n,)."""
-        fine = self.fine_fields
-        return LoadedContacts(
-            self.fields.take(frequencies, axis=0),
-            None if fine is None else fine.take(frequencies, axis=0),
-            self.power.take(frequencies, axis=0),
-            self.uncertain.take(frequencies, axis=0),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,11 +131,11 @@ class TouchedPlate:
     ) -> LoadedContacts:
         """Fields and expected powers at frequencies, by row (f,).
 
-        points (k, p, r), fine (k, fine, r): shapes under each finger; weights (k, p): of its
-        points, sum 1; error_power: mean square of the discretisation error of each ERA's field, at
-        all frequencies of the plate, (all, n).
+        points (g, p, r), fine (g, fine, r): shapes at groups of points, as under each finger;
+        weights (g, p): of its points, sum 1; error_power: mean square of the discretisation error
+        of each ERA's field, at all frequencies of the plate, (all, n).
         """
-        plate, n, f, (k, p, r) = self.on.plate, self.on.plate.era_count, len(rows), points.shape
+        plate, n, f, (g, p, r) = self.on.plate, self.on.plate.era_count, len(rows), points.shape
         forces, every = plate.forces[rows, None], points.reshape(-1, r)
         modelled = np.full(f, MODELLED)
         by_force, moved = self.sources(rows, modelled, every)
@@ -157,27 +147,27 @@ class TouchedPlate:
             for node in (THICKER, THINNER):
                 other, _ = self.sources(rows, np.full(f, node), every)
                 changes.append((other[:, :, :n] * forces - h) * np.float32(math.sqrt(0.5)))
-        each = np.stack(changes, axis=1).reshape(f, -1, k, p, n).swapaxes(1, 2)
-        power = gram((each * np.sqrt(weights)[:, None, :, None]).reshape(f, k, -1, n))
-        a = moved.shape[1]
+        each = np.stack(changes, axis=1).reshape(f, -1, g, p, n).swapaxes(1, 2)
+        power = gram((each * np.sqrt(weights)[:, None, :, None]).reshape(f, g, -1, n))
+        a, k = moved.shape[1], len(self.centres)
         uncertain = np.concatenate([np.arange(n), np.arange(a - k, a)])
         load = np.float32(plate.load_std) * self.stiffness[rows]
         by_one = np.concatenate([plate.by_stiffness[rows], load], axis=1)
         deformed = stretched[:, uncertain] * by_one[:, :, None]
-        reach = power_of(by_force[:, :, uncertain]).reshape(f, k, p, -1)
+        reach = power_of(by_force[:, :, uncertain]).reshape(f, g, p, -1)
         mean = weights[:, None]
         by_attachment = outer(deformed).reshape(f, n + k, -1)
-        power += ((mean @ reach)[:, :, 0] @ by_attachment).reshape(f, k, n, n)
-        size = (mean @ power_of(h).reshape(f, k, p, n))[:, :, 0]
-        diagonal = power.reshape(f, k, -1)[..., :: n + 1]
+        power += ((mean @ reach)[:, :, 0] @ by_attachment).reshape(f, g, n, n)
+        size = (mean @ power_of(h).reshape(f, g, p, n))[:, :, 0]
+        diagonal = power.reshape(f, g, -1)[..., :: n + 1]
         values = diagonal.real + plate.gain_variance * size + error_power[rows, None]
         diagonal[:] = values + RIDGE / n * values.sum(axis=-1, keepdims=True)
-        found = h.reshape(f, k, p, n)
+        found = h.reshape(f, g, p, n)
         uncertain = power - gram(found * np.sqrt(weights)[:, :, None])
         if fine is None:
             return LoadedContacts(found, None, power, uncertain)
         by_fine, _ = self.sources(rows, modelled, fine.reshape(-1, r))
-        at_fine = (by_fine[:, :, :n] * forces).reshape(f, k, -1, n)
+        at_fine = (by_fine[:, :, :n] * forces).reshape(f, g, -1, n)
         return LoadedContacts(found, at_fine, power, uncertain)
 
     def changes(

@@ -19,6 +19,7 @@ from model.choice import best_by, best_of
 from model.drive_modes import UNRESTRICTED
 from model.drive_modes.forms import Weights
 from model.drive_modes.tones import excitation_of
+from model.ensemble.touched_by_kernel import touch
 from model.errors import InputError
 from model.finger.perception import decibels
 from model.table.combinations import Stream
@@ -190,9 +191,10 @@ class _Answering:
         question = Question(
             tuple(each.at for each in every), loads=tuple(each.load for each in every)
         )
+        tips = table.read_fingertips(question.contacts)
         return FingersOnPlate.of(
-            table.on_eras,
-            table.read_fingertips(question.contacts),
+            touch(table.on_eras, tips.few[:, 0], question.loads),
+            tips,
             question,
             self._rows,
             threshold=table.thresholds,

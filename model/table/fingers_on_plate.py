@@ -12,8 +12,7 @@ from model.arrays import Complex64Array, Float32Array, IntArray
 from model.drive_modes.forms import Forms, Weights
 from model.ensemble.draws import Drawing, draw
 from model.ensemble.measures import Felt, Fingertips, felt, felt_at
-from model.ensemble.plate_on_eras import MODELLED, PlateOnEras
-from model.ensemble.touched_by_kernel import touch
+from model.ensemble.plate_on_eras import MODELLED
 from model.ensemble.touched_plate import LoadedContacts, Sensed, TouchedPlate, gram, outer
 from model.table.fingertip_shapes import FingertipShapes
 from model.table.pulse_gains import PulseResponses
@@ -55,7 +54,7 @@ class FingersOnPlate:
     @classmethod
     def of(
         cls,
-        on: PlateOnEras,
+        touched: TouchedPlate,
         tips: FingertipShapes,
         question: Question,
         rows: IntArray,
@@ -63,12 +62,11 @@ class FingersOnPlate:
         threshold: Float32Array,
         error_power: Float32Array,
     ) -> "FingersOnPlate":
-        """Put the fingers of a question on a plate, targets first; at its frequencies by row.
+        """Fingers of a question that touch a plate, targets first; at its frequencies by row.
 
         threshold (all,) [m/s²], at all of them.
         """
         t, fingers = len(question.targets), np.arange(len(tips.few))
-        touched = touch(on, tips.few[:, 0], question.loads)
         fine = tips.fine if len(fingers) <= 1 + MAX_FINGERS_BY_POINT else None
         return cls(
             touched,
@@ -93,15 +91,6 @@ class FingersOnPlate:
             quiet=np.array(quiet, dtype=int),
             gains=np.ones(len(targets), dtype=np.float32),
             wanted=10 ** (level_db_sl / 20),
-        )
-
-    def at(self, rows: IntArray) -> "FingersOnPlate":
-        """At some of its rows, by index (n,)."""
-        return replace(
-            self,
-            rows=self.rows.take(rows),
-            threshold=self.threshold.take(rows),
-            contacts=self.contacts.at(rows),
         )
 
     def forms(self, background: Complex64Array | None) -> Forms:
@@ -219,6 +208,34 @@ class FingersOnPlate:
         diagonal = expected.reshape(len(expected), -1)[:, :: expected.shape[1] + 1]
         diagonal *= 1 + np.float32(self.touched.on.plate.gain_variance)
         return expected
+
+
+def forms_to_rank(
+    touched: TouchedPlate,
+    tips: FingertipShapes,
+    question: Question,
+    rows: IntArray,
+    *,
+    threshold: Float32Array,
+    error_power: Float32Array,
+) -> Forms:
+    """Forms of one target and the mean over the quiet fingers, to rank frequencies by row (f,).
+
+    At the centres alone with many quiet fingers. threshold (all,) [m/s²]; else as
+    `FingersOnPlate.of`.
+    """
+    points, weights = tips.few, tips.few_weights
+    if len(question.quiet) > MAX_FINGERS_BY_POINT:
+        points, weights = touched.centres[:, None], np.ones_like(weights[:, :1])
+    shares = weights / np.float32(len(question.quiet))
+    shares[0] = 0.0  # the target, whose field alone counts
+    every = points.reshape(1, -1, points.shape[2])
+    contacts = touched.forms(rows, every, shares.reshape(1, -1), error_power)
+    at_target = contacts.fields[:, 0, : points.shape[1]]
+    mean = (weights[:1] @ at_target)[:, 0] * np.float32(question.gains[0])
+    wanted = 10 ** (question.level_db_sl / 20)
+    power = contacts.power.swapaxes(0, 1)
+    return Forms(mean[None], power, contacts.power, threshold.take(rows), wanted, level_margin=0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Shapes of the reduced plate under fingertips, kept for fingers that do not move."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,11 +24,6 @@ class FingertipShapes:
     fine: Float32Array
     few_weights: Float32Array
     fine_weights: Float32Array
-
-    def at_centres(self) -> "FingertipShapes":
-        """The centres alone in place of the few points."""
-        weights = np.ones((len(self.few), 1), dtype=np.float32)
-        return replace(self, few=self.few[:, :1], few_weights=weights)
 
 
 class FingertipReader:

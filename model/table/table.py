@@ -35,7 +35,7 @@ from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loads
 from model.structure.dispersion import Dispersion
 from model.structure.plate import Plate
-from model.table.fingers_on_plate import MAX_FINGERS_BY_POINT, FingersOnPlate
+from model.table.fingers_on_plate import FingersOnPlate, forms_to_rank
 from model.table.fingertip_shapes import FingertipReader, FingertipShapes
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.pattern_choice import (
@@ -389,15 +389,13 @@ class LocalizationTable:
         rest = self._cell_fields[:, :, is_background(self.cell_centres, question.targets)]
         return np.asarray(rest.conj() @ rest.swapaxes(1, 2) / np.float32(rest.shape[2]))
 
-    def _fingers(
-        self, question: Question, tips: FingertipShapes, rows: IntArray | None = None
-    ) -> FingersOnPlate:
-        """Fingers at rows (n,) of the frequencies, None for all."""
+    def _fingers(self, question: Question, tips: FingertipShapes) -> FingersOnPlate:
+        """Fingers at all frequencies."""
         return FingersOnPlate.of(
-            self.on_eras,
+            touch(self.on_eras, tips.few[:, 0], question.loads),
             tips,
             question,
-            np.arange(len(self.frequencies)) if rows is None else rows,
+            np.arange(len(self.frequencies)),
             threshold=self.thresholds,
             error_power=self.error_power,
         )
@@ -408,10 +406,9 @@ class LocalizationTable:
         """The best pattern at the frequencies most worth a search, None where those do not do."""
         if len(question.targets) > 1 or not question.quiet:
             return None
-        is_ranked_by_points = len(question.quiet) <= MAX_FINGERS_BY_POINT
-        ranked_at = tips if is_ranked_by_points else tips.at_centres()
-        fingers = self._fingers(question, ranked_at, playable)
-        kept = preselection.preselect(fingers.forms(None))
+        touched = touch(self.on_eras, tips.few[:, 0], question.loads)
+        sizes = {"threshold": self.thresholds, "error_power": self.error_power}
+        kept = preselection.preselect(forms_to_rank(touched, tips, question, playable, **sizes))
         if len(kept) in (0, len(playable)):
             return None
         rows = playable.take(kept)
@@ -419,9 +416,7 @@ class LocalizationTable:
             eras=self.eras,
             frequencies=self.frequencies.take(rows),
             playable=np.arange(len(rows)),
-            fingers=(
-                fingers.at(kept) if is_ranked_by_points else self._fingers(question, tips, rows)
-            ),
+            fingers=FingersOnPlate.of(touched, tips, question, rows, **sizes),
             background=None,
             threshold=self.thresholds.take(rows),
             threshold_name=self.threshold,

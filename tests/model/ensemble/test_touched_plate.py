@@ -236,11 +236,17 @@ def test_every_stage_is_that_of_numpy():
         each.forms(np.array([2, 0, 3]), few, shares.astype(np.float32), error, few[:, 1:3])
         for each in (touched, by_numpy)
     ]
+    # All fingers in one group, at their centres, whose fields are known already.
+    thirds = np.full((1, 3), 1 / 3, np.float32)
+    together = [
+        each.forms(np.arange(4), touched.centres[None], thirds, error, few[:1, 1:3])
+        for each in (touched, by_numpy)
+    ]
     felt = [
         felt_of(each, points, weights, count=45, seed=1, thicknesses=5)
         for each in (touched, by_numpy)
     ]
-    for one, other in (forms, felt):
+    for one, other in (forms, together, felt):
         for name, exact in vars(other).items():
             np.testing.assert_allclose(
                 getattr(one, name), exact, rtol=1e-4, atol=1e-4 * float(np.abs(exact).max())

@@ -19,13 +19,15 @@ typedef struct {
     value *at;               /* (k, b) accelerations of the fingers by a force at each attachment, without them */
     value *resting, *P, *D;  /* (k, b) the same with them; (k, k) (1 + G D)^-1, (k) */
     value *G;                /* (k, k) displacement of the fingers by a force at each, without the others */
-    value *row;              /* room for (b + r) */
+    value *through;          /* (b, k) Y at^T */
+    value *held, *forced;    /* (k, b) -D resting, (k, k) -w² P^T: of G, what fingers add to fields */
+    value *row;              /* room for (b + k + r) */
     lanes minus_omega2;
 } touched;
 
 INLINE size_t touched_space(const plates *on) {
     size_t b = on->b, k = on->k, r = on->r;
-    return b * r + r + b * b + 2 * k * b + 2 * k * k + k + b + r;
+    return b * r + r + b * b + 4 * k * b + 3 * k * k + k + b + k + r;
 }
 
 /* P = (1 + G D)^-1 of G, one finger after the other: none gives energy, the plate is damped. */
@@ -47,21 +49,23 @@ INLINE void invert(value *restrict P, const value *D, size_t k) {
     }
 }
 
+INLINE void add(value *to, const value *more, size_t count) {
+    for (size_t i = 0; i < count; i++) to[i] = (value){to[i].re + more[i].re, to[i].im + more[i].im};
+}
+
 /* G (p, k): displacement at points (p, r) by a force at each finger, without the others; of X (p, b),
  * accelerations there by a force at each attachment. */
 INLINE void by_fingers(value *restrict G, const float *points, size_t p, const value *X, const touched *of,
                        const plates *on) {
     const size_t b = on->b, k = on->k, r = on->r;
-    value *modal = of->row + b;
+    value *modal = of->row + b + k;
     for (size_t j = 0; j < k; j++) {
         for (size_t s = 0; s < r; s++) modal[s] = scaled(of->g[s], filled(on->centres[j * r + s]));
         multiply_into(G + j, k, points, modal, p, r);
     }
     for (size_t i = 0; i < p; i++) {
-        row_product(of->row, X + i * b, 1, of->Y, b, b, 0, 0); /* Y is symmetric */
-        for (size_t j = 0; j < k; j++)
-            for (size_t s = 0; s < b; s++)
-                G[i * k + j] = add_product(G[i * k + j], of->row[s], of->at[j * b + s]);
+        row_product(of->row, X + i * b, 1, of->through, b, k, 0, 0);
+        add(G + i * k, of->row, k);
     }
 }
 
@@ -70,25 +74,34 @@ SHARED value *put_fingers(touched *to, const plates *on, const int *rows, const 
     const size_t b = on->b, k = on->k, r = on->r;
     to->T = work, to->g = to->T + b * r, to->Y = to->g + r, to->at = to->Y + b * b;
     to->resting = to->at + k * b, to->P = to->resting + k * b, to->D = to->P + k * k, to->G = to->D + k;
-    to->row = to->G + k * k;
+    to->through = to->G + k * k, to->held = to->through + b * k, to->forced = to->held + k * b;
+    to->row = to->forced + k * k;
     load(to->T, on->by_force, b * r, cases);
     load(to->g, on->receptance, r, cases);
     load(to->Y, on->coupling, b * b, cases);
     load(to->D, on->stiffness, k, rows);
     load_real(&to->minus_omega2, on->minus_omega2, 1, rows);
     multiply(to->at, on->centres, to->T, k, r, b);
+    for (size_t i = 0; i < k; i++) {
+        row_product(to->row, to->at + i * b, 1, to->Y, b, b, 0, 0); /* Y is symmetric */
+        for (size_t j = 0; j < b; j++) to->through[j * k + i] = to->row[j];
+    }
     by_fingers(to->G, on->centres, k, to->at, to, on);
     memcpy(to->P, to->G, k * k * sizeof(value));
     invert(to->P, to->D, k);
     product(to->resting, to->P, k, to->at, k, k, b);
-    return to->row + b + r;
+    for (size_t i = 0; i < k; i++) {
+        for (size_t j = 0; j < b; j++) to->held[i * b + j] = subtract_product(ZERO, to->D[i], to->resting[i * b + j]);
+        for (size_t j = 0; j < k; j++) to->forced[i * k + j] = scaled(to->P[j * k + i], to->minus_omega2);
+    }
+    return to->row + b + k + r;
 }
 
 /* found (p, width): accelerations at points (p, r) by a force at each of the first width attachments
  * and fingers; room for (p, b + k). */
 SHARED void to_points(value *restrict found, size_t width, const float *points, size_t p, const touched *of,
                       const plates *on, value *room) {
-    const size_t b = on->b, k = on->k, of_fingers = width > b ? width - b : 0, fields = width - of_fingers;
+    const size_t b = on->b, k = on->k;
     const value *X = of->at, *G = of->G; /* at the centres */
     if (points != on->centres) {
         X = room, G = room + p * b;
@@ -96,18 +109,10 @@ SHARED void to_points(value *restrict found, size_t width, const float *points, 
         by_fingers(room + p * b, points, p, X, of, on);
     }
     for (size_t i = 0; i < p; i++) {
-        value *own = found + i * width;
-        for (size_t j = 0; j < of_fingers; j++) {
-            value sum = ZERO;
-            for (size_t s = 0; s < k; s++) sum = add_product(sum, G[i * k + s], of->P[j * k + s]);
-            own[b + j] = scaled(sum, of->minus_omega2);
-        }
-        memcpy(own, X + i * b, fields * sizeof(value));
-        for (size_t s = 0; s < k; s++) {
-            value force = times(G[i * k + s], of->D[s]);
-            for (size_t j = 0; j < fields; j++)
-                own[j] = subtract_product(own[j], force, of->resting[s * b + j]);
-        }
+        row_product(of->row, G + i * k, 1, of->held, k, b, 0, 0);
+        add(of->row, X + i * b, b);
+        if (width > b) row_product(of->row + b, G + i * k, 1, of->forced, k, k, 0, 0);
+        memcpy(found + i * width, of->row, width * sizeof(value));
     }
 }
 

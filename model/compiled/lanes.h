@@ -146,7 +146,8 @@ INLINE void store_real(float *to, const lanes *restrict from, size_t width, size
 SHARED void multiply_into(value *restrict found, size_t step, const float *restrict a,
                           const value *restrict b, size_t rows, size_t r) {
     size_t row = 0;
-    for (; row + 4 <= rows; row += 4) {
+    for (; row < rows && rows >= 4; row += 4) {
+        if (row + 4 > rows) row = rows - 4; /* some once more: one alone takes as long as four */
         const float *a0 = a + row * r, *a1 = a0 + r, *a2 = a1 + r, *a3 = a2 + r;
         value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO; /* in registers, as no array is */
         for (size_t j = 0; j < r; j++) {
@@ -175,13 +176,14 @@ INLINE void multiply(value *found, const float *a, const value *b, size_t rows, 
         multiply_into(found + column, columns, a, b + column * r, rows, r);
 }
 
-/* found (columns) from the first on = a (inner) b (inner, columns), each step apart in a, or of a
+/* found (columns) from the first on, or a few before it, = a (inner) b (inner, columns), each step apart in a, or of a
  * conjugated. */
 SHARED void row_product(value *restrict found, const value *a, size_t step, const value *b, size_t inner,
                         size_t columns, size_t first, int conjugated) {
     const float sign = conjugated ? -1 : 1;
     size_t j = first;
-    for (; j + 4 <= columns; j += 4) {
+    for (; j < columns && columns >= 4; j += 4) {
+        if (j + 4 > columns) j = columns - 4; /* as above */
         value s0 = ZERO, s1 = ZERO, s2 = ZERO, s3 = ZERO;
         for (size_t s = 0; s < inner; s++) {
             const value *from = b + s * columns + j;
@@ -210,7 +212,7 @@ SHARED void product(value *restrict found, const value *a, size_t width, const v
         row_product(found + i * columns, a + i * width, 1, b, inner, columns, 0, 0);
 }
 
-/* The upper triangle of R (n, n) = X^H X of X (rows, n). */
+/* The upper triangle of R (n, n) = X^H X of X (rows, n), and some below it. */
 SHARED void gram(value *restrict R, const value *X, size_t rows, size_t n) {
     for (size_t i = 0; i < n; i++) row_product(R + i * n, X + i, n, X, rows, n, i, 1);
 }

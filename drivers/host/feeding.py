@@ -45,10 +45,10 @@ class Feeding:
         """When the watchdog must have silenced it, even where it is fed once more [s].
 
         What an adapter has kept comes at any time, all at once: after the watchdog without effect.
+        Of several attempts without reply one may have arrived, and the next been kept.
         """
-        if not self.is_kept or self.plays <= self.since:
-            return self.lost_from
-        return max(self.lost_from, self.confirmed_at + 2 * self.watchdog + self.fade + SILENCING)
+        may_be_fed_again = self.is_kept and self.plays > self.since
+        return self.lost_from + (self.watchdog if may_be_fed_again else 0.0)
 
     def sent(self, now: float, arrives: float) -> None:
         """Note a request that may feed and let it play on: when it was sent, and arrives [s]."""

@@ -31,11 +31,12 @@ class _Ready(NamedTuple):
 class JointStart:
     """Where so many lines wait, each free for its commit; the slowest one sends first.
 
-    until: latest time [s] at which the last line must be free. Where one cannot send, none does.
+    until: latest time [s] at which the commits must arrive. Where one cannot send, none does that
+    has not sent before.
     """
 
     def __init__(self, count: int, until: float) -> None:
-        self._count = count
+        self._count, self._until = count, until
         self._ready: list[_Ready] = []
         self._failure: Exception | None = None
         self._arrival = 0.0
@@ -48,16 +49,20 @@ class JointStart:
     ) -> None:
         """Note that a line is free for a commit, which takes a time [s] to arrive.
 
-        result: of the commit. send: called once, when it is to be sent, or its result has an error.
+        result: of the commit. send: called once, when it is to be sent, or its result has an error;
+        calls `fail` where that does not succeed.
         """
         self._ready.append(_Ready(takes, result, send))
         if self._failure is not None:
             self.fail(self._failure)
         elif len(self._ready) == self._count:
-            self._timer.cancel()
             self._ready.sort(key=attrgetter("takes"))
             self._arrival = self._loop.time() + self._ready[-1].takes
-            self._send_due()
+            if self._arrival > self._until:
+                self._give_up()
+                return
+            self._timer.cancel()
+            self._loop.call_soon(self._send_due)  # none behind the pump of the line that came last
 
     def fail(self, error: Exception) -> None:
         """Note that one will not be sent: those that were not sent yet are not sent either."""
@@ -120,7 +125,8 @@ class Job:
     """A request from its queueing to its result; member: None for a broadcast.
 
     make: values of each attempt, in its turn; raises CommandRefused. attempts: left. start: of a
-    commit that goes out together with those of other lines. longer: than on a fast wire its reply
+    commit that goes out together with those of other lines, until it was sent: is_held for them,
+    then is_released. longer: than on a fast wire its reply
     may take [s]. delays: of this process, while its reply is awaited. had_no_reply: to an earlier
     attempt.
     """
@@ -136,6 +142,7 @@ class Job:
     result: "asyncio.Future[Values]"
     start: JointStart | None = None
     is_held: bool = False
+    is_released: bool = False
     not_before: float = 0.0
     sent_at: float = 0.0
     due: float = 0.0

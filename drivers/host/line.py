@@ -189,7 +189,9 @@ class Line:
                 if job is None or (job.start is not None and not self._may_start(job)):
                     break
                 self._queue.take(job, self._loop.time())
-                if not job.result.done():
+                if job.result.done():
+                    self._fail(job, Preempted(SUPERSEDED))  # its caller has gone: so have others
+                else:
                     self._start(job)
         finally:
             self._is_pumping = False
@@ -201,11 +203,11 @@ class Line:
             job.is_held = True
             takes = self.wire.transit(_COMMIT_WORDS)
             job.start.arrive(takes, job.result, partial(self._release, job))
-        return job.start is None
+        return job.start is None or job.is_released
 
     def _release(self, job: Job) -> None:
         """Send a commit that was held, unless its result is known by now."""
-        job.start = None
+        job.is_released = True
         self.pump()
 
     def _start(self, job: Job) -> None:
@@ -215,6 +217,7 @@ class Line:
             now = job.sent_at = self._loop.time()
             if job.member is None:
                 self._write(0, job.name, job.values, now)
+                job.start = None
                 job.result.set_result({})
                 return
             job.longer = job.member.next_request(job.name, job.values)
@@ -225,6 +228,7 @@ class Line:
                 return
             if self.loss is not None:  # by what the port did
                 raise LinkError(self.loss)
+            job.start = None
             job.due = begins + job.longer + job.timeout
             if job.longer and job.attempts == ATTEMPTS:
                 job.attempts -= 1  # a slow wire: as long as on others until it counts as degraded
@@ -340,7 +344,8 @@ class Line:
             self._schedule()
             return
         self._port.poll()
-        if self._current is not job:
+        if self._current is not job or self._loop.time() < job.due:
+            self._schedule()
             return
         if not job.is_last_look:
             job.due, job.is_last_look = now, True

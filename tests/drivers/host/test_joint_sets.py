@@ -7,12 +7,14 @@ from itertools import combinations
 import pytest
 
 from drivers.contents import Layer, Tone
-from drivers.errors import DriverError
+from drivers.errors import DriverError, LinkTimeout
 from drivers.host.can_wire import CanWire
 from drivers.host.group import Group
+from drivers.host.jobs import JointStart
 from drivers.host.modbus_wire import ModbusWire
 from drivers.host.serial_wire import SerialWire
 from drivers.host.wire import Wire
+from drivers.protocol.table import MESSAGES
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine
 
@@ -81,6 +83,45 @@ async def test_line_that_is_busy_for_too_long_commits_nothing() -> None:
     await asyncio.gather(*reads, return_exceptions=True)
     assert [started(end) for end in ends] == [[], []]
     assert not group.is_armed
+
+
+@pytest.mark.parametrize(("names", "fails"), [(("slow serial", "tcp"), 0), (("serial",) * 2, 1)])
+@in_virtual_time
+async def test_commit_that_fails_in_its_turn_keeps_the_others_back(
+    names: tuple[str, str], fails: int
+) -> None:
+    """A port does not take it: of the slower line, and of the one that was free last."""
+    ends = [timed_line(name, each) for name, each in zip(names, "ab", strict=True)]
+    group = Group({name: host for end in ends for name, host in end.hosts.items()}, watchdog=1.0)
+    await group.open()
+    await group.arm()
+    write = ends[fails].write
+
+    def block(data: bytes) -> None:
+        if ends[fails].kind.request_of(data) == (1, MESSAGES["Commit"].number):
+            raise LinkTimeout("write blocked; check the adapter")
+        write(data)
+
+    ends[fails].write = block  # type: ignore[method-assign]
+    with pytest.raises(DriverError, match="write blocked"):
+        await group.apply({"a": [LAYER], "b": [LAYER]})
+    await asyncio.sleep(0.02)
+    assert [started(end) for end in ends] == [[], []]
+
+
+@in_virtual_time
+async def test_commits_that_would_arrive_too_late_are_not_sent() -> None:
+    """Free 5 ms before the time until when their sets are admitted, and 10 ms on their way."""
+    loop = asyncio.get_running_loop()
+    start = JointStart(2, loop.time() + 0.1)
+    results = [loop.create_future() for _ in range(2)]
+    await asyncio.sleep(0.095)
+    for result in results:
+        start.arrive(0.01, result, lambda: None)
+    await asyncio.sleep(0.02)
+    assert [str(each.exception()).split(": ")[0] for each in results] == [
+        "one of several commits failed"
+    ] * 2
 
 
 @in_virtual_time

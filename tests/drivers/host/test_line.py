@@ -73,6 +73,25 @@ async def test_request_is_repeated_twice_and_once_on_a_slow_line(baud: int, atte
     assert (host.counts.timeouts, host.counts.retries) == (attempts, attempts - 1)
 
 
+@in_virtual_time
+async def test_read_behind_a_write_whose_response_was_found_late_is_awaited() -> None:
+    """Modbus: only the last look at the port finds that response; the status comes 20 ms on."""
+    end = MemoryLine("tcp", "a")
+    (host,) = end.hosts.values()
+    await host.open()
+    unread: list[bytes] = []
+
+    def poll() -> None:
+        end.outward = lambda name, data: [(0.02, data)]
+        while unread:
+            end.line.received(unread.pop())
+
+    end.poll = poll  # type: ignore[method-assign]
+    end.outward = lambda name, data: unread.append(data) or []  # type: ignore[func-returns-value]
+    await host.read_status()
+    assert host.counts.retries == 0
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @in_virtual_time
 async def test_refusal_after_no_reply_says_that_it_may_have_played(kind: str) -> None:

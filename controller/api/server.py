@@ -151,6 +151,8 @@ class ApiServer:
         """
         call: _Call | None = connection.ahead or self._read(connection)
         connection.ahead = None
+        if call is not None and not connection.is_open and call.method != "stop":
+            return  # the client has left: its fingers are lifted, and its lease has ended
         if call is not None and isinstance(call.params, TouchParams):
             connection.is_touching = bool(call.params.touches)
             connection.ahead = self._read(connection)

@@ -180,14 +180,14 @@ async def _keep_armed(daemon: Daemon, path: Path, recorder: TouchRecorder) -> No
 
 
 async def _armed(era: AsyncClient) -> str:
-    """Clear what is latched and arm; return the lease. Raises LinkError after `RECOVERY`."""
+    """Clear a fault, but no stop, and arm; return the lease. Raises LinkError after `RECOVERY`."""
     end = clock.now() + RECOVERY
     while True:
         status = await era.status()
-        if clock.now() > end:
+        if status.state == DaemonState.QUICK_STOP_ACTIVE or clock.now() > end:
             raise LinkError(f"demonstration aborted: {status.cause}")
         with contextlib.suppress(RpcError):  # the state has changed meanwhile
-            if status.state in (DaemonState.FAULT, DaemonState.QUICK_STOP_ACTIVE):
+            if status.state == DaemonState.FAULT:
                 await era.clear()
             if status.state == DaemonState.READY_TO_SWITCH_ON:
                 return (await era.arm("the demonstration", lease_s=MAX_LEASE)).lease

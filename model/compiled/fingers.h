@@ -103,7 +103,7 @@ SHARED void to_points(value *restrict found, size_t width, const float *points, 
                       const plates *on, value *room) {
     const size_t b = on->b, k = on->k;
     const value *X = of->at, *G = of->G; /* at the centres */
-    if (points != on->centres) {
+    if (points != on->centres || p != k) {
         X = room, G = room + p * b;
         multiply(room, points, of->T, p, on->r, b);
         by_fingers(room + p * b, points, p, X, of, on);

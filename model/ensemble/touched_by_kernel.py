@@ -39,6 +39,7 @@ class _Plates(ctypes.Structure):
         ("load_std", c_float),
         *((name, c_void_p) for name in (*_OF_CASES, *_OF_ROWS, "centres", "stiffness")),
     )
+    kept: list[NDArray[Any]]  # to which it points
 
 
 class _Forms(ctypes.Structure):
@@ -143,10 +144,13 @@ class TouchedByKernel(TouchedPlate):
         n, k, r = plate.era_count, len(self.centres), self.centres.shape[1]
         arrays = [getattr(on, name) for name in _OF_CASES]
         arrays += [getattr(plate, name) for name in _OF_ROWS]
-        return _Plates(
+        kept = [as_given(each) for each in (*arrays, self.centres, self.stiffness)]
+        plates = _Plates(
             *(n, plate.stiffness.shape[1], k, r, on.thickness_count, plate.load_std),
-            *(each.ctypes.data for each in (*arrays, self.centres, self.stiffness)),
+            *(each.ctypes.data for each in kept),
         )
+        plates.kept = kept
+        return plates
 
     def _run(
         self,

@@ -37,7 +37,7 @@ pytestmark = pytest.mark.real_time
 
 @pytest.fixture(autouse=True)
 def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    for method in (Amplifier._request, Line.submit):
+    for method in (Amplifier.request, Line.submit):
         monkeypatch.setitem(method.__kwdefaults__, "timeout", REPLY_TIMEOUT)
 
 

@@ -28,7 +28,7 @@ CONTACT_TIMEOUT = 5.0  # s; in place of 0.15 s
 
 def wait_long(patch: pytest.MonkeyPatch) -> None:
     """Let amplifiers be waited for, and wait, that long in this process."""
-    for method in (Line.submit, Amplifier._request):
+    for method in (Line.submit, Amplifier.request):
         patch.setitem(method.__kwdefaults__, "timeout", REPLY_TIMEOUT)  # type: ignore[arg-type]
     patch.setattr("drivers.host.amplifier.COMMIT_DELAY", REPLY_TIMEOUT)
     for made in (Controller, Group):

@@ -154,6 +154,16 @@ async def test_touch_frame_is_superseded_by_the_next_of_its_source() -> None:
     ]
 
 
+async def test_touch_read_ahead_of_a_client_that_left_is_not_served() -> None:
+    """Its fingers are lifted by then, and nobody would lift them again."""
+    served = ServedApi(costs=0.001)
+    client, _ = served.client()
+    served.called = lambda name: client.connection_lost(None)
+    client.data_received(touch("a", 1, x=0.1) + touch("a", 2, x=0.2))
+    await served.settle()
+    assert served.names == ["touch"]
+
+
 async def test_touch_frame_with_a_finger_that_the_next_has_not_is_served() -> None:
     """A tap whose frames come together is not lost; one more finger supersedes."""
     served = ServedApi()

@@ -15,6 +15,7 @@ from controller.sources.contacts import Change, Contact, ContactKey
 from daemon_bench import ENABLED, ready_daemon, until, until_state
 from drivers import clock
 from drivers.errors import LinkError
+from sim.faults.fault_window import FaultWindow
 
 FAULT = "amplifier d: state must be OPERATION_ENABLED, got FAULT with fault WATCHDOG"
 
@@ -75,19 +76,22 @@ async def test_row_of_a_finger_alone_names_no_other_finger(tmp_path: Path) -> No
     assert "finger" not in rows[0].reason
 
 
-async def test_plate_is_armed_again_after_a_stop(
+async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As after a fault of amplifiers that stalled: cleared, armed, and the recorder hears of it."""
+    """After one of amplifiers that stalled it is cleared, and the recorder hears of both."""
     monkeypatch.setattr(run, "RECOVERY", 5.0)
     async with ready_daemon(tmp_path) as (bench, era):
         recorder = recorder_of([], tmp_path)
         arming = asyncio.create_task(run._keep_armed(bench.daemon, bench.socket, recorder))
         await recorder.start()
         await until_state(era, ENABLED)
-        await era.stop()
+        bench.far.device.inject_fault(FaultWindow("over_voltage", lasts=0.05))
         await until(lambda: recorder._fault is not None)
         await until(lambda: recorder._fault is None or arming.done())
         assert not arming.done()
-        arming.cancel()
-        await asyncio.gather(arming, return_exceptions=True)
+        await until_state(era, ENABLED)
+        await era.stop()
+        with pytest.raises(LinkError, match="aborted: stopped"):
+            await arming
+        assert (await era.status()).state == "QUICK_STOP_ACTIVE"

@@ -158,7 +158,8 @@ async def test_touch_read_ahead_of_a_client_that_left_is_not_served() -> None:
     """Its fingers are lifted by then, and nobody would lift them again."""
     served = ServedApi(costs=0.001)
     client, _ = served.client()
-    served.called = lambda name: client.connection_lost(None)
+    leave = asyncio.get_running_loop().call_soon
+    served.called = lambda name: leave(client.connection_lost, None)
     client.data_received(touch("a", 1, x=0.1) + touch("a", 2, x=0.2))
     await served.settle()
     assert served.names == ["touch"]

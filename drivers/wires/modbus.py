@@ -27,7 +27,7 @@ class SilentPort(PortAbove):
     """A port that sends a frame once the line was silent for a time [s]; implements `Port`.
 
     byte_time [s]; on_data: called with what is received. A frame waits at most for the longest
-    other one, so that noise does not keep a stop waiting. Of those that wait a newer one replaces
+    other one, so that noise does not keep a stop waiting, but always for one of its own. Of those that wait a newer one replaces
     the older: its request was given up. Broadcasts stay, which have no reply to wait for.
     """
 
@@ -35,6 +35,7 @@ class SilentPort(PortAbove):
         self._silence, self._byte_time, self._on_data = silence, byte_time, on_data
         self._loop = asyncio.get_running_loop()
         self._free_from = self._loop.time() + silence
+        self._sent_until = 0.0  # s; the end of the last frame of its own, and silence
         self._waiting: list[tuple[float, bytes]] = []  # until when [s] at most, frame
         self._timer: asyncio.TimerHandle | None = None
 
@@ -59,14 +60,15 @@ class SilentPort(PortAbove):
         """Send what may go now; the timer sends the rest."""
         while self._waiting:
             latest, frame = self._waiting[0]
-            due = min(self._free_from, latest)
+            due = max(self._sent_until, min(self._free_from, latest))
             now = self._loop.time()
             if now < due:
                 if self._timer is None:
                     self._timer = self._loop.call_at(due, self._due)
                 return
             del self._waiting[0]
-            self._free_from = now + len(frame) * self._byte_time + self._silence
+            self._sent_until = now + len(frame) * self._byte_time + self._silence
+            self._free_from = max(self._free_from, self._sent_until)
             self.below.write(frame)
 
     def _due(self) -> None:

@@ -77,14 +77,17 @@ async def test_newer_request_replaces_one_that_waits_but_no_broadcast() -> None:
 
 @in_virtual_time
 async def test_noise_does_not_keep_a_stop_waiting_for_ever() -> None:
-    """On a line that never falls silent it goes after the longest frame, of 256 characters."""
+    """On a line that never falls silent it goes after the longest frame, of 256 characters, and after its own."""
     port, below = await opened()
     loop = asyncio.get_running_loop()
     begin = loop.time()
     port.received(b"?")
+    port.write(b"\0stops")
     port.write(b"\1stop")
-    while not below.sent:
+    while len(below.sent) < 2:
         assert loop.time() < begin + 1.0
         await asyncio.sleep(BYTE)
         port.received(b"?")
-    assert below.sent[0][0] - begin == pytest.approx((256 + 3.5) * BYTE, abs=BYTE)
+    (first, _), (second, _) = below.sent
+    assert first - begin == pytest.approx((256 + 3.5) * BYTE, abs=BYTE)
+    assert second - first == pytest.approx((6 + 3.5) * BYTE)

@@ -208,7 +208,7 @@ class UncertainPlayback:
             return max(abs(total) - uncertain, 0.0), min(abs(total) + uncertain, highest)
         # Tones of one frequency that began at different times may cancel.
         highs = sum(center + radius for center, radius in discs)
-        return max(2 * center - highs for center, _ in discs), highest
+        return max(0.0, *(2 * center - highs for center, _ in discs)), highest
 
 
 def _reached(way: Transition, time: float) -> complex:

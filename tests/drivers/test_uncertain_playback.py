@@ -102,6 +102,15 @@ def test_bounds_contain_every_amplifier(seed: int) -> None:
     check_course(seed)
 
 
+def test_tones_that_may_cancel_leave_those_of_other_frequencies_what_they_play() -> None:
+    """By hand: 0.5 at 20 Hz lasts, whatever three tones of 0.3 at 110 Hz make of one another."""
+    bounds = UncertainPlayback(Playback(1, 8))
+    for number, (frequency, level) in enumerate([(400, 5000), *[(2200, 3000)] * 3]):
+        one = LayerSet(number, 0, 0, (Command(0, frequency, level, 0),))
+        bounds.commit([one], number + 1, (0.1 * number, 0.1 * number + 0.001))
+    assert bounds.bounds(0, 1.0, 1.01) == pytest.approx((0.5, 1.4))
+
+
 def test_bounds_are_no_wider_than_need_be() -> None:
     """By hand: a rise to 0.5 along 100 ms that began within 2 ms is at 0.25 at half, +/- 0.008."""
     bounds = UncertainPlayback(Playback(1, 8))

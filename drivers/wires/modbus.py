@@ -27,8 +27,9 @@ class SilentPort(PortAbove):
     """A port that sends a frame once the line was silent for a time [s]; implements `Port`.
 
     byte_time [s]; on_data: called with what is received. A frame waits at most for the longest
-    other one, so that noise does not keep a stop waiting, but always for one of its own. Of those that wait a newer one replaces
-    the older: its request was given up. Broadcasts stay, which have no reply to wait for.
+    other one, so that noise does not keep a stop waiting, but always for one of its own.
+    Of those that wait a newer one replaces the older: its request was given up. Broadcasts stay,
+    which have no reply to wait for.
     """
 
     def __init__(self, silence: float, byte_time: float, on_data: Callable[[bytes], None]) -> None:

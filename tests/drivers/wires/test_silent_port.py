@@ -77,7 +77,7 @@ async def test_newer_request_replaces_one_that_waits_but_no_broadcast() -> None:
 
 @in_virtual_time
 async def test_noise_does_not_keep_a_stop_waiting_for_ever() -> None:
-    """On a line that never falls silent it goes after the longest frame, of 256 characters, and after its own."""
+    """It goes after the longest frame, of 256 characters, and one that follows after that."""
     port, below = await opened()
     loop = asyncio.get_running_loop()
     begin = loop.time()

@@ -96,25 +96,34 @@ class Playback:
         if time < self._changes_at:
             return
         while (due := self._next_due()) is not None and due[0] <= time:
-            at, number = due
-            # What has faded before is gone; a set that waited for its end may continue a voice.
-            self._drop_faded(math.nextafter(at - self.uncertainty, -math.inf))
-            layer = self._layers[number]
-            if layer.waiting is not None and layer.waiting[0] <= at:
-                _, one, token = layer.waiting
-                layer.waiting = None
-                self._start(one, token, at)
-            else:
-                self._end(number, at)
+            self._carry_out(*due)
         self._drop_faded(time - self.uncertainty)
         self._note_changes()
 
-    def _drop_faded(self, time: float) -> None:
-        """Drop the voices that are silent from a time on."""
+    def carry_out(self, due: tuple[float, int]) -> None:
+        """Carry out one of what is due, also before what is due of other layers sooner."""
+        self._carry_out(*due)
+        self._note_changes()
+
+    def _carry_out(self, at: float, number: int) -> None:
+        """End a layer at a time, or start what waits there."""
+        layer = self._layers[number]
+        # What has faded before is gone; a set that waited for its end may continue a voice.
+        self._drop_faded(math.nextafter(at - self.uncertainty, -math.inf), number)
+        if layer.waiting is not None and layer.waiting[0] <= at:
+            _, one, token = layer.waiting
+            layer.waiting = None
+            self._start(one, token, at)
+        else:
+            self._end(number, at)
+
+    def _drop_faded(self, time: float, layer: int | None = None) -> None:
+        """Drop the voices that are silent from a time on, of one layer or of all."""
         for channel, voices in enumerate(self.all_voices):
             kept = []
             for voice in voices:
-                if voice.transition.last or voice.transition.end > time:
+                is_other = layer is not None and voice.layer != layer
+                if is_other or voice.transition.last or voice.transition.end > time:
                     kept.append(voice)
             if len(kept) < len(voices):
                 self.all_voices[channel] = tuple(kept)
@@ -276,13 +285,18 @@ class Playback:
                     return False
         return True
 
-    def _next_due(self) -> tuple[float, int] | None:
-        first: tuple[float, int] | None = None
+    @property
+    def dues(self) -> list[tuple[float, int]]:
+        """When layers end by themselves or start what waits [s], the next of each, and which."""
+        dues = []
         for number, layer in self._layers.items():
             due = layer.ends if layer.waiting is None else min(layer.ends, layer.waiting[0])
-            if due < math.inf and (first is None or due < first[0]):
-                first = due, number
-        return first
+            if due < math.inf:
+                dues.append((due, number))
+        return dues
+
+    def _next_due(self) -> tuple[float, int] | None:
+        return min(self.dues, default=None)
 
     def _onsets_end(self, layer: int, time: float) -> float:
         ends = (

@@ -38,7 +38,8 @@ class UncertainPlayback:
         self.playback = playback
         self.half = [0.0] * _LAYERS
         self._marks: dict[int, _Mark] = {}
-        self._ghosts: list[tuple[int, _Mark]] = []  # by channel: voices that may still fade
+        # Channels of voices that are gone, and until when [s] they may still play.
+        self._ghosts: list[tuple[int, _Mark, float]] = []
         self._origins: dict[float, float] = {}  # half the interval of the origins of phases
 
     def copied(self) -> "UncertainPlayback":
@@ -64,7 +65,9 @@ class UncertainPlayback:
         changed = dict.fromkeys(range(_LAYERS), False)
         if layers is not None:
             changed = {one.layer: one.after for one in layers}
-        ends = [(self.playback.end_of(layer), self.half[layer]) for layer in changed]
+        # Of all layers: what is due is taken to have happened before what is to happen, or after.
+        ends = [(due, self.half[layer]) for due, layer in self.playback.dues]
+        ends += [(self.playback.end_of(layer), self.half[layer]) for layer in changed]
         for voice in (voice for voices in self.playback.all_voices for voice in voices):
             way, half = voice.transition, self._mark_of(voice.transition).half
             is_followed = voice.layer in waiting or changed.get(voice.layer, False)
@@ -112,19 +115,40 @@ class UncertainPlayback:
         self._mark(before, (due - half, due + half))
 
     def possible(self, start: float, end: float) -> Iterator["UncertainPlayback"]:
-        """Yield what may play between two times: before and after what may be due, in turn."""
+        """Yield what may play between two times: before and after what may be due, in any order.
+
+        What is due of several layers at one time happens at once. The last has all of it behind it.
+        """
         self.advance(start)
-        state = self
-        yield state
-        while (due := state.playback.next_due) <= end + state.lag:
-            state = state.copied()
-            state._pass(due)
-            yield state
+        states = {frozenset[float](): self}
+        while states:
+            yield from states.values()
+            after: dict[frozenset[float], UncertainPlayback] = {}
+            for passed, state in states.items():
+                for due in state._first_dues(end + self.lag):
+                    if passed | {due} not in after:
+                        after[passed | {due}] = state._after(due)
+            states = after
+
+    def _first_dues(self, until: float) -> set[float]:
+        """Return the times by another at which what is due may come before all other."""
+        dues = self.playback.dues
+        first = min((due + self.half[layer] for due, layer in dues), default=until)
+        return {due for due, layer in dues if due <= until and due - self.half[layer] <= first}
+
+    def _after(self, due: float) -> "UncertainPlayback":
+        """Return what plays once that has happened which is due at a time, and nothing else."""
+        after, half = self.copied(), max(self.half)
+        for each in self.playback.dues:
+            if each[0] == due:
+                after.playback.carry_out(each)
+        after._mark(self.playback.all_voices, (due - half, due + half))
+        return after
 
     def _mark(self, before: Sequence[Sequence[Voice]], when: Interval) -> None:
         """Note the radius of every transition that is new."""
         half, marks = (when[1] - when[0]) / 2, dict[int, _Mark]()
-        ghosts = [each for each in self._ghosts if each[1].way.end + each[1].half > when[0]]
+        ghosts = [each for each in self._ghosts if each[2] > when[0]]
         for channel, were in enumerate(before):
             left = {(each.layer, each.frequency, each.origin): each.transition for each in were}
             known = dict(left)
@@ -134,8 +158,11 @@ class UncertainPlayback:
                 self._origins.setdefault(voice.origin, half)
                 radius = self.radius(known[name], *when) if name in known else 0.0
                 marks[id(way)] = self._marks.get(id(way)) or _Mark(way, half, radius)
-            gone = [self._mark_of(way) for way in left.values()]
-            ghosts += [(channel, each) for each in gone if each.way.end + each.half > when[0]]
+            for mark in map(self._mark_of, left.values()):
+                is_cut = mark.way.last or mark.way.end > (when[0] + when[1]) / 2
+                until = when[1] if is_cut else mark.way.end + mark.half
+                if until > when[0]:
+                    ghosts.append((channel, mark, until))
         self._marks, self._ghosts = marks, ghosts
         origins = {voice.origin for voices in self.playback.all_voices for voice in voices}
         self._origins = {each: self._origins[each] for each in origins}
@@ -174,8 +201,8 @@ class UncertainPlayback:
             low, high = self._sum(frequency, by_origin, start, end, is_exact=is_exact)
             lowest += low
             highest += high
-        for at, mark in self._ghosts:
-            if at == channel and mark.way.end + mark.half > start:
+        for at, mark, until in self._ghosts:
+            if at == channel and until > start:
                 ghost = abs(_reached(mark.way, start - mark.half)) + mark.radius
                 lowest, highest = lowest - ghost, highest + ghost
         return max(lowest, 0.0), highest

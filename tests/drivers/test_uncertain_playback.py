@@ -96,10 +96,26 @@ def expect_bounded(
             assert low <= one.level(channel, moment) <= high, (channel, is_exact, moment)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", [*range(40), 68])
 def test_bounds_contain_every_amplifier(seed: int) -> None:
     """Whenever within its interval it carried each set out, early, late, or in between."""
     check_course(seed)
+
+
+def test_set_that_comes_as_another_layer_may_end_is_ambiguous() -> None:
+    """By hand: what began within 0 to 60 ms and is valid for 100 ends within 100 to 160 ms."""
+    bounds = UncertainPlayback(Playback(2, 8))
+    first = LayerSet(0, 0, 100, (Command(0, 2200, 5000, 0),))
+    bounds.commit([first], 1, (0.0, 0.06))
+    other = LayerSet(1, 0, 0, (Command(1, 400, 5000, 0),))
+    cases = (0.09, 0.099), (0.09, 0.101), (0.131, 0.133), (0.159, 0.17), (0.161, 0.17)
+    found = [bounds.is_ambiguous(when, [other]) for when in cases]
+    assert found == [False, True, True, True, False]
+    bounds.commit([other], 2, (0.131, 0.133))  # for whoever cannot wait for another moment
+    (state,) = bounds.possible(0.134, 0.136)
+    assert state.bounds(0, 0.134, 0.136) == pytest.approx((0.0, 0.5))
+    (state,) = bounds.possible(0.161, 0.162)
+    assert state.bounds(0, 0.161, 0.162) == (0.0, 0.0)
 
 
 def test_tones_that_may_cancel_leave_those_of_other_frequencies_what_they_play() -> None:

@@ -18,36 +18,51 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from controller.api.client_protocol import Unreachable, read_result
-from controller.api.jsonrpc import ErrorCode, RpcError, error_line, unknown_method
-from controller.api.methods import StatusResult
+from controller.api.jsonrpc import (
+    ErrorCode,
+    RpcError,
+    error_line,
+    read_params,
+    read_request,
+    unknown_method,
+)
+from controller.api.methods import DisarmParams, RequestedBy, StatusResult
 from controller.api.rate_limit import RateLimiter
 from controller.gateway.access import SUBPROTOCOL, Access
 from controller.gateway.bridge import bridge, client_name
 from controller.gateway.field import DrawnField
-from controller.gateway.link import KeptLink
+from controller.gateway.lasting import LastingLink
+from controller.gateway.link import KeptLink, request_of
 from controller.gateway.metrics import exposition
 from controller.gateway.openapi import HTTP_METHODS, HTTP_STATUS, openapi
 from controller.gateway.settings import Settings
 
 MAX_BODY = 1 << 16  # bytes
 MAX_SESSIONS = 24  # WebSockets; the daemon has 32 connections, and some for stops
-MAX_OPENING_RATE, OPENING_BURST = 15.0, 48.0  # 1/s; of a host's connections to the daemon, and in
-# a burst: fewer than the daemon accepts of one process
+MAX_OPENING_RATE, OPENING_BURST = 10.0, 32.0  # 1/s; of a host's connections to the daemon, and in
+# a burst
+MAX_TOTAL_RATE, TOTAL_BURST = 16.0, 48.0  # the same of all hosts together: fewer than the daemon
+# accepts of one process, so that there are always some for the gateway's own
 _MAX_HOSTS = 256  # above which those that have not connected lately are forgotten
-UNLIMITED = frozenset({"stop", "disarm"})
+# Over the lasting connection, whoever sends them; with their parameters.
+_SILENCING: dict[str, type[RequestedBy]] = {"stop": RequestedBy, "disarm": DisarmParams}
+_MAX_DISARMS = 8  # at once; the daemon carries out as many of one client
 TRY_AGAIN_LATER = 1013  # close code in the registry of RFC 6455
 
 _PAGE = Path(__file__).parent / "page"
 
 
 class Gateway:
-    """State shared by the routes; `app` is the ASGI application, `field` to be run beside it."""
+    """State shared by the routes; `app` is the ASGI application, `run` to be run beside it."""
 
     def __init__(self, settings: Settings) -> None:
         self.field = DrawnField(settings.socket)
         self._daemon = settings.socket
         self._session_count = 0
         self._rates: dict[str, RateLimiter] = {}  # of connections to the daemon, by host
+        self._rate = RateLimiter(MAX_TOTAL_RATE, burst=TOTAL_BURST, clock=time.monotonic)
+        self._lasting = LastingLink(settings.socket)
+        self._disarms = asyncio.Semaphore(_MAX_DISARMS)
         self._status = KeptLink()  # for the metrics
         self._reading = asyncio.Lock()
         self.app = Starlette(
@@ -74,6 +89,12 @@ class Gateway:
             ],
             exception_handlers={HTTPException: _http_error},
         )
+
+    async def run(self) -> None:
+        """Keep what it has of the daemon for all browsers, until cancelled."""
+        async with asyncio.TaskGroup() as own:
+            own.create_task(self.field.run())
+            own.create_task(self._lasting.run())
 
     async def _metrics(self, _: Request) -> Response:
         """Read the daemon's status for Prometheus, over one connection: it needs no token."""
@@ -104,17 +125,29 @@ class Gateway:
 
     async def _request(self, request: Request, method: str, params: bytes) -> dict[str, Any]:
         """The daemon's response, over the connection that this one keeps; raises RpcError."""
-        kept: KeptLink = request.state.daemon
-        if not (kept.is_open or method in UNLIMITED or self._may_connect(request)):
-            raise RpcError(ErrorCode.BUSY, "too many connections", remedy="keep one open")
         name = client_name("http", request)
         try:
+            if method in _SILENCING:
+                return {"result": await self._silence(name, method, params)}
+            kept: KeptLink = request.state.daemon
+            if not (kept.is_open or self._may_connect(request)):
+                raise RpcError(ErrorCode.BUSY, "too many connections", remedy="keep one open")
             reply: dict[str, Any] = json.loads(
                 await kept.request(self._daemon, name, method, params)
             )
         except Unreachable as error:
             raise RpcError(ErrorCode.LINK, str(error)) from error
         return reply
+
+    async def _silence(self, name: str, method: str, params: bytes) -> Any:
+        """The result of a stop or disarm of a client; raises RpcError and Unreachable."""
+        read = read_request(request_of(name, method, params))
+        given = read_params(_SILENCING[method], read)
+        given = given.model_copy(update={"client": given.client or name})
+        if method == "stop":
+            return await self._lasting.request(method, given)
+        async with self._disarms:
+            return await self._lasting.request(method, given)
 
     async def _serve(self, socket: WebSocket) -> None:
         """Serve one browser."""
@@ -139,7 +172,7 @@ class Gateway:
         rate = self._rates.setdefault(
             host, RateLimiter(MAX_OPENING_RATE, burst=OPENING_BURST, clock=time.monotonic)
         )
-        return rate.take()
+        return rate.take() and self._rate.take()
 
 
 async def _body(request: Request) -> bytes:

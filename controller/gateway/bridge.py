@@ -13,6 +13,8 @@ from controller.gateway.field import DrawnField
 from controller.gateway.link import DaemonLink
 
 SEND_TIMEOUT = 5.0  # s; for one frame
+_LAST_FRAMES = 0.1  # s; for those that a browser which is given up has sent
+_SILENCING = ('"stop"', '"disarm"')
 _MAX_NAME = 80  # characters; as in the API
 
 UNSUPPORTED_DATA = 1003  # close code of RFC 6455
@@ -30,12 +32,15 @@ async def bridge(socket: WebSocket, daemon: Path, field: DrawnField) -> None:
     try:
         link = await DaemonLink.open(daemon, client_name(f"web:{next(_numbers)}", socket))
         with contextlib.closing(link):
-            await socket.send_text(link.hello.decode())
-            async with asyncio.TaskGroup() as ways:
-                ways.create_task(_to_daemon(socket, link))
-                ways.create_task(_to_browser(socket, link))
-                if "field" in socket.query_params:
-                    ways.create_task(_draw(socket, field))
+            try:
+                await socket.send_text(link.hello.decode())
+                async with asyncio.TaskGroup() as ways:
+                    ways.create_task(_to_daemon(socket, link))
+                    ways.create_task(_to_browser(socket, link))
+                    if "field" in socket.query_params:
+                        ways.create_task(_draw(socket, field))
+            finally:
+                await _silence(socket, link)
     except* Unreachable:
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # closed already
             await socket.close(NO_DAEMON, "the daemon does not respond")
@@ -54,6 +59,16 @@ async def _to_daemon(socket: WebSocket, link: DaemonLink) -> None:
             await socket.close(UNSUPPORTED_DATA, "send text frames of one line")
             raise WebSocketDisconnect(UNSUPPORTED_DATA)
         await link.send(text.encode())
+
+
+async def _silence(socket: WebSocket, link: DaemonLink) -> None:
+    """Send the daemon what may silence of the frames that still wait, whoever else is at an end."""
+    with contextlib.suppress(RuntimeError, TimeoutError):  # it has left, or there is no further one
+        async with asyncio.timeout(_LAST_FRAMES):
+            while link.is_open:
+                text = (await socket.receive()).get("text") or ""
+                if "\n" not in text and any(method in text for method in _SILENCING):
+                    link.write(text.encode())
 
 
 async def _to_browser(socket: WebSocket, link: DaemonLink) -> None:

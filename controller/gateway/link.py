@@ -30,7 +30,11 @@ class DaemonLink:
     @classmethod
     async def open(cls, path: Path, name: str) -> Self:
         """Connect and introduce a browser by its name in the daemon's log; raises Unreachable."""
-        connected = await connected_socket(path)
+        try:
+            async with asyncio.timeout(RESPONSE_TIMEOUT):  # the daemon's queue may be full
+                connected = await connected_socket(path)
+        except TimeoutError as error:
+            raise Unreachable.at(path, error) from error
         link = cls(path, *await asyncio.open_unix_connection(sock=connected))
         try:
             params = json.dumps({"client": name}).encode()
@@ -49,12 +53,9 @@ class DaemonLink:
 
     async def request(self, method: str, params: bytes, *, id: str) -> bytes:
         """Send a request and wait for the next line, its response; raises Unreachable."""
-        # Before the parameters, which are unread: a key that they repeat is refused.
-        head = {"jsonrpc": "2.0", "id": id, "method": method}
-        line = json.dumps(head)[:-1].encode() + b',"params":' + params + b"}"
         try:
             async with asyncio.timeout(RESPONSE_TIMEOUT):
-                await self.send(line)
+                await self.send(request_of(id, method, params))
                 return await self.next_line()
         except TimeoutError as error:
             self.close()
@@ -62,11 +63,15 @@ class DaemonLink:
 
     async def send(self, line: bytes) -> None:
         """Send a line, as soon as the daemon reads; raises Unreachable."""
-        self._writer.write(line + b"\n")
+        self.write(line)
         try:
             await self._writer.drain()
         except OSError as error:
             raise Unreachable.at(self._path, error) from error
+
+    def write(self, line: bytes) -> None:
+        """Send a line without waiting, even if it is the last before `close`."""
+        self._writer.write(line + b"\n")
 
     async def next_line(self) -> bytes:
         """Wait for a line and return it without its line feed; raises Unreachable."""
@@ -93,6 +98,13 @@ class DaemonLink:
     def abort(self) -> None:
         """Close at once."""
         self._writer.transport.abort()
+
+
+def request_of(id: str, method: str, params: bytes) -> bytes:
+    """The line of a request, its parameters as they were received."""
+    # Before the parameters, which are unread: a key that they repeat is refused.
+    head = {"jsonrpc": "2.0", "id": id, "method": method}
+    return json.dumps(head)[:-1].encode() + b',"params":' + params + b"}"
 
 
 class KeptLink:

@@ -84,10 +84,10 @@ async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
         ssl_certfile=settings.certificate,
         ssl_keyfile=settings.key,
     )
-    drawing = asyncio.create_task(gateway.field.run())
+    own = asyncio.create_task(gateway.run())
     await _Server(config, announce=announce).serve(sockets=[listening])
-    drawing.cancel()
-    await asyncio.wait({drawing})
+    own.cancel()
+    await asyncio.wait({own})
 
 
 def check_certificate(settings: Settings) -> None:

@@ -44,9 +44,13 @@ export class Connection {
   }
 
   opened({ id, result }) {
-    this.attempts = 0;
+    const { socket } = this;
     this.wasOpen = this.wasEverAccepted = true;
-    this.call("subscribe", { topics: this.topics, rate_hz: 10 }).catch(() => {});
+    this.call("subscribe", { topics: this.topics, rate_hz: 10 }).then(() => { this.attempts = 0; }, () => {
+      if (socket !== this.socket) return;
+      this.wasOpen = false;  // the daemon has too many clients: connected later
+      socket.close();
+    });
     this.handlers.opened(result, id);
   }
 
@@ -128,6 +132,7 @@ export class Connection {
     const headers = { Authorization: `Bearer ${this.token}`, "Content-Type": "application/json" };
     const url = new URL(`api/v1/${method}`, location.href);
     url.hash = "";
-    return fetch(url, { method: "POST", headers, body: "{}", keepalive: true });
+    const signal = AbortSignal.timeout(RESPONSE_TIMEOUT_MS);
+    return fetch(url, { method: "POST", headers, body: "{}", keepalive: true, signal });
   }
 }

@@ -1,0 +1,184 @@
+"""A stop is passed on or answered, whatever other browsers and the daemon do."""
+
+import asyncio
+import socket
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+from unittest.mock import AsyncMock
+
+import pytest
+
+from controller.api.client_protocol import Unreachable
+from controller.api.methods import RequestedBy
+from controller.api.schema import API_VERSION
+from controller.gateway import bridge, lasting, link
+from controller.gateway.field import DrawnField
+from daemon_bench import PATIENCE
+from gateway_bench import TOKEN, GatewayProcess, ScriptedDaemon, gateway_process, wait_for_daemon
+
+
+@pytest.fixture
+def gateway(daemon: ScriptedDaemon, tmp_path: Path) -> Iterator[GatewayProcess]:
+    """A gateway from which no host has had a connection to the daemon yet, but ours."""
+    with gateway_process(tmp_path, daemon.socket) as made:
+        wait_for_daemon(made)
+        yield made
+
+
+def sent(gateway: GatewayProcess, method: str, host: str) -> socket.socket:
+    """A connection of a host over which one request was sent."""
+    made = socket.create_connection(
+        ("127.0.0.1", gateway.port), timeout=PATIENCE, source_address=(host, 0)
+    )
+    made.sendall(
+        f"POST /api/v1/{method} HTTP/1.1\r\nHost: {gateway.host}\r\nConnection: close\r\n"
+        f"Authorization: Bearer {TOKEN}\r\nContent-Length: 0\r\n\r\n".encode()
+    )
+    return made
+
+
+def status(connection: socket.socket) -> int:
+    """The status of the response."""
+    with connection:
+        return int(connection.recv(1 << 16)[9:12])
+
+
+def test_stops_are_passed_on_although_other_hosts_connect_often(
+    gateway: GatewayProcess, daemon: ScriptedDaemon
+) -> None:
+    """After the bursts of two hosts; the daemon accepts 64 connections at once of one process."""
+    daemon.calls.clear()
+    others = [sent(gateway, "status", f"127.0.0.{host}") for _ in range(45) for host in (2, 3)]
+    stops = [sent(gateway, "stop", "127.0.0.4") for _ in range(70)]
+    disarms = [sent(gateway, "disarm", "127.0.0.4") for _ in range(20)]
+    assert [status(each) for each in stops] == [200] * 70
+    assert [status(each) for each in disarms] == [200] * 20
+    assert daemon.methods.count("stop") == 70
+    for each in others:
+        each.close()
+
+
+@pytest.fixture
+def full_queue(tmp_path: Path) -> Iterator[Path]:
+    """The socket of a daemon that hangs: no further connection is queued."""
+    path = tmp_path / "era.sock"
+    waiting: list[socket.socket] = []
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(str(path))
+        bound.listen(0)
+        while True:
+            waiting.append(socket.socket(socket.AF_UNIX))
+            waiting[-1].setblocking(False)
+            try:
+                waiting[-1].connect(str(path))
+            except BlockingIOError:
+                break
+        yield path
+        for each in waiting:
+            each.close()
+
+
+async def test_stop_is_answered_although_the_daemon_hangs(
+    full_queue: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise nobody is told to switch the amplifiers off by hand."""
+    for module in (lasting, link):
+        monkeypatch.setattr(module, "RESPONSE_TIMEOUT", 0.05)
+    async with asyncio.timeout(PATIENCE):
+        with pytest.raises(Unreachable, match="does not respond"):
+            await link.DaemonLink.open(full_queue, "browser")
+        with pytest.raises(Unreachable, match="does not respond"):
+            await lasting.LastingLink(full_queue).request("stop", RequestedBy())
+
+
+async def test_stop_is_repeated_if_the_connection_is_lost(
+    daemon: ScriptedDaemon, tmp_path: Path
+) -> None:
+    """As when the daemon closes it at the same time for a new client."""
+    path = tmp_path / "era.sock"
+    lost = 0
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal lost
+        ours, theirs = await asyncio.open_unix_connection(daemon.socket)
+        theirs.write(await reader.readline())
+        writer.write(await ours.readline())
+        request = await reader.readline()
+        if lost:
+            theirs.write(request)
+            writer.write(await ours.readline())
+        lost += 1
+        writer.close()
+        theirs.close()
+
+    async with await asyncio.start_unix_server(serve, path):
+        assert await lasting.LastingLink(path).request("stop", RequestedBy()) == {"amplifiers": {}}
+    assert lost == 2
+
+
+class DeafBrowser:
+    """A WebSocket of a browser that reads the first frame only, and has sent others."""
+
+    client = None
+    query_params: tuple[()] = ()
+
+    def __init__(self) -> None:
+        self.frames: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+        self._sent = 0
+
+    async def receive(self) -> dict[str, Any]:
+        """The next frame."""
+        return await self.frames.get()
+
+    async def send_text(self, _: str) -> None:
+        """Send the first frame; the others wait."""
+        self._sent += 1
+        if self._sent > 1:
+            await asyncio.Event().wait()
+
+
+@pytest.fixture
+async def busy_daemon(tmp_path: Path) -> AsyncIterator[tuple[Path, asyncio.Future[list[bytes]]]]:
+    """The socket of a daemon that sends an event, and reads only later; what it read."""
+    path = tmp_path / "era.sock"
+    read: asyncio.Future[list[bytes]] = asyncio.get_running_loop().create_future()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        hello = b'{"jsonrpc":"2.0","id":"web","result":{"api_version":"%s"}}\n{}\n'
+        writer.write(hello % API_VERSION.encode())
+        writer.transport.pause_reading()  # type: ignore[attr-defined]
+        await given_up.wait()
+        writer.transport.resume_reading()  # type: ignore[attr-defined]
+        read.set_result((await reader.read()).splitlines())
+        writer.close()
+
+    given_up = asyncio.Event()
+    asyncio.get_running_loop().call_later(0.3, given_up.set)
+    async with await asyncio.start_unix_server(serve, path, limit=1 << 12):
+        yield path, read
+
+
+async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
+    busy_daemon: tuple[Path, "asyncio.Future[list[bytes]]"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It waits behind touches that a busy daemon has not read, and the browser does not read."""
+    path, read = busy_daemon
+    monkeypatch.setattr(bridge, "SEND_TIMEOUT", 0.05)
+    opened = await link.DaemonLink.open(path, "browser")
+    monkeypatch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
+    browser = DeafBrowser()
+    touch = (
+        '{"jsonrpc":"2.0","method":"touch","params":{"source":"page","touches":[]}}' + " " * 4000
+    )
+    stop = '{"jsonrpc":"2.0","id":9,"method":"stop"}'
+    for text in [touch] * 1000 + [stop]:
+        browser.frames.put_nowait({"type": "websocket.receive", "text": text})
+    async with asyncio.timeout(PATIENCE):
+        await bridge.bridge(browser, path, DrawnField(path))  # type: ignore[arg-type]
+        lines = await read
+    opened.abort()
+    await asyncio.sleep(0)
+    assert len(lines) < 900
+    assert lines[-1] == stop.encode()

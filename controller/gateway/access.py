@@ -5,6 +5,7 @@ token stops other users of the machine.
 """
 
 import hmac
+import re
 from typing import TypeAlias
 
 from starlette.datastructures import Headers
@@ -16,6 +17,7 @@ from controller.gateway.settings import Settings
 SUBPROTOCOL = "era-haptics.v1"
 _TOKEN_SUBPROTOCOL = "era-haptics.token."  # noqa: S105 (a prefix, not a token)
 _POLICY_VIOLATION = 1008
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 Refusal: TypeAlias = tuple[int, str]  # HTTP status and reason
 
@@ -63,6 +65,8 @@ class Access:
 
     def _refusal(self, scope: Scope) -> Refusal | None:
         headers = Headers(scope=scope)
+        if _CONTROL.search(scope["path"]):  # routes take a line feed at the end for nothing
+            return 400, "the path must have no control characters"
         hosts = headers.getlist("host")
         if len(hosts) != 1 or not self._is_allowed_host(hosts[0]):
             return 421, "this Host is not allowed; see --allow-host"

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from controller.api.jsonrpc import (
 )
 from controller.api.methods import DisarmParams, RequestedBy, StatusResult
 from controller.api.rate_limit import RateLimiter
+from controller.api.schema import Empty
 from controller.gateway.access import SUBPROTOCOL, Access
 from controller.gateway.bridge import bridge, client_name
 from controller.gateway.field import DrawnField
@@ -46,6 +48,7 @@ MAX_TOTAL_RATE, TOTAL_BURST = 16.0, 48.0  # the same of all hosts together: fewe
 _MAX_HOSTS = 256  # above which those that have not connected lately are forgotten
 # Over the lasting connection, whoever sends them; with their parameters.
 _SILENCING: dict[str, type[RequestedBy]] = {"stop": RequestedBy, "disarm": DisarmParams}
+_METRICS_TIME = 0.5  # s; for which the same metrics are given
 _MAX_DISARMS = 8  # at once; the daemon carries out as many of one client
 TRY_AGAIN_LATER = 1013  # close code in the registry of RFC 6455
 
@@ -63,8 +66,9 @@ class Gateway:
         self._rate = RateLimiter(MAX_TOTAL_RATE, burst=TOTAL_BURST, clock=time.monotonic)
         self._lasting = LastingLink(settings.socket)
         self._disarms = asyncio.Semaphore(_MAX_DISARMS)
-        self._status = KeptLink()  # for the metrics
         self._reading = asyncio.Lock()
+        self._read_at = -math.inf  # s; when the metrics were read
+        self._exposition = b""
         self.app = Starlette(
             routes=[
                 Mount(
@@ -97,14 +101,19 @@ class Gateway:
             own.create_task(self._lasting.run())
 
     async def _metrics(self, _: Request) -> Response:
-        """Read the daemon's status for Prometheus, over one connection: it needs no token."""
+        """The daemon's status for Prometheus, read once for all who need it: it needs no token."""
+        async with self._reading:
+            if time.monotonic() >= self._read_at + _METRICS_TIME:
+                self._exposition = exposition(await self._status())
+                self._read_at = time.monotonic()
+        return Response(self._exposition, media_type=CONTENT_TYPE_LATEST)
+
+    async def _status(self) -> StatusResult | None:
+        """The daemon's status, None without a daemon."""
         try:
-            async with self._reading:
-                reply = await self._status.request(self._daemon, "metrics", "status", b"{}")
-            status = read_result(json.loads(reply)["result"], StatusResult)
-        except (KeyError, Unreachable):
-            status = None
-        return Response(exposition(status), media_type=CONTENT_TYPE_LATEST)
+            return read_result(await self._lasting.request("status", Empty()), StatusResult)
+        except (RpcError, Unreachable):
+            return None
 
     async def _call(self, request: Request) -> Response:
         """Call one method of the API; its parameters are the body."""

@@ -14,7 +14,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import CloseCode, Frame
 
 from controller.api.rate_limit import RateLimiter
-from controller.gateway.link import KeptLink
+from controller.gateway.link import HttpLinks, KeptLink
 
 MAX_IDLE = 128  # connections that have not sent a complete request
 REQUEST_TIMEOUT = 5.0  # s; for a complete request
@@ -32,10 +32,16 @@ _BARE_OR_FOLDED = re.compile(rb"(?<!\r)\n|\n[ \t]")
 class _UnambiguousHttp(h11.Connection):
     """HTTP whose heads of requests no proxy may take for others."""
 
+    _searched = 0  # bytes without the end of a head
+
     def next_event(self) -> Any:
         """The next event; raises RemoteProtocolError, which is answered by 400."""
-        if self.their_state is h11.IDLE and _is_ambiguous(self.trailing_data[0]):
-            raise h11.RemoteProtocolError("ambiguous head")
+        if self.their_state is h11.IDLE:
+            received = self.trailing_data[0]
+            end = _BLANK_LINE.search(received, max(0, self._searched - 3))
+            self._searched = len(received) if end is None else 0
+            if end is not None and _is_ambiguous(received[: end.start() + 1].lower()):
+                raise h11.RemoteProtocolError("ambiguous head")
         return super().next_event()
 
 
@@ -54,7 +60,7 @@ class HttpConnection(H11Protocol):
         self._idle: dict[HttpConnection, asyncio.TimerHandle] = self.app_state.setdefault(
             "idle", {}
         )
-        self._daemon = KeptLink()
+        self._daemon = KeptLink(self.app_state.setdefault("links", HttpLinks()))
         self.app_state = {**self.app_state, "daemon": self._daemon}  # for requests
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -181,13 +187,11 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
         return is_within
 
 
-def _is_ambiguous(received: bytes) -> bool:
-    """Whether a proxy may read the head of a request otherwise, once it is complete.
+def _is_ambiguous(head: bytes) -> bool:
+    """Whether a proxy may read the head of a request, in lower case, otherwise.
 
     Lines that end with a line feed alone, folded lines, two ways to give the length of the body.
     """
-    end = _BLANK_LINE.search(received)
-    head = b"" if end is None else received[: end.start() + 1].lower()
     lengths = [name for name in (b"\ncontent-length:", b"\ntransfer-encoding:") if name in head]
     return len(lengths) > 1 or _BARE_OR_FOLDED.search(head) is not None
 

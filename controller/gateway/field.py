@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from controller.api.client_protocol import Notification, read_line, result_of
 from controller.api.schema import PlayedTone
-from controller.gateway.link import DaemonLink
+from controller.gateway.link import DaemonLink, request_of
 from model.arrays import ComplexArray, lattice
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import parse_rig
@@ -25,7 +26,7 @@ _MAX_FREQUENCIES = 64  # in the cache
 _FULL_SCALE = 32767
 _NO_FIELD = bytes(8 + 4)  # no columns, no rows, no frequencies, scale 0
 _RETRY_INTERVAL = 0.5  # s; of connecting to the daemon
-_TOPICS = b'{"jsonrpc":"2.0","method":"subscribe","params":{"topics":["pattern","silence"]}}'
+_TOPICS = b'{"topics":["pattern","silence"]}'
 
 _logger = logging.getLogger(__name__)
 
@@ -109,15 +110,18 @@ class DrawnField:
             await asyncio.sleep(_RETRY_INTERVAL)
 
     async def _follow(self) -> None:
-        """Have what plays drawn until the daemon disconnects; raises Unreachable."""
+        """Have what plays drawn until the daemon disconnects; raises RpcError and Unreachable."""
         link = await DaemonLink.open(self._daemon, "gateway")
-        self._problem = ""
         try:
             rig_text = json.loads(link.hello)["result"]["rig_text"]
-            await link.send(_TOPICS)
+            await link.send(request_of("gateway", "subscribe", _TOPICS))
             while True:
-                event = json.loads(await link.next_line())["params"]
-                self._show((rig_text, event["data"].get("drive", {})))
+                received = read_line(await link.next_line())
+                if isinstance(received, Notification):
+                    self._show((rig_text, received.data.get("drive", {})))
+                else:
+                    result_of(received)  # raises if the daemon has too many clients
+                    self._problem = ""
         finally:
             link.abort()
 

@@ -1,13 +1,16 @@
 """A connection to the daemon for one browser: lines of the API, passed on as they are."""
 
 import asyncio
+import contextlib
 import json
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Self
 
 from controller.api.channel import connected_socket
 from controller.api.client_protocol import RESPONSE_TIMEOUT, Unreachable, check_version
 
+MAX_KEPT = 8  # connections of HTTP; the daemon has 32
 _READ = 1 << 16  # bytes; read ahead, and the rest of a line that is incomplete
 
 
@@ -107,10 +110,39 @@ def request_of(id: str, method: str, params: bytes) -> bytes:
     return json.dumps(head)[:-1].encode() + b',"params":' + params + b"}"
 
 
+class HttpLinks:
+    """Bounds the connections to the daemon of all HTTP connections, which has some for others."""
+
+    def __init__(self) -> None:
+        self._places = asyncio.Semaphore(MAX_KEPT)
+        self._busy = 0
+        self._idle: dict[KeptLink, None] = {}  # longest idle first
+
+    @contextlib.asynccontextmanager
+    async def place(self, kept: "KeptLink") -> AsyncIterator[None]:
+        """Wait for a place for a request; whoever is idle longest loses its connection for it."""
+        async with self._places:
+            self._idle.pop(kept, None)
+            self._busy += 1
+            if self._busy + len(self._idle) > MAX_KEPT:
+                next(iter(self._idle)).drop()
+            try:
+                yield
+            finally:
+                self._busy -= 1
+                if kept.is_open:
+                    self._idle[kept] = None
+
+    def forget(self, kept: "KeptLink") -> None:
+        """One has closed its connection."""
+        self._idle.pop(kept, None)
+
+
 class KeptLink:
     """The connection to the daemon that an HTTP connection keeps, from its first request on."""
 
-    def __init__(self) -> None:
+    def __init__(self, links: HttpLinks) -> None:
+        self._links = links
         self._link: DaemonLink | None = None
         self._is_over = False
 
@@ -121,14 +153,24 @@ class KeptLink:
 
     async def request(self, path: Path, name: str, method: str, params: bytes) -> bytes:
         """Send a request of a client by its name, and return the response; raises Unreachable."""
-        if self._link is None or not self._link.is_open:
-            self._link = await DaemonLink.open(path, name)
-        if self._is_over:  # sent all the same: it may be a stop
-            asyncio.get_running_loop().call_soon(self._link.close)
-        return await self._link.request(method, params, id=name)
+        try:
+            async with asyncio.timeout(RESPONSE_TIMEOUT), self._links.place(self):
+                if self._link is None or not self._link.is_open:
+                    self._link = await DaemonLink.open(path, name)
+                if self._is_over:  # sent all the same
+                    asyncio.get_running_loop().call_soon(self.drop)
+                return await self._link.request(method, params, id=name)
+        except TimeoutError as error:
+            self.drop()
+            raise Unreachable.at(path, error) from error
+
+    def drop(self) -> None:
+        """Close it; a further request opens another."""
+        self._links.forget(self)
+        if self._link is not None and self._link.is_open:
+            self._link.close()
 
     def close(self) -> None:
         """Close it: the HTTP connection is over."""
         self._is_over = True
-        if self._link is not None:
-            self._link.close()
+        self.drop()

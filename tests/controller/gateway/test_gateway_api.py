@@ -1,5 +1,6 @@
 """The gateway for allowed clients: HTTP, OpenAPI and the WebSocket."""
 
+import contextlib
 import json
 import re
 import struct
@@ -11,7 +12,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from controller.api.methods import METHODS
+from controller.api.methods import METHODS, RequestedBy
 from controller.api.schema import PlayedTone
 from controller.api.topics import LogEvent, PatternEvent
 from gateway_bench import (
@@ -118,6 +119,30 @@ def test_http_touches_belong_to_their_connection(
         wait_for(lambda: not other.is_open)
         assert one.is_open
     wait_for(lambda: not one.is_open)
+
+
+def test_http_connections_leave_places_of_the_daemon_to_others(
+    gateway: GatewayProcess, daemon: ScriptedDaemon
+) -> None:
+    """The one longest idle loses its own, and gets another when it calls again."""
+    headers = {"Authorization": f"Bearer {TOKEN}"}
+    with contextlib.ExitStack() as stack:
+        kept = [
+            stack.enter_context(httpx.Client(base_url=gateway.url, headers=headers))
+            for _ in range(10)
+        ]
+        for each in (*kept, kept[0]):
+            assert each.post("api/v1/status").status_code == 200
+        first, second, third, *others, again = daemon.callers
+        wait_for(lambda: not any(each.is_open for each in (first, second, third)))
+        assert [each.is_open for each in (*others, again)] == [True] * 8
+
+
+def test_http_body_may_have_line_feeds(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
+    """They are spaces of JSON; between requests to the daemon they are the end of one."""
+    for method in ("stop", "clear"):
+        assert http(gateway, f"/api/v1/{method}", body=b'{"client":"a"\n}').status == 200
+    assert daemon.calls == [(name, RequestedBy(client="a")) for name in ("stop", "clear")]
 
 
 def test_http_method_without_parameters_needs_no_body(

@@ -163,8 +163,8 @@ ATTACKS: dict[str, tuple[dict[str, Any], set[int]]] = {
     # methods
     "method of Python": ({"target": "/api/v1/__class__"}, {404}),
     "method of the WebSocket": ({"target": "/api/v1/subscribe"}, {404}),
-    "escape codes in a method": ({"target": "/api/v1/%1b%5b2J"}, {404}),
-    "line feed in a method": ({"target": "/api/v1/arm%0aERROR:%20lost"}, {404}),
+    "escape codes in a method": ({"target": "/api/v1/%1b%5b2J"}, {400}),
+    "line feed in a method": ({"target": "/api/v1/arm%0aERROR:%20lost"}, {400}),
     "GET": (get("/api/v1/arm"), {405}),
     "OPTIONS": (get("/api/v1/arm", "OPTIONS"), {405}),
 }
@@ -219,6 +219,17 @@ def test_http_bytes_are_refused(gateway: GatewayProcess, data: bytes, statuses: 
     assert raw(gateway, filled(data, gateway)).status in statuses
 
 
+def test_head_in_pieces_is_refused(gateway: GatewayProcess) -> None:
+    """Whose last line feed comes alone, after the time in which the others were read."""
+    data = filled(GRANTED.replace(b"Type: ", b"Type:\r\n "), gateway)
+    end = data.index(b"\r\n\r\n") + 3
+    with gateway.connect() as connection:
+        connection.sendall(data[:end])
+        assert http(gateway, target="/api/v1/openapi.json", method="GET").status == 200
+        connection.sendall(data[end:])
+        assert connection.recv(1 << 16).startswith(b"HTTP/1.1 400 ")
+
+
 OWN = f"era-haptics.token.{TOKEN}"
 
 
@@ -245,6 +256,8 @@ def test_websocket_is_refused(gateway: GatewayProcess, changes: dict[str, Any]) 
 
 Misuse: TypeAlias = Callable[[RawWebSocket], None]
 
+REQUEST = b'{"jsonrpc": "2.0", "id": 1, "method": "arm", "params": ' + ARM + b"}"
+
 MISUSES: dict[str, tuple[Misuse, int]] = {
     "binary": (lambda ws: ws.send(b"\x00\x01", first=0x82), 1003),
     "too large": (lambda ws: ws.send(b" " * ((1 << 16) + 1)), 1009),
@@ -263,6 +276,7 @@ MISUSES: dict[str, tuple[Misuse, int]] = {
     "flood of pings": (lambda ws: ws.connection.sendall(frame(b"", first=0x89) * 10_000), 0),
     "flood of pongs": (lambda ws: ws.connection.sendall(frame(b"", first=0x8A) * 10_000), 0),
     "invalid UTF-8": (lambda ws: ws.send(b"\xff\xfe"), 1007),
+    "two lines": (lambda ws: ws.send(REQUEST + b"\n" + REQUEST), 1003),
 }
 
 

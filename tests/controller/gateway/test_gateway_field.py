@@ -1,11 +1,14 @@
 """The drawn field, whatever the daemon sends."""
 
 import asyncio
+import json
 import struct
+from pathlib import Path
 
 import pytest
 
-from controller.api.schema import Message, PlayedTone
+from controller.api.jsonrpc import ErrorCode, RpcError, error_line, result_line
+from controller.api.schema import API_VERSION, Message, PlayedTone
 from controller.api.topics import PatternEvent
 from controller.gateway.field import DrawnField
 from daemon_bench import PATIENCE
@@ -45,3 +48,31 @@ async def test_field_is_drawn_after_what_cannot_be_drawn(
     running.cancel()
     await asyncio.wait({running})
     assert caplog.text.count("field of the plate not drawn") == 1
+
+
+async def test_field_is_followed_again_after_a_refusal(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As by a daemon that has too many clients for a while."""
+    monkeypatch.setattr("controller.gateway.field._RETRY_INTERVAL", 0.0)
+    requests: asyncio.Queue[dict[str, object]] = asyncio.Queue()
+    busy = RpcError(ErrorCode.BUSY, "too many clients", remedy="try again later")
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        hello = json.loads(await reader.readline())
+        result = json.dumps({"api_version": API_VERSION, "rig_text": ""})
+        writer.write(result_line(hello["id"], result))
+        request = json.loads(await reader.readline())
+        requests.put_nowait(request)
+        writer.write(error_line(request.get("id"), busy) if "id" in request else b"")
+        await reader.read()
+        writer.close()
+
+    path = tmp_path / "era.sock"
+    async with await asyncio.start_unix_server(serve, path), asyncio.timeout(PATIENCE):
+        running = asyncio.create_task(DrawnField(path).run())
+        for _ in range(3):
+            assert (await requests.get())["method"] == "subscribe"
+        running.cancel()
+        await asyncio.wait({running})
+    assert caplog.text.count("too many clients") == 1

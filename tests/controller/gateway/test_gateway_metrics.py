@@ -3,12 +3,16 @@
 from collections.abc import MutableMapping
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock
 
+import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.responses import PlainTextResponse
 
+from controller.api.client_protocol import Unreachable
 from controller.api.methods import StatusResult
+from controller.gateway import app
 from controller.gateway.access import Access
 from controller.gateway.metrics import exposition
 from controller.gateway.settings import Settings
@@ -88,8 +92,26 @@ async def test_metrics_need_the_token_elsewhere(tmp_path: Path) -> None:
         return {"type": "http.request", "body": b""}
 
     access = Access(PlainTextResponse("era_up 1"), settings)
-    for token in (b"wrong", settings.token.encode()):
+    right = settings.token.encode()
+    for path, token in (("/metrics", b"wrong"), ("/metrics\n", b"wrong"), ("/metrics", right)):
         headers = [(b"host", b"panel.local"), (b"authorization", b"Bearer " + token)]
-        scope = {"type": "http", "path": "/metrics", "method": "GET", "headers": headers}
+        scope = {"type": "http", "path": path, "method": "GET", "headers": headers}
         await access(scope, receive, send)
-    assert statuses == [401, 200]
+    assert statuses == [401, 400, 200]
+
+
+async def test_metrics_are_read_once_for_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many read them within half a second."""
+    status = AsyncMock(side_effect=Unreachable)
+    monkeypatch.setattr(app.LastingLink, "request", status)
+    monkeypatch.setattr(app, "_METRICS_TIME", 1e9)
+    transport = httpx.ASGITransport(app.Gateway(Settings(socket=tmp_path / "era.sock")).app)
+    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
+        for _ in range(3):
+            assert "era_up 0.0" in (await client.get("/metrics")).text
+        assert status.await_count == 1
+        monkeypatch.setattr(app, "_METRICS_TIME", 0.0)
+        await client.get("/metrics")
+    assert status.await_count == 2

@@ -199,10 +199,18 @@ class Expected:
         for number, known in enumerate(tokens):
             expect_one_of(shown["tokens"][number], known, f"token of layer {number}, {where}")
 
+    def waits(self, when: When) -> bool:
+        """Whether a set surely waits for the end of an onset, whenever within an interval."""
+        return all(each.playback.waiting for each in self._plays.possible(*self._drifted(when)))
+
+    def _drifted(self, when: When) -> tuple[float, float]:
+        """Return an interval as the amplifier's clock may have it."""
+        drift = DRIFT * (when.latest - self.began.earliest)
+        return when.earliest - drift, when.latest + drift
+
     def _played(self, when: When) -> tuple[list[tuple[float, float]], list[set[int]]]:
         """Return least and largest level of each channel, and possible tokens of each layer."""
-        drift = DRIFT * (when.latest - self.began.earliest)
-        start, end = when.earliest - drift, when.latest + drift
+        start, end = self._drifted(when)
         states = [*self._plays.possible(start, end)]
         bounds = []
         for channel in range(self.can["channels"]):

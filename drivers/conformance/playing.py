@@ -74,7 +74,10 @@ def after(subject: Subject) -> Rows:
     newer = layer(0, subject.tone(0, 0.75), after=True)
 
     async def achieved() -> None:
-        plays = (await subject.request("GetAchieved", layer=0))["commands"]
+        answer = await subject.request("GetAchieved", layer=0)
+        if not subject.shown.waits(answer.when):
+            raise Late("the onset may have ended")
+        plays = answer["commands"]
         expect_equal(plays[0]["frequency"], subject.frequency, "frequency that is achieved")
 
     return [

@@ -14,6 +14,7 @@ import pytest
 
 import era_haptics
 from drivers import clock
+from drivers.codec.serial_line.frame import FrameReader
 from drivers.conformance import CHECKS, Result, judge, of_kind
 from drivers.conformance.check import run_checks
 from drivers.conformance.client import When
@@ -25,6 +26,7 @@ from drivers.conformance.subject import Subject
 from drivers.errors import LinkError
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
+from drivers.protocol.table import MESSAGES
 from drivers.trace import tracing
 from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
 from model.rig.rig import Rig
@@ -171,6 +173,24 @@ async def test_machine_that_is_always_late_has_no_verdict() -> None:
     with pytest.raises(LinkError, match="late 10 times"):
         await run_checks([(1, _tried([0.11] * 20))], line.client, level=0.2)
     line.close()
+
+
+def test_request_that_comes_after_an_onset_is_no_violation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first question what is achieved takes 300 ms, until the set that waited plays."""
+    delays, write = [0.3], JudgedLine.write
+
+    def late(line: JudgedLine, data: bytes) -> None:
+        (frame,) = FrameReader().feed(data)
+        if frame.type == MESSAGES["GetAchieved"].number and delays:
+            asyncio.get_running_loop().call_later(delays.pop(), write, line, data)
+        else:
+            write(line, data)
+
+    monkeypatch.setattr(JudgedLine, "write", late)
+    (result,) = judged("serial", ["after"])
+    assert (result.result, delays) == (Result.PASSED, []), result.reason
 
 
 async def test_verdict_over_a_real_port(tmp_path: Path) -> None:

@@ -150,4 +150,7 @@ def test_discover_fails_where_a_named_url_has_no_amplifier(url: str, status: int
 
 def test_what_is_unknown_is_not_shown() -> None:
     """A stop that is confirmed has no time for which it may play."""
-    assert "None" not in invoke("stop", URL).stdout
+    result = invoke("stop", URL)
+    assert result.exit_code == 0, result.output
+    assert "confirmed_silent" in result.stdout
+    assert "None" not in result.stdout

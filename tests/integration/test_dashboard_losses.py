@@ -1,14 +1,18 @@
 """The dashboard in a real browser after losses."""
 
+import signal
 from collections.abc import AsyncIterator
 from itertools import pairwise
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import pytest_asyncio
 
 import dashboard_pictures
 from chromium import Browser, Page, open_browser
+from controller.api.hub import Hub
+from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import DaemonStateName
 from controller.api.topics import LayoutEvent, StateEvent
 from controller.gateway.app import MAX_SESSIONS
@@ -142,3 +146,26 @@ async def test_full_gateway_is_shown_as_full(tab: Page, tmp_path: Path) -> None:
         await tab.until(f"{REASON} === 'simulated'")
         for other in others:
             other.connection.close()
+
+
+async def test_page_without_a_place_at_the_daemon_connects_again(
+    tab: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Instead of showing a state that no event changes."""
+    busy = RpcError(ErrorCode.BUSY, "too many clients", remedy="try again later")
+    with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
+        with monkeypatch.context() as full:
+            full.setattr(Hub, "subscribe", Mock(side_effect=busy))
+            await tab.show(f"{gateway.url}#token={gateway.token}")
+            await tab.until(f"{REASON} === 'gateway-full'")
+        await tab.until(f"{REASON} === 'simulated'")
+
+
+async def test_stop_without_an_answer_is_reported(tab: Page, tmp_path: Path) -> None:
+    """As not confirmed, after the time in which an answer may come: the gateway hangs."""
+    with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
+        await tab.show(f"{gateway.url}#token={gateway.token}")
+        await tab.until(f"{REASON} === 'simulated'")
+        gateway.process.send_signal(signal.SIGSTOP)
+        await tab.click("#stop")
+        await tab.until("document.querySelector('#problem').textContent.includes('by hand')")

@@ -1,5 +1,6 @@
 """The dashboard in a real browser after losses."""
 
+import asyncio
 import signal
 from collections.abc import AsyncIterator
 from itertools import pairwise
@@ -16,7 +17,7 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import DaemonStateName
 from controller.api.topics import LayoutEvent, StateEvent
 from controller.gateway.app import MAX_SESSIONS
-from daemon_bench import running_daemon, until_state
+from daemon_bench import PATIENCE, running_daemon, until_state
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard
 from gateway_bench import UNCONFIRMED, RawWebSocket, ScriptedDaemon, gateway_process
 from sim.faults.fault_window import FaultWindow
@@ -157,7 +158,8 @@ async def test_page_without_a_place_at_the_daemon_connects_again(
         with monkeypatch.context() as full:
             full.setattr(Hub, "subscribe", Mock(side_effect=busy))
             await tab.show(f"{gateway.url}#token={gateway.token}")
-            await tab.until(f"{REASON} === 'gateway-full'")
+            async with asyncio.timeout(PATIENCE / 6):
+                await tab.until(f"{REASON} === 'gateway-full'")
         await tab.until(f"{REASON} === 'simulated'")
 
 
@@ -168,4 +170,5 @@ async def test_stop_without_an_answer_is_reported(tab: Page, tmp_path: Path) -> 
         await tab.until(f"{REASON} === 'simulated'")
         gateway.process.send_signal(signal.SIGSTOP)
         await tab.click("#stop")
-        await tab.until("document.querySelector('#problem').textContent.includes('by hand')")
+        async with asyncio.timeout(PATIENCE / 6):
+            await tab.until("document.querySelector('#problem').textContent.includes('by hand')")

@@ -69,7 +69,7 @@ async def test_field_is_followed_again_after_a_refusal(
         writer.close()
 
     path = tmp_path / "era.sock"
-    async with await asyncio.start_unix_server(serve, path), asyncio.timeout(PATIENCE):
+    async with await asyncio.start_unix_server(serve, path), asyncio.timeout(PATIENCE / 6):
         running = asyncio.create_task(DrawnField(path).run())
         for _ in range(3):
             assert (await requests.get())["method"] == "subscribe"

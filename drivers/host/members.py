@@ -102,7 +102,10 @@ class Members:
             raise
 
     def checked(self, results: Sequence[_T | BaseException]) -> list[_T]:
-        """Return results; raises the most severe error: a lost link first, a degraded one last."""
+        """Return results; raises the most severe error.
+
+        A lost link is first; last are what others have preempted and, after it, a degraded link.
+        """
         good: list[_T] = []
         errors: list[BaseException] = []
         for each in results:
@@ -116,6 +119,8 @@ class Members:
 
     def _severity(self, error: BaseException) -> int:
         if self.is_degraded_only(error):
+            return 3
+        if isinstance(error, Preempted):  # by the cause, which is to be told
             return 2
         return 0 if isinstance(error, LinkError) else 1
 

@@ -226,9 +226,9 @@ class LocalizationTable:
         shapes = self.raster.at(self.shapes, points)
         return frequencies, np.abs(modal[:, 0] @ shapes.T).astype(float)
 
-    def shapes_at(self, points: Sequence[Point]) -> FloatArray:
-        """Shapes of the reduced plate at points [m] of it, (p, r)."""
-        if not points:
+    def shapes_at(self, points: Sequence[Point] | FloatArray) -> FloatArray:
+        """Shapes of the reduced plate at points or footprints [m] of it, (p, r)."""
+        if not len(points):
             return np.empty((0, len(self.omega)))
         return self.raster.at(self.shapes, np.array(points)).astype(float)
 
@@ -291,7 +291,7 @@ class LocalizationTable:
                 self.plate,
                 self.omega,
                 self.losses,
-                at=lambda points: self.raster.at(self.shapes, points).astype(float),
+                at=self.shapes_at,
             ),
             self.eras,
             loads=self.masses,

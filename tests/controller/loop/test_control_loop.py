@@ -391,18 +391,6 @@ async def test_heartbeat_is_sent_only_after_the_loop_has_run() -> None:
 
 
 @in_virtual_time
-async def test_finger_times_out_while_the_loop_does_not_run() -> None:
-    """As between a lost link and the next opening: its source falls silent, and it is not down."""
-    async with running() as bench:
-        bench.touch(FINGER)
-        await asyncio.sleep(0.05)
-        bench.loop.cancel()
-        await asyncio.sleep(0.14)
-        assert bench.controller._tracker.contacts == ()
-        bench.loop = asyncio.create_task(bench.controller.run())
-
-
-@in_virtual_time
 async def test_heartbeat_stops_when_the_loop_hangs() -> None:
     """While the loop waits for one amplifier, the other gets no heartbeat."""
     async with running("a", "b") as bench:

@@ -1,10 +1,11 @@
 """The reference in docs/reference/commands.md: every command with its arguments and options.
 
 `python docs/generators/command_page.py docs/reference/commands.md` writes it anew between the
-page's two marks, from the commands themselves.
+page's two marks, from the commands themselves. What many commands have stands once, above them.
 """
 
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,39 +16,61 @@ from controller.cli.main import load_commands
 from page_part import insert
 
 WRITER = "docs/generators/command_page.py"
+_MANY = 6
+"""So many commands with the same argument or option: it is a common one."""
+
+_Records = list[tuple[str, str]]
 
 
 def command_reference() -> str:
     """All commands by name, groups after the single ones, as Markdown."""
     group, _ = load_commands()
-    context = typer.Context(group, info_name="era")
-    return "\n".join(_group(group, context))
+    commands = list(_commands(group, typer.Context(group, info_name="era")))
+    counts = Counter(record for *_, records in commands for record in records)
+    common: dict[str, str] = {}
+    for (name, text), count in counts.most_common():
+        if count >= _MANY:
+            common.setdefault(name, text)
+    lines = ["### Common arguments and options", ""]
+    lines += [f"- `{name}`: {text}" for name, text in sorted(common.items())]
+    for path, usage, summary, records in commands:
+        lines += ["", f"### {path}", "", summary, "", *_entry(usage, records, common)]
+    return "\n".join(lines)
 
 
-def _group(group: TyperGroup, context: typer.Context) -> Iterator[str]:
+def _commands(
+    group: TyperGroup, context: typer.Context
+) -> Iterator[tuple[str, str, str, _Records]]:
+    """Of every command its full name, usage, summary, and its arguments and options."""
     commands = sorted(
         group.commands.items(), key=lambda item: (isinstance(item[1], TyperGroup), item[0])
     )
     for name, command in commands:
         inner = typer.Context(command, info_name=name, parent=context)
         if isinstance(command, TyperGroup):
-            yield from _group(command, inner)
+            yield from _commands(command, inner)
             continue
-        yield from (f"### {inner.command_path}", "")
-        yield from (" ".join((command.help or "").split()), "")
-        usage = " ".join(command.collect_usage_pieces(inner))
-        yield from ("```text", f"{inner.command_path} {usage}", "```", "")
-        records = [parameter.get_help_record(inner) for parameter in command.params]
-        yield from ("| | |", "|---|---|")
-        for record in records:
-            if record is not None:
-                yield f"| `{_cell(record[0])}` | {_cell(record[1])} |"
-        yield ""
+        usage = " ".join([inner.command_path, *command.collect_usage_pieces(inner)])
+        found = [parameter.get_help_record(inner) for parameter in command.params]
+        records = [(" ".join(one[0].split()), " ".join(one[1].split())) for one in found if one]
+        yield inner.command_path, usage, " ".join((command.help or "").split()), records
 
 
-def _cell(text: str) -> str:
-    """Without what a table of Markdown would take for its own."""
-    return " ".join(text.split()).replace("|", "\\|")
+def _entry(usage: str, records: _Records, common: dict[str, str]) -> Iterator[str]:
+    """The lines of one command: its usage, and what it does not share with others."""
+    is_common = [
+        name in common and text.startswith(common[name].rstrip(".")) for name, text in records
+    ]
+    options = [
+        f"`{name}`"
+        for (name, _), shared in zip(records, is_common, strict=True)
+        if shared and name.startswith("--")
+    ]
+    also = f", also with {', '.join(options)}" if options else ""
+    yield f"- `{usage}`{also}"
+    for (name, text), shared in zip(records, is_common, strict=True):
+        if not shared:
+            yield f"- `{name}`: {text}"
 
 
 if __name__ == "__main__":

@@ -10,9 +10,11 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.testing import CliRunner
 
+from command_page import WRITER, command_reference
 from controller.cli.main import load_commands
 from model.cli import app
 from model.table import contact_sets
+from page_part import insert
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "commands.md").read_text("utf-8")
@@ -32,16 +34,25 @@ def commands(group: TyperGroup, name: str = "era") -> Iterator[tuple[str, TyperC
 
 
 def test_page_lists_every_command_with_its_options() -> None:
-    """The names on the page are those of the program."""
+    """The names on the page are those of the program; what it says once, it says above them."""
     parts = re.split(r"^### ", PAGE, flags=re.MULTILINE)[1:]
     listed = {part.splitlines()[0]: part for part in parts}
     known = dict(commands(load_commands()[0]))
+    common = set(re.findall(r"^- `(--[a-z-]+)", parts[0], re.MULTILINE))
     assert {name for name in listed if name.startswith("era ")} == set(known)
     for name, command in known.items():
-        named = set(re.findall(r"^\| `(?:-\w, )?(--[a-z-]+)", listed[name], re.MULTILINE))
+        own = re.findall(r"^- `(?:-\w, )?(--[a-z-]+)", listed[name], re.MULTILINE)
+        also = re.findall(r"`(--[a-z-]+)", listed[name].partition(", also with ")[2].split("\n")[0])
+        assert set(also) <= common, name
+        named = {*own, *also}
         names = {max(option.opts, key=len) for option in command.params}
         options = {name for name in names if name.startswith("--")}
         assert named == options - {"--help"}, name
+
+
+def test_page_is_current() -> None:
+    """Written anew by the program that stands in the page."""
+    assert insert(PAGE, command_reference(), writer=WRITER) == PAGE, f"python {WRITER}"
 
 
 def test_no_list_of_commands_cuts_a_summary_off() -> None:
@@ -60,7 +71,11 @@ def test_every_command_with_json_tells_its_keys() -> None:
     table = PAGE.partition("## What `--json` prints")[2].partition("## All commands")[0]
     listed = " ".join(re.findall(r"^\| (`era .*?) \|", table, re.MULTILINE))
     parts = re.split(r"^### era ", PAGE, flags=re.MULTILINE)[1:]
-    with_json = [part.splitlines()[0] for part in parts if "| `--json` |" in part]
+    with_json = [
+        part.splitlines()[0]
+        for part in parts
+        if ", `--json`" in part or "also with `--json`" in part
+    ]
     assert len(with_json) > 30
     for name in with_json:
         assert f"`era {name}`" in listed or f"`{name.split()[-1]}`" in listed, name

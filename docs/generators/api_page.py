@@ -21,42 +21,48 @@ PAGE = Path(__file__).parents[1] / "reference" / "api.md"
 def reference() -> str:
     """All tables, as Markdown."""
     models: dict[str, type[Message]] = {}
-    lines = ["### Methods", ""]
+    lines = ["### Methods", "", "→ parameters, ← results; without any it is an empty object, `{}`."]
     for name, method in METHODS.items():
-        lines += [f"#### {name}", "", f"{_sentence(method.summary)}", ""]
-        lines += [*_table("parameter", method.params, models), ""]
-        lines += [*_table("result", method.result, models), ""]
-    lines += ["### Topics", "", "The parameters of every `event` notification:", ""]
-    lines += [*_table("parameter", EventParams, models), ""]
+        rows = [*_rows("→ ", method.params, models), *_rows("← ", method.result, models)]
+        lines += ["", f"#### {name}", "", _sentence(method.summary), "", *_HEAD, *rows]
+    lines += ["", "### Topics", "", "The parameters of every `event` notification, and its `data`:"]
+    lines += ["", *_HEAD, *_rows("", EventParams, models)]
     for topic, entry in TOPICS.items():
-        lines += [f"#### topic {topic}", "", f"{_sentence(entry.summary)}", ""]
-        lines += [*_table("data", entry.data, models), ""]
-    lines += ["### Types", ""]
+        lines += [f"| **{topic}** | | {entry.summary} |", *_data(entry.data, models)]
+    lines += ["", "### Types"]
     shown: set[str] = set()
     while left := [name for name in models if name not in shown]:
         for name in left:
             shown.add(name)
-            lines += [f"#### {name}", "", _summary(models[name]), ""]
-            lines += [*_table("key", models[name], models), ""]
-    lines += ["### Errors", "", "| code | name | meaning |", "|---|---|---|"]
+            rows = list(_rows("", models[name], models))
+            lines += ["", f"#### {name}", "", _summary(models[name]), "", *_HEAD, *rows]
+    lines += ["", "### Errors", "", "| code | name | meaning |", "|---|---|---|"]
     lines += [
         f"| {code.value} | {code.name} | {meaning} |" for code, meaning in ERROR_MEANINGS.items()
     ]
     return "\n".join(lines) + "\n"
 
 
-def _table(head: str, model: type[Message], models: dict[str, type[Message]]) -> Iterator[str]:
+_HEAD = ("| key | type | |", "|---|---|---|")
+
+
+def _rows(prefix: str, model: type[Message], models: dict[str, type[Message]]) -> Iterator[str]:
     """One row per field; collects the models that fields are made of."""
-    if not model.model_fields:
-        yield f"*{head}:* an empty object, `{{}}`"
-        return
-    yield f"| {head} | type | |"
-    yield "|---|---|---|"
     for name, field in model.model_fields.items():
         kind = _kind(field.rebuild_annotation(), models)
         optional = "" if field.is_required() else "optional"
         notes = "; ".join(part for part in (field.description, optional) if part)
-        yield f"| `{name}` | {kind} | {notes} |"
+        yield f"| {prefix}`{name}` | {kind} | {notes} |"
+
+
+def _data(model: type[Message], models: dict[str, type[Message]]) -> Iterator[str]:
+    """The rows of a topic; what `status` returns as well is one of them."""
+    status = set(_rows("", METHODS["status"].result, models))
+    rows = list(_rows("", model, models))
+    same = [row.split(" | ")[0].removeprefix("| ") for row in rows if row in status]
+    if len(same) > 1:
+        yield f"| {', '.join(same)} | as of [status](#status) | |"
+    yield from (row for row in rows if len(same) < 2 or row not in status)
 
 
 def _kind(annotation: Any, models: dict[str, type[Message]]) -> str:

@@ -18,5 +18,5 @@ def test_page_has_the_signatures_of_the_code() -> None:
     """Written anew by the program that the page names."""
     page = PAGE.read_text("utf-8")
     remedy = f"python {WRITER} docs/reference/python-api.md"
-    anew = insert(page, signatures(), writer=WRITER)
+    anew = insert(page, signatures(page), writer=WRITER)
     assert without_comments(anew) == without_comments(page), remedy

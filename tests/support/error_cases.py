@@ -249,7 +249,7 @@ def filled(shelf: Path) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Quotation:
-    """A box of the page: the lines that are typed, the message, and the status that is promised."""
+    """An error of the page: the lines that are typed, the message, and the promised status."""
 
     typed: list[str]
     text: str
@@ -257,15 +257,19 @@ class Quotation:
 
 
 def quotations() -> list[Quotation]:
-    """The boxes of the page in their order, each with the exit status of its section."""
+    """The errors of the page in their order, each with the exit status of its section.
+
+    Blank lines part those of a section; the first line of each says what is wrong.
+    """
     found, status = [], -1
     for section in PAGE.read_text("utf-8").split("\n## ")[1:]:
         if promised := re.search(r"Exit status (\d)", section):
             status = int(promised[1])
         for box in section.split("```text\n")[1:]:
-            lines = box.split("\n```")[0].splitlines()
-            typed = [line for line in lines if line.startswith(("# ", "$ "))]
-            found.append(Quotation(typed, "\n".join(lines[len(typed) :]), status))
+            for entry in box.split("\n```")[0].split("\n\n"):
+                lines = entry.splitlines()[1:]
+                typed = [line for line in lines if line.startswith(("# ", "$ "))]
+                found.append(Quotation(typed, "\n".join(lines[len(typed) :]), status))
     return found
 
 
@@ -279,7 +283,7 @@ def _write_page() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 text = provoke(case, Path(folder), Path(shelf)).text.rstrip("\n")
             typed = "\n".join(quoted.typed)
-            page = page.replace(f"{typed}\n{quoted.text}\n```", f"{typed}\n{text}\n```")
+            page = page.replace(f"\n{typed}\n{quoted.text}\n", f"\n{typed}\n{text}\n")
     PAGE.write_text(page, encoding="utf-8")
 
 

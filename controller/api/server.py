@@ -51,7 +51,7 @@ class _Call:
     expects_response: bool
     method: str = ""
     params: Message | None = None
-    error: RpcError | None = None
+    error: Exception | None = None
 
     def is_superseded_by(self, other: "_Call | None") -> bool:
         """Whether both are touch frames of one source without an id, and the newer one is enough.
@@ -87,7 +87,8 @@ class ApiServer:
     handlers: of all METHODS, called with the client and the parameters; on_disconnect: called with
     every client that disconnects; holds_lease: whether a client does, and must not be evicted;
     is_subscribed: whether it has subscriptions; is_busy: whether a touch is on its way to the wire,
-    for which clients wait; clock [s]; processor_time: of this thread [s].
+    for which clients wait; stop_all: requests a stop of all amplifiers, whatever has failed on the
+    way of a client's; clock [s]; processor_time: of this thread [s].
     """
 
     def __init__(
@@ -98,11 +99,13 @@ class ApiServer:
         holds_lease: Callable[[Connection], bool],
         is_subscribed: Callable[[Connection], bool],
         is_busy: Callable[[], bool] = lambda: False,
+        stop_all: Callable[[], object] = lambda: None,
         clock: Callable[[], float] = clock.now,
         processor_time: Callable[[], float] = time.thread_time,
     ) -> None:
         self._handlers = handlers
         self._on_disconnect = on_disconnect
+        self._stop_all = stop_all
         self._clock = clock
         self._admission = Admission(
             holds_lease=holds_lease, is_subscribed=is_subscribed, clock=clock
@@ -171,7 +174,12 @@ class ApiServer:
             return None
         if line is None:
             return None
-        call = _read_call(line)
+        try:
+            call = _read_call(line)
+        except Exception as error:  # a bug: what may be a stop is one
+            if STOP in line:
+                self._stop_all()
+            call = _Call(None, True, error=error)
         if is_urgent and STOP in line and call.method != "stop":
             connection.note_false_alarm()
         is_limited = call.error is not None or METHODS[call.method].is_limited
@@ -187,6 +195,8 @@ class ApiServer:
         try:
             result = self._call(connection, call)
         except Exception as error:
+            if call.method == "stop":
+                self._stop_all()
             self._respond(connection, call, error)
             return
         if isinstance(result, Message):

@@ -47,7 +47,8 @@ class Turns:
         share = partial(RateLimiter, SHARE, burst=BURST, clock=clock)
         self._first = _Lane(self._take, share(), is_busy=is_busy, clock=clock)
         self._others = _Lane(self._take, share(), is_busy=is_busy, clock=clock)
-        self._urgent = _Lane(self._take, self._others.budget, is_busy=None, clock=clock)
+        self._urgent: deque[Connection] = deque()
+        self._is_urgent_due = False
 
     def add(self, connection: Connection) -> None:
         """Serve a client that has lines."""
@@ -55,18 +56,31 @@ class Turns:
             for lane in (self._first, self._others):
                 with contextlib.suppress(ValueError):
                     lane.waiting.remove(connection)
-            self._urgent.add(connection)
+            if connection not in self._urgent:
+                self._urgent.append(connection)
+            if not self._is_urgent_due:
+                self._is_urgent_due = True
+                asyncio.get_running_loop().call_soon(self._take_urgent)
         elif not connection.is_paused and not any(
             connection in lane.waiting for lane in (self._first, self._others)
         ):
             (self._first if self._is_first(connection) else self._others).add(connection)
 
-    def _take(self, lane: "_Lane") -> None:
+    def _take_urgent(self) -> None:
+        """Serve clients whose input may hold a stop, within no limit, but counted."""
+        try:
+            self._take(self._urgent, self._others.budget)
+        finally:
+            self._is_urgent_due = bool(self._urgent)
+            if self._is_urgent_due:
+                asyncio.get_running_loop().call_soon(self._take_urgent)
+
+    def _take(self, waiting: deque[Connection], budget: RateLimiter) -> None:
         """Serve a line of each connection, round and round, until the turn's time is up."""
         began_at, end = self._processor_time(), time.perf_counter() + MAX_TURN
         reading_time = 0.0
-        while lane.waiting:
-            connection = lane.waiting.popleft()
+        while waiting:
+            connection = waiting.popleft()
             self._serve(connection)
             reading_time += connection.reading_time
             connection.reading_time = 0.0
@@ -77,7 +91,7 @@ class Turns:
             connection.close_if_finished()
             if time.perf_counter() >= end:
                 break
-        lane.budget.spend(self._processor_time() - began_at + reading_time)
+        budget.spend(self._processor_time() - began_at + reading_time)
 
     def _pause(self, connection: Connection) -> None:
         """Serve a client that exceeds its rate a little at a time, so that it delays no one."""
@@ -94,15 +108,15 @@ class Turns:
 class _Lane:
     """Clients that wait, and when their next turn is.
 
-    take: takes a turn; budget: of processor time; is_busy: None if turns wait for nothing.
+    take: takes a turn; budget: of processor time; is_busy: whether turns wait.
     """
 
     def __init__(
         self,
-        take: "Callable[[_Lane], None]",
+        take: Callable[[deque[Connection], RateLimiter], None],
         budget: RateLimiter,
         *,
-        is_busy: Callable[[], bool] | None,
+        is_busy: Callable[[], bool],
         clock: Callable[[], float],
     ) -> None:
         self.waiting: deque[Connection] = deque()
@@ -123,15 +137,13 @@ class _Lane:
         """Schedule a turn unless one is: after a delay [s], or in the next iteration but one.
 
         Data that arrived meanwhile and what it wakes, such as the control loop for a touch, run
-        first; not before turns that wait for nothing.
+        first.
         """
         if not self.waiting or self._is_turn_scheduled:
             return
         self._is_turn_scheduled = True
         loop = asyncio.get_running_loop()
-        if self._is_busy is None:
-            loop.call_soon(self._take_turn)
-        elif delay > 0:
+        if delay > 0:
             loop.call_later(delay, self._take_turn)
         else:
             loop.call_soon(loop.call_soon, self._take_turn)
@@ -141,13 +153,11 @@ class _Lane:
         delay = self._delay()
         if delay <= 0:
             self._deferred_since = None
-            self._take(self)
+            self._take(self.waiting, self.budget)
         self._schedule(delay)
 
     def _delay(self) -> float:
         """Return the time [s] by which the turn that is due has to wait, 0 for none."""
-        if self._is_busy is None:
-            return 0.0
         if self._is_busy():
             now = self._clock()
             if self._deferred_since is None:

@@ -4,7 +4,7 @@ import asyncio
 import itertools
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Awaitable, Mapping
 from typing import cast
 
 from controller.api.connection import Connection
@@ -47,6 +47,7 @@ from controller.daemon.touch_inputs import ApiTouches
 from controller.learning.learning import Learning
 from controller.loop.loop import Controller
 from drivers import clock
+from drivers.host.stop import Stopped
 from model.table.table import LocalizationTable
 
 _LEASE_RECHECK = 0.25  # s
@@ -197,18 +198,10 @@ class ApiService:
             raise _wrong_state(machine)
         return Empty()
 
-    async def _stop(self, client: Connection, params: RequestedBy) -> StopResult:
+    def _stop(self, client: Connection, params: RequestedBy) -> Awaitable[StopResult]:
+        """Stop; the amplifiers' requests are queued when this returns."""
         cause = f"stopped by {params.client or client.name!a}"
-        try:
-            outcomes = await self._supervisor.stop(cause, "clear (era clear), then arm again")
-        except Exception:
-            _logger.exception("stop failed, stopping each amplifier individually")
-            outcomes = await self._controller.group.stop()
-        now = clock.now()
-        amplifiers = {name: amplifier_silence(each, now) for name, each in outcomes.items()}
-        if not (outcomes and all(outcome.is_confirmed for outcome in outcomes.values())):
-            raise NotSilent(amplifiers)
-        return StopResult(amplifiers=amplifiers)
+        return _silence(self._supervisor.stop(cause, "clear (era clear), then arm again"))
 
     async def _clear(self, client: Connection, params: RequestedBy) -> Empty:
         machine = self._supervisor.machine
@@ -303,6 +296,16 @@ class ApiService:
             self._supervisor.post(DaemonEvent(Trigger.LEASE_LOST, cause, "arm again"))
         else:  # never armed
             self.end_lease()
+
+
+async def _silence(stopping: Awaitable[Mapping[str, Stopped]]) -> StopResult:
+    """Await a stop; raises NotSilent unless every amplifier is confirmed silent."""
+    outcomes = await stopping
+    now = clock.now()
+    amplifiers = {name: amplifier_silence(each, now) for name, each in outcomes.items()}
+    if not (outcomes and all(outcome.is_confirmed for outcome in outcomes.values())):
+        raise NotSilent(amplifiers)
+    return StopResult(amplifiers=amplifiers)
 
 
 def _wrong_state(machine: StateMachine, code: ErrorCode = ErrorCode.WRONG_STATE) -> RpcError:

@@ -25,9 +25,10 @@ from controller.learning.learning_status import LearningStatus
 from controller.loop.observer import Applied, Silenced
 from controller.sources.contacts import Contact, ContactKey
 from drivers import clock
-from drivers.host.amplifier import Amplifier, Stopped
+from drivers.host.amplifier import Amplifier
 from drivers.host.comparison import name_of
 from drivers.host.members import is_lost
+from drivers.host.stop import Stopped
 from drivers.protocol.table import FAULTS, QUANTITIES, STATES, STATUS_FLAGS
 from drivers.statistics import LinkStatistics
 from model.rig.rig import Rig

@@ -147,6 +147,7 @@ class Daemon:
             holds_lease=self._api.holds_lease,
             is_subscribed=self._publisher.hub.is_subscribed,
             is_busy=lambda: self._controller.is_preparing,
+            stop_all=lambda: asyncio.ensure_future(self._controller.group.stop()),
             clock=clock.now,
         )
         self._gateway: asyncio.Task[None] | None = None

@@ -41,9 +41,10 @@ from drivers.errors import (
     LinkError,
     Preempted,
 )
-from drivers.host.amplifier import WATCHDOG, Amplifier, Stopped
+from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.comparison import name_of
-from drivers.host.group import GroupState
+from drivers.host.group import Group, GroupState
+from drivers.host.stop import Stopped
 from drivers.protocol.records import Values
 from drivers.protocol.table import FAULTS, NO_CHANNEL
 from registry.plugins import failure_text
@@ -188,11 +189,14 @@ class Supervisor:
         may_play = any(each.feeding.may_play_until > now for each in known)
         return machine.assume_energised(now) or may_play
 
-    async def stop(self, cause: str, remedy: str | None = None) -> Mapping[str, Stopped]:
-        """Quick-stop all amplifiers in any state; returns the outcome of each, by name."""
-        stopping = self._spawn(self._stop())
+    def stop(self, cause: str, remedy: str | None = None) -> Awaitable[Mapping[str, Stopped]]:
+        """Quick-stop all amplifiers in any state; await the outcome of each, by name.
+
+        The requests to the amplifiers are queued when this returns.
+        """
+        stopping = self._spawn(self._stopped(self._controller.stop()))
         self._step(DaemonEvent(Trigger.STOP, cause, remedy))
-        return await asyncio.shield(stopping)
+        return asyncio.shield(stopping)
 
     async def handle(self, event: DaemonEvent) -> None:
         """Apply an event and carry out its actions; raises the error of an action.
@@ -294,18 +298,17 @@ class Supervisor:
                 await self.handle(DaemonEvent(Trigger.FAULT, str(error), ACKNOWLEDGE))
             raise
 
-    async def _stop(self) -> Mapping[str, Stopped]:
-        """Stop all amplifiers; one that is lost is a lost link. Never raises an Exception."""
-        try:
-            outcomes = await self._controller.stop()
-        except Exception:
-            _rate_limited_logger.exception("stop failed, stopping each amplifier individually")
-            outcomes = await self._controller.group.stop()
+    async def _stopped(self, stopping: Awaitable[Mapping[str, Stopped]]) -> Mapping[str, Stopped]:
+        """Await a stop of all amplifiers; one that is lost is a lost link."""
+        outcomes = await stopping
         try:
             await self._check_links()
         except Exception:
             _rate_limited_logger.exception("handling of a lost link failed")
         return outcomes
+
+    async def _stop(self) -> None:
+        await self._stopped(self._controller.stop())
 
     async def _check_links(self) -> None:
         """Handle the loss of an amplifier unless it is handled already."""
@@ -447,28 +450,29 @@ class Supervisor:
             await asyncio.sleep(STATUS_INTERVAL)
             if self._controller.group_state is not GroupState.DISARMED:
                 continue
-            group = self._controller.group
             try:
-                statuses = await group.statuses()
+                await self._check_disarmed(self._controller.group)
             except LinkError as error:
-                if group.state is GroupState.LOST:
+                if not self._controller.group.is_degraded_only(error):
                     await self._in_background(self._handle_loss(error))
             except DriverError:
-                continue  # preempted by another request, which reports for itself
+                pass  # preempted by another request, which reports for itself
             except Exception:
                 _rate_limited_logger.exception("status read failed")
-            else:
-                problem, state = find_problem(statuses, group.amplifiers), self.machine.state
-                if problem is not None and state is DaemonState.READY_TO_SWITCH_ON:
-                    fault = DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE)
-                    await self._in_background(self.handle(fault))
-                elif (
-                    not are_silent(statuses, group.amplifiers)
-                    and state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
-                    and not self.machine.is_acknowledged  # a clear reads back for itself
-                ):
-                    _rate_limited_logger.error("stop repeated: %s", problem)
-                    await self._stop()
+
+    async def _check_disarmed(self, group: Group) -> None:
+        statuses = await group.statuses()
+        problem, state = find_problem(statuses, group.amplifiers), self.machine.state
+        if problem is not None and state is DaemonState.READY_TO_SWITCH_ON:
+            fault = DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE)
+            await self._in_background(self.handle(fault))
+        elif (
+            not are_silent(statuses, group.amplifiers)
+            and state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
+            and not self.machine.is_acknowledged  # a clear reads back for itself
+        ):
+            _rate_limited_logger.error("stop repeated: %s", problem)
+            await self._stop()
 
     def _check_own_stop(self) -> None:
         """Post a fault if the control loop has stopped the amplifiers by itself."""

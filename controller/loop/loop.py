@@ -3,7 +3,8 @@
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from typing import Any
 
 from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
 from controller.loop.decision import RELEASE_RAMP, Decider, Decision
@@ -22,9 +23,10 @@ from drivers.errors import (
     LinkError,
     Preempted,
 )
-from drivers.host.amplifier import WATCHDOG, Amplifier, Stopped
+from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.group import Group, GroupState
 from drivers.host.joint_sets import Played
+from drivers.host.stop import Stopped
 from drivers.host.timing import HEARTBEAT
 from drivers.opening import Lines
 from model.drive_modes import DRIVE_MODES
@@ -217,9 +219,14 @@ class Controller:
         """Ramp to silence, then switch the high voltage off."""
         await self._group.disarm()
 
-    async def stop(self) -> Mapping[str, Stopped]:
-        """Quick-stop every amplifier; latched until `clear`; returns what became of each."""
-        stopped = await self._group.stop()
+    def stop(self) -> Coroutine[Any, Any, Mapping[str, Stopped]]:
+        """Quick-stop every amplifier; latched until `clear`; see `Group.stop`."""
+        return self._with_missing(self._group.stop())
+
+    async def _with_missing(
+        self, stopping: Awaitable[Mapping[str, Stopped]]
+    ) -> Mapping[str, Stopped]:
+        stopped = await stopping
         unknown = Stopped(False, -math.inf, "the amplifier is not connected")
         return {name: stopped.get(name, unknown) for name in self._urls}
 

@@ -22,6 +22,7 @@ from drivers.errors import CommandError, CommandRefused
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.dialogue import Staged
 from drivers.host.sensors import Reading, Sensor, measure_tones, read_sensors
+from drivers.host.stop import Stopped
 from drivers.host.timing import HEARTBEAT
 from drivers.protocol.table import ENABLED
 from drivers.protocol.tokens import token_after
@@ -88,7 +89,7 @@ class BlockingAmplifier:
 
     def stop(self) -> None:
         """Quick stop, latched until `clear`; CommandRefused where silence is not confirmed."""
-        stopped = self._wait(self._amplifier.stop())
+        stopped = self._wait(self._stopped())
         if not stopped.is_confirmed:
             raise CommandRefused(f"the amplifier may play: {stopped.cause}")
 
@@ -139,6 +140,9 @@ class BlockingAmplifier:
         self._token = token_after(self._token)
         layer = Layer(0, tuple(tones), ramp, valid_for)
         return await self._amplifier.stage(self._token, [layer], now=True)
+
+    async def _stopped(self) -> Stopped:
+        return await self._amplifier.stop()
 
     async def _measured(self, frequencies: Sequence[float], window: float) -> Reading:
         is_armed = (await self._amplifier.read_status())["state"] == ENABLED

@@ -1,8 +1,8 @@
 """One amplifier of protocol 3, whatever its wire: who it is, and its requests."""
 
 import asyncio
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 from drivers import clock
@@ -14,13 +14,13 @@ from drivers.host.comparison import (
     achieved_problem,
     check_capabilities,
     check_identity,
-    is_stopping,
     name_of,
 )
 from drivers.host.dialogue import Dialogue, Staged
 from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
+from drivers.host.stop import Stop, Stopped
 from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT, STOP_RAMP
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
@@ -45,18 +45,6 @@ _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
 
 
-@dataclass(frozen=True, slots=True)
-class Stopped:
-    """What became of a stop: confirmed silent, or until when [s] it may play, and why.
-
-    may_play_until: infinite without a watchdog that is known.
-    """
-
-    is_confirmed: bool
-    may_play_until: float
-    cause: str = ""
-
-
 class Amplifier(Dialogue):
     """An amplifier on a line that is open.
 
@@ -79,6 +67,7 @@ class Amplifier(Dialogue):
         self.limits, self._serial_number = limits, serial_number
         self._is_output = is_output
         self.identity: Values = {}
+        self._stop: Stop | None = None
 
     async def open(self) -> None:
         """Identify it and leave it disarmed; a latched stop or fault stays.
@@ -282,53 +271,17 @@ class Amplifier(Dialogue):
             raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
         return await self.request("Clear", {"latch": latch}, Priority.CLEAR)
 
-    async def stop(
-        self,
-        ramp: float = STOP_RAMP,
-        *,
-        timeout: float = CONFIRM_TIMEOUT,
-        on_sent: Callable[[], None] = lambda: None,
-    ) -> Stopped:
-        """Stop along a ramp [s], latched; repeated until it is confirmed, or for a time [s].
+    def stop(
+        self, ramp: float = STOP_RAMP, *, timeout: float = CONFIRM_TIMEOUT
+    ) -> "asyncio.Future[Stopped]":
+        """Stop along a ramp [s], latched; its request is queued when this returns.
 
-        The time counts from when the first is sent, and on_sent is called then. Confirmed by a
-        status in a latched state whose latch is newer than every one seen before, with the levels
-        of all channels at zero: another one may be old, kept on its way.
+        The future ends once silence is confirmed, or a time [s] after the request has gone out.
+        Until then all stops are one, which goes on if the caller is cancelled.
         """
-        cause, is_sent = "", False
-        values = {"ramp": self.wire_ramp(ramp)}
-        members = len(self.line.members)
-        # On a line that others share each has three exchanges: a stop and two statuses.
-        timeout += ramp + ATTEMPTS * members * self.exchange_time("GetStatus")
-        waiting = timeout * (members + 1)  # on a line that others keep busy
-        try:
-            async with asyncio.timeout(waiting) as limit:
-
-                def make() -> Values:
-                    nonlocal is_sent
-                    if not is_sent:
-                        limit.reschedule(asyncio.get_running_loop().time() + timeout)
-                        on_sent()
-                    is_sent = True
-                    return values
-
-                while self.line.loss is None:
-                    before = self.latch
-                    try:
-                        status = await self.line.submit(
-                            self, Priority.STOP, "Stop", values, make=make
-                        )
-                        while is_stopping(status, before):
-                            if self.is_silent(status):
-                                return Stopped(True, clock.now())
-                            await asyncio.sleep(_INTERVAL)
-                            status = await self.read_status(Priority.STOP)
-                    except Exception as error:  # whatever it is, the stop goes on
-                        cause = str(error) or type(error).__name__
-                    await asyncio.sleep(_RAMP.from_wire(values["ramp"]) + _INTERVAL)
-        except TimeoutError:
-            cause = cause or f"silence was not reported within {timeout:g} s"
-        return Stopped(False, self.feeding.may_play_until, self.line.loss or cause)
+        if self._stop is None or self._stop.is_sent or self._stop.result.done():
+            self._stop = Stop(self, ramp, timeout)
+        return asyncio.shield(self._stop.result)
 
     async def request(
         self,

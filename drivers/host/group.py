@@ -18,10 +18,12 @@ from drivers.errors import (
     LinkError,
     Preempted,
 )
-from drivers.host.amplifier import DISARM_RAMP, WATCHDOG, Amplifier, Stopped
+from drivers.host.amplifier import DISARM_RAMP, WATCHDOG, Amplifier
 from drivers.host.jobs import Priority
 from drivers.host.joint_sets import JointSets, Played
-from drivers.host.members import Heartbeats, Members, Stopping, is_lost, retried
+from drivers.host.line import Line
+from drivers.host.members import Heartbeats, Members, is_lost, retried, seen
+from drivers.host.stop import Stopped
 from drivers.host.timing import STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values
 from drivers.protocol.table import ENABLED, QUANTITIES
@@ -59,11 +61,11 @@ class Group(Members):
         self._watchdog = watchdog
         self._draw = draw
         self._heartbeats = Heartbeats(self)
-        self._stopping = Stopping(self.amplifiers)
         self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
         self._sets = JointSets(self, draw(_TOKEN.minimum, _TOKEN.maximum))
         self._stops = self._cleared = 0  # stops so far, and at the last clear
+        self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # of stops
         self._limit: asyncio.Timeout | None = None  # of an exchange in progress
 
     @property
@@ -222,11 +224,8 @@ class Group(Members):
             is_explained = self.silences != before and self.state is not GroupState.LOST
             if is_explained and isinstance(error, DriverError):
                 raise Preempted("a stop or disarm came first") from error
-            self._leave_armed()
-            self._stops += 1
             replying = [name for name, each in self.amplifiers.items() if not each.silence_cause]
-            stopping = self._stopping.stop(STOP_RAMP, waits_for=replying)
-            await self.silenced(stopping)
+            await self.stop(waits_for=replying)
             raise
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> None:
@@ -244,14 +243,54 @@ class Group(Members):
             await self.stop()
             raise
 
-    async def stop(self, ramp: float = STOP_RAMP) -> Mapping[str, Stopped]:
+    def stop(
+        self, ramp: float = STOP_RAMP, *, waits_for: Sequence[str] | None = None
+    ) -> Coroutine[Any, Any, Mapping[str, Stopped]]:
         """Stop every amplifier along a ramp [s], lost ones too; latched until `clear`.
 
-        Returns what became of each, by name. It goes on to its end if its caller is cancelled.
+        The requests are queued when this returns; those of one line get a broadcast first, so that
+        none waits for the reply of another. Await it for what became of each, by name: of those of
+        some names, None for all. It goes on to its end if its caller is cancelled.
         """
         self._leave_armed()
         self._stops += 1
-        return await self.silenced(self._stopping.stop(ramp))
+        for line in {each.line for each in self.amplifiers.values()}:
+            if len(line.members) > 1:
+                try:
+                    self._broadcast(line, ramp)
+                except Exception:  # each amplifier is stopped by itself as well
+                    _logger.exception("%s: the broadcast of a stop failed", line.name)
+        stops: dict[str, asyncio.Future[Stopped]] = {}
+        for name, amplifier in self.amplifiers.items():
+            try:
+                stops[name] = amplifier.stop(ramp)
+            except Exception as error:  # the others are stopped all the same
+                stops[name] = asyncio.get_running_loop().create_future()
+                stops[name].set_exception(error)
+        names = [*stops] if waits_for is None else waits_for
+        return self.silenced(self._outcomes({name: stops[name] for name in names}))
+
+    def _broadcast(self, line: Line, ramp: float) -> None:
+        """Request a stop of all amplifiers of a line, unless one is queued."""
+        queued = self._broadcasts.get(line)
+        if queued is None or queued.done():
+            first = next(iter(self.amplifiers.values()))
+            sent = line.submit(None, Priority.STOP, "Stop", {"ramp": first.wire_ramp(ramp)})
+            sent.add_done_callback(seen)
+            self._broadcasts[line] = sent
+
+    async def _outcomes(
+        self, stops: Mapping[str, "asyncio.Future[Stopped]"]
+    ) -> Mapping[str, Stopped]:
+        outcomes: dict[str, Stopped] = {}
+        for name, result in zip(
+            stops, await asyncio.gather(*stops.values(), return_exceptions=True), strict=True
+        ):
+            if isinstance(result, BaseException):
+                until = self.amplifiers[name].feeding.may_play_until
+                result = Stopped(False, until, f"{type(result).__name__}: {result}")
+            outcomes[name] = result
+        return outcomes
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone.

@@ -29,10 +29,11 @@ import sim
 from drivers.by_hand import actions
 from drivers.contents import Layer, Shape, Tone
 from drivers.errors import DriverError
-from drivers.host.amplifier import WATCHDOG, Stopped
+from drivers.host.amplifier import WATCHDOG
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.feeding import SILENCING
 from drivers.host.group import Group
+from drivers.host.stop import Stopped
 from drivers.protocol.records import Values
 from virtual_loop import Stuck, run_virtual
 from words_line import Alter, MemoryLine, unaltered
@@ -275,9 +276,13 @@ SCENES: Mapping[str, Callable[[Chain], Awaitable[None]]] = {
 
 async def _stop(chain: Chain, wire: str, scene: str, tally: Tally) -> None:
     """Stop all, and judge the outcome."""
-    stopping = asyncio.ensure_future(chain.group.stop())
-    await asyncio.wait([stopping], timeout=LONGEST)  # cancelled, it would still go on
     tally.counts[wire, "stops"] += 1
+    try:
+        stopping = asyncio.ensure_future(chain.group.stop())
+    except Planted:  # no success
+        tally.counts[wire, "raised"] += 1
+        return
+    await asyncio.wait([stopping], timeout=LONGEST)  # cancelled, it would still go on
     if not stopping.done():
         chain.found.append(f"{scene}: stop has not ended within {LONGEST:g} s")
     elif stopping.exception() is not None:  # no success

@@ -21,13 +21,15 @@ class ServedApi:
     """A server whose methods take a processor time [s] each; clock [s].
 
     calls: name, parameters and time of each; is_busy: whether a touch is on its way to the wire;
-    may_arm: what arming waits for; called: called with each name.
+    may_arm: what arming waits for; called: called with each name, and its exceptions are those of
+    the method; stops: how often the server itself has stopped all.
     """
 
     def __init__(self, *, clock: Callable[[], float] = lambda: 0.0, costs: float = 0.0) -> None:
         self.calls: list[tuple[str, Message, float]] = []
         self.is_busy = False
         self.may_arm = asyncio.Event()
+        self.stops = 0
         self.called: Callable[[str], object] = lambda name: None
         self._processor_time = 0.0
         self.clock = clock
@@ -39,6 +41,7 @@ class ServedApi:
             holds_lease=lambda client: False,
             is_subscribed=lambda client: False,
             is_busy=lambda: self.is_busy,
+            stop_all=self._stop_all,
             clock=clock,
             processor_time=lambda: self._processor_time,
         )
@@ -65,6 +68,9 @@ class ServedApi:
         while left:
             await asyncio.sleep(0)
             left = 8 if any(client.has_lines for client in self._clients) else left - 1
+
+    def _stop_all(self) -> None:
+        self.stops += 1
 
     def _handle(
         self, name: str, client: Connection, params: Message

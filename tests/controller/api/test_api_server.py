@@ -78,6 +78,27 @@ async def test_bug_in_a_method_is_reported_without_details(
     assert "/a/path" in caplog.text
 
 
+@pytest.mark.parametrize("where", ["the line", "the method"])
+async def test_server_stops_all_when_a_stop_fails_on_its_way(
+    monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """By a bug as its line is read, or in its method; its client is not told of success."""
+    served = ServedApi()
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    if where == "the line":
+        monkeypatch.setattr("controller.api.server.read_params", fail)
+    else:
+        served.called = fail
+    client, wire = served.client()
+    client.data_received(request("stop", id=1) + request("status", id=2))
+    await served.settle()
+    assert served.stops == 1
+    assert {"error" in line for line in wire.lines()} == {True}
+
+
 async def test_stop_is_served_while_requests_are_pending() -> None:
     """Eight may be pending, further ones are refused, a stop is served at once."""
     served = ServedApi()

@@ -1,0 +1,97 @@
+"""One stop of one amplifier: its request goes out first, then its silence is confirmed."""
+
+import asyncio
+import contextlib
+from dataclasses import dataclass
+
+from drivers import clock
+from drivers.host.comparison import is_stopping
+from drivers.host.dialogue import Dialogue
+from drivers.host.jobs import Priority
+from drivers.host.timing import ATTEMPTS
+from drivers.protocol.records import Values
+from drivers.protocol.table import QUANTITIES
+
+_INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
+_RAMP = QUANTITIES["ramp"]
+
+
+@dataclass(frozen=True, slots=True)
+class Stopped:
+    """What became of a stop: confirmed silent, or until when [s] it may play, and why.
+
+    may_play_until: infinite without a watchdog that is known.
+    """
+
+    is_confirmed: bool
+    may_play_until: float
+    cause: str = ""
+
+
+class Stop:
+    """A stop along a ramp [s], begun when it is made; the first request is queued by then.
+
+    Repeated until it is confirmed, or for a time [s] from when the first request goes out.
+    Confirmed by a status in a latched state whose latch is newer than every one seen before, with
+    the levels of all channels at zero: another one may be old, kept on its way.
+    """
+
+    def __init__(self, amplifier: Dialogue, ramp: float, timeout: float) -> None:
+        self.is_sent = False
+        """Whether its first request has gone out: what comes later needs a stop of its own."""
+        self._amplifier = amplifier
+        self._values = {"ramp": amplifier.wire_ramp(ramp)}
+        self._latch: int | None = None
+        self._limit: asyncio.Timeout | None = None
+        self._first: asyncio.Future[Values] | None = None
+        members = len(amplifier.line.members)
+        # On a line that others share each has three exchanges: a stop and two statuses.
+        exchanges = ATTEMPTS * members * amplifier.exchange_time("GetStatus")
+        self._timeout = timeout + ramp + exchanges
+        self._ends = self._now() + self._timeout * (members + 1)  # on a line that others keep busy
+        self.result = asyncio.ensure_future(self._confirm())
+        with contextlib.suppress(Exception):  # then it is requested in `_confirm`
+            self._first = self._request()
+
+    def _now(self) -> float:
+        return asyncio.get_running_loop().time()
+
+    def _request(self) -> "asyncio.Future[Values]":
+        amplifier = self._amplifier
+        self._latch = amplifier.latch
+        return amplifier.line.submit(
+            amplifier, Priority.STOP, "Stop", self._values, make=self._sent
+        )
+
+    def _sent(self) -> Values:
+        """Return the values of the request, which goes out now."""
+        if not self.is_sent:
+            self.is_sent = True
+            self._ends = self._now() + self._timeout
+            if self._limit is not None:
+                self._limit.reschedule(self._ends)
+        return self._values
+
+    async def _confirm(self) -> Stopped:
+        amplifier, cause = self._amplifier, ""
+        pause = _RAMP.from_wire(self._values["ramp"]) + _INTERVAL
+        try:
+            async with asyncio.timeout_at(self._ends) as self._limit:
+                while amplifier.line.loss is None:
+                    try:
+                        stopping, self._first = self._first or self._request(), None
+                        status = await stopping
+                        while is_stopping(status, self._latch):
+                            if amplifier.is_silent(status):
+                                return Stopped(True, clock.now())
+                            await asyncio.sleep(_INTERVAL)
+                            status = await amplifier.line.submit(
+                                amplifier, Priority.STOP, "GetStatus", {}
+                            )
+                    except Exception as error:  # whatever it is, the stop goes on
+                        cause = str(error) or type(error).__name__
+                    await asyncio.sleep(pause)
+        except TimeoutError:
+            cause = cause or f"silence was not reported within {self._timeout:g} s"
+        loss = amplifier.line.loss
+        return Stopped(False, amplifier.feeding.may_play_until, loss or cause)

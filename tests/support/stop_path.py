@@ -1,0 +1,113 @@
+"""The way of a stop: own functions from the bytes on the socket to the bytes on the wire.
+
+    python tests/support/stop_path.py
+
+A daemon in memory, armed, is sent one stop. Each callback of the event loop is known with what has
+scheduled it, so that the chain of calls goes back to the bytes.
+"""
+
+import asyncio
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import controller
+import drivers
+from controller.daemon.config import load_daemon_config
+from controller.daemon.daemon import Daemon
+from controller.daemon.log import LogThread
+from controller.daemon.service_manager import ServiceManager
+from controller.daemon.states import DaemonEvent, Trigger
+from controller_bench import BenchLines, FarEnd
+from daemon_bench import READY, daemon_table, until, write_daemon
+from served_api import request
+from virtual_loop import run_virtual
+from wire_of_memory import Wire
+
+_OWN = tuple(str(Path(package.__path__[0])) for package in (controller, drivers))
+
+
+class Chain:
+    """The own functions that lead to the present one, over callbacks of the event loop."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._before: tuple[str, ...] = ()
+        self._call_soon = loop.call_soon
+        loop.call_soon = self._scheduled  # type: ignore[method-assign, assignment]
+
+    def _scheduled(self, callback: Callable[..., Any], *args: Any, context: Any = None) -> Any:
+        chain = self.here(sys._getframe(1))
+
+        def run(*given: Any) -> None:
+            self._before = chain
+            callback(*given)
+            self._before = ()
+
+        return self._call_soon(run, *args, context=context)
+
+    def here(self, frame: types.FrameType | None) -> tuple[str, ...]:
+        """The functions on the way to a frame, outermost first."""
+        found: list[str] = []
+        while frame is not None:
+            code = frame.f_code
+            if code.co_filename.startswith(_OWN):
+                found.append(f"{Path(code.co_filename).name}:{code.co_qualname}")
+            frame = frame.f_back
+        return tuple(dict.fromkeys((*self._before, *reversed(found))))
+
+
+async def _stopped(folder: Path) -> tuple[tuple[str, ...], int]:
+    far_end = FarEnd(channels=8)
+    config = load_daemon_config(write_daemon(folder, {"main": "sim://"}))
+    daemon = Daemon(
+        config,
+        daemon_table(),
+        log=LogThread(folder / "log"),
+        manager=ServiceManager({}),
+        dashboard=None,
+        lines=lambda: BenchLines({"main": far_end}),
+    )
+    running = asyncio.create_task(daemon._supervisor.run(daemon._controller))
+    await until(lambda: daemon._supervisor.machine.state.value == READY)
+    await daemon._supervisor.handle(DaemonEvent(Trigger.ARM))
+    client, wire = daemon._server._make_connection(0), Wire()
+    client.connection_made(wire)
+    await asyncio.sleep(0.01)
+    chain, written, calls = Chain(asyncio.get_running_loop()), list[tuple[str, ...]](), 0
+    write = far_end.write
+
+    def first(data: bytes) -> None:
+        written.append(chain.here(sys._getframe(1)))
+        sys.setprofile(None)
+        write(data)
+
+    def count(frame: types.FrameType, event: str, _: object) -> None:
+        nonlocal calls
+        calls += event == "call" and frame.f_code.co_filename.startswith(_OWN)
+
+    far_end.write = first  # type: ignore[method-assign]
+    line = request("stop", id=1)
+    client.get_buffer(len(line))[: len(line)] = line
+    sys.setprofile(count)
+    client.buffer_updated(len(line))
+    await until(lambda: wire.waiting)
+    assert '"result"' in wire.waiting.decode(), wire.waiting
+    await daemon._supervisor.close("done")
+    await running
+    return written[0], calls
+
+
+def stop_path() -> tuple[tuple[str, ...], int]:
+    """The functions on the way of a stop, and how many own calls there are until its first byte."""
+    with TemporaryDirectory() as folder:
+        return run_virtual(_stopped(Path(folder)))
+
+
+if __name__ == "__main__":
+    path, calls = stop_path()
+    owners = dict.fromkeys(each.rpartition(".")[0] for each in path)
+    sys.stdout.write("\n".join(path) + f"\n{len(path)} functions of {len(owners)} owners, ")
+    sys.stdout.write(f"{calls} own calls before the first byte\n")

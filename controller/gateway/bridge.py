@@ -9,12 +9,13 @@ from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from controller.api.client_protocol import Unreachable
+from controller.api.jsonrpc import RpcError, read_request
 from controller.gateway.field import DrawnField
 from controller.gateway.link import DaemonLink
 
 SEND_TIMEOUT = 5.0  # s; for one frame
 _LAST_FRAMES = 0.1  # s; for those that a browser which is given up has sent
-_SILENCING = ('"stop"', '"disarm"')
+_SILENCING = ("stop", "disarm")
 _MAX_NAME = 80  # characters; as in the API
 
 UNSUPPORTED_DATA = 1003  # close code of RFC 6455
@@ -67,8 +68,16 @@ async def _silence(socket: WebSocket, link: DaemonLink) -> None:
         async with asyncio.timeout(_LAST_FRAMES):
             while link.is_open:
                 text = (await socket.receive()).get("text") or ""
-                if "\n" not in text and any(method in text for method in _SILENCING):
-                    link.write(text.encode())
+                line = text.encode()
+                if b"\n" not in line and _method_of(line) in _SILENCING:
+                    link.write(line)
+
+
+def _method_of(line: bytes) -> str:
+    try:
+        return read_request(line).method
+    except RpcError:
+        return ""
 
 
 async def _to_browser(socket: WebSocket, link: DaemonLink) -> None:

@@ -254,15 +254,10 @@ class Controller:
         All others are stopped first. While disarmed the loop sends nothing: a lost link then shows
         in the next request, which raises, and in `group_state`, as the daemon's supervisor checks.
         """
-        try:
-            while self.group_state is not GroupState.CLOSED:
-                await self.step()
-                self._report(lambda each: each.cycle_completed())
-                await self._wait_for_event()
-        finally:
-            if self._expiry is not None:
-                self._expiry.cancel()
-                self._expiry = None  # else no later one would be set
+        while self.group_state is not GroupState.CLOSED:
+            await self.step()
+            self._report(lambda each: each.cycle_completed())
+            await self._wait_for_event()
 
     async def step(self) -> None:
         """Run the loop once: decide, send what changed, then the heartbeat if it is due."""

@@ -163,7 +163,10 @@ async def busy_daemon(tmp_path: Path) -> AsyncIterator[tuple[Path, asyncio.Futur
 async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
     busy_daemon: tuple[Path, "asyncio.Future[list[bytes]]"], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It waits behind touches that a busy daemon has not read, and the browser does not read."""
+    """It waits behind touches that a busy daemon has not read, and the browser does not read.
+
+    However its name is written; what only looks like it is not passed on.
+    """
     path, read = busy_daemon
     monkeypatch.setattr(bridge, "SEND_TIMEOUT", 0.05)
     opened = await link.DaemonLink.open(path, "browser")
@@ -172,8 +175,9 @@ async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
     touch = (
         '{"jsonrpc":"2.0","method":"touch","params":{"source":"page","touches":[]}}' + " " * 4000
     )
-    stop = '{"jsonrpc":"2.0","id":9,"method":"stop"}'
-    for text in [touch] * 1000 + [stop]:
+    stop = '{"jsonrpc":"2.0","id":9,"method":"st\\u006fp"}'
+    play = '{"jsonrpc":"2.0","id":8,"method":"play","params":{"effect":"stop","x_m":0,"y_m":0}}'
+    for text in [touch] * 1000 + [stop, play]:
         browser.frames.put_nowait({"type": "websocket.receive", "text": text})
     async with asyncio.timeout(PATIENCE):
         await bridge.bridge(browser, path, DrawnField(path))  # type: ignore[arg-type]

@@ -77,6 +77,20 @@ async def test_lost_link_stops_the_others_and_ends_the_loop() -> None:
 
 
 @in_virtual_time
+async def test_finger_of_a_silent_source_is_lifted_while_the_link_is_lost() -> None:
+    """150 ms after its last frame, as with a link; not only once all are open again."""
+    async with running() as bench:
+        bench.touch(FINGER)
+        await asyncio.sleep(0.05)
+        bench.far_end.line.lose("the cable was pulled")
+        with pytest.raises(LinkError):
+            await bench.ended()
+        assert bench.reports.contacts == [1]
+        await asyncio.sleep(0.151)
+        assert bench.reports.contacts == [1, 0]
+
+
+@in_virtual_time
 async def test_amplifiers_stage_before_any_commits() -> None:
     """Several amplifiers stage under one token, all before any commits."""
     async with running("a", "b") as bench:

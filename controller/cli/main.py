@@ -14,7 +14,7 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import typer
 from typer.core import TyperGroup
@@ -33,6 +33,17 @@ COMMANDS = (
     *("model.cli", "controller.report.cli", "sim.cli"),
 )
 """Modules with commands, by name: packages beside this one do not import each other."""
+
+SECTIONS = {
+    "Try": ("demo", "sim", "figure"),
+    "Plate": ("config", "plate", "table", "layout", "calibrate", "rig", "design", "measure"),
+    "Run": (
+        *("daemon", "status", "arm", "disarm", "stop", "clear", "touch", "watch", "gateway"),
+        *("forget", "report"),
+    ),
+    "Amplifier": ("amp", "soft-amp", "witness"),
+}
+"""The commands as help and reference list them, in each section the seldom used ones last."""
 
 BAD_INPUT = 2
 BUG = 70  # EX_SOFTWARE of sysexits.h
@@ -97,9 +108,38 @@ def _take_debug(arguments: Sequence[str]) -> tuple[bool, list[str]]:
     return len(kept) < end, [*kept, *arguments[end:]]
 
 
+class _Commands(TyperGroup):
+    """The commands of `era` by section; those without one come last."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Names in the order of help and reference."""
+        return [name for names in self.sections().values() for name in names]
+
+    def sections(self) -> dict[str, list[str]]:
+        """Names by the title of their section."""
+        listed = {
+            title: [name for name in names if name in self.commands]
+            for title, names in SECTIONS.items()
+        }
+        others = set(self.commands).difference(*listed.values())
+        return {**listed, "Others": sorted(others)}
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write a list of commands for each section."""
+        width = max(len(name) for name in self.commands)
+        limit = formatter.width - width - 6
+        for title, names in self.sections().items():
+            rows = [
+                (name.ljust(width), self.commands[name].get_short_help_str(limit)) for name in names
+            ]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
+
 def load_commands(modules: Iterable[str] = COMMANDS) -> tuple[TyperGroup, ExitStatus]:
     """Return one group with the commands of all modules, and the exit status by error class."""
-    app = typer.Typer(no_args_is_help=True)
+    app = typer.Typer(cls=_Commands, no_args_is_help=True)
     app.callback()(_root)
     group = _group(app)
     statuses: ExitStatus = {}

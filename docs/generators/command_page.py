@@ -23,7 +23,7 @@ _Records = list[tuple[str, str]]
 
 
 def command_reference() -> str:
-    """All commands by name, groups after the single ones, as Markdown."""
+    """All commands in the order of `era --help`, as Markdown."""
     group, _ = load_commands()
     commands = list(_commands(group, typer.Context(group, info_name="era")))
     counts = Counter(record for *_, records in commands for record in records)
@@ -42,10 +42,8 @@ def _commands(
     group: TyperGroup, context: typer.Context
 ) -> Iterator[tuple[str, str, str, _Records]]:
     """Of every command its full name, usage, summary, and its arguments and options."""
-    commands = sorted(
-        group.commands.items(), key=lambda item: (isinstance(item[1], TyperGroup), item[0])
-    )
-    for name, command in commands:
+    for name in group.list_commands(context):
+        command = group.commands[name]
         inner = typer.Context(command, info_name=name, parent=context)
         if isinstance(command, TyperGroup):
             yield from _commands(command, inner)

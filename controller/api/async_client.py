@@ -37,7 +37,7 @@ from controller.api.methods import (
     StatusResult,
     StopResult,
 )
-from controller.api.schema import Empty, Message, Topic
+from controller.api.schema import Empty, Message, Topic, headline
 from controller.api.socket_path import find_socket
 from drivers.pauses import pauses
 
@@ -365,4 +365,4 @@ class AsyncClient:
             status = read_result(found, StatusResult)
         except (RpcError, Unreachable):
             return LeaseLost(str(reason))
-        return LeaseLost(f"{status.state}: {status.cause}")
+        return LeaseLost(headline(status.state, status.cause))

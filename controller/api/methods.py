@@ -13,6 +13,7 @@ from controller.api.schema import (
     MAX_RATE,
     MIN_LEASE,
     PROMISED,
+    STATE_WORDS,
     AmplifierSilence,
     AmplifierStatus,
     ContactStatus,
@@ -58,6 +59,10 @@ class StatusResult(Message):
     time_s: float = Field(description="time of this response on CLOCK_MONOTONIC")
     unix_time_s: float = Field(description="the same time on the wall clock")
     state: DaemonStateName
+    word: str = Field(
+        default_factory=lambda known: STATE_WORDS[known["state"]],
+        description="the state in a word for people",
+    )
     cause: str = Field(description="why the daemon is in this state")
     remedy: str | None = Field(description="what to do about it; null if nothing")
     amplifiers_state: GroupStateName

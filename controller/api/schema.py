@@ -31,6 +31,26 @@ DaemonStateName: TypeAlias = Literal[
 ]
 """State of the daemon: the names of CiA 402, and COMM_LOST."""
 
+STATE_WORDS: dict[str | None, str] = {
+    "NOT_READY": "not ready",
+    "SWITCH_ON_DISABLED": "off",
+    "READY_TO_SWITCH_ON": "ready",
+    "SWITCHED_ON": "on",
+    "OPERATION_ENABLED": "on",
+    "QUICK_STOP_ACTIVE": "stopped",
+    "FAULT_REACTION_ACTIVE": "fault",
+    "FAULT": "fault",
+    "COMM_LOST": "lost",
+}
+"""What people see of a state, of the daemon and of an amplifier."""
+
+
+def headline(state: DaemonStateName, cause: str) -> str:
+    """A state and its cause in one line for people."""
+    word = STATE_WORDS[state]
+    return cause if cause.startswith(word) else f"{word}: {cause}"
+
+
 GroupStateName: TypeAlias = Literal["closed", "disarmed", "armed", "lost"]
 """State of all amplifiers together."""
 
@@ -186,6 +206,10 @@ class AmplifierStatus(Message):
     url: str
     serial_number: str | None
     state: str | None = Field(description="its own state, by the names of CiA 402")
+    word: str | None = Field(
+        default_factory=lambda known: STATE_WORDS.get(known["state"]),
+        description="the state in a word for people",
+    )
     fault: str | None
     levels: list[float] = Field(
         description="0 to 1 of the full stroke, by channel, as it reports; empty if unknown"

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from controller.api.schema import (
     PROMISED,
+    STATE_WORDS,
     AmplifierStatus,
     ContactStatus,
     Count,
@@ -23,6 +24,10 @@ class StateEvent(Message):
 
     old: DaemonStateName
     new: DaemonStateName
+    word: str = Field(
+        default_factory=lambda known: STATE_WORDS[known["new"]],
+        description="the new state in a word for people",
+    )
     cause: str
     remedy: str | None = Field(description="what to do about it; null if nothing")
 

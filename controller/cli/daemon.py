@@ -96,7 +96,7 @@ def daemon(
 
 @app.command()
 def status(socket: Socket = None, as_json: Json = False) -> None:
-    """Show daemon, amplifiers and contacts. Exit status 0 in FAULT and COMM_LOST too."""
+    """Show daemon, amplifiers and contacts. Exit status 0 in a fault, too."""
     with _client(socket) as era:
         status = era.status()
     typer.echo(status.model_dump_json() if as_json else show_status(status))
@@ -128,7 +128,7 @@ def arm(
                     era.status()  # raises LeaseLost
         except KeyboardInterrupt:
             if not as_json:
-                typer.echo("disarmed")
+                typer.echo("ready: disarmed")
 
 
 def _call(method: str, text: str) -> None:
@@ -254,7 +254,7 @@ def _print_lease(granted: "ArmResult", how_long: str, *, as_json: bool) -> None:
     if as_json:
         typer.echo(granted.model_dump_json())
     else:
-        typer.echo(f"armed {how_long}; era stop stops everything at once")
+        typer.echo(f"on: armed {how_long}; era stop stops everything at once")
 
 
 def _check_positions(positions: "list[tuple[float, float]]", rig: "RigSummary") -> None:
@@ -274,13 +274,15 @@ def _check_positions(positions: "list[tuple[float, float]]", rig: "RigSummary") 
 
 
 def _print_state(era: "Client", *, as_json: bool) -> None:
+    from controller.api.schema import headline
+
     status = era.status()
     if as_json:
         typer.echo(
             json.dumps({"state": status.state, "cause": status.cause, "remedy": status.remedy})
         )
     else:
-        typer.echo(f"{status.state}: {status.cause}")
+        typer.echo(headline(status.state, status.cause))
 
 
 def show_event(event: "Notification", *, ahead: float) -> str:
@@ -314,7 +316,9 @@ def _show_learning(learning: "LearningSummary") -> list[str]:
 
 def show_status(status: "StatusResult") -> str:
     """Format a status."""
-    lines = [f"{status.state}: {status.cause}"]
+    from controller.api.schema import headline
+
+    lines = [headline(status.state, status.cause)]
     if status.remedy:
         lines.append(f"  remedy: {status.remedy}")
     if status.lost_for_s is not None:
@@ -376,5 +380,5 @@ def show_status(status: "StatusResult") -> str:
         )
     for reason, count in status.rejected_touches.items():
         lines.append(f"  rejected touches, {reason.replace('_', ' ')}: {count}")
-    lines.append(f"  up for {status.uptime_s:.0f} s")
+    lines.append(f"  state {status.state}, up for {status.uptime_s:.0f} s")
     return "\n".join(lines)

@@ -28,7 +28,7 @@ from controller.api.methods import (
     TouchParams,
     UnsubscribeParams,
 )
-from controller.api.schema import Empty, GroupStateName
+from controller.api.schema import Empty, GroupStateName, headline
 from controller.api.server import Handler
 from controller.daemon.active_layout import ActiveLayout
 from controller.daemon.api_views import amplifier_silence, hello_result
@@ -311,7 +311,7 @@ async def _silence(stopping: Awaitable[Mapping[str, Stopped]]) -> StopResult:
 def _wrong_state(machine: StateMachine, code: ErrorCode = ErrorCode.WRONG_STATE) -> RpcError:
     return RpcError(
         code,
-        f"the daemon is in {machine.state.value}: {machine.cause}",
+        headline(machine.state.value, machine.cause),
         where="state",
         remedy=machine.remedy or _REMEDIES.get(machine.state),
     )

@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from controller.api.schema import headline
+from controller.api.topics import StateEvent
 from controller.daemon.api_views import learning_summary
 from controller.daemon.config_sections import (
     CalibrationSection,
@@ -14,6 +16,7 @@ from controller.daemon.config_sections import (
     LogSection,
     TouchSection,
 )
+from controller.daemon.states import DaemonState
 from controller.gateway.metrics import exposition
 from controller.learning.learning_status import LearningStatus
 from daemon_bench import running_daemon, until_state
@@ -33,6 +36,17 @@ def test_every_key_of_the_daemons_file_is_in_its_table() -> None:
     """As the configuration's model has them, and no others."""
     keys = [row[0].strip("`") for row in rows("daemon.md", "| key | meaning | default |")]
     assert sorted(keys) == sorted(DaemonSection.model_fields)
+
+
+def test_people_see_the_word_that_the_page_has_for_each_state() -> None:
+    """In the status, in the event of a change, and in a line unless the cause begins with it."""
+    shown = {row[0]: row[1].strip("*") for row in rows("daemon.md", "| state | shown |")}
+    assert list(shown) == [state.value for state in DaemonState]
+    for state, word in shown.items():
+        event = StateEvent(old="FAULT", new=state, cause="a cable was cut", remedy=None)
+        assert event.model_dump()["word"] == word
+        assert headline(state, event.cause) == f"{word}: a cable was cut"
+        assert headline(state, f"{word} by 'era'") == f"{word} by 'era'"
 
 
 @pytest.mark.parametrize(

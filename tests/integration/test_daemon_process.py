@@ -78,7 +78,7 @@ async def test_commands_control_daemon(tmp_path: Path) -> None:
         status, out, _ = await run_era("stop", *where, "--json")
         assert (status, json.loads(out)["state"]) == (0, "QUICK_STOP_ACTIVE")
         status, out, _ = await run_era("clear", *where)
-        assert (status, out.partition(":")[0]) == (0, "READY_TO_SWITCH_ON")
+        assert (status, out.partition(":")[0]) == (0, "ready")
         assert far.summary().state == "SWITCH_ON_DISABLED"
         arming = await asyncio.create_subprocess_exec(
             *(ERA, "arm", "--lease", "1", *map(str, where)),
@@ -91,7 +91,7 @@ async def test_commands_control_daemon(tmp_path: Path) -> None:
             await era.disarm()
         _, err_bytes = await asyncio.wait_for(arming.communicate(), PATIENCE)
         assert arming.returncode == 1
-        assert b"READY_TO_SWITCH_ON" in err_bytes or b"SWITCH_ON_DISABLED" in err_bytes
+        assert b"ready: " in err_bytes or b"off: " in err_bytes
     status, _, err = await run_era("status", *where)
     assert status == 3
     assert str(daemon.socket) in err

@@ -45,6 +45,7 @@ pytestmark = pytest.mark.asyncio(loop_scope="module")
 READY, ENABLED, STOPPED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
 LENGTH, WIDTH = 0.3048, 0.2286  # m; 12 by 9 inches, as in the rig's file
 DESKTOP, PHONE = SCREENS[0], SCREENS[2]
+WORD = "document.querySelector('#state').textContent"
 PROBES = (Path(dashboard_pictures.__file__).with_name("page_probes.js")).read_text(encoding="utf-8")
 
 _logger = logging.getLogger(__name__)  # what was measured; shown by pytest --log-cli-level=info
@@ -317,7 +318,9 @@ async def test_buttons_arm_disarm_stop_and_clear(page: Page, era: Client) -> Non
         "['arm', 'disarm', 'clear', 'stop'].filter(id => !document.getElementById(id).disabled)"
     )
     await page.until(f"{enabled}.join()", lambda text: text == "arm,stop")
+    assert await page.evaluate(WORD) == "ready"
     await arm(page, era)
+    assert await page.evaluate(WORD) == "on"
     assert (era.status().armed_by or "").startswith("dashboard (web:")
     await page.until(f"{enabled}.join()", lambda text: text == "disarm,stop")
     await page.click("#disarm")
@@ -327,6 +330,7 @@ async def test_buttons_arm_disarm_stop_and_clear(page: Page, era: Client) -> Non
     await page.click("#stop")
     await until_state(era, STOPPED)
     await page.until(f"{enabled}.join()", lambda text: text == "clear,stop")
+    assert await page.evaluate(WORD) == "stopped"
     await page.until(
         "document.querySelector('#log li')?.innerText", lambda text: "era clear" in text
     )

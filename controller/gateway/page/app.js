@@ -4,10 +4,9 @@ import { Connection } from "./connection.js";
 import { decodeField, FieldView } from "./field.js";
 import { Fingers } from "./fingers.js";
 import { fixed, PlateOverlay } from "./plate.js";
-import { addEvent, annotate, showAmplifiers, showEffects, showLatency, STATES, timeOfDay } from "./side.js";
+import { addEvent, annotate, showAmplifiers, showEffects, showLatency, timeOfDay } from "./side.js";
 
 const TOPICS = ["state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link", "layout", "plate"];
-const LEASE_S = 5;
 const TOKEN_KEY = "era-haptics-token";
 const DISARMED = ["SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON"];
 const LATCHED = ["QUICK_STOP_ACTIVE", "FAULT"];
@@ -24,7 +23,6 @@ const FAILURES = {
 const at = (id) => document.getElementById(id);
 const log = at("log");
 let connection;
-let lease = null;  // until renewing is refused: the state may arrive later than the response to arm
 let state = null;
 let knownAlarms;  // of the plate; undefined before the first event of it
 let daemon = null;  // result of hello; null while disconnected
@@ -40,7 +38,7 @@ const fieldView = new FieldView(at("field"), at("scale"), (low, high) => {
   at("scale-low").textContent = `${low}`;
   at("scale-high").textContent = `${high} m/s²`;
 });
-new Fingers(at("plate"), overlay, (touches) => connection?.notify("touch", { source: "page", touches }));
+new Fingers(at("plate"), overlay, (touches) => connection?.touch(touches));
 window.eraHaptics = { get frames() { return fieldView.frames; } };  // for measuring the frame rate
 
 function showError(error) {
@@ -49,10 +47,11 @@ function showError(error) {
   addEvent(log, "error", error.message, remedy && !error.message.includes(remedy) ? remedy : null);
 }
 
-async function call(method, params) {
+// The result of what is called; null, and shown, if it is refused.
+async function attempt(called) {
   at("problem").textContent = "";
   try {
-    return await connection.call(method, params);
+    return await called();
   } catch (error) {
     showError(error);
     return null;
@@ -62,7 +61,6 @@ async function call(method, params) {
 const NOT_SILENT = 1006;
 
 async function stop() {
-  lease = null;
   try {
     if (!connection) throw new Error("no token");
     await connection.stop();
@@ -72,22 +70,6 @@ async function stop() {
     showError(unconfirmed ?? new Error("The stop was not confirmed. Switch the amplifiers off by hand."));
   }
 }
-
-async function arm() {
-  const granted = await call("arm", { owner: `dashboard (${ownName})`, lease_s: LEASE_S });
-  lease = granted?.lease ?? null;
-  showButtons();
-}
-
-setInterval(() => {
-  if (!lease || !connection?.isOpen) return;
-  connection.call("renew", { lease }).catch((error) => {
-    if (error.code === 1002) {
-      lease = null;
-      showButtons();
-    }
-  });
-}, (1000 * LEASE_S) / 3);
 
 function showButtons() {
   const isArmed = state === "OPERATION_ENABLED";
@@ -120,11 +102,11 @@ function showBanner() {
   at("banner").classList.toggle("grave", reason !== "simulated");
 }
 
-function showState(next, cause) {
+function showState(next, word, cause) {
   if (next !== null) lostSince = next === "COMM_LOST" ? lostSince ?? new Date() : null;
   state = next;
   showBanner();
-  at("state").textContent = STATES[state] ?? "not connected";
+  at("state").textContent = word ?? "not connected";
   at("state").dataset.state = state ?? "disconnected";
   at("state").title = state ?? "";
   at("cause").textContent = at("cause").title = cause ?? "";
@@ -133,7 +115,7 @@ function showState(next, cause) {
 }
 
 function showStatus(status) {
-  showState(status.state, status.cause);
+  showState(status.state, status.word, status.cause);
   watchdog = status.watchdog_s;
   if (status.lost_for_s !== null) {
     lostSince = new Date(Date.now() - 1000 * status.lost_for_s);
@@ -149,7 +131,7 @@ function showOutage(message) {
 
 // Without events the state of plate and amplifiers is unknown.
 function showUnknown(cause) {
-  showState(null, cause);
+  showState(null, null, cause);
   overlay.show({ contacts: [], drive: {} });
   fieldView.clear();
   at("summary").textContent = "";
@@ -179,9 +161,9 @@ function summariseSilence() {
 }
 
 const HANDLERS = {
-  state({ old, new: next, cause, remedy }) {
+  state({ old, new: next, word, cause, remedy }) {
     const isChange = state !== null && old !== next && !TRANSIENT.includes(next);
-    showState(next, cause);
+    showState(next, word, cause);
     summariseSilence();
     if (next === "COMM_LOST") {
       showLinkLoss(cause, remedy);
@@ -190,8 +172,7 @@ const HANDLERS = {
     if (linkLoss && next !== "NOT_READY") {
       annotate(linkLoss.item, `${timeOfDay(new Date())} all amplifiers reconnected, disarmed`, remedy);
     } else if (isChange) {
-      const label = STATES[next] ?? next;
-      addEvent(log, next === "FAULT" ? "error" : "info", cause.startsWith(label) ? cause : `${label}: ${cause}`, remedy);
+      addEvent(log, next === "FAULT" ? "error" : "info", cause.startsWith(word) ? cause : `${word}: ${cause}`, remedy);
     }
     linkLoss = null;
   },
@@ -241,7 +222,7 @@ const HANDLERS = {
 async function play(effect) {
   const { rig, cursor, contacts } = overlay;
   const { x_m, y_m } = cursor ?? contacts.at(-1) ?? { x_m: rig.length_m / 2, y_m: rig.width_m / 2 };
-  const result = await call("play", { effect, x_m, y_m });
+  const result = await attempt(() => connection.call("play", { effect, x_m, y_m }));
   if (result?.held_back) at("problem").textContent = `${effect}: ${result.held_back}`;
 }
 
@@ -265,7 +246,6 @@ function opened(hello, name) {
 }
 
 function closed() {
-  lease = null;
   daemon = null;
 }
 
@@ -295,14 +275,11 @@ function connect(token) {
 }
 
 // A closed page cannot stop anything: disarm.
-window.addEventListener("pagehide", () => lease && connection.post("disarm").catch(() => {}));
+window.addEventListener("pagehide", () => connection?.lease && connection.post("disarm").catch(() => {}));
 
-at("arm").addEventListener("click", arm);
-at("disarm").addEventListener("click", () => {
-  lease = null;
-  call("disarm");
-});
-at("clear").addEventListener("click", () => call("clear"));
+at("arm").addEventListener("click", () => attempt(() => connection.arm(`dashboard (${ownName})`)));
+at("disarm").addEventListener("click", () => attempt(() => connection.disarm()));
+at("clear").addEventListener("click", () => attempt(() => connection.call("clear")));
 at("stop").addEventListener("click", stop);
 at("motion").addEventListener("change", ({ target }) => fieldView.setMotion(target.checked));
 at("login").addEventListener("submit", (event) => {

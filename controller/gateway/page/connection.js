@@ -1,8 +1,18 @@
-// The WebSocket to the gateway: JSON-RPC 2.0 in both directions, reconnecting by itself.
+// The plate over the gateway's WebSocket (JSON-RPC 2.0), for the dashboard and for pages of your own,
+// which import it from the gateway or copy it: docs/how-to/your-own-application.md.
+//
+// It reconnects by itself and subscribes anew. Calls that are pending at a loss are rejected and never
+// sent again: whether to arm, play or clear then is for the caller to decide.
 
 const RETRY_MS = [200, 500, 1000, 2000];
 const RESPONSE_TIMEOUT_MS = 6000;
+const CHECK_MS = 1000;
+const QUIET_CHECKS = 2;  // after as many without a message the gateway is asked for one
+const SILENT_CHECKS = { open: 4, opening: 8 };  // after as many it is left: a lost network closes nothing
+const LEASE_S = 5;
+const REPEAT_MS = 50;  // the daemon lifts fingers that are not repeated within 150 ms
 const NO_DAEMON = 4001;  // close code of the gateway
+const NO_LEASE = 1002;  // code of the API
 
 export class RpcError extends Error {
   constructor({ code, message, data }) {
@@ -13,20 +23,27 @@ export class RpcError extends Error {
 }
 
 export class Connection {
-  // topics: to subscribe to. handlers: opened(hello, name) once the daemon has responded, closed(),
-  // failed(why) after each loss or failed attempt to connect, event(params), field(ArrayBuffer).
-  // name: of this page, in the daemon's log. why: "daemon" if the daemon does not respond, "refused"
-  // because of the token, "full" if the gateway responds but accepts no WebSocket, "unreachable".
-  constructor(token, topics, handlers) {
+  // topics: to subscribe to. handlers, all optional: opened(hello, name) once the daemon has responded,
+  // closed(), failed(why) after each loss or failed attempt to connect, event({ topic, data, lost }),
+  // disarmed() when the daemon refuses to renew the lease, field(ArrayBuffer). name: of this page, in
+  // the daemon's log. why: "daemon" if the daemon does not respond, "refused" because of the token,
+  // "full" if the gateway responds but accepts no WebSocket, "unreachable". gateway: its URL.
+  constructor(token, topics, handlers, gateway = import.meta.url) {
     this.token = token;
     this.topics = topics;
     this.handlers = handlers;
+    this.gateway = gateway;
     this.pending = new Map();
     this.lastId = 0;
     this.attempts = 0;
     this.wasEverAccepted = false;
     this.wasOpen = false;  // since the last attempt to connect
+    this.lease = null;  // while armed by `arm`; it outlives a short loss
+    this.touches = [];
     this.connect();
+    setInterval(() => this.check(), CHECK_MS);
+    setInterval(() => this.renew(), (1000 * LEASE_S) / 3);
+    setInterval(() => this.touches.length && this.touch(this.touches), REPEAT_MS);
   }
 
   get isOpen() {
@@ -34,9 +51,9 @@ export class Connection {
   }
 
   connect() {
-    const url = new URL("api/v1/ws?field", location.href);
-    url.protocol = location.protocol === "https:" ? "wss:" : "ws:";
-    url.hash = "";
+    const url = new URL(this.handlers.field ? "api/v1/ws?field" : "api/v1/ws", this.gateway);
+    url.protocol = url.protocol.replace("http", "ws");
+    this.silentChecks = 0;
     this.socket = new WebSocket(url, ["era-haptics.v1", `era-haptics.token.${this.token}`]);
     this.socket.binaryType = "arraybuffer";
     this.socket.onmessage = ({ data }) => this.received(data);
@@ -51,7 +68,7 @@ export class Connection {
       this.wasOpen = false;  // the daemon has too many clients: connected later
       socket.close();
     });
-    this.handlers.opened(result, id);
+    this.handlers.opened?.(result, id);
   }
 
   closed(code) {
@@ -59,24 +76,26 @@ export class Connection {
       reject(new RpcError({ code: 0, message: "the gateway does not respond" }));
     }
     this.pending.clear();
-    this.handlers.closed();
+    this.handlers.closed?.();
     if (code === NO_DAEMON) {
       this.wasEverAccepted = true;
-      this.handlers.failed("daemon");
-    } else if (this.wasOpen) this.handlers.failed("unreachable");
+      this.handlers.failed?.("daemon");
+    } else if (this.wasOpen) this.handlers.failed?.("unreachable");
     else this.diagnose();
     this.wasOpen = false;
+    this.silentChecks = 0;
     setTimeout(() => this.connect(), RETRY_MS[Math.min(this.attempts++, RETRY_MS.length - 1)]);
   }
 
   received(data) {
+    this.silentChecks = 0;
     if (data instanceof ArrayBuffer) {
       this.handlers.field(data);
       return;
     }
     const message = JSON.parse(data);
     if (message.method === "event") {
-      this.handlers.event(message.params);
+      this.handlers.event?.(message.params);
       return;
     }
     if (!this.wasOpen) {  // the first is the response to the gateway's hello
@@ -88,6 +107,16 @@ export class Connection {
     this.pending.delete(message.id);
     if (message.error) call.reject(new RpcError(message.error));
     else call.resolve(message.result);
+  }
+
+  // Ask a silent gateway for a message, and connect again if none comes.
+  check() {
+    this.silentChecks += 1;
+    if (this.silentChecks > SILENT_CHECKS[this.isOpen ? "open" : "opening"]) {
+      this.socket.onmessage = this.socket.onclose = null;
+      this.socket.close();
+      this.closed();
+    } else if (this.silentChecks > QUIET_CHECKS && this.isOpen) this.call("status").catch(() => {});
   }
 
   // Call a method; a promise of its result.
@@ -107,13 +136,40 @@ export class Connection {
     });
   }
 
-  // Send a request that needs no response, such as touches.
-  notify(method, params) {
-    if (this.isOpen) this.socket.send(JSON.stringify({ jsonrpc: "2.0", method, params }));
+  // Switch the high voltage on, and renew the lease until `disarm` or `stop`, or until it is refused.
+  async arm(owner) {
+    const { lease } = await this.call("arm", { owner, lease_s: LEASE_S });
+    this.lease = lease;
+  }
+
+  renew() {
+    const { lease } = this;
+    if (!lease || !this.isOpen) return;
+    this.call("renew", { lease }).catch(({ code }) => {
+      if (code !== NO_LEASE || lease !== this.lease) return;
+      this.lease = null;
+      this.handlers.disarmed?.();
+    });
+  }
+
+  // Ramp to silence and switch the high voltage off.
+  disarm() {
+    this.lease = null;
+    return this.call("disarm");
+  }
+
+  // Report all fingers that are down, [{ id, x_m, y_m }, ...], the newest last; repeated until the next
+  // call, and reported to the daemon again after a loss.
+  touch(touches) {
+    this.touches = touches;
+    if (!this.isOpen) return;
+    const params = { source: "page", touches };
+    this.socket.send(JSON.stringify({ jsonrpc: "2.0", method: "touch", params }));
   }
 
   // Stop over the WebSocket and over HTTP; a promise that all amplifiers are confirmed silent.
   stop() {
+    this.lease = null;
     const overHttp = this.post("stop").then(async (response) => {
       const { error, code, data } = await response.json();
       if (!response.ok) throw new RpcError({ message: error, code, data });
@@ -125,14 +181,13 @@ export class Connection {
   diagnose() {
     this.post("effects")
       .then(({ status }) => (status === 401 ? "refused" : "full"), () => "unreachable")
-      .then((why) => this.isOpen || this.handlers.failed(why));
+      .then((why) => this.isOpen || this.handlers.failed?.(why));
   }
 
   post(method) {
     const headers = { Authorization: `Bearer ${this.token}`, "Content-Type": "application/json" };
-    const url = new URL(`api/v1/${method}`, location.href);
-    url.hash = "";
     const signal = AbortSignal.timeout(RESPONSE_TIMEOUT_MS);
+    const url = new URL(`api/v1/${method}`, this.gateway);
     return fetch(url, { method: "POST", headers, body: "{}", keepalive: true, signal });
   }
 }

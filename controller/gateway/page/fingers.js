@@ -1,11 +1,10 @@
 // Fingers on the plate's picture: pointers of every kind, and one moved by the keyboard.
 
-const REPEAT_MS = 50;  // the daemon lifts fingers that are not repeated within 150 ms
 const STEP_M = 0.005;
 const KEYBOARD = -1;   // an id that no pointer has
 
 export class Fingers {
-  // send(touches) is called with all fingers at every change, and every 50 ms while any is down.
+  // send(touches) is called with all fingers at every change.
   constructor(plate, overlay, send) {
     this.overlay = overlay;
     this.send = send;
@@ -21,7 +20,6 @@ export class Fingers {
     plate.addEventListener("blur", () => this.removeCursor());
     window.addEventListener("blur", () => this.liftAll());
     document.addEventListener("visibilitychange", () => document.hidden && this.liftAll());
-    setInterval(() => this.positions.size && this.report(), REPEAT_MS);
   }
 
   press(event, plate) {

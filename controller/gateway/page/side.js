@@ -2,12 +2,6 @@
 
 import { fixed } from "./plate.js";
 
-export const STATES = {
-  NOT_READY: "not ready", SWITCH_ON_DISABLED: "disarmed", READY_TO_SWITCH_ON: "disarmed",
-  SWITCHED_ON: "switched on", OPERATION_ENABLED: "armed", QUICK_STOP_ACTIVE: "stopped",
-  FAULT_REACTION_ACTIVE: "fault", FAULT: "fault", COMM_LOST: "link lost",
-};
-
 const SVG = "http://www.w3.org/2000/svg";
 const MAX_EVENTS = 200;
 const OLD_REPLY_S = 1.5;  // three times the interval of status reads while disarmed
@@ -28,12 +22,13 @@ function ageText(seconds) {
 
 // eras: of the rig, for the names of the channels.
 function tile(amplifier, eras) {
-  const { name, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost, closed_with_lost } = amplifier;
+  const { name, word, state, fault, levels, temperature_c, high_voltage, high_voltage_v, reply_age_s, lost, closed_with_lost } = amplifier;
   const isFaulty = fault && fault !== "NONE";
   const made = element("article", undefined, lost || isFaulty ? "tile bad" : "tile");
   const title = element("h3");
-  const status = lost ? "no link" : closed_with_lost ? "closed with the lost one" : isFaulty ? `fault: ${fault.toLowerCase().replaceAll("_", " ")}` : STATES[state] ?? "unknown";
+  const status = lost ? "no link" : closed_with_lost ? "closed with the lost one" : isFaulty ? `fault: ${fault.toLowerCase().replaceAll("_", " ")}` : word ?? "unknown";
   title.append(element("span", name), element("span", status));
+  title.title = state ?? "";
   made.append(title);
   const channels = element("div", undefined, "channels");
   const eraOf = (channel) => eras.find((each) => each.amplifier === name && each.channel === channel)?.name;

@@ -80,7 +80,7 @@ class ServedApi:
         self.called(name)
         if name == "play":
             raise KeyError("a bug, with /a/path in it")
-        return self._arm() if name == "arm" else METHODS[name].result.model_construct()
+        return self._arm() if name == "arm" else METHODS[name].result.model_construct(state="FAULT")
 
     async def _arm(self) -> Message:
         await self.may_arm.wait()

@@ -77,7 +77,7 @@ async def test_status_of_lost_amplifier(tmp_path: Path, capsys: pytest.CaptureFi
         await until_state(era, "FAULT")
         await asyncio.to_thread(status, socket=bench.socket)
     lines = capsys.readouterr().out.splitlines()
-    assert [line.partition(":")[0] for line in lines if line[0] != " "] == ["COMM_LOST", "FAULT"]
+    assert [line.partition(":")[0] for line in lines if line[0] != " "] == ["lost", "fault"]
     (line,) = [line for line in show_status(lost).splitlines() if "serial://" in line]
     assert re.search(r"\): LOST, last reply [\d.]+ s ago$", line)
     for assume_energised, shown in ((True, "ASSUME ENERGISED"), (False, "unreachable for 12.0 s")):

@@ -34,7 +34,8 @@ def command_reference() -> str:
     lines = ["### Common arguments and options", ""]
     lines += [f"- `{name}`: {text}" for name, text in sorted(common.items())]
     for path, usage, summary, records in commands:
-        lines += ["", f"### {path}", "", summary, "", *_entry(usage, records, common)]
+        entry = list(_entry(path, usage, summary, records, common))
+        lines += ["", f"### {path}", "", entry[0], *(["", *entry[1:]] if entry[1:] else [])]
     return "\n".join(lines)
 
 
@@ -54,8 +55,10 @@ def _commands(
         yield inner.command_path, usage, " ".join((command.help or "").split()), records
 
 
-def _entry(usage: str, records: _Records, common: dict[str, str]) -> Iterator[str]:
-    """The lines of one command: its usage, and what it does not share with others."""
+def _entry(
+    path: str, usage: str, summary: str, records: _Records, common: dict[str, str]
+) -> Iterator[str]:
+    """The lines of one command: its summary, its usage, and what it does not share with others."""
     is_common = [
         name in common and text.startswith(common[name].rstrip(".")) for name, text in records
     ]
@@ -64,8 +67,12 @@ def _entry(usage: str, records: _Records, common: dict[str, str]) -> Iterator[st
         for (name, _), shared in zip(records, is_common, strict=True)
         if shared and name.startswith("--")
     ]
-    also = f", also with {', '.join(options)}" if options else ""
-    yield f"- `{usage}`{also}"
+    also = f"also with {', '.join(options)}" if options else ""
+    if usage == f"{path} [OPTIONS]":
+        yield f"{summary} {also.capitalize()}." if also else summary
+    else:
+        yield summary
+        yield f"- `{usage}`{also and f', {also}'}"
     for (name, text), shared in zip(records, is_common, strict=True):
         if not shared:
             yield f"- `{name}`: {text}"

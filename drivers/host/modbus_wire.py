@@ -30,7 +30,7 @@ from drivers.host.wire import (
 )
 from drivers.protocol.records import TEXT_MAX, Refusal, Values
 from drivers.protocol.serial_payload import BROADCAST, TEXTS
-from drivers.protocol.table import MESSAGES
+from drivers.protocol.table import MESSAGES, REACTION
 from drivers.statistics import WireCounters
 
 _BOX = 256  # registers of a message
@@ -39,6 +39,7 @@ _REPLY_HEAD = 2  # registers: tag, result
 _IDENTITY = Read(1065, 2 + len(TEXTS) * TEXT_MAX // 2)
 _WRITE_SIZE = 9  # bytes on RTU of a write, without its registers
 _FRAME_SIZE = 3  # bytes on RTU of a frame beside its PDU
+_HEADER_SIZE = 7  # bytes on TCP of a frame beside its PDU
 _ANSWERS_SIZE = 21  # bytes on RTU of the response to a write, of a read and its response
 _BITS = 11  # of a byte, with start, parity and stop
 _GAP = 3.5  # characters of silence before a frame
@@ -94,6 +95,9 @@ class ModbusWire:
                 return self._written(BROADCAST, name, values).adu.frame
             adus = [self._written(unit, name, values).adu for unit in self._sizes]
             self._reader.unawaited = {adu.transaction for adu in adus}
+            if self._baud and adus:  # a gateway sends a write once the one before was replied to
+                echo = self._time(adus[0].size + _FRAME_SIZE) + self.silence + REACTION
+                self.takes += (len(adus) - 1) * (self.takes + echo)
             return b"".join(adu.frame for adu in adus)
         self._sizes.setdefault(address, WIDEST)
         if name == "Hello":
@@ -144,10 +148,10 @@ class ModbusWire:
         self.counters.frames_out += 1
         transaction = 0 if self._is_rtu else self._number
         adu = build_adu(transfer, unit=unit, transaction=transaction, is_rtu=self._is_rtu)
-        self.takes = self._time(len(adu.frame)) + self.silence
+        size = len(adu.frame) - (0 if self._is_rtu else _HEADER_SIZE - _FRAME_SIZE)
+        self.takes = self._time(size) + self.silence
         if self._is_rtu:
-            response = adu.size + _FRAME_SIZE
-            self.busy = self._time(len(adu.frame) + response) + 2 * self.silence
+            self.busy = self.takes + self._time(adu.size + _FRAME_SIZE) + self.silence
         return adu
 
     def _written(self, unit: int, name: str, values: Values) -> _Request:

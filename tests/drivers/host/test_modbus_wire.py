@@ -273,3 +273,21 @@ def test_times_on_a_line_are_those_of_its_characters() -> None:
     slow = ModbusWire(9600, is_rtu=True, number=0)
     assert slow.silence == pytest.approx(3.5 * 11 / 9600)
     assert ModbusWire(0, is_rtu=False, number=0).exchange_time(22, 3) == 0
+
+
+def test_broadcast_over_a_gateway_arrives_after_the_writes_before() -> None:
+    """By hand: to three units 3 · 15 characters at 9600 baud, two echoes of 8, five silences.
+
+    Each echo may begin 10 ms late. A network has no time of its own.
+    """
+    commit = ("Commit", {"session": 9, "token": 7})
+    wire = ModbusWire(9600, is_rtu=False, number=0)
+    for unit in (1, 2, 3):
+        wire.request(unit, "GetStatus", {})
+    wire.request(0, *commit)
+    characters = 3 * 15 + 2 * 8 + 5 * 3.5
+    assert wire.takes == pytest.approx(characters * 11 / 9600 + 2 * 0.01)
+    network = ModbusWire(0, is_rtu=False, number=0)
+    network.request(1, "GetStatus", {})
+    network.request(0, *commit)
+    assert network.takes == 0

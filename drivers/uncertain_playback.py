@@ -18,6 +18,7 @@ from drivers.voices import Voice
 
 Interval: TypeAlias = tuple[float, float]
 _LAYERS = QUANTITIES["layer_count"].maximum
+_PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
 
 
 class _Mark(NamedTuple):
@@ -63,8 +64,10 @@ class UncertainPlayback:
         """
         waiting = {one.layer for one in self.playback.waiting}
         changed = dict.fromkeys(range(_LAYERS), False)
+        sooner = dict.fromkeys(range(_LAYERS), ramp)  # of what falls silent: its end, from now on
         if layers is not None:
             changed = {one.layer: one.after for one in layers}
+            sooner = {one.layer: self._ends_after(one) for one in layers}
         # Of all layers: what is due is taken to have happened before what is to happen, or after.
         ends = [(due, self.half[layer]) for due, layer in self.playback.dues]
         ends += [(self.playback.end_of(layer), self.half[layer]) for layer in changed]
@@ -72,11 +75,18 @@ class UncertainPlayback:
             way, half = voice.transition, self._mark_of(voice.transition).half
             is_followed = voice.layer in waiting or changed.get(voice.layer, False)
             is_due = not way.last or (is_followed and bool(way.knots))
-            if layers is None and ramp and not way.last and way.step:  # or it ends sooner
-                ends.append((way.end - ramp, half))
+            if voice.layer in sooner and not way.last and way.step:
+                if layers is None or not voice.has_ended:  # it goes on, or ends sooner
+                    ends.append((way.end - sooner[voice.layer], half))
             if not voice.has_ended and voice.layer in changed and is_due:
                 ends.append((way.end, half))
         return any(when[0] - half <= end <= when[1] + half for end, half in ends)
+
+    def _ends_after(self, one: LayerSet) -> float:
+        """Return how long after a set a layer is silent that falls silent by it [s]."""
+        if not one.renew:
+            return one.ramp / _PER_RAMP
+        return self.playback.ramp_of(one.layer) + one.valid_for / _PER_VALID_FOR
 
     def commit(self, layers: Sequence[LayerSet], token: int, when: Interval) -> None:
         """Play a set from some time between two on."""

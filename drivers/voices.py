@@ -15,6 +15,7 @@ from drivers.protocol.table import QUANTITIES, SHORTENED_FADE
 from drivers.transition import Transition, along, amplitude_of, towards
 
 _PER_HERTZ = QUANTITIES["frequency"].per_unit
+_SAME = 1e-6  # s; ends nearer than that are one, so that rounding decides nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +39,12 @@ class Voice:
         return math.inf if self.transition.last else self.transition.end
 
     def faded(self, time: float, ramp: float, uncertainty: float = 0.0) -> "Voice":
-        """Return it falling silent along a ramp [s], or as it does if that is sooner.
+        """Return it falling silent along a ramp [s], or as it does if that is no later.
 
         uncertainty [s]: see `Playback`.
         """
         transition, end = self.transition, time + ramp
-        if transition.last or transition.end > end:
+        if transition.last or transition.end > end + _SAME:
             is_over = time - uncertainty >= transition.end
             first = transition.last if is_over else transition.reached(time, uncertainty)
             transition = Transition(time, ramp, first, 0j, end)

@@ -75,9 +75,9 @@ class UncertainPlayback:
             way, half = voice.transition, self._mark_of(voice.transition).half
             is_followed = voice.layer in waiting or changed.get(voice.layer, False)
             is_due = not way.last or (is_followed and bool(way.knots))
-            if voice.layer in sooner and not way.last and way.step:
-                if layers is None or not voice.has_ended:  # it goes on, or ends sooner
-                    ends.append((way.end - sooner[voice.layer], half))
+            left = sooner.get(voice.layer, 0.0)
+            if left and not way.last and way.step and (layers is None or not voice.has_ended):
+                ends.append((way.end - left, half))  # it goes on, or ends sooner
             if not voice.has_ended and voice.layer in changed and is_due:
                 ends.append((way.end, half))
         return any(when[0] - half <= end <= when[1] + half for end, half in ends)

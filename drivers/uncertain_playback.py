@@ -62,7 +62,6 @@ class UncertainPlayback:
 
         layers: of a set; None: all fall silent along a ramp [s].
         """
-        waiting = {one.layer for one in self.playback.waiting}
         changed = dict.fromkeys(range(_LAYERS), False)
         sooner = dict.fromkeys(range(_LAYERS), ramp)  # of what falls silent: its end, from now on
         if layers is not None:
@@ -71,8 +70,11 @@ class UncertainPlayback:
         # Of all layers: what is due is taken to have happened before what is to happen, or after.
         ends = [(due, self.half[layer]) for due, layer in self.playback.dues]
         ends += [(self.playback.end_of(layer), self.half[layer]) for layer in changed]
-        for voice in (voice for voices in self.playback.all_voices for voice in voices):
-            way, half = voice.transition, self._mark_of(voice.transition).half
+        by_then = self.copied()
+        by_then._pass_until(when[0])
+        waiting = {one.layer for one in by_then.playback.waiting}
+        for voice in (voice for voices in by_then.playback.all_voices for voice in voices):
+            way, half = voice.transition, by_then._mark_of(voice.transition).half
             is_followed = voice.layer in waiting or changed.get(voice.layer, False)
             is_due = not way.last or (is_followed and bool(way.knots))
             left = sooner.get(voice.layer, 0.0)

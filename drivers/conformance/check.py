@@ -6,9 +6,10 @@ from inspect import isawaitable
 from drivers import clock
 from drivers.conformance.client import Client, read_as
 from drivers.conformance.findings import Late, Optional, Violation
+from drivers.conformance.material import FULL
 from drivers.conformance.report import Check, CheckResult, Result, Steps
 from drivers.conformance.subject import MAX_ATTEMPTS, Subject
-from drivers.errors import LinkError
+from drivers.errors import CommandError, LinkError
 from drivers.protocol.table import MESSAGES
 
 
@@ -50,7 +51,7 @@ async def run_checks(
     """Run checks in turn, each with its number, on one amplifier; return their results.
 
     Nothing is run after a check that the amplifier leaves without silence. Raises LinkError for a
-    line that is lost, or where this machine is always late.
+    line that is lost, or where this machine is always late, CommandError for a level below a step.
     """
     results: list[CheckResult] = []
     for number, check in checks:
@@ -95,6 +96,9 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Exceptio
     try:
         subject = await identified(client, level)
         if check.drives:
+            step = subject.can["level_step"] / FULL
+            if subject.level < step:
+                raise CommandError(f"level must be at least {step:g}, its step, got {level:g}")
             await subject.rest()
         rows = check.run(subject)
         await (rows if isawaitable(rows) else subject.run(rows))

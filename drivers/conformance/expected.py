@@ -5,12 +5,14 @@ out is known as an interval.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 from drivers.conformance.client import When
 from drivers.conformance.findings import Late, expect, expect_equal, expect_one_of, expect_within
 from drivers.playback import playback_of
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet
+from drivers.protocol.sets import Command, LayerSet
 from drivers.protocol.table import (
     FAULTS,
     MESSAGES,
@@ -26,6 +28,7 @@ SLACK = 0.002  # s; of times in milliseconds
 DRIFT = 1e-3  # of a time; of the amplifier's clock
 NAMES = {number: name for name, number in STATES.items()}
 OFF, ENABLED, STOPPED = "SWITCH_ON_DISABLED", "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
+_TONE = "frequency", "level", "phase"
 _FALLING = {"SWITCHED_ON": ("SWITCHED_ON", OFF), "FAULT": ("FAULT_REACTION_ACTIVE", "FAULT")}
 """What is shown until all is silent, and then."""
 _TRIP, FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until a trip, of a fault, until a state shows
@@ -33,13 +36,14 @@ _LASTING = 3.0  # s; what ends after it is not awaited
 _LATE = 0.002  # s; by which a set may begin later
 _TOLERANCE = 0.0015  # of full level
 _MAX_STEPS = 4  # halves, beside one of each voice
-_FULL = QUANTITIES["level"].per_unit
+_FULL, _HALF_CIRCLE = QUANTITIES["level"].per_unit, QUANTITIES["phase_step"].maximum
 
 
 class Expected:
     """An amplifier since a status at rest; times [s] are intervals of this machine's clock.
 
-    fed: when the watchdog was fed last. sets: by their tokens. is_exact: whether its levels show
+    fed: when the watchdog was fed last. sets: by their tokens, as played where that is known;
+    is_exactly: whether it plays them to the word. is_exact: whether its levels show
     how tones of one frequency interfere.
     """
 
@@ -48,6 +52,7 @@ class Expected:
         self.state, self.fault = OFF, FAULTS["NONE"]
         self.session = 0
         self.sets: dict[int, tuple[LayerSet, ...]] = {}
+        self.is_exactly: dict[int, bool] = {}
         self.is_exact = False
         self.watchdog = 0.0
         self.fed = self.began = self.silent = self._first = when
@@ -134,6 +139,38 @@ class Expected:
         if self._plays.is_ambiguous(begins, layers, ramp):
             raise Late("a request came as a layer ended by itself, or its onset")
         return begins
+
+    def achieved(
+        self, one: LayerSet, shown: Mapping[str, Any], *, is_exact: bool = False
+    ) -> LayerSet:
+        """Return a layer as it plays by a GetAchieved; raises Violation beyond half a step."""
+        found = {each["channel"]: each for each in shown["commands"]}
+        where = f"in layer {one.layer}"
+        driven = {tone.channel for tone in one.commands if tone.is_driven}
+        expect_equal(sorted(found.keys() - driven), [], f"channels achieved but not driven {where}")
+        played = []
+        for tone in one.commands:
+            requested = {name: getattr(tone, name) for name in _TONE}
+            shown_tone = found.get(tone.channel, {**requested, "level": 0})
+            plays = {name: shown_tone[name] for name in _TONE}
+            for name in _TONE:
+                error = abs(plays[name] - requested[name])
+                error = min(error, 2 * _HALF_CIRCLE - error) if name == "phase" else error
+                allowed = 0.0 if is_exact else self._rounding(name, tone)
+                what = f"error of achieved {name} of channel {tone.channel} {where}"
+                expect_within(error, 0, allowed, what)
+            played.append(replace(tone, **plays) if tone.channel in found else tone)
+        return replace(one, commands=tuple(played))
+
+    def _rounding(self, name: str, tone: Command) -> float:
+        """Return by how much a part of a tone may be rounded: inwards at the limits."""
+        limits, step = self.can["limits"][tone.channel], self.can[f"{name}_step"]
+        if name != "phase":
+            value = getattr(tone, name)
+            low, high = limits.get(f"{name}_min", 0), limits[f"{name}_max"]
+            if not low <= value - step / 2 <= value + step / 2 <= high:
+                return float(step)
+        return float(step / 2)
 
     # What it must show
 

@@ -2,6 +2,7 @@
 
 import math
 
+from drivers.conformance.findings import Optional
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES, has_feature
@@ -43,8 +44,14 @@ class Material:
         onset: Envelope | None = None,
         ending: Envelope | None = None,
     ) -> Command:
-        """Make a command at a fraction of the test level; frequency in steps, 0 for the usual."""
-        numbers = round(fraction * self.level * FULL), QUANTITIES["phase"].to_wire(phase)
+        """Make a command at a fraction of the test level; frequency in steps, 0 for the usual.
+
+        Raises Optional for a level that the amplifier may round to 0.
+        """
+        level, step = round(fraction * self.level * FULL), self.can["level_step"]
+        if 0 < level < step:
+            raise Optional(f"its steps of level are coarser than {level / FULL:g}; see --level")
+        numbers = level, QUANTITIES["phase"].to_wire(phase)
         return Command(channel, frequency or self.frequency, *numbers, keep, skip, onset, ending)
 
     def one(
@@ -99,7 +106,8 @@ class Material:
         """Return a frequency of a layer of its own, so that layers do not interfere."""
         step = self.can["frequency_step"]
         above = self.frequency + max(40, step) * number
-        return int(min(above, self.highest - (len(self.layers) - number) * step))
+        highest = self.highest - (len(self.layers) - number) * step
+        return int(max(min(above, highest), self.lowest))
 
 
 def layer(

@@ -23,7 +23,7 @@ from drivers.conformance.findings import Violation
 from drivers.conformance.material import layer
 from drivers.conformance.report import Check, CheckResult, Report
 from drivers.conformance.subject import Subject
-from drivers.errors import LinkError
+from drivers.errors import CommandError, LinkError
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
 from drivers.protocol.table import MESSAGES
@@ -89,28 +89,55 @@ async def test_sensors_on_a_plate_pass(coarse_rig: Rig) -> None:
 
 
 class _Coarse(Amplifier):
-    """An amplifier that keeps its own steps of frequency and level, and says so."""
+    """An amplifier that keeps its own steps, of frequency from its lowest one on, and says so."""
 
     def _play(self, layers: Sequence[LayerSet], token: int, now: float) -> None:
-        steps = {name: self.capabilities[f"{name}_step"] for name in ("frequency", "level")}
-
-        def rounded(tone: Command) -> Command:
-            own = {name: step * round(getattr(tone, name) / step) for name, step in steps.items()}
-            return replace(tone, **own)
-
-        played = [replace(one, commands=tuple(map(rounded, one.commands))) for one in layers]
+        played = [replace(one, commands=tuple(map(self._rounded, one.commands))) for one in layers]
         super()._play(played, token, now)
+
+    def _rounded(self, tone: Command) -> Command:
+        if not tone.level:
+            return tone
+        can, limits = self.capabilities, self.capabilities["limits"][tone.channel]
+        lowest, highest = limits["frequency_min"], limits["frequency_max"]
+        step = can["frequency_step"]
+        steps = min(round((tone.frequency - lowest) / step), (highest - lowest) // step)
+        phase = can["phase_step"] * round(tone.phase / can["phase_step"])
+        return replace(
+            tone,
+            frequency=lowest + steps * step,
+            level=can["level_step"] * round(tone.level / can["level_step"]),
+            phase=(phase + 18_000) % 36_000 - 18_000,
+        )
 
     def _take(self, part: Values, now: float) -> Values:
         return {**super()._take(part, now), "exact": 0}
 
 
-@pytest.mark.parametrize("steps", [{"frequency_step": 20, "level_step": 5}, {"level_step": 40}])
+@pytest.mark.parametrize(
+    "steps",
+    [
+        {"frequency_step": 20, "level_step": 5},
+        {"level_step": 40},
+        {"frequency_step": 7},
+        {"frequency_step": 30, "phase_step": 300},
+        {"frequency_step": 60, "phase_step": 18_000},
+        {"frequency_step": 65_535, "phase_step": 77},
+    ],
+)
 def test_amplifier_that_keeps_its_own_steps_passes(steps: dict[str, int]) -> None:
-    """Those that it states: 1 Hz, thousandths or even 0.4 % of full level."""
+    """Those that it states: 1 Hz, thousandths or even 0.4 % of full level, half a circle."""
     far = _Coarse("coarse", channels=2)
     far.capabilities.update(steps)
     expect_passed(judged("serial", far=far), SKIPPED["serial"] - {"steps_as_stated"})
+
+
+def test_level_below_a_step_is_refused() -> None:
+    """An amplifier that has full level alone cannot be driven at a fifth of it."""
+    far = _Coarse("coarse", channels=2)
+    far.capabilities.update(level_step=10_000)
+    with pytest.raises(CommandError, match="at least 1"):
+        judged("serial", ["stop"], far=far)
 
 
 class _PlaysOn(Amplifier):

@@ -6,6 +6,7 @@ longer, such as arming, runs as a task of its own.
 
 import asyncio
 import logging
+import math
 import socket
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -29,6 +30,7 @@ from controller.api.methods import METHODS, TouchParams
 from controller.api.schema import Empty, Message
 from controller.api.turns import Turns
 from controller.api.waiting_touches import supersedes
+from controller.sources.contacts import CONTACT_TIMEOUT
 from drivers import clock
 from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
@@ -112,7 +114,7 @@ class ApiServer:
         )
         self._turns = Turns(
             self._serve_line,
-            is_first=lambda client: client.is_touching or holds_lease(client),
+            is_first=lambda client: self._is_touching(client) or holds_lease(client),
             is_busy=is_busy,
             clock=clock,
             processor_time=processor_time,
@@ -147,6 +149,10 @@ class ApiServer:
         self._admission.admitted.discard(connection)
         self._on_disconnect(connection)
 
+    def _is_touching(self, connection: Connection) -> bool:
+        """Whether fingers of a client are down; those that it no longer reports count as lifted."""
+        return self._clock() - connection.touched_at <= CONTACT_TIMEOUT
+
     def _serve_line(self, connection: Connection) -> None:
         """Serve the next line of a client, unless it is a touch frame that the one after replaces.
 
@@ -157,7 +163,7 @@ class ApiServer:
         if call is not None and not connection.is_open and call.method != "stop":
             return  # the client has left: its fingers are lifted, and its lease has ended
         if call is not None and isinstance(call.params, TouchParams):
-            connection.is_touching = bool(call.params.touches)
+            connection.touched_at = self._clock() if call.params.touches else -math.inf
             connection.ahead = self._read(connection)
             if call.is_superseded_by(connection.ahead):
                 return

@@ -54,6 +54,19 @@ async def test_client_that_touches_waits_for_no_other_client() -> None:
 
 
 @in_virtual_time
+async def test_client_whose_fingers_were_never_lifted_is_one_of_the_others() -> None:
+    """150 ms after its last frame, as its contacts: it and the others have one share."""
+    served = serve(costs=0.001)
+    silent, _ = served.client()
+    silent.data_received(TOUCH_DOWN)
+    served.client()[0].data_received(REQUEST * 400)
+    await asyncio.sleep(0.3)
+    silent.data_received(REQUEST * 400)
+    await asyncio.sleep(1.0 - served.clock())
+    assert len(served.calls) == pytest.approx(1 + 20 + 250, abs=3)
+
+
+@in_virtual_time
 async def test_requests_wait_while_a_touch_is_on_its_way_to_the_wire(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

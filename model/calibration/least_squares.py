@@ -17,12 +17,13 @@ def search(
     bounds: FloatArray,
     *,
     loss: Loss = "linear",
-    steps: int = 60,
+    evaluations: int = 60,
     tolerance: float = 1e-8,
 ) -> OptimizeResult:
     """Minimize residuals (m,) with derivatives (m, n), from a start (n,) within bounds (2, n).
 
-    steps: at most; a plate that fits takes ten. tolerance: of the sum of squares, relative.
+    evaluations: at most; a plate that fits takes ten. tolerance: of the sum of squares, relative.
+    The derivatives of the result are those of the residuals, whatever the loss.
     """
     last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
@@ -39,14 +40,17 @@ def search(
     def jacobian(y: FloatArray) -> FloatArray:
         return both(y)[1]
 
-    return least_squares(
+    found = least_squares(
         residuals,
         np.clip(start, bounds[0] + 1e-9, bounds[1] - 1e-9),
         jacobian,
         bounds=(bounds[0], bounds[1]),
         loss=loss,
         x_scale="jac",
-        max_nfev=steps,
+        max_nfev=evaluations,
         xtol=1e-7,
         ftol=tolerance,
     )
+    if loss != "linear":
+        found.jac = jacobian(found.x)  # which it has scaled
+    return found

@@ -66,9 +66,12 @@ class Problem:
 
 
 def solve(
-    problem: Problem, start: FloatArray, free: NDArray[np.bool_], *, iterations: int = 40
+    problem: Problem, start: FloatArray, free: NDArray[np.bool_], *, evaluations: int = 40
 ) -> Linearised:
-    """Minimise the cost over the free parameters (p,) within their bounds, from a start (p,)."""
+    """Minimise the cost over the free parameters (p,) within their bounds, from a start (p,).
+
+    evaluations: of the model, at most.
+    """
     space = problem.model.space
     searched = np.flatnonzero(free)
 
@@ -83,5 +86,7 @@ def solve(
         return np.append(now.residuals, y), np.vstack([now.jacobian[:, searched], prior])
 
     bounds = np.array([space.lower, space.upper])[:, searched]
-    found = search(linearised, start[searched], bounds, steps=iterations, tolerance=_CONVERGED)
+    found = search(
+        linearised, start[searched], bounds, evaluations=evaluations, tolerance=_CONVERGED
+    )
     return problem.linearised(full(found.x))

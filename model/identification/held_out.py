@@ -9,7 +9,7 @@ from model.identification.fit import Problem, solve
 from model.identification.stages import Fitted
 
 _FOLDS = 5
-_ITERATIONS = 8
+_EVALUATIONS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ def hold_out(fitted: Fitted) -> HeldOut | None:
         part = measurement.part(~unseen)
         shown = model.with_frequencies(part.tones)
         free = fitted.space.uncertain
-        found = solve(Problem(shown, part), fitted.best.x, free, iterations=_ITERATIONS)
+        found = solve(Problem(shown, part), fitted.best.x, free, evaluations=_EVALUATIONS)
         rest = measurement.part(unseen)
         responses = model.with_frequencies(rest.tones).at(found.x).responses
         predicted[unseen] = responses[rest.rows, rest.at, rest.eras]

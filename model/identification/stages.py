@@ -21,9 +21,11 @@ from model.identification.measurement import Measurement
 from model.identification.parameters import Space, inwards, space_of
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig
+from model.structure.plate import Plate
 
 _EXTRA_NOISE = 0.05  # of the rms at each frequency
 _THICKNESSES = (0.0, 1.5, -1.5)  # standard deviations
+_MARGIN = 1.02  # of frequency, since layers do not stiffen all modes alike
 _GOOD = 0.5  # chi² under the raised noise that needs no further start
 _INWARDS = 0.6  # standard deviations
 _SCANNED = (8, 6)
@@ -105,14 +107,18 @@ def _solved_anew(setting: Setting, found: Fitted) -> Fitted:
     """Fit from there with the plate solved for its thickness and modulus, as a table will be."""
     values, plate = found.problem.model.at(found.best.x).values, setting.rig.plate
     identified = plate_with(plate, values)
-    free = solve_free_plate(
-        replace(identified, mode_deviations=plate.mode_deviations),
-        setting.free.mesh,
-        frequency_max=setting.free.frequency_max,
-    )
+    identified = replace(identified, mode_deviations=plate.mode_deviations)
+    free = solved_with_modes_of(setting.free, identified)
     model = replace(found.problem.model, free=free, last_places={})
     problem = Problem(model, setting.measurement)
     return Fitted(problem, solve(problem, found.best.x, found.space.uncertain))
+
+
+def solved_with_modes_of(free: FreePlate, plate: Plate) -> FreePlate:
+    """Solve a plate on the mesh of another, with all modes of that one though it may be stiffer."""
+    stiffer = plate.lowest_bending_frequency / free.plate.lowest_bending_frequency
+    frequency_max = free.frequency_max * max(stiffer * _MARGIN, 1.0)
+    return solve_free_plate(plate, free.mesh, frequency_max=frequency_max)
 
 
 def chi2(fitted: Fitted) -> float:

@@ -18,6 +18,8 @@ from model.structure.attachments import Gain
 from model.structure.plate import Material
 
 _PER_LINE = 4
+_SAME = 1e-4  # relative; of phases and of what modes deviate, absolute
+_SAME_PLACE = 1e-6  # m
 
 # ruamel.yaml wraps long sequences anywhere, so rows replace placeholders in its text.
 _ROWS_OF = "rows-of-"
@@ -67,8 +69,7 @@ def rewritten_text(
     text = f"{lines}\n{_PLACEHOLDER.sub(rows_text, edited_text(document, change))}"
     back = rig_of(parse_document(document.source, text), mesh=mesh)
     read, expected = _numbers(back), _numbers(after)
-    # The absolute part is for numbers near zero: 1 mg, 1 µm, a ten-thousandth of a gain.
-    if len(read) != len(expected) or not np.allclose(read, expected, rtol=1e-4, atol=1e-4):
+    if len(read) != len(expected) or not all(map(_is_same, read, expected)):
         raise InputError(
             f"{document.source}: values read back must be those written; write plate and ERAs as "
             "`era config init` does, and try again"
@@ -76,21 +77,27 @@ def rewritten_text(
     return text
 
 
-def _numbers(rig: Rig) -> list[float]:
-    """Values of a rig that are written: lengths in mm, masses in g."""
+def _numbers(rig: Rig) -> list[tuple[float, float]]:
+    """Values of a rig that are written, each with what counts as none of its quantity."""
     plate = rig.plate
     layers = rig.laminate.layers if rig.laminate else ()
-    found = [layer.material.E for layer in layers] or [plate.material.E]
-    found += [1e3 * plate.thickness, plate.loss_factor, plate.loss_exponent]
-    found += [part for pair in plate.mode_deviations for part in pair]
-    found += asdict(rig.uncertainty).values()
+    found = [(layer.material.E, 0.0) for layer in layers] or [(plate.material.E, 0.0)]
+    found += [(each, 0.0) for each in (plate.thickness, plate.loss_factor, plate.loss_exponent)]
+    found += [(part, _SAME) for pair in plate.mode_deviations for part in pair]
+    found += [(each, 0.0) for each in asdict(rig.uncertainty).values()]
     for era in rig.eras:
-        found += [1e3 * era.x, 1e3 * era.y, era.stiffness, era.damping, 1e3 * era.bolt_mass]
+        found += [(era.x, _SAME_PLACE), (era.y, _SAME_PLACE)]
+        found += [(each, 0.0) for each in (era.stiffness, era.damping, era.bolt_mass)]
         for _, size, phase in era.gains:
-            found += [size, np.cos(phase), np.sin(phase)]
+            found += [(size, 0.0), (np.cos(phase), _SAME), (np.sin(phase), _SAME)]
     for mass in rig.masses:
-        found += [1e3 * mass.x, 1e3 * mass.y, 1e3 * mass.mass]
+        found += [(mass.x, _SAME_PLACE), (mass.y, _SAME_PLACE), (mass.mass, 0.0)]
     return found
+
+
+def _is_same(read: tuple[float, float], expected: tuple[float, float]) -> bool:
+    """Whether a value was read back as it was written."""
+    return math.isclose(read[0], expected[0], rel_tol=_SAME, abs_tol=expected[1])
 
 
 def _change_plate(data: CommentedMap, before: Rig, after: Rig) -> None:

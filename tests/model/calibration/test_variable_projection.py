@@ -128,3 +128,12 @@ def test_jacobians_of_searches_are_exact(
     monkeypatch.setattr(least_squares, "least_squares", checking)
     searched()
     assert checked
+
+
+def test_derivatives_found_are_those_of_the_residuals_whatever_the_loss() -> None:
+    """A line through four points, one of them far off, whose weight in the loss is small."""
+    A, values = np.array([[1.0], [2.0], [3.0], [4.0]]), np.array([1.0, 2.0, 3.0, 40.0])
+    found = least_squares.search(
+        lambda x: (A @ x - values, A), np.zeros(1), np.array([[-9.0], [9.0]]), loss="soft_l1"
+    )
+    np.testing.assert_allclose(found.jac, A)

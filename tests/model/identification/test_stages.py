@@ -1,5 +1,7 @@
 """Identification of hidden thin plates in Hermite elements, whose theory is not the model's."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,13 @@ from benchmarks.identification.hidden import Hidden, draw
 from long_form import shortly
 from model.identification.forward import Sensor
 from model.identification.measurement import Measurement
-from model.identification.stages import Fitted, Setting, chi2, fit_in_stages
+from model.identification.stages import (
+    Fitted,
+    Setting,
+    chi2,
+    fit_in_stages,
+    solved_with_modes_of,
+)
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import example_rig_path, load_rig
 
@@ -48,3 +56,21 @@ def test_one_round_of_interleaved_tones_finds_the_springs() -> None:
     values = found.problem.model.at(found.best.x).values
     np.testing.assert_allclose(values.stiffness, hidden.mounted.stiffness, rtol=0.02)
     assert values.masses[0, 0] < 0.3e-3
+
+
+def test_plate_solved_anew_keeps_the_modes_of_the_fit() -> None:
+    """One a tenth thicker, with tones to 180 Hz, has its eighth mode above twice that."""
+    rig = load_rig(example_rig_path())
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=180.0)
+    measurement = Measurement.of(
+        [Sensor("A1", rig.eras[0].name)], np.array([60.0]), np.ones((1, 1, 4))
+    )
+    model = Setting(rig, free, measurement).model(masses=0)
+    thicker = rig.plate.scaled(modulus=1.0, thickness=1.1)
+    anew = replace(model, free=solved_with_modes_of(free, thicker))
+    shifts = np.zeros(model.space.size)
+    shifts[model.space.groups["mode_shifts"]] = 0.01
+    assert anew.at(shifts).responses.shape == (1, 1, len(rig.eras))
+    # Eigenvalues go as the square of the thickness, but for its shear.
+    lowest = [np.sort(each.free.modes.eigenvalues)[3:11] for each in (model, anew)]
+    np.testing.assert_allclose(lowest[1], 1.21 * lowest[0], rtol=2e-3)

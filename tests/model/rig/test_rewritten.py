@@ -144,3 +144,13 @@ def test_text_that_reads_back_otherwise_is_refused(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(rewritten, "_set_modulus", lambda *_: None)
     with pytest.raises(InputError, match="read back"):
         rewritten_text(document, rig, other_values(rig), comment="")
+
+
+def test_small_value_that_reads_back_otherwise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A loss factor of 0.02 that would have to become 0.02005, a quarter of a percent."""
+    document = parse_document("rig.yaml", FLOW)
+    rig = rig_of(document)
+    other = replace(rig, plate=replace(rig.plate, loss_factor=rig.plate.loss_factor + 5e-5))
+    monkeypatch.setattr(rewritten, "_change_plate", lambda *_: None)
+    with pytest.raises(InputError, match="read back"):
+        rewritten_text(document, rig, other, comment="")

@@ -263,7 +263,7 @@ def quotations() -> list[Quotation]:
     """
     found, status = [], -1
     for section in PAGE.read_text("utf-8").split("\n## ")[1:]:
-        if promised := re.search(r"Exit status (\d)", section):
+        if promised := re.search(r"exit status (\d)", section.splitlines()[0]):
             status = int(promised[1])
         for box in section.split("```text\n")[1:]:
             for entry in box.split("\n```")[0].split("\n\n"):

@@ -11,9 +11,11 @@ import json
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from textwrap import TextWrapper
 from typing import Any
 
 PROJECT = "era-haptics"
+_WRAPPER = TextWrapper(120, subsequent_indent="  ", break_on_hyphens=False)
 
 NOTES: Mapping[str, str] = {
     "numpy": "wheels contain OpenBLAS (BSD-3-Clause) and libgfortran (GPL-3.0 with the GCC "
@@ -65,13 +67,14 @@ def licence(component: Mapping[str, Any]) -> str:
     return " / ".join(known or [name.rpartition(" :: ")[2] for name in named]) or "not stated"
 
 
-def rows(components: Iterable[Mapping[str, Any]]) -> str:
-    """A table of name, version, licence and note."""
-    lines = ["| distribution | version | licence | note |", "|---|---|---|---|"]
+def lists(components: Iterable[Mapping[str, Any]]) -> str:
+    """A list by licence: names and versions, the licence of most distributions first."""
+    found: dict[str, list[str]] = {}
     for one in sorted(components, key=lambda one: one["name"].lower()):
-        note = NOTES.get(one["name"].lower(), "")
-        lines.append(f"| {one['name']} | {one['version']} | {licence(one)} | {note} |")
-    return "\n".join(lines) + "\n"
+        found.setdefault(licence(one), []).append(f"{one['name']} {one['version']}")
+    items = sorted(found.items(), key=lambda item: (-len(item[1]), item[0].lower()))
+    lines = [f"- **{name}**: {', '.join(distributions)}" for name, distributions in items]
+    return "\n".join(_WRAPPER.fill(line) for line in lines) + "\n"
 
 
 def page(plain: Mapping[str, Any], extras: Mapping[str, Any]) -> str:
@@ -79,10 +82,14 @@ def page(plain: Mapping[str, Any], extras: Mapping[str, Any]) -> str:
     first = [one for one in plain["components"] if one["name"] != PROJECT]
     names = {PROJECT, *(one["name"] for one in first)}
     others = [one for one in extras["components"] if one["name"] not in names]
+    there = {one["name"].lower() for one in [*first, *others]}
+    notes = [f"- {name}: {note}" for name, note in sorted(NOTES.items()) if name in there]
     return (
-        f"{TOP}\n## Plain installation\n\n{rows(first)}"
+        f"{TOP}\n## Plain installation\n\n{lists(first)}"
         f"\n## Additional packages of the extras `gateway`, `cluster` and `sound`\n\n"
-        f"{rows(others)}{BOTTOM}"
+        f"{lists(others)}\n## What the metadata leave out\n\n"
+        + "\n".join(_WRAPPER.fill(note) for note in notes)
+        + f"\n{BOTTOM}"
     )
 
 

@@ -33,7 +33,6 @@ from paper_plate import make_paper_rig  # noqa: E402
 
 SLOWEST = (
     "test_dashboard.py",
-    "test_touch_to_finger_processes.py",
     "test_demo.py",
     "test_desk.py",
     "test_daemon_faults_process.py",
@@ -46,12 +45,10 @@ SLOWEST = (
     "test_dashboard_losses.py",
     "test_rig_check.py",
     "test_tutorials.py",
-    "test_sound_amplifiers.py",
     "test_calibration.py",
     "test_diagnosis.py",
     "test_daemon_over_a_wire.py",
     "test_soak.py",
-    "test_vanished_host.py",
     "test_lost_sound_server.py",
     "test_daemon_faults_killed.py",
     "test_soft_amp_sound.py",
@@ -63,7 +60,6 @@ SLOWEST = (
     "test_calibrate_on_the_bench.py",
     "test_identify.py",
     "test_effects_felt.py",
-    "test_study_cli.py",
     "test_consistency.py",
     "test_layout_check.py",
 )

@@ -177,8 +177,13 @@ def _list(title: str, named: Mapping[str, int]) -> str:
 
 def mailboxes() -> str:
     """Return the registers of each message on Modbus."""
-    rows = ((each.name, 256 * each.number, 256 * each.number + 128) for each in MESSAGES.values())
-    return _table(("message", "written from register", "reply read from register"), rows)
+    cells = [(each.name, 256 * each.number, 256 * each.number + 128) for each in MESSAGES.values()]
+    half = (len(cells) + 1) // 2
+    rows = [
+        (*left, *right)
+        for left, right in zip(cells[:half], [*cells[half:], ("",) * 3], strict=False)
+    ]
+    return _table(("message", "written from", "reply from register") * 2, rows)
 
 
 def emergencies() -> str:

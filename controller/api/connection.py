@@ -53,6 +53,7 @@ class Connection(asyncio.BufferedProtocol):
         self.reading_time = 0.0  # s; processor time of reading, not yet subtracted from a budget
         self.is_at_end = False  # whether it has closed its side
         self.pending: set[asyncio.Task[None]] = set()
+        self.silenced = 0  # its stops and disarms
         self.touched_at = -math.inf  # s; when it sent fingers, unless it has lifted them since
         self.ahead: Any = None
         self._on_connect = on_connect

@@ -234,6 +234,7 @@ class ApiServer:
             raise RpcError(ErrorCode.BUSY, "too many pending requests", remedy="await responses")
         if method.needs_reply:
             return _for_one_who_stays(connection, lambda: handle(connection, call.params))
+        connection.silenced += call.method in ("stop", "disarm")
         return handle(connection, call.params)
 
     async def _finish(
@@ -256,9 +257,12 @@ class ApiServer:
 async def _for_one_who_stays(
     connection: Connection, handle: Callable[[], Message | Awaitable[Message]]
 ) -> Message:
-    """Handle a request of a client that has not left with the same bytes."""
+    """Handle a request of a client that has not left, or silenced all, with the same bytes."""
+    silenced = connection.silenced
     for _ in range(2):  # iterations in which its end is received
         await asyncio.sleep(0)
+    if connection.silenced != silenced:
+        raise RpcError(ErrorCode.LEASE, "stopped or disarmed meanwhile", remedy="arm again")
     if connection.has_left:
         raise RpcError(ErrorCode.LEASE, "the client has left", remedy="stay to renew the lease")
     result = handle()

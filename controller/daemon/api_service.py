@@ -33,7 +33,7 @@ from controller.api.server import Handler
 from controller.daemon.active_layout import ActiveLayout
 from controller.daemon.api_views import amplifier_silence, hello_result
 from controller.daemon.config import DaemonConfig
-from controller.daemon.lease import LeaseHolder
+from controller.daemon.lease import Lease, check_lease
 from controller.daemon.publisher import EventPublisher
 from controller.daemon.states import (
     ENERGISED,
@@ -42,7 +42,7 @@ from controller.daemon.states import (
     StateMachine,
     Trigger,
 )
-from controller.daemon.supervisor import Supervisor
+from controller.daemon.supervisor import LEASE_OVER, Supervisor
 from controller.daemon.touch_inputs import ApiTouches
 from controller.learning.learning import Learning
 from controller.loop.loop import Controller
@@ -50,12 +50,9 @@ from drivers import clock
 from drivers.host.stop import Stopped
 from model.table.table import LocalizationTable
 
-_LEASE_RECHECK = 0.25  # s
-
 _logger = logging.getLogger(__name__)
 
 _ENABLED = DaemonState.OPERATION_ENABLED
-_LEASE_OVER = DaemonEvent(Trigger.LEASE_LOST, "the arming lease was not renewed", "arm again")
 _REMEDIES = {
     DaemonState.SWITCH_ON_DISABLED: "wait a moment and try again",
     DaemonState.READY_TO_SWITCH_ON: "arm first (era arm)",
@@ -87,9 +84,7 @@ class ApiService:
         self._touches = touches
         self._layout = layout
         self._learning = learning
-        self._lease = LeaseHolder()
-        self._holders: set[Connection] = set()  # clients that armed or renewed the lease
-        self._expiry: asyncio.TimerHandle | None = None
+        self._tokens: dict[Connection, str] = {}  # of clients that armed or renewed a lease
         self._client_numbers: dict[Connection, int] = {}
         self._next_number = itertools.count(1)
         self._started = clock.now()
@@ -102,16 +97,17 @@ class ApiService:
         """Release what a disconnected client holds; lift its fingers."""
         self._publisher.hub.forget(client)
         self._client_numbers.pop(client, None)
-        self._holders.discard(client)
+        self._tokens.pop(client, None)
         self._touches.lift_all(client, now=clock.now())
 
     def holds_lease(self, client: Connection) -> bool:
         """Whether a client armed or renewed the current lease: it is never evicted."""
-        return client in self._holders and self._lease.current(clock.now()) is not None
+        lease = self._supervisor.machine.lease_at(clock.now())
+        return lease is not None and self._tokens.get(client) == lease.token
 
     def _status(self, client: Connection, params: Empty) -> StatusResult:
         machine, view, now = self._supervisor.machine, self._publisher.view, clock.now()
-        lease = self._lease.current(now)
+        lease = machine.lease_at(now)
         pattern = view.pattern_event() if machine.state is _ENABLED else None
         return StatusResult(
             time_s=now,
@@ -151,45 +147,41 @@ class ApiService:
         )
 
     async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
-        is_over = self._lease.current(clock.now()) is None
-        if self._supervisor.machine.state is _ENABLED and is_over:
-            await self._supervisor.handle(
-                _LEASE_OVER
-            )  # before its timer: what plays is not inherited
-        machine, now = self._supervisor.machine, clock.now()
-        if machine.state not in (DaemonState.READY_TO_SWITCH_ON, *ENERGISED):
+        if self._supervisor.machine.is_lease_over(clock.now()):  # what plays is not inherited
+            await self._supervisor.handle(LEASE_OVER)
+        machine = self._supervisor.machine
+        if machine.state in ENERGISED:
+            raise _armed_already(machine)
+        if machine.state is not DaemonState.READY_TO_SWITCH_ON:
             raise _wrong_state(machine)
-        if machine.state is DaemonState.SWITCHED_ON:
-            raise RpcError(ErrorCode.LEASE, "another client is arming", remedy="wait, or disarm")
-        duration = min(params.lease_s, self.longest_lease)
-        lease = self._lease.grant(params.owner, duration=duration, now=now)
+        lease = Lease(params.owner, min(params.lease_s, self.longest_lease))
+        cause = f"armed by {params.owner!a}"
         try:
             await self._supervisor.handle(
-                DaemonEvent(Trigger.ARM, f"armed by {params.owner!a}", "era disarm, or era stop")
+                DaemonEvent(Trigger.ARM, cause, "era disarm, or era stop", lease)
             )
-            if self._supervisor.machine.state is not _ENABLED:
-                raise _wrong_state(self._supervisor.machine)
-            # Arming may have taken longer than the lease, so its time starts now.
-            lease = self._lease.restart(lease.token, now=clock.now())
+            machine = self._supervisor.machine
+            if machine.state is not _ENABLED or machine.lease is None:
+                raise _wrong_state(machine)
+            if machine.lease.token != lease.token:
+                raise _armed_already(machine)
         except BaseException:
-            self._disarm_for(lease.token, "arming failed")
+            self._supervisor.withdraw(lease.token, "arming failed")
             raise
-        self._holders = {client}
-        self._check_lease()
+        self._tokens[client] = lease.token
         # After the reply was sent, or failed to be sent.
         asyncio.get_running_loop().call_soon(self._check_holder, client, lease.token)
         return ArmResult(lease=lease.token, lease_s=lease.duration)
 
     def _renew(self, client: Connection, params: RenewParams) -> RenewResult:
-        lease = self._lease.renew(params.lease, now=clock.now())
-        self._holders.add(client)
-        self._check_lease()
+        lease = self._supervisor.renew(params.lease)
+        self._tokens[client] = lease.token
         return RenewResult(lease_s=lease.duration)
 
     async def _disarm(self, client: Connection, params: DisarmParams) -> Empty:
         machine = self._supervisor.machine
         if params.lease is not None:
-            self._lease.check(params.lease, now=clock.now())
+            check_lease(machine.lease, params.lease, clock.now())
         if machine.state in ENERGISED:
             cause = f"disarmed by {params.client or client.name!a}"
             await self._supervisor.handle(DaemonEvent(Trigger.DISARM, cause))
@@ -264,38 +256,18 @@ class ApiService:
         self._publisher.hub.unsubscribe(client, params.topics)
         return Empty()
 
-    def end_lease(self) -> None:
-        """End the lease: only the armed state has one."""
-        self._lease.end()
-        if self._expiry is not None:
-            self._expiry.cancel()
-
-    def _check_lease(self) -> None:
-        """End the lease if it has expired, else when it does; again, should that fail."""
-        if self._expiry is not None:
-            self._expiry.cancel()
-        expires_at = self._lease.expires_at
-        if expires_at is None:
-            return
-        left = expires_at - clock.now()
-        loop = asyncio.get_running_loop()
-        self._expiry = loop.call_later(left if left > 0 else _LEASE_RECHECK, self._check_lease)
-        if left <= 0:
-            self._supervisor.post(_LEASE_OVER)
-
     def _check_holder(self, client: Connection, token: str) -> None:
         """Disarm if the client disconnected before it received its lease."""
         if client.has_left:
-            self._disarm_for(token, "the arming client disconnected")
+            self._supervisor.withdraw(token, "the arming client disconnected")
 
-    def _disarm_for(self, token: str, cause: str) -> None:
-        """Disarm, which ends the lease, unless it has ended or another has replaced it."""
-        if not self._lease.is_granted(token):
-            return
-        if self._supervisor.machine.state in ENERGISED:
-            self._supervisor.post(DaemonEvent(Trigger.LEASE_LOST, cause, "arm again"))
-        else:  # never armed
-            self.end_lease()
+
+def _armed_already(machine: StateMachine) -> RpcError:
+    """Return the error of a client that arms what another has armed, or is arming."""
+    what, lease = "another client is arming", machine.lease
+    if machine.state is _ENABLED and lease is not None:
+        what = f"armed by {lease.owner!a} for {lease.expires_at - clock.now():.1f} s more"
+    return RpcError(ErrorCode.LEASE, what, remedy="wait, or disarm first: every client may")
 
 
 async def _silence(stopping: Awaitable[Mapping[str, Stopped]]) -> StopResult:

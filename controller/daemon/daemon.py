@@ -86,7 +86,6 @@ class Daemon:
             ),
             link_changed=lambda *change: self._publisher.link_changed(*change),
             alive=lambda: manager.alive(clock.now()),
-            disarmed=lambda: self._api.end_lease(),
             watchdog=watchdog,
         )
         self._layout = ActiveLayout(config.effective_layout)

@@ -6,8 +6,8 @@ State names follow CiA 402.
   OPERATION_ENABLED.
 - QUICK_STOP_ACTIVE and FAULT lead only to SWITCH_ON_DISABLED, after an acknowledgement (CLEAR) and
   a read-back of all amplifiers without a fault and at level zero.
-- COMM_LOST ends when all amplifiers are reconnected *and* any lost amplifier's watchdog has
-  certainly expired; it leads to FAULT if anything was latched or energised before.
+- COMM_LOST ends with RECONNECTED, not before any lost amplifier's watchdog has certainly expired;
+  it leads to FAULT if anything was latched or energised before.
 - An event without an entry in the table changes nothing.
 """
 
@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from enum import Enum, StrEnum, auto
 from typing import NamedTuple
 
+from controller.daemon.lease import Lease
 from drivers.host.amplifier import WATCHDOG
 
 ACKNOWLEDGE = "find the cause, then clear (era clear) and arm again"
@@ -55,8 +56,7 @@ class Trigger(Enum):
     LINK_LOST = auto()  # an amplifier cannot be reached
     LINK_DEGRADED = auto()  # an amplifier does not reply, and may still play
     LINK_RESTORED = auto()  # all reply again, and play what they should
-    RECONNECTED = auto()  # all amplifiers reply again and are disarmed
-    TICK = auto()  # time has passed
+    RECONNECTED = auto()  # all amplifiers reply again and are disarmed, and the lost ones silent
     CLOSE = auto()  # the daemon shuts down
 
 
@@ -80,16 +80,18 @@ class DaemonEvent:
     trigger: Trigger
     cause: str = ""
     remedy: str | None = None
+    lease: Lease | None = None
 
 
 @dataclass(frozen=True)
 class StateMachine:
-    """The daemon's state and everything that its next transition depends on.
+    """The operation of the plate: its state and everything that the next transition depends on.
 
     is_latched: an acknowledgement is required before arming; is_acknowledged: it was given, and the
-    amplifiers are being read back; lost_at [s]: when the link was lost; is_reconnected: since then;
-    is_degraded: whether an amplifier does not reply while armed, so that nothing new is played;
-    watchdog [s]: of armed amplifiers.
+    amplifiers are being read back; lost_at [s]: when the link was lost; is_degraded: whether an
+    amplifier does not reply while armed, so that nothing new is played; watchdog [s]: of armed
+    amplifiers; lease: of who armed, in the states of ENERGISED alone. epoch: rises with every stop,
+    disarm, fault, loss and close: what began before must not go on.
     """
 
     state: DaemonState = DaemonState.NOT_READY
@@ -98,9 +100,19 @@ class StateMachine:
     is_latched: bool = False
     is_acknowledged: bool = False
     lost_at: float = 0.0
-    is_reconnected: bool = False
     is_degraded: bool = False
     watchdog: float = WATCHDOG
+    lease: Lease | None = None
+    epoch: int = 0
+
+    def lease_at(self, now: float) -> Lease | None:
+        """The lease, unless it has expired at a time [s]."""
+        return self.lease if self.lease is not None and now < self.lease.expires_at else None
+
+    def is_lease_over(self, now: float) -> bool:
+        """Whether amplifiers are armed for a client whose lease has expired at a time [s]."""
+        is_armed = self.state is DaemonState.OPERATION_ENABLED and self.lease is not None
+        return is_armed and self.lease_at(now) is None
 
     def lost_for(self, now: float) -> float | None:
         """Time since the link was lost [s]; None while it is up."""
@@ -123,6 +135,11 @@ class Transition(NamedTuple):
 _SILENT = (DaemonState.SWITCH_ON_DISABLED, DaemonState.READY_TO_SWITCH_ON)
 ENERGISED = (DaemonState.SWITCHED_ON, DaemonState.OPERATION_ENABLED)
 """States in which amplifiers have or get high voltage."""
+_OVERTAKING = (
+    *(Trigger.STOP, Trigger.DISARM, Trigger.LEASE_LOST),
+    *(Trigger.FAULT, Trigger.LINK_LOST, Trigger.CLOSE),
+)
+"""Events before which nothing may have begun that goes on after them."""
 _LATCHING = (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT)
 _OPEN = (*_SILENT, *ENERGISED, *_LATCHING)
 
@@ -134,20 +151,6 @@ def _is_latched(machine: StateMachine, now: float) -> bool:
 def _is_acknowledged(machine: StateMachine, now: float) -> bool:
     return machine.is_acknowledged
 
-
-def _may_leave_comm_lost(machine: StateMachine, now: float) -> bool:
-    return machine.is_reconnected and not machine.assume_energised(now)
-
-
-def _must_leave_latched(machine: StateMachine, now: float) -> bool:
-    return machine.is_latched and _may_leave_comm_lost(machine, now)
-
-
-_LEAVE_COMM_LOST = (
-    Transition(DaemonState.FAULT, when=_must_leave_latched),
-    Transition(DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,), _may_leave_comm_lost),
-    Transition(DaemonState.COMM_LOST),
-)
 
 TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
     (DaemonState.NOT_READY, Trigger.OPENED): (
@@ -212,18 +215,16 @@ TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
         Transition(DaemonState.COMM_LOST, (Action.RECONNECT,)),
     ),
     (DaemonState.COMM_LOST, Trigger.LINK_LOST): (
-        Transition(
-            DaemonState.COMM_LOST,
-            (Action.RECONNECT,),
-            lambda machine, now: machine.is_reconnected,
-        ),
+        Transition(DaemonState.COMM_LOST, (Action.RECONNECT,)),
     ),
     **{
         (DaemonState.OPERATION_ENABLED, trigger): (Transition(DaemonState.OPERATION_ENABLED),)
         for trigger in (Trigger.LINK_DEGRADED, Trigger.LINK_RESTORED)
     },
-    (DaemonState.COMM_LOST, Trigger.RECONNECTED): _LEAVE_COMM_LOST,
-    (DaemonState.COMM_LOST, Trigger.TICK): _LEAVE_COMM_LOST,
+    (DaemonState.COMM_LOST, Trigger.RECONNECTED): (
+        Transition(DaemonState.FAULT, when=_is_latched),
+        Transition(DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,)),
+    ),
     **{
         (state, Trigger.CLOSE): (Transition(DaemonState.NOT_READY, (Action.CLOSE,)),)
         for state in DaemonState
@@ -245,16 +246,28 @@ def step(
 
 def failed(machine: StateMachine, cause: str) -> StateMachine:
     """Return the state machine after an unexpected exception: latched, and in FAULT if open."""
+    epoch = machine.epoch + 1
     if machine.state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):
-        return replace(machine, is_latched=True, is_acknowledged=False)
+        return replace(machine, is_latched=True, is_acknowledged=False, epoch=epoch)
     return StateMachine(
-        DaemonState.FAULT, cause, ACKNOWLEDGE, is_latched=True, watchdog=machine.watchdog
+        DaemonState.FAULT,
+        cause,
+        ACKNOWLEDGE,
+        is_latched=True,
+        watchdog=machine.watchdog,
+        epoch=epoch,
     )
 
 
 def _with_event(machine: StateMachine, event: DaemonEvent, now: float) -> StateMachine:
-    """Update the flags that an event sets regardless of the next state."""
+    """Update what an event sets regardless of the next state."""
+    if event.trigger in _OVERTAKING:
+        machine = replace(machine, epoch=machine.epoch + 1)
     match event.trigger:
+        case Trigger.ARM if event.lease is not None:
+            return replace(machine, lease=event.lease.renewed(now))
+        case Trigger.ARMED if machine.lease is not None:  # arming may have taken longer than it
+            return replace(machine, lease=machine.lease.renewed(now))
         case Trigger.CLEAR:
             return replace(machine, is_acknowledged=True)
         case Trigger.FAULT:
@@ -262,19 +275,16 @@ def _with_event(machine: StateMachine, event: DaemonEvent, now: float) -> StateM
         case Trigger.STOP:
             return replace(machine, is_acknowledged=False, is_latched=True)
         case Trigger.NOT_FOUND:
-            return replace(machine, lost_at=now, is_reconnected=False)
+            return replace(machine, lost_at=now)
         case Trigger.LINK_LOST if machine.state is not DaemonState.COMM_LOST:
             return replace(
                 machine,
                 lost_at=now,
-                is_reconnected=False,
                 is_latched=machine.is_latched or machine.state in ENERGISED,
                 is_acknowledged=False,
             )
         case Trigger.LINK_DEGRADED | Trigger.LINK_RESTORED:
             return replace(machine, is_degraded=event.trigger is Trigger.LINK_DEGRADED)
-        case Trigger.RECONNECTED:
-            return replace(machine, is_reconnected=True)
         case _:
             return machine
 
@@ -283,8 +293,6 @@ def _enter(
     before: StateMachine, updated: StateMachine, to: DaemonState, event: DaemonEvent
 ) -> StateMachine:
     """Enter the next state of a transition with its cause and remedy."""
-    if event.trigger is Trigger.LINK_LOST:
-        updated = replace(updated, is_reconnected=False)
     if to is before.state:
         # A persisting fault may have a new cause.
         has_cause = (Trigger.FAULT, Trigger.LINK_DEGRADED, Trigger.LINK_RESTORED)
@@ -304,4 +312,5 @@ def _enter(
         is_latched=is_latched,
         is_acknowledged=False,
         is_degraded=False,
+        lease=updated.lease if to in ENERGISED else None,
     )

@@ -5,20 +5,21 @@ unexpected exception in a transition or action ends in a stop of all amplifiers 
 """
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from controller.daemon.deferred_calls import DeferredCalls, call_guarded
+from controller.daemon.lease import Lease, check_lease
 from controller.daemon.read_back import (
     READ_BACK_INTERVAL,
     are_silent,
     find_problem,
     is_any_armed,
 )
-from controller.daemon.reconnect import ALIVE_INTERVAL, LinkChange, reconnect, wait_alive
 from controller.daemon.states import (
     ACKNOWLEDGE,
     ENERGISED,
@@ -45,12 +46,15 @@ from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.comparison import name_of
 from drivers.host.group import Group, GroupState
 from drivers.host.stop import Stopped
+from drivers.pauses import pauses
 from drivers.protocol.records import Values
 from drivers.protocol.table import FAULTS, NO_CHANNEL
+from model.errors import InputError
 from registry.plugins import failure_text
 
 STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
 _MAX_READ_BACKS = 15
+_RECHECK = 0.05  # s; of whether the watchdog of a lost amplifier has passed
 _SEARCHING = "check cables and supply; the daemon reconnects by itself and stays disarmed"
 
 _LOG_LEVELS = {
@@ -58,6 +62,8 @@ _LOG_LEVELS = {
     DaemonState.FAULT_REACTION_ACTIVE: logging.ERROR,
 }
 
+LEASE_OVER = DaemonEvent(Trigger.LEASE_LOST, "the arming lease was not renewed", "arm again")
+LinkChange = Literal["degraded", "restored", "lost", "retry", "reopened"]
 StateObserver = Callable[[StateMachine, StateMachine], None]
 """Receives the old and the new state machine."""
 
@@ -70,11 +76,9 @@ class Supervisor:
     """Keeps the amplifiers of a controller connected, and armed only as the state machine allows.
 
     The controller must be created with `observe(observer)` and `connected` of this supervisor.
-    state_changed are called a moment after every transition, disarmed within each one
-    from a state in which amplifiers have or get high voltage to another; link_changed receives the
-    kind of change, the lost amplifiers ("lost" only) and a message; alive is called after each
-    cycle of the control loop and periodically while there is no link. watchdog [s]: of armed
-    amplifiers.
+    state_changed are called a moment after every transition; link_changed receives the kind of
+    change, the lost amplifiers ("lost" only) and a message; alive is called after each cycle of the
+    control loop and periodically while there is none. watchdog [s]: of armed amplifiers.
     """
 
     def __init__(
@@ -83,21 +87,17 @@ class Supervisor:
         state_changed: Sequence[StateObserver],
         link_changed: Callable[[LinkChange, Sequence[str], str], None],
         alive: Callable[[], None],
-        disarmed: Callable[[], None] = lambda: None,
         watchdog: float = WATCHDOG,
     ) -> None:
         self.machine = StateMachine(watchdog=watchdog)
         self._state_observers = (_log_transition, *state_changed)
         self._link_observer = link_changed
         self._alive_observer = alive
-        self._disarmed = disarmed
         self.started = asyncio.Event()  # the amplifiers are open, or searched for
-        self._is_closing = False
+        self._closing = asyncio.Event()
         self._reports = DeferredCalls()
         self._controller_if_running: Controller | None = None
         self._control_loop: asyncio.Task[None] | None = None
-        self._refusal = ""
-        self._arm_count = 0
         self._tasks: set[asyncio.Task[Any]] = set()
         self._loss_lock = asyncio.Lock()  # held until the lost amplifiers are closed
 
@@ -105,12 +105,15 @@ class Supervisor:
         """Wrap an observer so that the supervisor sees refusals and cycles first."""
 
         def refused(reason: str) -> None:
-            self._refusal = reason
-            if not self._has_stopped_itself:  # the fault that follows reports it
+            is_armed = self.machine.state is DaemonState.OPERATION_ENABLED
+            if is_armed and self._controller.group_state is GroupState.DISARMED:
+                # The control loop has stopped the amplifiers by itself.
+                self.post(DaemonEvent(Trigger.FAULT, reason, ACKNOWLEDGE))
+            else:
                 observer.refused(reason)
 
         def cycle_completed() -> None:
-            self._check_own_stop()
+            self.tick()
             self._check_degraded()
             self._alive()
             observer.cycle_completed()
@@ -130,49 +133,45 @@ class Supervisor:
         amplifiers that do not fit the configuration.
         """
         self._controller_if_running = controller
-        await self._open()
-        self.started.set()
-        polling = asyncio.create_task(self._poll_disarmed())
+        polling = asyncio.create_task(self._poll())
         try:
+            await self._open()
+            self.started.set()
             while self.machine.state is not DaemonState.NOT_READY:
-                try:
-                    if self.machine.state is not DaemonState.COMM_LOST:
-                        await self._run_control_loop()
-                except LinkError as error:
-                    lost = self._in_background(self._handle_loss(error))
-                    await wait_alive(lost, self._alive)
-                except DriverError:
-                    raise
-                except Exception as error:  # unforeseen: a fault, which can be cleared
-                    _logger.exception("control loop failed, stopping all amplifiers")
-                    await wait_alive(self._fail(error), self._alive)
-                    await asyncio.sleep(ALIVE_INTERVAL)
-                while self.machine.state is DaemonState.COMM_LOST:
+                if self.machine.state is DaemonState.COMM_LOST:
                     await self._restore_link()
+                else:
+                    await self._run_control_loop()
         finally:
             polling.cancel()
             await asyncio.gather(polling, *self._tasks, return_exceptions=True)
             self._reports.flush()
 
     async def _run_control_loop(self) -> None:
-        """Run the control loop until it ends or a reconnection cancels it; raises its error."""
+        """Run the control loop until it ends or a reconnection cancels it; handle its error."""
         loop = self._control_loop = asyncio.create_task(self._controller.run(), name="control loop")
         try:
             await asyncio.wait({loop})
         finally:
+            self._control_loop = None
             loop.cancel()
             await asyncio.wait({loop})
-        if not loop.cancelled():
-            loop.result()
-        if self._controller.group_state is GroupState.CLOSED and self.machine.state not in (
-            DaemonState.COMM_LOST,
-            DaemonState.NOT_READY,
-        ):
-            raise LinkError("the amplifiers must be open, got closed ones; they are opened again")
+        error = None if loop.cancelled() else loop.exception()
+        is_over = self.machine.state in (DaemonState.COMM_LOST, DaemonState.NOT_READY)
+        if error is None and self._controller.group_state is GroupState.CLOSED and not is_over:
+            error = LinkError("the amplifiers must be open, got closed ones; they are opened again")
+        if isinstance(error, LinkError):
+            await self._in_background(self._handle_loss(error))
+        elif isinstance(error, DriverError):
+            raise error
+        elif isinstance(error, Exception):  # unforeseen: a fault, which can be cleared
+            _logger.error("control loop failed, stopping all amplifiers", exc_info=error)
+            await self._fail(error)
+            await asyncio.sleep(_RECHECK)
 
     async def close(self, cause: str) -> None:
         """Ramp down, read back, disarm and close the amplifiers; ends `run`."""
-        self._is_closing = True
+        self._closing.set()
         if self._controller_if_running is not None:
             await self.handle(DaemonEvent(Trigger.CLOSE, cause))
         self._reports.flush()
@@ -215,6 +214,24 @@ class Supervisor:
         """Apply an event at once and carry out its actions in a task."""
         self._spawn(self._in_background(self._carry_out(self._step(event))))
 
+    def tick(self) -> None:
+        """End the lease if it has expired."""
+        if self.machine.is_lease_over(clock.now()):
+            self.post(LEASE_OVER)
+
+    def renew(self, token: str) -> Lease:
+        """Renew the lease of a token; raises RpcError if it has expired or is another's."""
+        now = clock.now()
+        lease = check_lease(self.machine.lease, token, now).renewed(now)
+        self.machine = replace(self.machine, lease=lease)
+        return lease
+
+    def withdraw(self, token: str, cause: str) -> None:
+        """Disarm, unless the lease of a token has ended."""
+        lease = self.machine.lease
+        if lease is not None and lease.token == token:
+            self.post(DaemonEvent(Trigger.LEASE_LOST, cause, "arm again"))
+
     @property
     def _controller(self) -> Controller:
         if self._controller_if_running is None:
@@ -239,9 +256,7 @@ class Supervisor:
         return actions
 
     def _report_transition(self, before: StateMachine) -> None:
-        """Notify of a disarmed plate at once, and the observers of a new state, deferred."""
-        if before.state in ENERGISED and self.machine.state not in ENERGISED:
-            call_guarded(self._disarmed)
+        """Notify the observers of a new state, deferred."""
         if self.machine.state is not before.state:
             for observer in self._state_observers:
                 call_guarded(partial(self._reports.add, partial(observer, before, self.machine)))
@@ -320,12 +335,12 @@ class Supervisor:
     async def _open(self) -> None:
         """Open and verify the amplifiers; without a good reply they are searched for."""
         try:
-            await wait_alive(self._controller.open(), self._alive)
-            if self._is_closing:
+            await self._controller.open()
+            if self._closing.is_set():
                 await self._controller.close()
                 return
         except (LinkError, CommandRefused, FrameError) as error:
-            if self._is_closing:
+            if self._closing.is_set():
                 return
             self._link_changed("retry", (), str(error))
             event = DaemonEvent(Trigger.NOT_FOUND, str(error), _SEARCHING)
@@ -335,8 +350,7 @@ class Supervisor:
         await self._in_background(self.handle(opened))
 
     async def _arm(self) -> None:
-        self._arm_count += 1
-        number = self._arm_count
+        epoch = self.machine.epoch
         try:
             await self._controller.arm()
         except LinkDegraded:  # disarmed, but not lost
@@ -347,8 +361,8 @@ class Supervisor:
             raise
         except DriverError as error:
             # A stop or disarm in the meantime explains the error and is not a fault.
-            is_newest = number == self._arm_count
-            if is_newest and self.machine.state is DaemonState.SWITCHED_ON:
+            is_arming = self.machine.state is DaemonState.SWITCHED_ON
+            if is_arming and epoch == self.machine.epoch:
                 await self.handle(DaemonEvent(Trigger.FAULT, str(error), ACKNOWLEDGE))
             raise
         await self.handle(DaemonEvent(Trigger.ARMED, self.machine.cause))
@@ -422,32 +436,54 @@ class Supervisor:
             await self.handle(DaemonEvent(Trigger.LINK_LOST, cause, _SEARCHING))
 
     async def _restore_link(self) -> None:
-        """Take the next step towards leaving COMM_LOST."""
+        """Reopen the amplifiers, with growing pauses; leave COMM_LOST once they are all silent."""
         try:
-            if self.machine.is_reconnected:  # wait for the watchdog of the lost amplifier
-                await asyncio.sleep(ALIVE_INTERVAL)
-                self._alive()
-                await self.handle(DaemonEvent(Trigger.TICK))
-            elif await reconnect(
-                self._controller,
-                should_continue=lambda: self.machine.state is DaemonState.COMM_LOST,
-                report=lambda change, message: self._link_changed(change, (), message),
-                alive=self._alive,
-            ):
+            await self._controller.close()  # a pending close would close it again
+            for pause in pauses():
+                if self.machine.state is not DaemonState.COMM_LOST:
+                    return
+                if await self._reopen():
+                    break
+                await self._pause(pause)
+            epoch = self.machine.epoch
+            while self.assume_energised(clock.now()) and not self._closing.is_set():
+                await self._pause(_RECHECK)
+            if epoch == self.machine.epoch:  # none was lost again meanwhile
                 await self.handle(DaemonEvent(Trigger.RECONNECTED))
         except DriverError as error:
             _rate_limited_logger.info("failed: %s", error)
         except Exception:
             _rate_limited_logger.exception("reconnection failed")
-            await asyncio.sleep(STATUS_INTERVAL)
+            await self._pause(STATUS_INTERVAL)
 
-    async def _poll_disarmed(self) -> None:
+    async def _reopen(self) -> bool:
+        """Open all amplifiers, disarmed; none that may be armed stays open."""
+        try:
+            await self._controller.open()
+            await self._controller.disarm()  # a short loss may not have expired the watchdog
+        except (DriverError, InputError) as error:
+            self._link_changed("retry", (), str(error))
+            await self._controller.close()
+            return False
+        self._link_changed("reopened", (), "all amplifiers reply again and are disarmed")
+        return True
+
+    async def _pause(self, duration: float) -> None:
+        """Wait for a time [s], or until `close`."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(duration):
+                await self._closing.wait()
+
+    async def _poll(self) -> None:
         """Poll the status of disarmed amplifiers; the control loop polls armed ones.
 
-        A stop or fault reaction that has not silenced all of them is repeated.
+        A stop or fault reaction that has not silenced all of them is repeated. While there is no
+        control loop, these are the signs of life.
         """
         while True:
             await asyncio.sleep(STATUS_INTERVAL)
+            if self._control_loop is None:
+                self._alive()
             if self._controller.group_state is not GroupState.DISARMED:
                 continue
             try:
@@ -474,12 +510,6 @@ class Supervisor:
             _rate_limited_logger.error("stop repeated: %s", problem)
             await self._stop()
 
-    def _check_own_stop(self) -> None:
-        """Post a fault if the control loop has stopped the amplifiers by itself."""
-        if self._has_stopped_itself:
-            cause = self._refusal or "an amplifier refused a command"
-            self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
-
     def _check_degraded(self) -> None:
         """Note that armed amplifiers have ceased to reply, or that all reply again."""
         degraded = self._controller.degraded
@@ -496,12 +526,6 @@ class Supervisor:
             self.post(DaemonEvent(Trigger.LINK_RESTORED, cause, "era disarm, or era stop"))
             _rate_limited_logger.info("link: restored: %s", cause, extra={"topic": "link"})
             self._link_changed("restored", (), cause)
-
-    @property
-    def _has_stopped_itself(self) -> bool:
-        """Whether the control loop has stopped the amplifiers without a request to do so."""
-        is_armed = self.machine.state is DaemonState.OPERATION_ENABLED
-        return is_armed and self._controller.group_state is GroupState.DISARMED
 
     def _amplifier_event(self, name: str, event: Values) -> None:
         """Post a fault that an amplifier reports unsolicited, ahead of the next heartbeat."""

@@ -5,6 +5,7 @@ import json
 
 import pytest
 
+from controller.api.jsonrpc import ErrorCode
 from controller.api.methods import TouchParams
 from served_api import ServedApi, request
 
@@ -99,11 +100,27 @@ async def test_server_stops_all_when_a_stop_fails_on_its_way(
     assert {"error" in line for line in wire.lines()} == {True}
 
 
+@pytest.mark.parametrize("silencing", ["stop", "disarm"])
+async def test_arm_is_not_carried_out_after_what_silences(silencing: str) -> None:
+    """Both in the same bytes: it ends disarmed; the other way round it is armed."""
+    served = ServedApi()
+    served.may_arm.set()
+    client, wire = served.client()
+    client.data_received(request("arm", ARM, id=1) + request(silencing, id=2))
+    await served.settle()
+    assert served.names == [silencing]
+    assert [line["error"]["code"] for line in wire.lines() if line["id"] == 1] == [ErrorCode.LEASE]
+    client.data_received(request(silencing, id=3) + request("arm", ARM, id=4))
+    await served.settle()
+    assert served.names == [silencing] * 2 + ["arm"]
+
+
 async def test_stop_is_served_while_requests_are_pending() -> None:
     """Eight may be pending, further ones are refused, a stop is served at once."""
     served = ServedApi()
     client, wire = served.client()
     client.data_received(b"".join(request("arm", ARM, id=id) for id in range(10)))
+    await served.settle()
     client.data_received(request("stop", id=99))
     await served.settle()
     lines = wire.lines()

@@ -56,11 +56,12 @@ async def test_lease_lasts_from_armed_state_when_arming_takes_longer(
 ) -> None:
     """The armed state has a lease at every moment, and no other client gets one meanwhile."""
     async with ready_daemon(tmp_path) as (bench, era):
-        leases = bench.daemon._api._lease
+        supervisor = bench.daemon._supervisor
 
         def expire() -> None:
-            assert leases._lease is not None
-            leases._lease = replace(leases._lease, expires_at=0.0)
+            assert supervisor.machine.lease is not None
+            lease = replace(supervisor.machine.lease, expires_at=0.0)
+            supervisor.machine = replace(supervisor.machine, lease=lease)
 
         released = delay_arming(bench.daemon, monkeypatch, then=expire)
         arming = asyncio.ensure_future(era.arm("me", lease_s=1))
@@ -166,7 +167,7 @@ async def test_shutdown_while_a_port_is_opened_leaves_none_open(
         async with daemon_at(far, tmp_path) as bench:
             await until(lambda: opened)
             bench.daemon.shut_down("end of the test")
-            await until(lambda: bench.daemon._supervisor._is_closing)
+            await until(lambda: bench.daemon._supervisor._closing.is_set())
             asyncio.get_running_loop().call_later(0.1, may_open.set)
         await until(lambda: not opened[0].is_open)
         assert len(opened) == 1

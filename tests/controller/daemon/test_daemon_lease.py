@@ -9,9 +9,24 @@ import pytest
 
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import ArmParams
-from controller.daemon.lease import LeaseHolder
-from controller.daemon.states import ENERGISED, DaemonEvent, Trigger
+from controller.daemon.lease import Lease, check_lease
+from controller.daemon.states import (
+    ENERGISED,
+    DaemonEvent,
+    DaemonState,
+    StateMachine,
+    Trigger,
+    step,
+)
+from controller.daemon.supervisor import Supervisor
 from daemon_bench import error_code, ready_daemon, until_state
+
+
+def expire(supervisor: Supervisor) -> None:
+    """Let the lease have expired."""
+    assert supervisor.machine.lease is not None
+    lease = replace(supervisor.machine.lease, expires_at=0.0)
+    supervisor.machine = replace(supervisor.machine, lease=lease)
 
 
 async def test_client_that_arms_after_the_end_of_a_lease_inherits_nothing(
@@ -19,11 +34,11 @@ async def test_client_that_arms_after_the_end_of_a_lease_inherits_nothing(
 ) -> None:
     """Between the end of a lease and its event: disarmed first, then armed anew."""
     async with ready_daemon(tmp_path) as (bench, era):
-        api = bench.daemon._api
-        monkeypatch.setattr(api, "_check_lease", lambda: None)  # its event comes later
+        supervisor = bench.daemon._supervisor
+        monkeypatch.setattr(supervisor, "tick", lambda: None)  # its event comes later
         states: list[str] = []
         await era.arm("me", lease_s=60)
-        monkeypatch.setattr(api._lease, "_lease", replace(api._lease._lease, expires_at=0.0))
+        expire(supervisor)
         monkeypatch.setattr(
             bench.daemon._publisher, "state_changed", lambda old, new: states.append(new.state.name)
         )
@@ -39,13 +54,12 @@ async def test_lease_ends_within_the_transition_from_armed(
 ) -> None:
     """Not with the next look at it; its token is refused from that moment on."""
     async with ready_daemon(tmp_path) as (bench, era):
-        leases, supervisor = bench.daemon._api._lease, bench.daemon._supervisor
+        supervisor = bench.daemon._supervisor
         lease = await era.arm("me", lease_s=60)
-        await era.status()
-        assert leases.is_granted(lease.lease)
+        assert supervisor.machine.lease is not None
         supervisor.post(DaemonEvent(trigger, "a test"))
         assert supervisor.machine.state not in ENERGISED
-        assert not leases.is_granted(lease.lease)
+        assert supervisor.machine.lease is None
         assert await error_code(era.renew(lease.lease)) is ErrorCode.LEASE
 
 
@@ -69,60 +83,56 @@ async def test_arming_that_is_cancelled_leaves_nothing_armed_without_a_lease(
         with pytest.raises(asyncio.CancelledError):
             await arming
         assert bench.daemon._supervisor.machine.state not in ENERGISED
-        assert api._lease.expires_at is None
+        assert bench.daemon._supervisor.machine.lease is None
         released.set()
         await until_state(era, "READY_TO_SWITCH_ON")
 
 
 def test_lease_lasts_its_duration_from_each_renewal() -> None:
-    """5 s from the grant and 5 s from the renewal, but not from an attempt after its end."""
-    leases = LeaseHolder()
-    lease = leases.grant("me", duration=5, now=100)
-    assert leases.current(104.999) == lease
-    assert leases.renew(lease.token, now=104).expires_at == 109
-    assert leases.current(108.999) is not None
-    assert leases.current(109) is None
+    """5 s from when it is armed and 5 s from the renewal, but not from an attempt after its end."""
+    lease = Lease("me", 5).renewed(100)
+    assert check_lease(lease, lease.token, 104.999) == lease
+    renewed = check_lease(lease, lease.token, 104).renewed(104)
+    assert (renewed.token, renewed.expires_at) == (lease.token, 109)
     with pytest.raises(RpcError) as caught:
-        leases.renew(lease.token, now=109)
+        check_lease(renewed, lease.token, 109)
     assert caught.value.code is ErrorCode.LEASE
-
-
-def test_lease_is_granted_to_one_owner_at_a_time() -> None:
-    """A refusal names the owner and the time left, not the token."""
-    leases = LeaseHolder()
-    lease = leases.grant("me", duration=5, now=0)
-    with pytest.raises(RpcError, match=r"'me'.*2\.0 s") as caught:
-        leases.grant("you", duration=5, now=3)
-    assert lease.token not in str(caught.value)
-    assert leases.grant("you", duration=5, now=5).owner == "you"
 
 
 @pytest.mark.parametrize("token", ["", "x", "ü" * 32])
 def test_lease_is_renewed_by_its_token_only(token: str) -> None:
-    """Any other token leaves its end as it is."""
-    leases = LeaseHolder()
-    leases.grant("me", duration=5, now=0)
-    with pytest.raises(RpcError) as caught:
-        leases.renew(token, now=1)
+    """A refusal names the owner, not the token; without a lease every token is refused."""
+    lease = Lease("me", 5).renewed(0)
+    with pytest.raises(RpcError, match="'me'") as caught:
+        check_lease(lease, token, 1)
     assert caught.value.code is ErrorCode.LEASE
-    assert leases.expires_at == 5
-
-
-def test_lease_cannot_be_renewed_or_restarted_when_ended() -> None:
-    """After a stop the old token is of no use."""
-    leases = LeaseHolder()
-    lease = leases.grant("me", duration=5, now=0)
-    leases.end()
-    assert (leases.current(1), leases.expires_at) == (None, None)
-    for attempt in (leases.renew, leases.restart):
-        with pytest.raises(RpcError) as caught:
-            attempt(lease.token, now=1)
-        assert caught.value.code is ErrorCode.LEASE
+    assert lease.token not in str(caught.value)
+    with pytest.raises(RpcError) as caught:
+        check_lease(None, token, 1)
+    assert caught.value.code is ErrorCode.LEASE
 
 
 def test_lease_tokens_are_random() -> None:
     """128 bits each, no two alike."""
-    leases = LeaseHolder()
-    tokens = {leases.grant("me", duration=1, now=2 * n).token for n in range(100)}
+    tokens = {Lease("me", 1).token for _ in range(100)}
     assert len(tokens) == 100
     assert all(len(bytes.fromhex(token)) == 16 for token in tokens)
+
+
+@pytest.mark.parametrize("state", DaemonState)
+@pytest.mark.parametrize("trigger", Trigger)
+def test_lease_exists_while_energised_alone(state: DaemonState, trigger: Trigger) -> None:
+    """Whatever happens; and what may not go on afterwards is told by the epoch."""
+    lease = Lease("me", 5, expires_at=10.0) if state in ENERGISED else None
+    before = StateMachine(state, lease=lease, epoch=7)
+    after, _ = step(before, DaemonEvent(trigger, "a test", lease=Lease("you", 3)), 6.0)
+    if after.state in ENERGISED:
+        is_new = after.state is not state
+        owner = "you" if is_new and trigger is Trigger.ARM else "me"
+        end = {"you": 9.0, "me": 11.0}[owner] if is_new else 10.0
+        assert after.lease is not None
+        assert (after.lease.owner, after.lease.expires_at) == (owner, end)
+    else:
+        assert after.lease is None
+    if state in ENERGISED and after.state not in ENERGISED:
+        assert after.epoch == 8

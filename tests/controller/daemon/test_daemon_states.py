@@ -29,7 +29,7 @@ OPERATION_ENABLED     .      .    .    .    .  SD:dv SD:dv QS:s .   FR:r .  CL:s
 QUICK_STOP_ACTIVE     .      .    .    .    .  .     .     =:s  =:c FR:r .  CL:sn NR:x
 FAULT_REACTION_ACTIVE .      .    .    .    .  .     .     =:s  .   .   FA: CL:sn NR:x
 FAULT                 .      .    .    .    .  .     .     =:s  =:c =:s  .  CL:sn NR:x
-COMM_LOST             .      .    .    .    .  .     .     =:s  .   .    .  .     NR:x
+COMM_LOST             .      .    .    .    .  .     .     =:s  .   .    .  =:n   NR:x
 """
 STATES = {
     "NR": DaemonState.NOT_READY,
@@ -52,7 +52,7 @@ ACTIONS = {
     "n": Action.RECONNECT,
     "x": Action.CLOSE,
 }
-UNTABLED = (Trigger.RECONNECTED, Trigger.TICK, Trigger.LINK_DEGRADED, Trigger.LINK_RESTORED)
+UNTABLED = (Trigger.RECONNECTED, Trigger.LINK_DEGRADED, Trigger.LINK_RESTORED)
 LATCHED = [DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT]
 LOST_AT = 0.0
 ENERGISED_UNTIL = LOST_AT + 0.25 + 0.1  # the watchdog's time, and a margin
@@ -72,8 +72,8 @@ def grid() -> dict[tuple[DaemonState, Trigger], str]:
 def machines(state: DaemonState) -> list[StateMachine]:
     """All machines in a state, with every combination of flags."""
     return [
-        StateMachine(state, "why", None, latched, acknowledged, LOST_AT, reopened)
-        for latched, acknowledged, reopened in product((False, True), repeat=3)
+        StateMachine(state, "why", None, latched, acknowledged, LOST_AT)
+        for latched, acknowledged in product((False, True), repeat=2)
         if latched or state not in LATCHED
     ]
 
@@ -93,8 +93,6 @@ def test_step_follows_table(state: DaemonState, trigger: Trigger) -> None:
                 expected = (DaemonState.QUICK_STOP_ACTIVE, [Action.STOP])
             case Trigger.VERIFIED if state in LATCHED[::2] and machine.is_acknowledged:
                 expected = (DaemonState.SWITCH_ON_DISABLED, [Action.VERIFY])
-            case Trigger.LINK_LOST if state is DaemonState.COMM_LOST and machine.is_reconnected:
-                expected = (state, [Action.RECONNECT])
             case _:
                 expected = (STATES.get(to, state), [ACTIONS[letter] for letter in letters])
         assert (after.state, [*actions]) == expected
@@ -120,37 +118,17 @@ def test_step_returns_latched_when_link_lost_while_energised(state: DaemonState)
     assert "era clear" in (back.remedy or "")
 
 
-@pytest.mark.parametrize("trigger", [Trigger.RECONNECTED, Trigger.TICK])
-@pytest.mark.parametrize(
-    "state", [state for state in DaemonState if state is not DaemonState.COMM_LOST]
-)
-def test_step_ignores_reconnection_outside_comm_lost(state: DaemonState, trigger: Trigger) -> None:
-    """RECONNECTED and TICK change nothing in other states."""
+@pytest.mark.parametrize("state", DaemonState)
+def test_step_leaves_comm_lost_alone_when_reconnected(state: DaemonState) -> None:
+    """For FAULT if anything is latched; in other states nothing changes."""
     for machine in machines(state):
-        assert step(machine, DaemonEvent(trigger), ENERGISED_UNTIL + 1) == (machine, ())
-
-
-@pytest.mark.parametrize("watchdog", [0.25, 2.0])
-@pytest.mark.parametrize("latched", [False, True])
-def test_step_leaves_comm_lost_when_reconnected_and_watchdog_expired(
-    latched: bool, watchdog: float
-) -> None:
-    """Both are required: a reconnection, and the watchdog time with its margin."""
-    until = LOST_AT + watchdog + 0.1
-    lost = StateMachine(
-        DaemonState.COMM_LOST, "unplugged", None, latched, False, LOST_AT, watchdog=watchdog
-    )
-    waiting, actions = step(lost, DaemonEvent(Trigger.TICK), until + 1)
-    assert (waiting.state, actions) == (DaemonState.COMM_LOST, ())
-    early, actions = step(lost, DaemonEvent(Trigger.RECONNECTED), until - 0.001)
-    assert (early.state, actions) == (DaemonState.COMM_LOST, ())
-    late, actions = step(early, DaemonEvent(Trigger.TICK), until)
-    again, _ = step(lost, DaemonEvent(Trigger.RECONNECTED), until)
-    assert late.state is again.state
-    if latched:
-        assert (late.state, actions) == (DaemonState.FAULT, ())
-    else:
-        assert (late.state, actions) == (DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,))
+        after, actions = step(machine, DaemonEvent(Trigger.RECONNECTED), ENERGISED_UNTIL)
+        if state is not DaemonState.COMM_LOST:
+            assert (after, actions) == (machine, ())
+        elif machine.is_latched:
+            assert (after.state, actions) == (DaemonState.FAULT, ())
+        else:
+            assert (after.state, actions) == (DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,))
 
 
 @pytest.mark.parametrize("state", DaemonState)
@@ -167,19 +145,6 @@ def test_degraded_link_changes_no_state(state: DaemonState) -> None:
     assert (restored.state, restored.is_degraded) == (state, False)
     stopped, _ = step(degraded, DaemonEvent(Trigger.STOP), 0.0)
     assert not stopped.is_degraded
-
-
-def test_step_reconnects_again_when_lost_twice() -> None:
-    """A second loss during reconnection starts no second attempt; one after it does."""
-    lost, _ = step(StateMachine(DaemonState.SWITCHED_ON), DaemonEvent(Trigger.LINK_LOST), LOST_AT)
-    assert step(lost, DaemonEvent(Trigger.LINK_LOST), LOST_AT + 0.1)[1] == ()
-    back, _ = step(lost, DaemonEvent(Trigger.RECONNECTED), LOST_AT + 0.1)
-    again, actions = step(back, DaemonEvent(Trigger.LINK_LOST), LOST_AT + 0.2)
-    assert actions == (Action.RECONNECT,)
-    assert (
-        step(again, DaemonEvent(Trigger.TICK), ENERGISED_UNTIL + 1)[0].state
-        is DaemonState.COMM_LOST
-    )
 
 
 @pytest.mark.parametrize("state", DaemonState)

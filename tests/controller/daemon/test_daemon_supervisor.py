@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from controller.daemon.lease import Lease
 from controller.daemon.states import DaemonEvent, DaemonState, Trigger
 from controller.daemon.supervisor import Supervisor
 from controller.loop.loop import Controller
@@ -298,6 +299,57 @@ async def test_lost_link_is_retried_with_growing_pauses() -> None:
         assert not daemon.far_end.requests("Arm", "Set")
         await daemon.handle(CLEAR)
         assert daemon.state is DaemonState.READY_TO_SWITCH_ON
+
+
+@in_virtual_time
+async def test_lease_that_is_not_renewed_ends() -> None:
+    """A renewal prolongs it; then the plate is disarmed within a heartbeat of its end."""
+    async with watched() as daemon:
+        lease = Lease("me", 0.3)
+        await daemon.handle(DaemonEvent(Trigger.ARM, lease=lease))
+        await asyncio.sleep(0.2)
+        daemon.supervisor.renew(lease.token)
+        await asyncio.sleep(0.29)
+        assert daemon.state is ENABLED
+        await asyncio.sleep(0.01 + HEARTBEAT)
+        assert daemon.state is not ENABLED
+        await asyncio.sleep(0.5)
+        assert daemon.state is DaemonState.READY_TO_SWITCH_ON
+
+
+@in_virtual_time
+async def test_loss_while_reopened_amplifiers_are_waited_for_opens_them_again() -> None:
+    """Before the watchdog of the first loss has passed; the first loss stays latched."""
+    async with watched() as daemon:
+        await daemon.handle(ARM)
+        daemon.far_end.attempts.clear()
+        await daemon.handle(DaemonEvent(Trigger.LINK_LOST))
+        await asyncio.sleep(0.1)
+        assert (daemon.state, len(daemon.far_end.attempts)) == (DaemonState.COMM_LOST, 1)
+        await daemon.handle(DaemonEvent(Trigger.LINK_LOST))
+        await asyncio.sleep(0.5)
+        assert (daemon.state, len(daemon.far_end.attempts)) == (DaemonState.FAULT, 2)
+
+
+@in_virtual_time
+async def test_amplifiers_that_cannot_be_disarmed_are_opened_again() -> None:
+    """None that may be armed stays open, and each attempt is reported."""
+    async with watched() as daemon:
+        await daemon.handle(ARM)
+        disarm, failures = daemon.controller.disarm, [LinkError("injected")]
+
+        async def fail_once() -> None:
+            if failures:
+                assert daemon.far_end.is_open
+                raise failures.pop()
+            await disarm()
+
+        daemon.controller.disarm = fail_once
+        daemon.far_end.attempts.clear()
+        await daemon.handle(DaemonEvent(Trigger.LINK_LOST))
+        await asyncio.sleep(1)
+        assert (daemon.links, len(daemon.far_end.attempts)) == (["retry", "reopened"], 2)
+        assert daemon.state is DaemonState.FAULT
 
 
 @in_virtual_time

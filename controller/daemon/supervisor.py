@@ -203,7 +203,7 @@ class Supervisor:
         The actions are completed even if the caller is cancelled.
         """
         try:
-            await asyncio.shield(self._spawn(self._carry_out(self._step(event))))
+            await asyncio.shield(self._spawn(self._applied(event)))
         except (DriverError, asyncio.CancelledError):
             raise
         except Exception as error:
@@ -212,7 +212,7 @@ class Supervisor:
 
     def post(self, event: DaemonEvent) -> None:
         """Apply an event at once and carry out its actions in a task."""
-        self._spawn(self._in_background(self._carry_out(self._step(event))))
+        self._spawn(self._in_background(self._applied(event)))
 
     def tick(self) -> None:
         """End the lease if it has expired."""
@@ -268,9 +268,14 @@ class Supervisor:
     def _alive(self) -> None:
         call_guarded(self._alive_observer)
 
-    async def _carry_out(self, actions: Sequence[Action]) -> None:
+    def _applied(self, event: DaemonEvent) -> Coroutine[Any, Any, None]:
+        """Apply an event; await its actions."""
+        actions = self._step(event)
+        return self._carry_out(actions, self.machine.epoch)
+
+    async def _carry_out(self, actions: Sequence[Action], epoch: int) -> None:
         for action in actions:
-            await self._do(action)
+            await self._do(action, epoch)
 
     async def _fail(self, error: Exception) -> None:
         """Stop all amplifiers after an unexpected exception, which is a fault."""
@@ -280,14 +285,14 @@ class Supervisor:
         if self.machine.state is DaemonState.COMM_LOST and self._control_loop is not None:
             self._control_loop.cancel()  # so that amplifiers are reopened
 
-    async def _do(self, action: Action) -> None:
+    async def _do(self, action: Action, epoch: int) -> None:
         match action:
             case Action.VERIFY:
-                await self._over_link(self._verify())
+                await self._over_link(self._verify(epoch), epoch)
             case Action.ARM:
-                await self._arm()
+                await self._over_link(self._arm(), epoch)
             case Action.DISARM:
-                await self._over_link(self._controller.disarm())
+                await self._over_link(self._controller.disarm(), epoch)
             case Action.STOP:
                 await self._stop()
             case Action.REACT:
@@ -295,21 +300,26 @@ class Supervisor:
                 cause, remedy = self.machine.cause, self.machine.remedy
                 await self.handle(DaemonEvent(Trigger.REACTION_DONE, cause, remedy))
             case Action.CLEAR:
-                await self._over_link(self._clear())
+                await self._over_link(self._clear(epoch), epoch)
             case Action.RECONNECT | Action.CLOSE:
                 await self._controller.close()
 
-    async def _over_link(self, work: Awaitable[object]) -> None:
-        """Await work that needs the link; a loss or refusal becomes an event, then is raised."""
+    async def _over_link(self, work: Awaitable[object], epoch: int) -> None:
+        """Await work that needs the link; a loss or refusal becomes an event, then is raised.
+
+        Not where it is explained: by what has raised the epoch since, or by a stop that goes on.
+        """
         try:
             await work
         except LinkError as error:
-            await self._handle_loss(error)
+            if isinstance(error, LinkDegraded) and self.machine.state is DaemonState.SWITCHED_ON:
+                await self.handle(DaemonEvent(Trigger.DISARM, "an amplifier did not reply to arm"))
+            else:
+                await self._handle_loss(error)
             raise
         except DriverError as error:
-            # The request that preempted it is an event of its own, and has left this state.
-            is_explained = self.machine.state is not DaemonState.SWITCH_ON_DISABLED
-            if not (isinstance(error, Preempted) and is_explained):
+            is_stopping = isinstance(error, Preempted) and self.machine.is_latched
+            if epoch == self.machine.epoch and not is_stopping:
                 await self.handle(DaemonEvent(Trigger.FAULT, str(error), ACKNOWLEDGE))
             raise
 
@@ -350,29 +360,15 @@ class Supervisor:
         await self._in_background(self.handle(opened))
 
     async def _arm(self) -> None:
-        epoch = self.machine.epoch
-        try:
-            await self._controller.arm()
-        except LinkDegraded:  # disarmed, but not lost
-            await self.handle(DaemonEvent(Trigger.DISARM, "an amplifier did not reply to arm"))
-            raise
-        except LinkError as error:
-            await self._handle_loss(error)
-            raise
-        except DriverError as error:
-            # A stop or disarm in the meantime explains the error and is not a fault.
-            is_arming = self.machine.state is DaemonState.SWITCHED_ON
-            if is_arming and epoch == self.machine.epoch:
-                await self.handle(DaemonEvent(Trigger.FAULT, str(error), ACKNOWLEDGE))
-            raise
+        await self._controller.arm()
         await self.handle(DaemonEvent(Trigger.ARMED, self.machine.cause))
 
-    async def _verify(self) -> None:
+    async def _verify(self, epoch: int) -> None:
         """Disarm what still plays, then read back all amplifiers."""
         if is_any_armed(await self._controller.group.statuses()):
             await self._controller.disarm()
-        problem = await self._read_back()
-        if self.machine.state is not DaemonState.SWITCH_ON_DISABLED:
+        problem = await self._read_back(epoch)
+        if epoch != self.machine.epoch:
             return  # stopped in the meantime, so they need not be disarmed yet
         if problem is None:
             cause = "all amplifiers are disarmed, at level zero and without a fault"
@@ -380,46 +376,37 @@ class Supervisor:
         else:
             await self.handle(DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE))
 
-    async def _clear(self) -> None:
-        # An amplifier that is still ramping down ignores Clear, so it is repeated before each read.
-        problem = await self._read_back(before_each=self._acknowledge)
-        self._check_acknowledged()
+    async def _clear(self, epoch: int) -> None:
+        problem = await self._read_back(epoch, clears=True)
+        self._check_none_since(epoch)
         if problem is None:
             await self.handle(DaemonEvent(Trigger.VERIFIED, "acknowledged, and the cause is gone"))
             return
         await self.handle(DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE))
         raise CommandRefused(f"{problem}; the cause persists, so nothing was cleared")
 
-    async def _acknowledge(self) -> None:
-        """Clear the amplifiers; raises Preempted if a stop or fault came after the request."""
-        self._check_acknowledged()
-        try:
-            await self._controller.clear()
-        except Preempted:
-            self._check_acknowledged()
-            raise
-
-    def _check_acknowledged(self) -> None:
-        if not self.machine.is_acknowledged:
+    def _check_none_since(self, epoch: int) -> None:
+        """Raise Preempted if a stop or fault came after an acknowledgement."""
+        if epoch != self.machine.epoch:
             raise Preempted(
                 "not cleared: a stop or fault came after the request; find the cause, then clear "
                 "again"
             )
 
-    async def _read_back(
-        self, *, before_each: Callable[[], Awaitable[None]] | None = None
-    ) -> str | None:
+    async def _read_back(self, epoch: int, *, clears: bool = False) -> str | None:
         """Read back until all amplifiers are silent; return the problem that remains, if any.
 
-        before_each: awaited before each read. Ends early when the state changes.
+        clears: before each read, for one that is still ramping down ignores Clear. Ends early
+        when the epoch rises.
         """
-        problem, initial_state = None, self.machine.state
+        problem = None
         for _ in range(_MAX_READ_BACKS):
-            if before_each is not None:
-                await before_each()
+            if clears:
+                self._check_none_since(epoch)
+                await self._controller.clear()
             group = self._controller.group
             problem = find_problem(await group.statuses(), group.amplifiers)
-            if problem is None or self.machine.state is not initial_state:
+            if problem is None or epoch != self.machine.epoch:
                 break
             await asyncio.sleep(READ_BACK_INTERVAL)
         return problem

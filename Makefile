@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 # Hundreds of processes are started: what is compiled of us is kept, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo firmware firmware-test test test-long test-busy test-kernels nightly lint format docs fuzz faults kill-test fault-test stop-test desk-test estimate-test soak bench bench-latency \
+.PHONY: demo firmware firmware-test test test-long test-busy test-kernels nightly lint format docs fuzz faults kill-test fault-test stop-test desk-test qt-test estimate-test soak bench bench-latency \
 	bench-localization bench-plant bench-promise bench-wires dist dist-platform smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
@@ -39,7 +39,7 @@ test: .venv/installed-test
 
 # All that is long, one target after another, each within an hour; the rest goes on after a failure.
 # Two hours on two cores. Others: make nightly NIGHTLY='soak kill-test'
-NIGHTLY := test-long test-kernels test-busy faults firmware-test fuzz stop-test kill-test soak desk-test estimate-test smoke-lowest
+NIGHTLY := test-long test-kernels test-busy faults firmware-test fuzz stop-test kill-test soak desk-test qt-test estimate-test smoke-lowest
 nightly: .venv/installed-test
 	@failed=; for target in $(NIGHTLY); do start=$$(date +%s); echo "nightly: $$target"; \
 		$(MAKE) $$target || failed="$$failed $$target"; \
@@ -100,6 +100,10 @@ stop-test: .venv/installed-test
 desk-test: .venv/installed-test
 	.ci/install jackd2:jackd gcc:cc
 	$(BIN)/python -m benchmarks.desk --plates 1 --promises 10 --touches 4 $(DESK)
+
+# The Qt application of the examples with PySide6, without a screen.
+qt-test: .venv/installed-qt
+	$(BIN)/pytest -q tests/integration/test_qt_application.py
 
 # The whole chain in virtual time, thousands of seeds; `make test` takes twelve short ones.
 # Others: make soak SOAK='--minutes 10 --wire serial', or one again: make soak SOAK='--seed 17'
@@ -194,6 +198,10 @@ $(BIN)/python:
 .venv/installed-test: $(BIN)/python pyproject.toml
 	$(PIP) '.[test]'
 	touch $@ .venv/installed
+
+.venv/installed-qt: .venv/installed-test
+	$(PIP) '.[test,qt]'
+	touch $@
 
 .venv/installed-docs: $(BIN)/python pyproject.toml
 	$(PIP) '.[docs]'

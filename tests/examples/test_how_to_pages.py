@@ -22,6 +22,7 @@ NAMES = [
     "add-an-effect",
     "drive-a-signal-generator",
     "design-a-layout",
+    "your-own-application",
 ]
 WITH_CONFORMANCE = ["write-an-amplifier"]
 """It runs the whole of it."""

@@ -1,0 +1,211 @@
+"""A Qt application that shows what the plate does and lets a finger play on it, over the gateway.
+
+    python qt_plate.py http://127.0.0.1:8137/ TOKEN
+
+It needs PySide6 (`pip install 'era-haptics[qt]'`).
+"""
+
+import itertools
+import json
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from PySide6.QtCore import QObject, QTimer, QUrl, Signal
+from PySide6.QtGui import QMouseEvent
+from PySide6.QtNetwork import QAbstractSocket, QNetworkRequest
+from PySide6.QtWebSockets import QWebSocket, QWebSocketHandshakeOptions
+from PySide6.QtWidgets import QApplication, QLabel, QPushButton, QVBoxLayout, QWidget
+
+LEASE = 5.0  # s
+NO_LEASE = 1002  # code of the API
+MAX_SILENT = 4  # s
+
+
+class Plate(QObject):
+    """The plate over a gateway; reconnects by itself and subscribes anew.
+
+    Calls that are pending at a loss fail and are never sent again: whether to arm, play or clear
+    then is for the caller to decide. url: of the gateway.
+    """
+
+    opened = Signal(dict)  # the daemon's hello
+    failed = Signal(str)  # why there is no connection
+    event = Signal(str, dict)  # topic and data
+    refused = Signal(str)  # message of a call that failed
+
+    def __init__(self, url: str, token: str, topics: list[str]) -> None:
+        super().__init__()
+        address = QUrl(url).resolved(QUrl("api/v1/ws"))
+        address.setScheme({"http": "ws", "https": "wss"}[address.scheme()])
+        self._request = QNetworkRequest(address)
+        self._request.setRawHeader(b"Authorization", f"Bearer {token}".encode())
+        self._options = QWebSocketHandshakeOptions()
+        self._options.setSubprotocols(["era-haptics.v1"])
+        self._topics = topics
+        self._ids = itertools.count(1)
+        self._pending: dict[int, Callable[[Any], None]] = {}
+        self._lease: str | None = None
+        self._touches: list[dict[str, Any]] = []
+        self._is_open = False
+        self._silent = 0  # s
+        self._socket = QWebSocket()
+        self._socket.textMessageReceived.connect(self._received)
+        self._socket.stateChanged.connect(self._state_changed)
+        self._socket.pong.connect(self._heard)
+        for interval, action in ((1000, self._check), (1500, self._renew), (50, self._repeat)):
+            timer = QTimer(self, interval=interval)
+            timer.timeout.connect(action)
+            timer.start()
+        self._connect()
+
+    def call(
+        self, method: str, done: Callable[[Any], None] = lambda result: None, **params: object
+    ) -> None:
+        """Call a method of the API; `refused` tells if it fails."""
+        if not self._is_open:
+            self.refused.emit("not connected")
+            return
+        number = next(self._ids)
+        self._pending[number] = done
+        self._send(method, params, id=number)
+
+    def arm(self, owner: str) -> None:
+        """Switch the high voltage on; the lease is renewed until `disarm`, or until refused."""
+        self.call("arm", self._armed, owner=owner, lease_s=LEASE)
+
+    def disarm(self) -> None:
+        """Ramp to silence and switch the high voltage off."""
+        self._lease = None
+        self.call("disarm")
+
+    def stop(self) -> None:
+        """Stop all amplifiers; `refused` names those that are not confirmed silent."""
+        self._lease = None
+        self.call("stop")
+
+    def touch(self, places: list[tuple[float, float]]) -> None:
+        """Report all fingers, at x, y [m], the newest last; repeated until the next call."""
+        self._touches = [{"id": id, "x_m": x, "y_m": y} for id, (x, y) in enumerate(places)]
+        if self._is_open:
+            self._send("touch", {"source": "qt", "touches": self._touches})
+
+    def _connect(self) -> None:
+        self._silent = 0
+        self._socket.open(self._request, self._options)
+
+    def _send(self, method: str, params: dict[str, Any], **head: int) -> None:
+        request = {"jsonrpc": "2.0", **head, "method": method, "params": params}
+        self._socket.sendTextMessage(json.dumps(request))
+
+    def _received(self, text: str) -> None:
+        self._silent = 0
+        message = json.loads(text)
+        if message.get("method") == "event":
+            self.event.emit(message["params"]["topic"], message["params"]["data"])
+        elif not self._is_open:  # the response to the gateway's hello
+            self._is_open = True
+            self.opened.emit(message["result"])
+            self.call("subscribe", topics=self._topics)
+        elif (done := self._pending.pop(message["id"], None)) is not None:
+            if "error" in message:
+                self._fail(message["error"])
+            else:
+                done(message["result"])
+
+    def _fail(self, error: dict[str, Any]) -> None:
+        if error["code"] == NO_LEASE:
+            self._lease = None
+        self.refused.emit(error["message"])
+
+    def _state_changed(self, state: QAbstractSocket.SocketState) -> None:
+        if state is not QAbstractSocket.SocketState.UnconnectedState:
+            return
+        self._is_open = False
+        for _ in range(len(self._pending)):
+            self.refused.emit("the connection was lost")
+        self._pending.clear()
+        self.failed.emit(self._socket.closeReason() or self._socket.errorString())
+        QTimer.singleShot(500, self, self._connect)
+
+    def _heard(self) -> None:
+        self._silent = 0
+
+    def _check(self) -> None:
+        """Leave a gateway that is silent: a lost network closes nothing."""
+        self._silent += 1
+        if self._silent > MAX_SILENT:
+            self._socket.abort()
+        elif self._is_open:
+            self._socket.ping()
+
+    def _armed(self, result: dict[str, Any]) -> None:
+        self._lease = result["lease"]
+
+    def _renew(self) -> None:
+        if self._lease is not None and self._is_open:
+            self.call("renew", lease=self._lease)
+
+    def _repeat(self) -> None:
+        if self._touches and self._is_open:
+            self._send("touch", {"source": "qt", "touches": self._touches})
+
+
+class Window(QWidget):
+    """Buttons, the state in a word with its cause, and the plate, which a mouse touches."""
+
+    def __init__(self, plate: Plate) -> None:
+        super().__init__()
+        self.setWindowTitle("My application")
+        self.plate = plate
+        self.arm, self.disarm, self.stop = map(QPushButton, ("Arm", "Disarm", "Stop"))
+        self.state, self.felt, self.surface = QLabel("connecting"), QLabel(), Surface(plate)
+        column = QVBoxLayout(self)
+        for each in (self.arm, self.disarm, self.stop, self.state, self.felt, self.surface):
+            column.addWidget(each)
+        self.arm.clicked.connect(lambda: plate.arm("my application"))
+        self.disarm.clicked.connect(plate.disarm)
+        self.stop.clicked.connect(plate.stop)
+        plate.failed.connect(lambda why: self.state.setText(f"no connection: {why}"))
+        plate.refused.connect(self.felt.setText)
+        plate.event.connect(self._show)
+
+    def _show(self, topic: str, data: dict[str, Any]) -> None:
+        if topic == "state":
+            self.state.setText(f"{data['word']}: {data['cause']}")
+        elif topic == "pattern":
+            self.felt.setText(f"played by {', '.join(sorted(data['drive']))}")
+        elif topic == "silence":
+            self.felt.setText(f"silent: {data['reason']}")
+
+
+class Surface(QWidget):
+    """The plate's surface: a pressed mouse is a finger."""
+
+    def __init__(self, plate: Plate) -> None:
+        super().__init__()
+        self._plate, self._size = plate, (0.0, 0.0)
+        self.setFixedSize(400, 300)
+        plate.opened.connect(self._measure)
+
+    def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802 (Qt's name)
+        """Put the finger down, or move it."""
+        x, y = event.position().x() / self.width(), 1 - event.position().y() / self.height()
+        length, width = self._size
+        self._plate.touch([(x * length, y * width)])
+
+    mouseMoveEvent = mousePressEvent
+
+    def mouseReleaseEvent(self, event: QMouseEvent) -> None:  # noqa: N802 (Qt's name)
+        """Lift the finger."""
+        self._plate.touch([])
+
+    def _measure(self, hello: dict[str, Any]) -> None:
+        self._size = hello["rig"]["length_m"], hello["rig"]["width_m"]
+
+
+if __name__ == "__main__":
+    application = QApplication(sys.argv)
+    window = Window(Plate(*sys.argv[1:3], ["state", "pattern", "silence"]))
+    window.show()
+    sys.exit(application.exec())

@@ -1,0 +1,198 @@
+"""Examples of an application: a page in a real browser through losses, a program in Python."""
+
+import asyncio
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import AsyncIterator, Iterator
+from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from chromium import Page, open_browser
+from controller.api.client import Client
+from controller.api.topics import StateEvent
+from gateway_bench import (
+    TOKEN,
+    ScriptedDaemon,
+    gateway_process,
+    real_daemon,
+    wait_for,
+    wait_for_state,
+)
+
+FOLDER = Path(__file__).parents[2] / "examples" / "application"
+SAID = "document.querySelector('#state').textContent"
+FELT = "document.querySelector('#felt').textContent"
+
+pytestmark = pytest.mark.real_time
+
+
+class Network:
+    """Between browser and gateway: passes bytes on, loses them, or refuses connections."""
+
+    def __init__(self) -> None:
+        self.port = 0
+        self.target = 0  # port of the gateway
+        self._is_muted = self._is_cut = False
+        self._writers: set[asyncio.StreamWriter] = set()
+
+    @asynccontextmanager
+    async def serving(self) -> AsyncIterator["Network"]:
+        """Accept connections on a free port."""
+        async with await asyncio.start_server(self._accept, "127.0.0.1", 0) as server:
+            self.port = server.sockets[0].getsockname()[1]
+            yield self
+            self.cut()
+
+    def mute(self) -> None:
+        """Lose every byte from now on; nothing closes."""
+        self._is_muted = True
+
+    def cut(self) -> None:
+        """Close all connections and refuse others."""
+        self._is_cut = True
+        for writer in self._writers:
+            writer.transport.abort()
+
+    def restore(self) -> None:
+        """Close what has lost bytes, and pass everything on."""
+        self.cut()
+        self._is_muted = self._is_cut = False
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._writers.add(writer)
+        if self._is_cut:
+            writer.transport.abort()
+            return
+        with suppress(OSError):
+            back, forth = await asyncio.open_connection("127.0.0.1", self.target)
+            self._writers.add(forth)
+            await asyncio.gather(self._pass(reader, forth), self._pass(back, writer))
+        writer.transport.abort()
+
+    async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while data := await reader.read(1 << 16):
+            if not self._is_muted:
+                writer.write(data)
+        writer.close()
+
+
+@contextmanager
+def pages() -> Iterator[str]:
+    """The origin of a server of the example's page, which is not the gateway."""
+    handler = partial(SimpleHTTPRequestHandler, directory=str(FOLDER))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+@asynccontextmanager
+async def shown(tmp_path: Path) -> AsyncIterator[tuple[Page, Network, ExitStack, str]]:
+    """A tab, the network, what ends at the end, and the origin of the page."""
+    with ExitStack() as ended:
+        origin = ended.enter_context(pages())
+        async with (
+            Network().serving() as network,
+            open_browser(tmp_path / "profile") as browser,
+            browser.open_page() as tab,
+        ):
+            yield tab, network, ended, origin
+
+
+def url(origin: str, network: Network) -> str:
+    """The page's address, with that of its gateway."""
+    return f"{origin}/plate.html?gateway=http://127.0.0.1:{network.port}/#{TOKEN}"
+
+
+async def test_page_plays_and_comes_back_after_every_loss(tmp_path: Path) -> None:
+    """Armed and touched over a cut network; after a new daemon and gateway it follows, disarmed."""
+    async with shown(tmp_path) as (tab, network, ended, origin):
+
+        async def until_said(start: str) -> None:
+            await tab.until(SAID, lambda text: text.startswith(start))
+
+        with gateway_process(tmp_path, tmp_path / "era.sock", "--allow-origin", origin) as gateway:
+            network.target = gateway.port
+            with real_daemon(tmp_path) as socket, Client.connect(socket) as era:
+                wait_for_state(era, "READY_TO_SWITCH_ON")
+                await tab.show(url(origin, network))
+                await until_said("ready: ")
+                await tab.click("#arm")
+                await until_said("on: armed by 'my application'")
+                x, y, width, height = await tab.evaluate(
+                    "(({x, y, width, height}) => [x, y, width, height])"
+                    "(document.querySelector('#plate').getBoundingClientRect())"
+                )
+                await tab.touch("touchStart", [(x + width / 4, y + height / 2)])
+                await tab.until(FELT, lambda text: text.startswith("played by "))
+                rig = era.hello("test").rig
+                (contact,) = era.status().contacts
+                assert contact.x_m == pytest.approx(rig.length_m / 4, abs=2e-3)
+                assert contact.y_m == pytest.approx(rig.width_m / 2, abs=2e-3)
+                network.cut()
+                await until_said("no connection: ")
+                network.restore()
+                await until_said("on: armed by 'my application'")
+                await asyncio.to_thread(wait_for, lambda: (era.status().lease_left_s or 0) < 4.2)
+                await asyncio.to_thread(wait_for, lambda: (era.status().lease_left_s or 0) > 4.5)
+                await asyncio.to_thread(wait_for, lambda: len(era.status().contacts) == 1)
+            await until_said("no connection: daemon")
+            with real_daemon(tmp_path) as socket, Client.connect(socket) as era:
+                await until_said("ready: ")
+                await asyncio.to_thread(wait_for, lambda: len(era.status().contacts) == 1)
+                assert era.status().armed_by is None
+                gateway.terminate()
+                await until_said("no connection: unreachable")
+                again = ("--allow-origin", origin, "--listen", f"127.0.0.1:{gateway.port}")
+                ended.enter_context(gateway_process(tmp_path, socket, *again))
+                await until_said("ready: ")
+                await tab.touch("touchEnd", [])
+                await asyncio.to_thread(wait_for, lambda: not era.status().contacts)
+
+
+def test_program_holds_fingers_and_prints_what_plays(tmp_path: Path) -> None:
+    """It arms, plays and leaves the daemon disarmed."""
+    with real_daemon(tmp_path) as socket, Client.connect(socket) as era:
+        wait_for_state(era, "READY_TO_SWITCH_ON")
+        done = subprocess.run(
+            [sys.executable, FOLDER / "follow.py", "0.22,0.16", "0.08,0.06"],
+            capture_output=True,
+            text=True,
+            check=False,
+            env={**os.environ, "ERA_HAPTICS_SOCKET": str(socket)},
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+        assert "on: armed by 'follow'\n" in done.stdout
+        assert "played by " in done.stdout
+        assert era.status().state == "READY_TO_SWITCH_ON"
+        assert not era.status().contacts
+
+
+async def test_page_leaves_a_silent_network_and_repeats_no_arm(tmp_path: Path) -> None:
+    """A pending arm is given up with the connection; the page subscribes anew."""
+    async with shown(tmp_path) as (tab, network, ended, origin):
+        daemon = ended.enter_context(ScriptedDaemon(tmp_path))
+        options = ("--allow-origin", origin)
+        gateway = ended.enter_context(gateway_process(tmp_path, daemon.socket, *options))
+        network.target = gateway.port
+        await tab.show(url(origin, network))
+        await tab.until(SAID, lambda text: text.startswith("ready: "))
+        with daemon.holding():
+            await tab.click("#arm")
+            await asyncio.to_thread(wait_for, lambda: "arm" in daemon.methods)
+            network.mute()
+            await tab.until(SAID, lambda text: not text.startswith("ready: "))
+            network.restore()
+            await tab.until(SAID, lambda text: text.startswith("ready: "))
+        cut = StateEvent(
+            old="READY_TO_SWITCH_ON", new="FAULT", cause="a cable was cut", remedy=None
+        )
+        daemon.publish("state", cut)
+        await tab.until(f"{SAID} === 'fault: a cable was cut'")
+        assert daemon.methods.count("arm") == 1

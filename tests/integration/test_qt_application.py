@@ -1,0 +1,83 @@
+"""The Qt application of the examples, without a screen."""
+
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from controller.api.client import Client
+from gateway_bench import TOKEN, gateway_process, real_daemon, wait_for
+
+FOLDER = Path(__file__).parents[2] / "examples" / "application"
+
+pytestmark = [pytest.mark.real_time, pytest.mark.long]
+
+
+@pytest.fixture
+def _qt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PySide6 without a screen; its absence is a failure only where `make qt-test` installs it."""
+    monkeypatch.setenv("QT_QPA_PLATFORM", "offscreen")
+    monkeypatch.syspath_prepend(FOLDER)
+    try:
+        import qt_plate  # noqa: F401
+    except ImportError as error:
+        reason = f"no PySide6 ({error}): make qt-test installs it, apt libegl1 and libgl1"
+        if (Path(sys.prefix) / "installed-qt").exists():
+            pytest.fail(reason)
+        pytest.skip(reason)
+
+
+@pytest.mark.usefixtures("_qt")
+def test_application_plays_and_comes_back_after_every_loss(tmp_path: Path) -> None:
+    """By a mouse; after a new daemon, and a gateway that hangs, it follows and stays disarmed."""
+    from PySide6.QtCore import QPoint, Qt
+    from PySide6.QtTest import QTest
+    from PySide6.QtWidgets import QApplication
+    from qt_plate import Plate, Window
+
+    application = QApplication([])
+
+    def until(condition: Callable[[], object]) -> None:
+        def processed() -> object:
+            application.processEvents()
+            return condition()
+
+        wait_for(processed)
+
+    with gateway_process(tmp_path, tmp_path / "era.sock") as gateway:
+        window = Window(Plate(gateway.url, TOKEN, ["state", "pattern", "silence"]))
+        window.show()
+
+        def until_said(start: str) -> None:
+            until(lambda: window.state.text().startswith(start))
+
+        left, at = Qt.MouseButton.LeftButton, QPoint(100, 150)  # of 400 by 300
+        until_said("no connection: the daemon does not respond")
+        with real_daemon(tmp_path) as socket, Client.connect(socket) as era:
+            until_said("ready: ")
+            QTest.mouseClick(window.arm, left)
+            until_said("on: armed by 'my application'")
+            QTest.mousePress(window.surface, left, pos=at)
+            until(lambda: window.felt.text().startswith("played by "))
+            rig = era.hello("test").rig
+            (contact,) = era.status().contacts
+            assert contact.x_m == pytest.approx(rig.length_m / 4, abs=1e-3)
+            assert contact.y_m == pytest.approx(rig.width_m / 2, abs=1e-3)
+            until(lambda: (era.status().lease_left_s or 0) < 4.2)
+            until(lambda: (era.status().lease_left_s or 0) > 4.5)
+        until_said("no connection: ")
+        with real_daemon(tmp_path) as socket, Client.connect(socket) as era:
+            until_said("ready: ")
+            until(lambda: len(era.status().contacts) == 1)
+            assert era.status().armed_by is None
+            gateway.process.send_signal(signal.SIGSTOP)
+            until_said("no connection: ")
+            gateway.process.send_signal(signal.SIGCONT)
+            until_said("ready: ")
+            QTest.mouseRelease(window.surface, left, pos=at)
+            until(lambda: not era.status().contacts)
+            QTest.mouseClick(window.stop, left)
+            until_said("stopped: ")
+            assert era.status().state == "QUICK_STOP_ACTIVE"

@@ -187,7 +187,7 @@ async def test_page_leaves_a_silent_network_and_repeats_no_arm(tmp_path: Path) -
             await tab.click("#arm")
             await asyncio.to_thread(wait_for, lambda: "arm" in daemon.methods)
             network.mute()
-            await tab.until(SAID, lambda text: not text.startswith("ready: "))
+            await tab.until(SAID, lambda text: "gateway" in text or "no connection" in text)
             network.restore()
             await tab.until(SAID, lambda text: text.startswith("ready: "))
         cut = StateEvent(

@@ -98,11 +98,12 @@ def test_gateway_connects_to_a_daemon_that_starts_later(tmp_path: Path) -> None:
 def test_gateway_serves_tls(
     daemon: ScriptedDaemon, tmp_path: Path, pair: tuple[Path, Path]
 ) -> None:
-    """HTTP and WebSockets over a verified certificate; no response without TLS."""
+    """To a tablet: on all addresses, HTTP and WebSockets over a verified certificate, TLS alone."""
     certificate, key = pair
-    options = ("--certificate", str(certificate), "--key", str(key))
-    with gateway_process(tmp_path, daemon.socket, *options) as gateway:
-        assert gateway.url.startswith("https://")
+    tls = ("--certificate", str(certificate), "--key", str(key))
+    outside = ("--listen", "0.0.0.0:0", "--allow-host", "localhost")
+    with gateway_process(tmp_path, daemon.socket, *tls, *outside) as gateway:
+        assert gateway.url.startswith("https://localhost:")
         plain = f"POST /api/v1/stop HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
         assert raw(gateway, plain).status == 0
         gateway.context = _Verified(certificate)

@@ -16,6 +16,7 @@ import pytest
 from chromium import Page, open_browser
 from controller.api.client import Client
 from controller.api.topics import StateEvent
+from daemon_bench import PATIENCE
 from gateway_bench import (
     TOKEN,
     ScriptedDaemon,
@@ -73,13 +74,15 @@ class Network:
             back, forth = await asyncio.open_connection("127.0.0.1", self.target)
             self._writers.add(forth)
             await asyncio.gather(self._pass(reader, forth), self._pass(back, writer))
-        writer.transport.abort()
+        if not self._is_muted:
+            writer.transport.abort()
 
     async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while data := await reader.read(1 << 16):
             if not self._is_muted:
                 writer.write(data)
-        writer.close()
+        if not self._is_muted:
+            writer.close()
 
 
 @contextmanager
@@ -187,7 +190,8 @@ async def test_page_leaves_a_silent_network_and_repeats_no_arm(tmp_path: Path) -
             await tab.click("#arm")
             await asyncio.to_thread(wait_for, lambda: "arm" in daemon.methods)
             network.mute()
-            await tab.until(SAID, lambda text: "gateway" in text or "no connection" in text)
+            async with asyncio.timeout(PATIENCE / 6):
+                await tab.until(SAID, lambda text: "gateway" in text or "no connection" in text)
             network.restore()
             await tab.until(SAID, lambda text: text.startswith("ready: "))
         cut = StateEvent(

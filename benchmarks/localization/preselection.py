@@ -7,6 +7,7 @@ eight, twelve and sixteen ERAs, against the answer that searches every frequency
 """
 
 import argparse
+from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING
 
@@ -55,19 +56,16 @@ def _lost(table: "LocalizationTable", question: "Question") -> list[float]:
     """Decibels of robust felt contrast that are lost; none where the level is not reached."""
     import numpy as np
 
-    from model.drive_modes import preselection
-    from model.errors import InputError
+    from model.table.contents import Contents
+    from model.table.contents_kernel import choose_tones
 
-    kept = preselection.preselect
-    try:
-        some = table.query(question).robust_felt_contrast_db
-        preselection.preselect = lambda forms: np.arange(forms.frequency_count)
-        every = table.query(question).robust_felt_contrast_db
-    except InputError:
-        return []
-    finally:
-        preselection.preselect = kept
-    return [] if some is None or every is None else [every - some]
+    rows = np.arange(len(table.frequencies))
+    ranked = Contents.of(question, table.read_fingertips(question.contacts), rows)
+    each = [
+        choose_tones(table, replace(ranked, is_ranked=is_ranked)) for is_ranked in (True, False)
+    ]
+    worst = [found.worst for found in each if found is not None]
+    return [] if len(worst) < 2 else [20 * float(np.log10(worst[1] / worst[0]))]
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ typedef struct {
     const float *receptance, *by_force, *coupling, *moved; /* (f, t, ...) g (r), T (b, r), Y (b, b), (b, n) */
     const float *minus_omega2, *drives, *strokes;          /* (f), (f, n), (f, n) */
     const float *by_damping, *by_stiffness;                /* (f, n) */
+    const float *by_loss, *attached, *shapes;              /* (f, t, r); (f, b) Z; (b, r) */
     const float *centres, *stiffness;                      /* (k, r); (f, k) D */
 } plates;
 

@@ -3,15 +3,17 @@
 import ctypes
 import logging
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from model.compiled.compiler import compile_library
 from model.compiled.library_cache import kept_library
+from model.compiled.structures import NO_MEMORY
 from model.errors import InputError
 
 _HERE = Path(__file__).parent
@@ -85,6 +87,14 @@ def kernels() -> Kernels | None:
     except (InputError, OSError) as error:
         _logger.warning("answers take several times as long without kernels in C: %s", error)
         return None
+
+
+def run(kernel: Callable[..., int], *given: Any) -> int:
+    """Run a kernel on structures and other arguments; its status. Raises MemoryError."""
+    status = kernel(*(ctypes.byref(e) if isinstance(e, ctypes.Structure) else e for e in given))
+    if status == NO_MEMORY:
+        raise MemoryError("kernels could not get the memory that an answer takes")
+    return status
 
 
 def compile_kernels(folder: Path) -> list[Path]:

@@ -1,6 +1,6 @@
 """A fast robust score of a layout: expected contrast over sampled contact sets.
 
-As answers are found (`model.ensemble.contact_forms`, `model.drive_modes.coherent`), at a few
+As answers are found (`model.ensemble.touched_plate`, `model.drive_modes.coherent`), at a few
 frequencies, from the receptances of the free plate, and with each finger loading the plate where it
 rests: what it changes at the others is left out, so that all is computed once for each finger. With
 ERAs e of dynamic stiffness Z on the plate, a finger f of dynamic stiffness D and its points p:

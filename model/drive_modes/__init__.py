@@ -38,7 +38,7 @@ def find_drives(forms: Forms, drive_mode: str) -> list[tuple[float, Weights]]:
     """
     if drive_mode == "switched":
         return find_switched(forms, 0.0)[:ALTERNATIVES]
-    found = PHASED.search(forms, 0.0)
+    found = PHASED.search(forms)
     score, best = found.score, float(found.score.max())
     top = best_first(score)[:ALTERNATIVES].tolist()
     drives = [(float(score[f]), Weights.at(f, found.weights[f])) for f in top if score[f] > 0]

@@ -5,9 +5,8 @@ quadratic form w^H R w of the weights w, and the weights that reach the targets 
 solve R w = c, where c sums conj(h_t) of the targets, each times its phase factor. Where the maximum
 over the quiet fingertips counts, their weights mu_q are multiplied by the root of their expected
 power and the system is solved again (Lawson's algorithm for minimax approximation; few steps, since
-the minimax of expected powers is not the best percentile). A mean is at most the maximum:
-|c^H w| / sqrt(w^H R w) bounds the score at a frequency, and most frequencies are pruned after one
-or two iterations.
+the minimax of expected powers is not the best percentile). A mean is at most the maximum, so that
+|c^H w| / sqrt(w^H R w) bounds the score at a frequency.
 """
 
 from collections.abc import Sequence
@@ -19,18 +18,15 @@ from typing import TypeAlias
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
-from model.choice import best_along, best_first
+from model.choice import best_along
 from model.drive_modes.forms import Forms
-
-MAX_CANDIDATES = 12
-"""Frequencies at which Lawson's iterations are done."""
 
 LAWSON_STEPS = 3
 """Iterations; twelve lose 0.1 to 0.3 dB of the tenth percentile."""
 
 PRUNE_MARGIN = 0.84
-"""A frequency whose bound is below this times the best score is pruned: 1.5 dB, since the
-percentile decides among the best."""
+"""Patterns of `switched` below this times the best score are left out: 1.5 dB, since the percentile
+decides among the best."""
 
 LIMITED_STEPS = 30
 """Iterations towards weights that reach the level within full stroke; ten lose up to 1.4 dB where
@@ -60,44 +56,28 @@ class Coherent:
     phases: tuple[int, int]
     iterations: int
 
-    def search(self, forms: Forms, min_score: float) -> "CoherentResult":
-        """Find the best weights at each frequency that can have the best score of all.
-
-        min_score: best score so far; frequencies that cannot come near it are pruned.
-        """
-        found = _BestCandidates(forms, min_score)
-        self._search_at(forms, found, np.arange(forms.frequency_count))
+    def search(self, forms: Forms) -> "CoherentResult":
+        """Find the best weights at each frequency, brought within full stroke where they must."""
+        found = self._tried(forms)
         if found.is_level_limited:
             self._limit_weights(forms, found)
             self._relax_level(forms, found)
         return found.search()
 
-    def _search_at(self, forms: Forms, found: "_BestCandidates", chosen: IntArray) -> None:
-        """Search at some of the frequencies, by ascending index (n,)."""
-        if len(chosen) < forms.frequency_count:
-            forms = forms.at(chosen)
-        weights, bound = self._weights(forms, _mean(forms))
-        expected = forms.quiet_power(weights)
-        found.add(chosen, forms, [(weights, expected, bound)])
-        if expected.shape[1] == 1:
-            return
-        kept = (bound > PRUNE_MARGIN * found.score).nonzero()[0]
-        if len(kept) == 0:
-            return
-        if len(kept) > MAX_CANDIDATES:
-            kept = kept[best_first(bound[kept])[:MAX_CANDIDATES]]
-        if len(kept) < len(chosen):
-            chosen, forms, expected = chosen[kept], forms.at(kept), expected[kept]
-        found.add(chosen, forms, self._iterate(forms, expected))
-
     def search_all(self, forms: Forms) -> "CoherentResult":
-        """Find the best weights at every frequency, none pruned and none raised to the level."""
-        found = _BestCandidates(forms, 0.0)
+        """Find the best weights at every frequency, none raised to the level."""
+        return self._tried(forms).search()
+
+    def _tried(self, forms: Forms) -> "_BestCandidates":
+        """The best of the first weights, and of Lawson's where there are several constraints."""
+        found = _BestCandidates(forms)
         weights, bound = self._weights(forms, _mean(forms))
         expected = forms.quiet_power(weights)
-        tried = [(weights, expected, bound), *self._iterate(forms, expected)]
+        tried: list[_Tried] = [(weights, expected, bound)]
+        if expected.shape[1] > 1:
+            tried += self._iterate(forms, expected)
         found.add(np.arange(forms.frequency_count), forms, tried)
-        return found.search()
+        return found
 
     def _iterate(self, forms: Forms, expected: Float32Array) -> "list[_Tried]":
         """Lawson's iterations from expected powers (f, q) at the quiet fingertips."""
@@ -192,13 +172,13 @@ _Tried: TypeAlias = tuple[Complex64Array, Float32Array, Float32Array | None]
 class _BestCandidates:
     """The best candidate weights so far; score: the best of those that reach the level."""
 
-    def __init__(self, forms: Forms, min_score: float) -> None:
+    def __init__(self, forms: Forms) -> None:
         count = forms.frequency_count
         self._scores = np.zeros(count, dtype=np.float32)
         self._infeasible_scores = np.zeros(count, dtype=np.float32)
         self._weights = np.zeros((count, forms.era_count), dtype=np.complex64)
         self.bound = np.full(count, np.inf, dtype=np.float32)
-        self.score = min_score
+        self.score = 0.0
 
     def add(self, frequencies: IntArray, forms: Forms, tried: Sequence[_Tried]) -> None:
         """Add what was tried at frequencies, by index (n,); forms: at these only."""

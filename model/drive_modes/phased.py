@@ -11,24 +11,27 @@ from model.drive_modes import phased_kernel
 from model.drive_modes.coherent import Coherent, CoherentResult
 from model.drive_modes.forms import Forms
 
+MAX_TARGETS = 4
+"""Of a search by the kernel, whose room grows by five for each."""
+
 
 @dataclass(frozen=True)
 class Phased(Coherent):
-    """The search for any weights, by a kernel in C for one target."""
+    """The search for any weights, by a kernel in C where it can be compiled."""
 
-    def search(self, forms: Forms, min_score: float) -> CoherentResult:
-        """Find the best weights at each frequency that can have the best score of all."""
+    def search(self, forms: Forms) -> CoherentResult:
+        """As of `Coherent`."""
         by = kernels()
-        if by is None or len(forms.targets) > 1:
-            return super().search(forms, min_score)
-        return phased_kernel.search(by, forms, min_score)
+        if by is None or len(forms.targets) > MAX_TARGETS:
+            return super().search(forms)
+        return phased_kernel.search(by, self, forms)
 
     def search_all(self, forms: Forms) -> CoherentResult:
-        """Find the best weights at every frequency, none pruned and none raised to the level."""
+        """As of `Coherent`."""
         by = kernels()
-        if by is None or len(forms.targets) > 1:
+        if by is None or len(forms.targets) > MAX_TARGETS:
             return super().search_all(forms)
-        return phased_kernel.search_all(by, forms)
+        return phased_kernel.search_all(by, self, forms)
 
 
 PHASED = Phased(phases=(1, 5), iterations=8)

@@ -1,16 +1,13 @@
-"""The search of `model.drive_modes.coherent` for one target and any weights, by its kernel in C."""
+"""The search of `model.drive_modes.coherent` by its kernel in C."""
 
-import ctypes
-from ctypes import c_float, c_int, c_size_t, c_void_p
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, Float32Array, IntArray
-from model.compiled.kernels import Kernels
-from model.compiled.lanes import as_given, work_space
+from model.compiled.kernels import Kernels, run
+from model.compiled.lanes import address_of, as_given
+from model.compiled.structures import GivenForms, Method
 from model.drive_modes.coherent import (
     LAWSON_STEPS,
     LEVEL_RELAXATION,
@@ -18,33 +15,14 @@ from model.drive_modes.coherent import (
     LIMITED_STEPS,
     MAX_GROWTH,
     MAX_MULTIPLIER,
+    Coherent,
     CoherentResult,
 )
 from model.drive_modes.forms import Forms
 
-_ARRAYS = ("targets", "target_power", "quiet", "threshold", "few", "fine")
-
-
-class _Forms(ctypes.Structure):
-    _fields_ = (
-        *((name, c_int) for name in ("n", "q", "few", "fine")),
-        *((name, c_float) for name in ("wanted", "margin")),
-        *((f"of_{name}", c_void_p) for name in _ARRAYS),
-    )
-
-
-class _Method(ctypes.Structure):
-    """Weights that are tried: how many at each frequency, the rest as in `phased_search.c`."""
-
-    _fields_ = (
-        *((name, c_int) for name in ("steps", "limited")),
-        *((name, c_float) for name in ("variance", "gain", "reserve", "growth", "most")),
-    )
-
-
-_ONE_FINGER, _SEVERAL = _Method(steps=1), _Method(steps=1 + LAWSON_STEPS)
-_WITHIN_STROKE = (
-    _Method(
+ONE_FINGER, SEVERAL = Method(steps=1), Method(steps=1 + LAWSON_STEPS)
+WITHIN_STROKE = (
+    Method(
         steps=LIMITED_STEPS,
         limited=1,
         gain=1,
@@ -52,42 +30,42 @@ _WITHIN_STROKE = (
         growth=MAX_GROWTH,
         most=MAX_MULTIPLIER,
     ),
-    *(_Method(steps=1, variance=sigma**2, gain=gain) for sigma, gain in LEVEL_RELAXATION),
+    *(Method(steps=1, variance=sigma**2, gain=gain) for sigma, gain in LEVEL_RELAXATION),
 )
 
 
-def search(kernels: Kernels, forms: Forms, min_score: float) -> CoherentResult:
-    """As `Coherent.search`, none pruned."""
-    kernel = _Kernel(kernels, forms)
-    found = kernel.tried(np.arange(forms.frequency_count), _steps(forms))
+def search(kernels: Kernels, coherent: Coherent, forms: Forms) -> CoherentResult:
+    """As `Coherent.search`."""
+    return _searched(kernels, coherent, forms, WITHIN_STROKE)
+
+
+def search_all(kernels: Kernels, coherent: Coherent, forms: Forms) -> CoherentResult:
+    """As `Coherent.search_all`."""
+    return _searched(kernels, coherent, forms, ())
+
+
+def _searched(
+    kernels: Kernels, coherent: Coherent, forms: Forms, further: tuple[Method, ...]
+) -> CoherentResult:
+    """The best by the first method, and by further ones where that misses the level."""
+    given = _given(coherent, forms)
+    first = SEVERAL if forms.quiet.shape[1] > 1 else ONE_FINGER
+    found = _tried(kernels, given, np.arange(forms.frequency_count), first)
     score, missed = found.score, found.missed
-    best = max(min_score, float(score.max()))
-    open_ = _level_limited(score, missed, best)
-    for method in _WITHIN_STROKE:
+    for method in further:
+        open_ = _level_limited(score, missed)
         if len(open_) == 0:
             break
-        further = kernel.tried(open_, method)
-        score[open_], found.weights[open_] = further.score, further.weights
-        missed[open_] = np.maximum(missed[open_], further.missed)
-        best = max(best, float(score.max()))
-        open_ = _level_limited(score, missed, best)
-    return CoherentResult(score, found.weights, found.bound, len(open_) > 0)
+        more = _tried(kernels, given, open_, method)
+        score[open_], found.weights[open_] = more.score, more.weights
+        missed[open_] = np.maximum(missed[open_], more.missed)
+    is_limited = len(_level_limited(score, missed)) > 0
+    return CoherentResult(score, found.weights, found.bound, is_limited)
 
 
-def search_all(kernels: Kernels, forms: Forms) -> CoherentResult:
-    """As `Coherent.search_all`."""
-    found = _Kernel(kernels, forms).tried(np.arange(forms.frequency_count), _steps(forms))
-    open_ = _level_limited(found.score, found.missed, float(found.score.max()))
-    return CoherentResult(found.score, found.weights, found.bound, len(open_) > 0)
-
-
-def _steps(forms: Forms) -> _Method:
-    return _SEVERAL if forms.quiet.shape[1] > 1 else _ONE_FINGER
-
-
-def _level_limited(score: Float32Array, missed: Float32Array, best: float) -> IntArray:
+def _level_limited(score: Float32Array, missed: Float32Array) -> IntArray:
     """Frequencies without weights that reach the level, but of a better score than the best."""
-    return np.asarray(((score == 0) & (missed > best)).nonzero()[0])
+    return np.asarray(((score == 0) & (missed > score.max())).nonzero()[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,38 +81,33 @@ class _Tried:
     bound: Float32Array
 
 
-class _Kernel:
-    """The kernel for forms of one target."""
-
-    def __init__(self, kernels: Kernels, forms: Forms) -> None:
-        fields = () if forms.few is None or forms.fine is None else (forms.few, forms.fine)
-        given = (forms.targets[0], forms.target_power[0], forms.quiet, forms.threshold, *fields)
-        # Kept, since the kernel reads them.
-        self._arrays = [as_given(each) for each in given]
-        _, q, n, _ = forms.quiet.shape
-        points = [each.shape[2] for each in fields] or [0, 0]
-        pointers = [each.ctypes.data for each in self._arrays]
-        self._forms = ctypes.byref(
-            _Forms(n, q, *points, forms.wanted, forms.level_margin, *pointers)
-        )
-        library = kernels.library
-        library.phased_search_space.restype = c_size_t
-        self._space = library.phased_search_space(self._forms)
-        self._kernels, self._eras = kernels, n
-
-    def tried(self, rows: IntArray, method: _Method) -> _Tried:
-        """What a method finds at frequencies, by index (n,)."""
-        count = len(rows)
-        weights = np.empty((count, self._eras), dtype=np.complex64)
-        measures = np.empty((3, count), dtype=np.float32)
-        at = np.ascontiguousarray(rows, dtype=np.int32)
-        self._kernels.library.phased_search(
-            *(self._forms, ctypes.byref(method)),
-            *(_at(at), count, work_space(self._kernels, self._space)),
-            *(_at(each) for each in (weights, *measures)),
-        )
-        return _Tried(weights, *measures)
+def _given(coherent: Coherent, forms: Forms) -> GivenForms:
+    """Forms as kernels read them."""
+    _, q, n, _ = forms.quiet.shape
+    is_deep = forms.few is not None and forms.fine is not None
+    points = [
+        each.shape[2] if each is not None and is_deep else 0 for each in (forms.few, forms.fine)
+    ]
+    found = GivenForms(
+        *(n, len(forms.targets), q, *points, forms.wanted, forms.level_margin),
+        *(coherent.phases[1], coherent.iterations),
+    )
+    found.point(
+        of_targets=forms.targets.swapaxes(0, 1),
+        target_power=forms.target_power.swapaxes(0, 1),
+        quiet=forms.quiet,
+        threshold=forms.threshold,
+        few_fields=forms.few,
+        fine_fields=forms.fine,
+    )
+    return found
 
 
-def _at(array: NDArray[Any]) -> c_void_p:
-    return c_void_p(array.ctypes.data)
+def _tried(kernels: Kernels, forms: GivenForms, rows: IntArray, method: Method) -> _Tried:
+    """What a method finds at frequencies, by index (n,)."""
+    count, at = len(rows), as_given(rows)
+    weights = np.empty((count, forms.n), dtype=np.complex64)
+    measures = np.empty((3, count), dtype=np.float32)
+    to = [address_of(each) for each in (weights, *measures)]
+    run(kernels.library.search_stage, forms, method, address_of(at), count, *to)
+    return _Tried(weights, *measures)

@@ -17,7 +17,7 @@ own, gains as sigma: exact derivatives of the loaded plate, but for what a finge
 For the thickness, half the sum of dh* dh^T of the plates thicker and thinner by it, exactly. The
 loss factor changes next to nothing.
 
-`model.ensemble.touched_by_kernel` is the same in C.
+`model.ensemble.touched_by_kernel` runs the same in C.
 """
 
 import math
@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
-from model.ensemble.draws import Draws
+from model.ensemble.draws import Drawing, Draws, draw
 from model.ensemble.measures import over_fingertips
 from model.ensemble.plate_on_eras import MODELLED, THICKER, THINNER, PlateOnEras
 
@@ -197,27 +197,34 @@ class TouchedPlate:
         loss = -stiffness * real_product(lost, shapes.T)
         return Changes(loss, damping, own, drives, at_points)
 
-    def felt(
+    def drawn(
         self,
-        draws: Draws,
-        by_force: Complex64Array,
-        sources: IntArray,
-        changes: Changes,
-        at_nodes: Complex64Array,
-        error: Float32Array,
+        by: Drawing,
+        rows: IntArray,
+        weights: Complex64Array,
+        points: Float32Array,
+        shares: Float32Array,
+        error_power: Float32Array,
         threshold: Float32Array,
-        weights: Float32Array,
         *,
-        with_powers: bool,
+        with_powers: bool = False,
     ) -> Sensed:
-        """What is felt on drawn plates of m tones, whose changes are those of some thicknesses.
+        """What is felt on the plate as modelled and on drawn ones of tones at rows (m,).
 
-        by_force (s, k p, a): of `sources`, and which is that of each tone and thickness, (m, t);
-        changes (m t, ...): in that order; at_nodes (m, 1 + nodes, k p): accelerations on the plate
-        as modelled, and of the draws' thicknesses; error (m,): root mean square of the
-        discretisation error; threshold (m,) [m/s²]; weights (k, p): in the mean over fingertips.
+        weights (m, n): of the ERAs; points (k p, r): shapes; shares (k, p): of the points in the
+        mean over fingertips; error_power (f, n): mean square of the discretisation error of each
+        ERA's field; threshold (f,) [m/s²]; both at all frequencies of the plate.
         """
-        (m, t), (k, p), d = sources.shape, weights.shape, len(draws.node)
+        m, (k, p), d = len(rows), shares.shape, by.count
+        draws, nodes, (t, first_base), first = drawn_on(self.on, k, by)
+        cases = np.array([MODELLED, *range(first, first + nodes)])
+        at_nodes = self.fields(
+            rows.repeat(1 + nodes), np.tile(cases, m), weights.repeat(1 + nodes, axis=0), points
+        ).reshape(m, 1 + nodes, -1)
+        bases = first_base + np.tile(np.arange(t), m)
+        at, of_base = rows.repeat(t), weights.repeat(t, axis=0)
+        by_force, moved = self.sources(at, bases, points)
+        changes = self.changes(at, bases, of_base, np.matvec(moved, of_base), points)
         parts = [
             each[:, :, None] * numbers
             for each, numbers in (
@@ -230,13 +237,15 @@ class TouchedPlate:
         forces = np.add.reduce(parts).reshape(m, t, -1, t, d // t)
         by_loss = changes.by_loss.reshape(m, t, -1, 1) * draws.loss.reshape(t, 1, -1)
         own = np.arange(t)
-        changed = by_force[sources] @ forces[:, own, :, own].swapaxes(0, 1) + by_loss
+        by_force = by_force.reshape(m, t, *by_force.shape[1:])
+        changed = by_force @ forces[:, own, :, own].swapaxes(0, 1) + by_loss
         found = at_nodes[:, 1 + draws.node].swapaxes(1, 2)
         found = found + changed.swapaxes(1, 2).reshape(m, k * p, d)
+        error = np.sqrt((error_power[rows] * power_of(weights)).sum(axis=1))
         found.reshape(m, k, p, d)[:] += (error[:, None, None] * draws.errors)[:, :, None]
         every = np.concatenate([at_nodes[:, 0, :, None], found], axis=2)
-        powers = power_of(every) / (threshold**2)[:, None, None]
-        return Sensed(*over_fingertips(powers, weights), powers if with_powers else None)
+        powers = power_of(every) / (threshold[rows] ** 2)[:, None, None]
+        return Sensed(*over_fingertips(powers, shares), powers if with_powers else None)
 
     def _fingers(
         self, rows: IntArray, nodes: IntArray
@@ -266,6 +275,30 @@ class TouchedPlate:
         resting = np.asarray(P @ at)
         held = self.stiffness[rows, :, None] * resting
         return np.asarray(free - held.swapaxes(1, 2) @ G), resting
+
+
+def drawn_on(
+    on: PlateOnEras, finger_count: int, by: Drawing
+) -> tuple[Draws, int, tuple[int, int], int]:
+    """Drawn plates; how many thicknesses they have; for changes how many, and the first's index.
+
+    And that of the first of the plates' own. One, that as modelled, where it is certain.
+    """
+    plate = on.plate
+    first = on.first.get(by.thicknesses, MODELLED)
+    nodes = by.thicknesses if first else 1
+    draws = draw(
+        plate.era_count,
+        finger_count,
+        masses=plate.stiffness.shape[1] - plate.era_count,
+        count=by.count,
+        seed=by.seed,
+        gain=plate.gain,
+        phase=plate.phase,
+        thicknesses=nodes,
+    )
+    first_base = on.first.get(by.bases, MODELLED)
+    return draws, nodes, (by.bases if first_base else 1, first_base), first
 
 
 def product(points: Float32Array, modal: Complex64Array) -> Complex64Array:

@@ -10,32 +10,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from model.arguments import expect_at_least
-from model.arrays import Float32Array, FloatArray, IntArray
+from model.arrays import FloatArray, IntArray
 from model.choice import best_by, best_of
-from model.drive_modes import UNRESTRICTED
 from model.drive_modes.forms import Weights
 from model.drive_modes.tones import excitation_of
-from model.ensemble.touched_by_kernel import touch
 from model.errors import InputError
 from model.finger.perception import decibels
-from model.table.combinations import Stream
-from model.table.contents import (
-    Chosen,
-    choose_contents,
-    contrasts,
-    felt_amplitudes,
-    loudest_power,
-    own_amplitudes,
-    promise,
-    tones_chosen,
-)
-from model.table.fingers_on_plate import FingersOnPlate
-from model.table.pattern_choice import PROMISED_PERCENTILE, UnreachableLevel
-from model.table.question import Question
+from model.table.contents import Contents, Stream
+from model.table.contents_kernel import choose_tones
 from model.table.request import (
     APART_HZ,
     MIN_CONTRAST_DB,
@@ -48,7 +35,6 @@ from model.table.request import (
     check_requests,
 )
 from model.table.table import LocalizationTable
-from model.vibration.excitation import base_amplitudes
 
 
 def answer(
@@ -141,10 +127,6 @@ class _Answering:
             plan.applied + below + found.applied,
         )
 
-    @cached_property
-    def _every(self) -> tuple[Request | Finger, ...]:
-        return (*self.requests, *self.fingers)
-
     def _with_less(self, plan: _Plan, found: _Measured) -> _Plan:
         """The plan after the next step of the rule."""
         requests, contents = self.requests, plan.contents
@@ -184,22 +166,9 @@ class _Answering:
             (*plan.applied, f"content of {_at(requests[given_up[0]])} {verb}"),
         )
 
-    @cached_property
-    def _on_plate(self) -> FingersOnPlate:
-        """All fingers on the plate, at the frequencies of all bands."""
-        table, every = self.table, self._every
-        question = Question(
-            tuple(each.at for each in every), loads=tuple(each.load for each in every)
-        )
-        tips = table.read_fingertips(question.contacts)
-        return FingersOnPlate.of(
-            touch(table.on_eras, tips.few[:, 0], question.loads),
-            tips,
-            question,
-            self._rows,
-            threshold=table.thresholds,
-            error_power=table.error_power,
-        )
+    @property
+    def _every(self) -> list[Request | Finger]:
+        return [*self.requests, *self.fingers]
 
     @cached_property
     def _rows(self) -> IntArray:
@@ -218,110 +187,81 @@ class _Answering:
             )
         return rows
 
-    def _streams(self, plan: _Plan) -> list[Stream]:
-        bands = [np.searchsorted(self._rows, self._band(each)) for each in self.requests]
-        return [
-            Stream(
-                each,
-                max(self.requests[finger].level_db_sl for finger in each),
-                tuple(bands) if self.bands_may_swap else (bands[each[0]],),
+    def _contents(self, plan: _Plan) -> Contents:
+        """A plan for a kernel."""
+        table, every = self.table, self._every
+        bands = []
+        for each in self.requests:
+            rows = np.searchsorted(self._rows, self._band(each)).tolist()
+            bands.append((rows[0], rows[-1] + 1))
+        streams = []
+        for fingers in plan.contents:
+            requests = [self.requests[finger] for finger in fingers]
+            own = tuple(bands) if self.bands_may_swap else (bands[fingers[0]],)
+            level, priority = (
+                max(getattr(e, key) for e in requests) for key in ("level_db_sl", "priority")
             )
-            for each in plan.contents
-        ]
+            streams.append(Stream(fingers, level, own, priority))
+        first = streams[0]
+        is_plain = len(streams) == len(first.targets) == len(first.bands) == 1
+        others = [finger for stream in streams[1:] for finger in stream.targets]
+        rest = (
+            None if plan.quiet or others else [self.requests[finger].at for finger in first.targets]
+        )
+        return Contents(
+            table.read_fingertips([each.at for each in every]),
+            tuple(each.load for each in every),
+            tuple(streams),
+            plan.quiet,
+            self._rows,
+            self.apart_hz,
+            background=None if rest is None else table.background(rest),
+            is_ranked=is_plain and bool(plan.quiet),
+        )
 
     def _measure(self, plan: _Plan) -> _Measured:
         """What fingers feel of a plan's contents."""
-        streams = self._streams(plan)
-        frequencies, weights = self.table.frequencies, self._on_plate.tips.fine_weights
-        chosen = self._choose(streams, plan.quiet)
-        gains, factor = self._gains(streams, chosen)
-        power = chosen.power * np.square(gains, dtype=np.float32)[:, None, None, None]
-        ratios = contrasts(power, weights, chosen.rows, streams, plan.quiet)
-        layers = {}
-        for number, stream in enumerate(streams):
-            drive = Weights.at(int(self._rows[chosen.rows[number]]), chosen.weights[number])
-            excitation = excitation_of(
-                drive, self.table.eras, frequencies, gain=float(gains[number])
+        table, contents = self.table, self._contents(plan)
+        found = choose_tones(table, contents)
+        if found is None:
+            raise AssertionError("contents must have tones")
+        with np.errstate(divide="ignore"):
+            contrast, level, foreign_amplitudes = (
+                _known(decibels(each))
+                for each in (found.contrast, found.level, found.foreign_amplitudes)
             )
-            others = np.arange(len(streams)) != number
+        layers = {}
+        for number, stream in enumerate(contents.streams):
+            drive = Weights.at(int(found.rows[number]), found.weights[number])
+            excitation = excitation_of(
+                drive, table.eras, table.frequencies, gain=float(found.gains[number])
+            )
             for finger in stream.targets:
-                felt = _as_decibels(ratios[finger]) if finger in ratios else (None, None, None)
-                level = _as_decibels(
-                    felt_amplitudes(power, weights, chosen.rows, number, (finger,))
-                )
-                heard = loudest_power(power[others], chosen.rows[others], finger)
+                nominal, median, promised = contrast[finger]
                 is_shared = finger != stream.targets[0]
                 layers[finger] = Layer(
                     self.requests[finger],
                     excitation,
-                    "shared" if is_shared else _verdict(felt[2]),
-                    level_db_sl=level[0],
-                    promised_level_db_sl=level[2],
-                    felt_contrast_db=felt[0],
-                    median_felt_contrast_db=felt[1],
-                    promised_contrast_db=felt[2],
-                    foreign_level_db_sl=_highest(heard) if others.any() else None,
+                    "shared" if is_shared else _verdict(promised),
+                    level_db_sl=level[finger][0],
+                    promised_level_db_sl=level[finger][1],
+                    felt_contrast_db=nominal,
+                    median_felt_contrast_db=median,
+                    promised_contrast_db=promised,
+                    foreign_level_db_sl=foreign_amplitudes[finger],
                 )
-        quiet = {}
-        for finger in plan.quiet:
-            nominal, _, promised = _as_decibels(ratios[finger])
-            highest = _highest(loudest_power(power, chosen.rows, finger))
-            quiet[finger] = QuietFinger(self._every[finger].at, nominal, promised, highest)
-        worst = _as_decibels(np.minimum.reduce([*ratios.values()]))[2] if ratios else None
-        applied = () if chosen.is_apart else (f"frequencies are nearer than {self.apart_hz:g} Hz",)
-        return _Measured(layers, quiet, worst, factor, applied)
-
-    def _gains(self, streams: Sequence[Stream], chosen: Chosen) -> tuple[FloatArray, float]:
-        """Gains (K,) to the levels at nine of ten plates, and the least factor within the stroke.
-
-        The contents of each priority take one factor of what is left by the higher ones.
-        """
-        weights, gains = self._on_plate.tips.fine_weights, []
-        for stream, power in zip(streams, chosen.power, strict=True):
-            own = promise(own_amplitudes(power, weights, stream.targets))
-            gains.append(10 ** (stream.level_db_sl / 20) / max(own, 1e-30))
-        amplitudes = np.array(gains)[:, None] * np.abs(chosen.weights)
-        priorities = [
-            max(self.requests[finger].priority for finger in stream.targets) for stream in streams
-        ]
-        factors, left = np.zeros(len(streams)), np.ones(amplitudes.shape[1])
-        for priority in sorted({*priorities}, reverse=True):
-            of = np.array(priorities) == priority
-            full = np.maximum(amplitudes[of].sum(axis=0), 1e-30)
-            factors[of] = min(1.0, float((left / full).min()))
-            left = np.maximum(left - factors[of] @ amplitudes[of], 0.0)
-        return np.array(gains) * factors, float(factors.min())
-
-    def _choose(self, streams: Sequence[Stream], quiet: Sequence[int]) -> Chosen:
-        """The tones of all contents; of one for one finger as `LocalizationTable.query`."""
-        table, (first, *others) = self.table, streams
-        is_plain = len(first.targets) == len(first.rows) == 1
-        if others or (quiet and not is_plain):  # alone it is weighed against the rest of the plate
-            return choose_contents(
-                self._on_plate,
-                streams,
-                quiet,
-                table.frequencies[self._rows],
-                apart_hz=self.apart_hz,
+        quiet = {
+            finger: QuietFinger(
+                self._every[finger].at,
+                contrast[finger][0],
+                contrast[finger][2],
+                foreign_amplitudes[finger],
             )
-        every = [self._every[finger] for finger in (*first.targets, *quiet)]
-        count = len(first.targets)
-        question = Question(
-            tuple(each.at for each in every[:count]),
-            tuple(each.at for each in every[count:]),
-            level_db_sl=first.level_db_sl,
-            drive_mode=UNRESTRICTED,
-            frequencies=self.requests[first.targets[0]].band_hz,
-            loads=tuple(each.load for each in every),
-        )
-        try:
-            pattern = table.query(question)
-        except UnreachableLevel as error:
-            pattern = table.query(replace(question, level_db_sl=error.reachable_db_sl))
-        frequencies, bases = base_amplitudes(pattern.excitation, table.eras)
-        rows = np.searchsorted(table.frequencies[self._rows], frequencies)
-        weights = (bases / [era.stroke for era in table.eras]).astype(np.complex64)
-        return tones_chosen(self._on_plate, rows, weights)
+            for finger in plan.quiet
+        }
+        worst = None if math.isnan(found.worst) else float(decibels(found.worst))
+        applied = () if found.is_apart else (f"frequencies are nearer than {self.apart_hz:g} Hz",)
+        return _Measured(layers, quiet, worst, found.stroke_factor, applied)
 
 
 def _worst_of(tried: tuple[_Plan, _Measured]) -> float:
@@ -333,16 +273,9 @@ def _at(request: Request) -> str:
     return f"({request.at[0]:g}, {request.at[1]:g}) m"
 
 
-def _as_decibels(ratio: Float32Array) -> tuple[float, float, float]:
-    """Of ratios (1 + d,): as modelled, of half of the drawn plates, of nine of ten."""
-    half, promised = promise(ratio, 50), promise(ratio)
-    nominal, half, promised = decibels(np.array([ratio[0], half, promised])).tolist()
-    return nominal, half, promised
-
-
-def _highest(power: Float32Array) -> float:
-    """Level [dB] of powers (1 + d,) that nine of ten drawn plates do not exceed."""
-    return float(decibels(math.sqrt(promise(power, 100 - PROMISED_PERCENTILE))))
+def _known(values: FloatArray) -> list[Any]:
+    """Values as lists, None for those that are not known."""
+    return list(np.where(np.isnan(values), None, values).tolist())  # type: ignore[call-overload]
 
 
 def _verdict(contrast_db: float | None) -> str:

@@ -10,9 +10,8 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
 from model.drive_modes.forms import Forms, Weights
-from model.ensemble.draws import Drawing, draw
+from model.ensemble.draws import Drawing
 from model.ensemble.measures import Felt, Fingertips, felt, felt_at
-from model.ensemble.plate_on_eras import MODELLED
 from model.ensemble.touched_plate import LoadedContacts, Sensed, TouchedPlate, gram, outer
 from model.table.fingertip_shapes import FingertipShapes
 from model.table.pulse_gains import PulseResponses
@@ -34,10 +33,10 @@ class FingersOnPlate:
     """Fields, expected powers and drawn plates at fingers, some of which are targets, some quiet.
 
     touched: the table's plate with k fingers on it; rows (f,): of its frequencies; tips: of the
-    fingers; threshold (f,) [m/s²]; error_power (all, eras): mean square of the discretisation error
-    of each ERA's field, at all of the plate's frequencies; contacts: at the rows; targets, quiet:
-    indices of fingers; gains: factors on the fields of the targets that make all levels the same;
-    wanted: their amplitude to threshold.
+    fingers; threshold (all,) [m/s²], error_power (all, eras): mean square of the discretisation
+    error of each ERA's field, at all of the plate's frequencies; contacts: at the rows; targets,
+    quiet: indices of fingers; gains: factors on the fields of the targets that make all levels the
+    same; wanted: their amplitude to threshold.
     """
 
     touched: TouchedPlate
@@ -72,7 +71,7 @@ class FingersOnPlate:
             touched,
             rows,
             tips,
-            threshold.take(rows),
+            threshold,
             error_power,
             touched.forms(rows, tips.few, tips.few_weights, error_power, fine),
             fingers[:t],
@@ -110,7 +109,8 @@ class FingersOnPlate:
             if background is None
             else self._expected(background)[:, None]
         )
-        found = Forms(by_target, power, quiet, self.threshold, self.wanted)
+        threshold = self.threshold.take(self.rows)
+        found = Forms(by_target, power, quiet, threshold, self.wanted)
         is_deep = self.touched.on.plate.gain_variance < MAX_VARIANCE_FINE
         if background is not None or not is_deep or len(self.quiet) > MAX_FINGERS_BY_POINT:
             return found
@@ -198,7 +198,6 @@ class FingersOnPlate:
             self,
             self.rows.take(rows),
             np.array([weights for tones in each for _, weights in tones]),
-            self.threshold.take(rows),
             np.array([0, *ends[:-1]]),
         )
 
@@ -210,46 +209,17 @@ class FingersOnPlate:
         return expected
 
 
-def forms_to_rank(
-    touched: TouchedPlate,
-    tips: FingertipShapes,
-    question: Question,
-    rows: IntArray,
-    *,
-    threshold: Float32Array,
-    error_power: Float32Array,
-) -> Forms:
-    """Forms of one target and the mean over the quiet fingers, to rank frequencies by row (f,).
-
-    At the centres alone with many quiet fingers. threshold (all,) [m/s²]; else as
-    `FingersOnPlate.of`.
-    """
-    points, weights = tips.few, tips.few_weights
-    if len(question.quiet) > MAX_FINGERS_BY_POINT:
-        points, weights = touched.centres[:, None], np.ones_like(weights[:, :1])
-    shares = weights / np.float32(len(question.quiet))
-    shares[0] = 0.0  # the target, whose field alone counts
-    every = points.reshape(1, -1, points.shape[2])
-    contacts = touched.forms(rows, every, shares.reshape(1, -1), error_power)
-    at_target = contacts.fields[:, 0, : points.shape[1]]
-    mean = (weights[:1] @ at_target)[:, 0] * np.float32(question.gains[0])
-    wanted = 10 ** (question.level_db_sl / 20)
-    power = contacts.power.swapaxes(0, 1)
-    return Forms(mean[None], power, contacts.power, threshold.take(rows), wanted, level_margin=0.0)
-
-
 @dataclass(frozen=True, eq=False)
 class DriveResponses:
     """Responses of the fingertips' points to m tones of c drives.
 
-    rows (m,): of the plate's frequencies; weights (m, n): of the ERAs; threshold (m,) [m/s²];
-    starts (c,): the first tone of each drive.
+    rows (m,): of the plate's frequencies; weights (m, n): of the ERAs; starts (c,): the first tone
+    of each drive.
     """
 
     fingers: FingersOnPlate
     rows: IntArray
     weights: Complex64Array
-    threshold: Float32Array
     starts: IntArray
 
     def of(self, drive: int) -> "DriveResponses":
@@ -260,59 +230,21 @@ class DriveResponses:
             self,
             rows=self.rows[tones],
             weights=self.weights[tones],
-            threshold=self.threshold[tones],
             starts=np.zeros(1, dtype=int),
         )
 
-    def drawn(self, by: Drawing, *, with_powers: bool = False) -> Sensed:
+    def drawn(self, by: Drawing) -> Sensed:
         """What is felt on the plate as modelled, and on drawn ones."""
-        touched, tips, m = self.fingers.touched, self.fingers.tips, len(self.rows)
-        on, plate = touched.on, touched.on.plate
-        points = tips.fine.reshape(-1, tips.fine.shape[2])
-        first = on.first.get(by.thicknesses, MODELLED)
-        nodes = np.array([MODELLED, *range(first, first + (by.thicknesses if first else 1))])
-        at_nodes = touched.fields(
-            self.rows.repeat(len(nodes)),
-            np.tile(nodes, m),
-            self.weights.repeat(len(nodes), axis=0),
-            points,
-        ).reshape(m, len(nodes), -1)
-        first_base = on.first.get(by.bases, MODELLED)
-        bases = by.bases if first_base else 1
-        rows, which = np.unique(self.rows, return_inverse=True)
-        by_force, moved = touched.sources(
-            rows.repeat(bases), np.tile(first_base + np.arange(bases), len(rows)), points
-        )
-        sources = which[:, None] * bases + np.arange(bases)
-        weights = self.weights.repeat(bases, axis=0)
-        changes = touched.changes(
-            self.rows.repeat(bases),
-            np.tile(first_base + np.arange(bases), m),
-            weights,
-            np.matvec(moved[sources.ravel()], weights),
-            points,
-        )
-        draws = draw(
-            plate.era_count,
-            len(tips.fine),
-            masses=plate.stiffness.shape[1] - plate.era_count,
-            count=by.count,
-            seed=by.seed,
-            gain=plate.gain,
-            phase=plate.phase,
-            thicknesses=len(nodes) - 1,
-        )
-        error = self.fingers.error_power.take(self.rows, axis=0) * np.abs(self.weights) ** 2
-        return touched.felt(
-            draws,
-            by_force,
-            sources,
-            changes,
-            at_nodes,
-            np.sqrt(np.add.reduce(error, axis=1)),
-            self.threshold,
+        touched, tips = self.fingers.touched, self.fingers.tips
+        return touched.drawn(
+            by,
+            self.rows,
+            self.weights,
+            tips.fine.reshape(-1, tips.fine.shape[2]),
             tips.fine_weights,
-            with_powers=with_powers or len(self.starts) < m,
+            self.fingers.error_power,
+            self.fingers.threshold,
+            with_powers=len(self.starts) < len(self.rows),
         )
 
     def felt(self, sensed: Sensed) -> Felt:
@@ -320,5 +252,6 @@ class DriveResponses:
         weights, gains = self.fingers.tips.fine_weights, self.fingers.gains
         if sensed.powers is None:
             return felt_at(sensed.means, sensed.loudest, gains)
-        power = sensed.powers * (self.threshold**2)[:, None, None]
-        return felt(power, self.threshold, self.starts, Fingertips(weights, gains))
+        threshold = self.fingers.threshold.take(self.rows)
+        power = sensed.powers * (threshold**2)[:, None, None]
+        return felt(power, threshold, self.starts, Fingertips(weights, gains))

@@ -21,11 +21,19 @@ from model.drive_modes.exact_search import search_exactly, sensation_found
 from model.drive_modes.forms import Forms, Weights
 from model.drive_modes.phased import PHASED
 from model.drive_modes.tones import excitation_of
-from model.ensemble.draws import Drawing
 from model.ensemble.measures import Felt, percentile, percentile_of_sorted
 from model.errors import InputError
 from model.finger.perception import decibels
 from model.structure.attachments import Era
+from model.table.contents import (
+    JUDGING_DRAWS,
+    ONSET_MARGIN_DB,
+    ONSET_WEIGHT,
+    PROMISED_DRAWS,
+    PROMISED_PERCENTILE,
+    REACHED,
+    Tones,
+)
 from model.table.fingers_on_plate import (
     CENTRE_AND_FOUR,
     MAX_FINGERS_BY_POINT,
@@ -37,28 +45,11 @@ from model.table.pulse_gains import OverEffect, contrast_over_effect
 from model.table.question import Question
 from model.transients.onset import RampedRinging
 
-JUDGING_DRAWS = Drawing(count=64, seed=1, thicknesses=5)
-PROMISED_DRAWS = Drawing(count=200, seed=8, thicknesses=40, bases=5)
-"""Drawn plates that judge candidates, and those of the promise."""
-
 MAX_DURING_EFFECT = 3
 """Drives that are rated by what is felt over a short effect, and as many at their frequencies."""
 
-PROMISED_PERCENTILE = 9
-"""Percentile of the draws that is promised.
-
-It is about the tenth of plates solved exactly: what is beyond the first order in other parameters
-than the thickness costs some tenths of a decibel.
-"""
-
 _PERCENTS = (PROMISED_PERCENTILE, 50, 100 - PROMISED_PERCENTILE)
 
-# Among drives of nearly the same robust contrast the onset decides, too: a decibel of contrast
-# counts as much as three in the first 100 ms (docs/decisions, on ramps).
-ONSET_WEIGHT = 1 / 3
-ONSET_MARGIN_DB = 0.3
-
-_ROUNDING = 1 - 1e-5
 _NEARLY = 10 ** (-1 / 20)  # within a decibel
 
 OnsetContrast: TypeAlias = Callable[[IntArray, Complex64Array], FloatArray | None]
@@ -125,10 +116,34 @@ def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) 
     raise _level_error(question, drive_mode, max_sensation(forms, drive_mode))
 
 
-def choose_reaching(question: Question, drive_mode: str, candidates: Candidates) -> Pattern | None:
-    """Choose the best pattern that reaches the level at nine of ten plates, None without one."""
-    found = _search(question, drive_mode, candidates, _forms(question, candidates))
-    return _best(question, drive_mode, candidates, found) if found else None
+def pattern_of(
+    question: Question,
+    tones: Tones,
+    *,
+    eras: Sequence[Era],
+    frequencies: FloatArray,
+    threshold: str,
+) -> Pattern:
+    """The pattern of one target's tone, turned down to the wanted level at nine of ten plates."""
+    gain = float(tones.gains[0])
+    amplitudes = [*tones.level[0] / gain, tones.loudest / gain, *tones.contrast[0]]
+    nominal, robust, loudest, contrast, median, promised = decibels(np.array(amplitudes)).tolist()
+    gain_db = min(0.0, question.level_db_sl - robust)
+    drive = Weights.at(int(tones.rows[0]), tones.weights[0])
+    return Pattern(
+        excitation=excitation_of(drive, eras, frequencies, gain=10 ** (gain_db / 20)),
+        ramp=ONSET_RAMP,
+        level_db_sl=gain_db + nominal,
+        robust_level_db_sl=gain_db + robust,
+        drive_mode=UNRESTRICTED,
+        threshold=threshold,
+        contrast_db=contrast,
+        quiet_level_db_sl=gain_db + nominal - contrast,
+        robust_quiet_level_db_sl=gain_db + loudest,
+        robust_contrast_db=promised,
+        robust_felt_contrast_db=promised,
+        median_felt_contrast_db=median,
+    )
 
 
 def _forms(question: Question, candidates: Candidates) -> Forms:
@@ -196,7 +211,7 @@ def _by_point(
     if len(at) == 0:
         return []
     by_point = candidates.fingers.by_point(forms.at(at), candidates.playable[at])
-    found = _drives_of(PHASED.search(by_point, 0.0), at)
+    found = _drives_of(PHASED.search(by_point), at)
     return [found[each] for each in best_first([score for score, _ in found])[:ALTERNATIVES]]
 
 
@@ -276,7 +291,7 @@ def _judged(
     if candidates.over_effect is not None:
         return _judged_over_effect(question, drives, scores, judged, candidates.over_effect)
     least = percentile(judged.level[:, 1:])
-    reaches = least >= 10 ** (question.level_db_sl / 20) * _ROUNDING
+    reaches = least >= 10 ** (question.level_db_sl / 20) * REACHED
     if not reaches.any():
         reaches[:] = True
     if judged.contrast is None:
@@ -313,7 +328,7 @@ def _judged_over_effect(
     gains = [responses.gains(drive) for drive in drives]
     lag = 10 ** (np.array([min(each.targets) for each in gains]) / 20)
     level = judged.level[:, 0] * lag
-    near = min(10 ** (question.level_db_sl / 20) * _ROUNDING, level.max() * _NEARLY)
+    near = min(10 ** (question.level_db_sl / 20) * REACHED, level.max() * _NEARLY)
     if judged.contrast is None:
         return best_of((level >= near) * scores * lag)
     quiet = 10 ** (np.array([each.quiet_db_sl for each in gains]) / 20)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
-from model.drive_modes import UNRESTRICTED, preselection
+from model.drive_modes import UNRESTRICTED
 from model.drive_modes.exact_search import pattern_count
 from model.drive_modes.forms import Forms
 from model.drive_modes.sources import (
@@ -35,17 +35,12 @@ from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loads
 from model.structure.dispersion import Dispersion
 from model.structure.plate import Plate
-from model.table.fingers_on_plate import FingersOnPlate, forms_to_rank
+from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS, Contents
+from model.table.contents_kernel import choose_tones
+from model.table.fingers_on_plate import FingersOnPlate
 from model.table.fingertip_shapes import FingertipReader, FingertipShapes
 from model.table.pattern import ONSET_RAMP, Pattern
-from model.table.pattern_choice import (
-    JUDGING_DRAWS,
-    PROMISED_DRAWS,
-    Candidates,
-    OnsetContrast,
-    choose_pattern,
-    choose_reaching,
-)
+from model.table.pattern_choice import Candidates, OnsetContrast, choose_pattern, pattern_of
 from model.table.pulse_gains import OverEffect
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
 from model.table.raster import Raster
@@ -156,7 +151,7 @@ class LocalizationTable:
             )
         tips = self.read_fingertips(question.contacts)
         if drive_mode == UNRESTRICTED and over_effect is None:
-            found = self._pattern_of_part(question, drive_mode, tips, playable)
+            found = self._tone(question, tips, playable)
             if found is not None:
                 return found
         candidates = Candidates(
@@ -164,7 +159,7 @@ class LocalizationTable:
             frequencies=self.frequencies,
             playable=playable,
             fingers=self._fingers(question, tips),
-            background=None if question.quiet else self._background(question),
+            background=None if question.quiet else self.background(question.targets),
             threshold=self.thresholds,
             threshold_name=self.threshold,
             onset_contrast=self._onset_contrast(question, tips),
@@ -194,7 +189,7 @@ class LocalizationTable:
 
     def forms(self, question: Question) -> Forms:
         """Expected powers at the fingertips of a question, at all frequencies of the table."""
-        background = None if question.quiet else self._background(question)
+        background = None if question.quiet else self.background(question.targets)
         tips = self.read_fingertips(question.contacts)
         return self._fingers(question, tips).forms(background)
 
@@ -384,9 +379,9 @@ class LocalizationTable:
         centres = self.shapes_at(contacts).astype(np.float32)
         return touch(self.on_eras, centres, tuple(loads)).coordinates()
 
-    def _background(self, question: Question) -> Complex64Array:
-        """Mean power of the plate beyond the targets, without fingers on it, (f, eras, eras)."""
-        rest = self._cell_fields[:, :, is_background(self.cell_centres, question.targets)]
+    def background(self, targets: Sequence[Point]) -> Complex64Array:
+        """Mean power of the plate beyond targets, without fingers on it, (f, eras, eras)."""
+        rest = self._cell_fields[:, :, is_background(self.cell_centres, targets)]
         return np.asarray(rest.conj() @ rest.swapaxes(1, 2) / np.float32(rest.shape[2]))
 
     def _fingers(self, question: Question, tips: FingertipShapes) -> FingersOnPlate:
@@ -400,44 +395,29 @@ class LocalizationTable:
             error_power=self.error_power,
         )
 
-    def _pattern_of_part(
-        self, question: Question, drive_mode: str, tips: FingertipShapes, playable: IntArray
+    def _tone(
+        self, question: Question, tips: FingertipShapes, playable: IntArray
     ) -> Pattern | None:
-        """The best pattern at the frequencies most worth a search, None where those do not do."""
+        """The best pattern of one tone for one target, None where that hardly reaches the level."""
         if len(question.targets) > 1 or not question.quiet:
             return None
-        touched = touch(self.on_eras, tips.few[:, 0], question.loads)
-        sizes = {"threshold": self.thresholds, "error_power": self.error_power}
-        kept = preselection.preselect(forms_to_rank(touched, tips, question, playable, **sizes))
-        if len(kept) in (0, len(playable)):
+        found = choose_tones(self, Contents.of(question, tips, playable))
+        if found is None:
             return None
-        rows = playable.take(kept)
-        part = Candidates(
+        return pattern_of(
+            question,
+            found,
             eras=self.eras,
-            frequencies=self.frequencies.take(rows),
-            playable=np.arange(len(rows)),
-            fingers=FingersOnPlate.of(touched, tips, question, rows, **sizes),
-            background=None,
-            threshold=self.thresholds.take(rows),
-            threshold_name=self.threshold,
-            onset_contrast=self._onset_contrast(question, tips, rows),
-            over_effect=None,
-            ringing=None,
+            frequencies=self.frequencies,
+            threshold=self.threshold,
         )
-        return choose_reaching(question, drive_mode, part)
 
-    def _onset_contrast(
-        self, question: Question, tips: FingertipShapes, among: IntArray | None = None
-    ) -> OnsetContrast:
-        """Contrast of plain ramps at the fingertips, by row of the table's frequencies.
-
-        among (n,): rows of them that are counted, None for all.
-        """
+    def _onset_contrast(self, question: Question, tips: FingertipShapes) -> OnsetContrast:
+        """Contrast of plain ramps at the fingertips, by row of the table's frequencies."""
 
         def contrast(rows: IntArray, weights: Complex64Array) -> FloatArray | None:
             if self.onsets is None:
                 return None
-            rows = rows if among is None else among.take(rows)
             discs, count = tips.fine, len(question.targets)
             # An onset's target counts by the plain mean over its points.
             scales = discs.shape[1] * tips.fine_weights[:count] * np.array(question.gains)[:, None]

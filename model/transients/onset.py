@@ -41,7 +41,7 @@ class RampedOnsets:
         self._eras = len(plate.eras)
         batches = np.split(2 * np.pi * frequencies, range(BATCH, len(frequencies), BATCH))
         parts = [ramp_responses(plate, omega, times, ramp)[0] for omega in batches]
-        self._parts = np.concatenate(parts, dtype=np.complex64, casting="same_kind")
+        self.parts = np.concatenate(parts, dtype=np.complex64, casting="same_kind")
 
     def contrast(
         self,
@@ -56,7 +56,7 @@ class RampedOnsets:
         targets, quiet: shapes (p, r) of the reduced plate at their points.
         """
         n = len(frequencies)
-        parts = self._parts.take(frequencies, axis=0).reshape(n, self._eras, -1)
+        parts = self.parts.take(frequencies, axis=0).reshape(n, self._eras, -1)
         responses = (weights[:, None, :] @ parts).reshape(n * TIME_COUNT, -1)
         rows = np.concatenate([responses.real, responses.imag])
         real, imaginary = (rows @ np.concatenate([*targets, quiet]).T).reshape(2, n, TIME_COUNT, -1)

@@ -51,7 +51,7 @@ def found_alone(mode, given):
     """The drive that a mode finds by itself, without what its restricted modes have found."""
     if mode == "switched":
         return switched_mode.find_switched(given, 0.0)[0][1]
-    search = PHASED.search(given, 0.0)
+    search = PHASED.search(given)
     best = int(search.score.argmax())
     return Weights.at(best, search.weights[best])
 

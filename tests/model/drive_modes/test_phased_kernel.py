@@ -24,9 +24,9 @@ def test_both_ways_find_the_same(
     if margin:
         doubtful = given.target_power * np.float32(1.1)
         given = replace(given, target_power=doubtful, level_margin=margin)
-    by_kernel = PHASED.search(given, 0.0), PHASED.search_all(given)
+    by_kernel = PHASED.search(given), PHASED.search_all(given)
     without_kernels()
-    by_numpy = PHASED.search(given, 0.0), PHASED.search_all(given)
+    by_numpy = PHASED.search(given), PHASED.search_all(given)
     for one, other in zip(by_kernel, by_numpy, strict=True):
         best = int(other.score.argmax())
         assert one.score[best] == pytest.approx(other.score[best], rel=1e-4)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from model.ensemble.attached_plate import attach
-from model.ensemble.draws import draw
+from model.ensemble.draws import Drawing
 from model.ensemble.plate_on_eras import MODELLED, PlateOnEras, thickness_nodes
 from model.ensemble.touched_by_kernel import touch
 from model.ensemble.touched_plate import TouchedPlate
@@ -135,7 +135,6 @@ def test_fields_are_those_of_the_direct_solve(loads):
     assert error.max() < 2e-4
 
 
-NO_ERROR = np.zeros(4, np.float32)
 WEIGHTS = np.array([0.6, -0.3 + 0.5j, 1.0, 0.2j], dtype=np.complex64)
 
 CHANGES = {
@@ -207,20 +206,18 @@ def test_responses_add_up_from_the_parts_of_each_era():
 
 def felt_of(touched, points, weights, **drawn):
     """What drawn plates feel of a tone of weights (4, n) at each frequency, at all points."""
-    at, nodes, first = np.arange(4), np.full(4, MODELLED), touched.on.first[drawn["thicknesses"]]
-    by_force, moved = touched.sources(at, nodes, points)
-    of_nodes = [MODELLED, *range(first, first + drawn["thicknesses"])]
-    at_nodes = [touched.fields(at, np.full(4, node), weights, points) for node in of_nodes]
-    plate, count = touched.on.plate, len(touched.centres)
-    return touched.felt(
-        draw(4, count, masses=1, gain=plate.gain, phase=plate.phase, **drawn),
-        by_force,
-        at[:, None],
-        touched.changes(at, nodes, weights, np.einsum("fan,fn->fa", moved, weights), points),
-        np.stack(at_nodes, axis=1),
-        np.array([0.0, 0.02, 0.1, 0.0], dtype=np.float32) if drawn["count"] < 100 else NO_ERROR,
-        np.ones(4, dtype=np.float32),
+    count = len(touched.centres)
+    error = np.zeros((4, 4), np.float32)
+    if drawn["count"] < 100:
+        error[1:3] = [[1e-4], [1e-2]]
+    return touched.drawn(
+        Drawing(**drawn),
+        np.arange(4),
+        weights,
+        points,
         np.tile(FIVE_POINTS.weights, (count, 1)).astype(np.float32),
+        error,
+        np.ones(4, dtype=np.float32),
         with_powers=True,
     )
 
@@ -264,10 +261,11 @@ def test_every_stage_is_that_of_numpy(count):
         for each in (touched, by_numpy)
     ]
     felt = [
-        felt_of(each, points, weights, count=45, seed=1, thicknesses=5)
+        felt_of(each, points, weights, count=45, seed=1, thicknesses=5, bases=bases)
         for each in (touched, by_numpy)
+        for bases in (1, 5)
     ]
-    for one, other in (forms, together, felt):
+    for one, other in (forms, together, felt[::2], felt[1::2]):
         for name, exact in vars(other).items():
             np.testing.assert_allclose(
                 getattr(one, name), exact, rtol=1e-4, atol=1e-4 * float(np.abs(exact).max())

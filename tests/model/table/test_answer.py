@@ -10,8 +10,7 @@ from model.cli import app
 from model.errors import InputError
 from model.finger.perception import detection_threshold
 from model.table.answer import answer
-from model.table.combinations import Stream, worst_ratios
-from model.table.contents import felt_amplitudes, loudest_power
+from model.table.contents_numpy import felt_amplitudes, loudest_power
 from model.table.exact_plates import Plates, draw_plates, powers_on
 from model.table.file import save_table
 from model.table.query import answer_as_json
@@ -353,21 +352,3 @@ def test_a_batch_holds_lines_with_contents(table_file, tmp_path):
 def test_the_command_refuses_what_it_cannot_answer(table_file, options):
     """A band that is none, and options of the other form."""
     assert isinstance(run(table_file, *options.split()).exception, InputError)
-
-
-@pytest.mark.usefixtures("kernels_or_numpy")
-def test_worst_finger_of_combinations_is_counted_plate_by_plate() -> None:
-    """By hand: two contents, a quiet finger and one that counts for nothing, on eleven plates.
-
-    The percentile of eleven plates is the second smallest; the first of the contents alone counts
-    at the quiet finger only.
-    """
-    own = np.array([[2.0] * 11, [3.0] * 11], dtype=np.float32)
-    loudest = np.ones((2, 4, 11), dtype=np.float32)
-    loudest[1, 0] = np.arange(1, 12)  # of the second content at the first one's finger
-    loudest[:, 3] = 1e6
-    streams = [Stream((0,), 20.0, ()), Stream((1,), 20.0, ())]
-    both = worst_ratios(np.array([[0, 1]]), streams, [2], own, loudest)
-    assert both == pytest.approx([4 / 10])
-    alone = worst_ratios(np.array([[0], [1]]), streams, [2], own, loudest)
-    assert alone == pytest.approx([4.0, 9.0])

@@ -1,4 +1,8 @@
-/* Expected powers at groups of points: `model.ensemble.contact_forms` in C, whose symbols are used. */
+/* Expected powers at groups of points: `model.ensemble.touched_plate.TouchedPlate.forms` in C. */
+#ifndef FORMS_H
+#define FORMS_H
+
+#include "arena.h"
 #include "fingers.h"
 
 typedef struct {
@@ -7,16 +11,17 @@ typedef struct {
     float gain_variance, ridge;
     const float *points, *fine_points, *weights; /* (groups p, r); (fine, r); (groups p) */
     const float *error;        /* (f, n) */
-    /* Found: (rows, groups p, n) h; (rows, fine, n); (rows, groups, n, n) R, and without what is as modelled */
-    float *fields, *fine_fields, *power, *uncertain;
-} forms;
+} grouped;
 
-/* Values of work space. */
-size_t contact_forms_space(const plates *on, const forms *of) {
-    size_t n = on->n, b = on->b, k = on->k, a = b + k, groups = of->groups, at = groups * of->p;
-    size_t points = (size_t)of->fine > at ? (size_t)of->fine : at;
-    return touched_space(on) + points * a + at * a + 4 * at * n + of->fine * n + a * n + b * n +
-           4 * n + 2 * n * n + k * n + (4 * of->p + n + k) * n + (2 * groups + 1) * n * n + n;
+/* At LANES frequencies: (groups p, n) h; (fine, n); (groups, n, n) R, and without what is as modelled. */
+typedef struct {
+    value *fields, *fine, *power, *uncertain;
+} formed;
+
+SHARED formed new_forms(const plates *on, const grouped *of, arena *memory) {
+    const size_t n = on->n, groups = of->groups;
+    return (formed){values(memory, groups * of->p * n), values(memory, of->fine * n), values(memory, groups * n * n),
+                    values(memory, groups * n * n)};
 }
 
 /* Times the force of each ERA, of accelerations (p, n) by forces. */
@@ -25,26 +30,25 @@ INLINE void drive(value *h, const value *drives, size_t p, size_t n) {
         for (size_t e = 0; e < n; e++) h[i * n + e] = times(h[i * n + e], drives[e]);
 }
 
-/* At frequencies (count) from first on. */
-void contact_forms(const plates *on, const forms *of, int first, int count, const int *frequencies,
-                   value *work) {
+/* At frequencies (LANES). */
+SHARED void find_forms(formed *to, const plates *on, const grouped *of, const int *rows, arena *memory) {
     const size_t n = on->n, b = on->b, k = on->k, a = b + k, j = n + k;
     const size_t p = of->p, groups = of->groups, at = groups * p;
     const int parts = of->others ? 4 : 2;
-    int rows[LANES], cases[LANES];
-    for (int l = 0; l < LANES; l++) {
-        rows[l] = frequencies[first + (l < count ? l : count - 1)];
-        cases[l] = rows[l] * on->t;
-    }
+    const arena mark = *memory;
+    int cases[LANES];
+    for (int l = 0; l < LANES; l++) cases[l] = rows[l] * on->t;
     touched now;
     const size_t points = (size_t)of->fine > at ? (size_t)of->fine : at;
-    value *room = put_fingers(&now, on, rows, cases, work), *t = room + points * a;
-    value *h = t + at * a, *fine = h + 4 * at * n, *moved = fine + of->fine * n, *without = moved + a * n;
-    value *drives = without + b * n, *strokes = drives + n, *by_damping = strokes + n;
-    value *by_stiffness = by_damping + n, *damped = by_stiffness + n, *changes = damped + n * n;
-    value *X = changes + j * n, *R = X + (4 * p + j) * n, *U = R + groups * n * n;
-    value *modelled = U + groups * n * n;
-    lanes *error = (lanes *)(modelled + n * n);
+    value *space = values(memory, touched_space(on)), *room = values(memory, points * a);
+    value *t = values(memory, at * a), *h = values(memory, parts * at * n), *fine = to->fine;
+    value *moved = values(memory, a * n), *without = values(memory, b * n), *drives = values(memory, n);
+    value *strokes = values(memory, n), *by_damping = values(memory, n), *by_stiffness = values(memory, n);
+    value *damped = values(memory, n * n), *changes = values(memory, j * n);
+    value *X = values(memory, (parts * p + j) * n), *R = to->power, *U = to->uncertain;
+    value *modelled = values(memory, n * n);
+    lanes *error = take(memory, n * sizeof(lanes));
+    put_fingers(&now, on, rows, cases, space);
     load(drives, on->drives, n, rows);
     load(strokes, on->strokes, n, rows);
     load(by_damping, on->by_damping, n, rows);
@@ -59,9 +63,8 @@ void contact_forms(const plates *on, const forms *of, int first, int count, cons
     if (of->fine) {
         to_points(fine, n, of->fine_points, of->fine, &now, on, room);
         drive(fine, drives, of->fine, n);
-        store(of->fine_fields + 2 * (size_t)first * of->fine * n, fine, of->fine * n, count);
     }
-    store(of->fields + 2 * (size_t)first * at * n, h, at * n, count);
+    memcpy(to->fields, h, at * n * sizeof(value));
     with_fingers_moved(moved, without, &now, drives, on);
     for (size_t i = 0; i < n; i++) {
         for (size_t e = 0; e < n; e++) {
@@ -80,7 +83,7 @@ void contact_forms(const plates *on, const forms *of, int first, int count, cons
     /* Plates thicker and thinner, each counting half. */
     for (int part = 2; part < parts; part++) {
         for (int l = 0; l < LANES; l++) cases[l] = rows[l] * on->t + part - 1;
-        put_fingers(&now, on, rows, cases, work);
+        put_fingers(&now, on, rows, cases, space);
         value *other = h + part * at * n;
         to_points(other, n, of->points, at, &now, on, room);
         drive(other, drives, at, n);
@@ -132,6 +135,7 @@ void contact_forms(const plates *on, const forms *of, int first, int count, cons
             }
         for (size_t u = 0; u < n; u++) rest[u * n + u].im = ZERO.im;
     }
-    store(of->uncertain + 2 * (size_t)first * groups * n * n, U, groups * n * n, count);
-    store(of->power + 2 * (size_t)first * groups * n * n, R, groups * n * n, count);
+    release(memory, mark);
 }
+
+#endif

@@ -1,0 +1,276 @@
+/* From fingers to the tones of all their contents and what they promise: `model.table.contents` in C. */
+#include "candidates.h"
+#include "promise.h"
+
+/* What candidates do on the plates that judge: amplitude at their targets (count, draws), at a gain to the level if
+ * there are several contents, and power at the loudest point of each finger (count, k, draws). */
+SHARED void judge(float *own, float *loudest, const candidates *from, const plates *on, const rules *by,
+                  const question *of, const float *columns, arena *memory) {
+    const draws *draws = of->judging;
+    const size_t k = on->k, fine = of->fine, points = k * fine, n = on->n, count = draws->count;
+    enum { BATCH = 64 };
+    for (size_t first = 0; first < (size_t)from->count; first += BATCH) {
+        const arena mark = *memory;
+        const size_t some = from->count - first < BATCH ? from->count - first : BATCH;
+        const sensors at = {points, of->fine_points, of->fine_weights, by->error, by->threshold};
+        const tones drawn = respond(on, draws, &at, columns, some, from->rows + first, from->weights + 2 * n * first, memory);
+        lanes *sensed = take(memory, points * sizeof(lanes));
+        value *found = values(memory, points), *force = values(memory, on->b + k + 1);
+        for (size_t tone = 0; tone < some; tone++) {
+            const size_t each = first + tone, content = from->content[each];
+            for (size_t group = 1; group < group_count(draws); group++) {
+                size_t at_plate, plates = plates_of(draws, group, &at_plate);
+                sense(sensed, &drawn, tone, group, found, force);
+                lanes weakest = filled(INFINITY);
+                for (int t = of->starts[content]; t < of->starts[content + 1]; t++) {
+                    lanes mean = {0};
+                    for (size_t i = of->targets[t] * fine; i < (of->targets[t] + 1) * fine; i++)
+                        mean += of->fine_weights[i] * root(sensed[i]);
+                    weakest = smaller(weakest, mean);
+                }
+                memcpy(own + each * count + at_plate - 1, &weakest, plates * sizeof(float));
+                for (size_t finger = 0; finger < k; finger++) {
+                    lanes highest = {0};
+                    for (size_t i = finger * fine; i < (finger + 1) * fine; i++) highest = larger(highest, sensed[i]);
+                    memcpy(loudest + (each * k + finger) * count + at_plate - 1, &highest, plates * sizeof(float));
+                }
+            }
+        }
+        release(memory, mark);
+    }
+}
+
+/* Contrast of an onset along a plain ramp. */
+SHARED float onset_contrast(const plates *on, const rules *by, const question *of, const float *columns, int row,
+                            const float *weights, arena *memory) {
+    const size_t n = on->n, r = on->r, times = by->times, fine = of->fine, padded = padded_to(on->k * fine);
+    const arena mark = *memory;
+    float *moved = floats(memory, 2 * times * r), *found = floats(memory, 2 * times * padded);
+    memset(moved, 0, 2 * times * r * sizeof(float));
+    for (size_t e = 0; e < n; e++) {
+        const float *from = by->onsets + 2 * ((size_t)row * n + e) * times * r, re = weights[2 * e], im = weights[2 * e + 1];
+        for (size_t i = 0; i < times * r; i++) {
+            moved[2 * i] += re * from[2 * i] - im * from[2 * i + 1];
+            moved[2 * i + 1] += re * from[2 * i + 1] + im * from[2 * i];
+        }
+    }
+    at_points(found, moved, times, columns, padded, r);
+    float weakest = INFINITY, loudest = 0;
+    for (int each = 0; each < of->starts[1] + of->quiet_count; each++) {
+        const size_t finger = each < of->starts[1] ? of->targets[each] : of->quiet[each - of->starts[1]];
+        float mean = 0;
+        for (size_t i = finger * fine; i < (finger + 1) * fine; i++) {
+            float peak = 0;
+            for (size_t time = 0; time < times; time++) {
+                float a = found[2 * time * padded + i], b = found[(2 * time + 1) * padded + i];
+                peak = fmaxf(peak, a * a + b * b);
+            }
+            mean += of->fine_weights[i] * sqrtf(peak);
+            if (each >= of->starts[1]) loudest = fmaxf(loudest, sqrtf(peak));
+        }
+        if (each < of->starts[1]) weakest = fminf(weakest, mean);
+    }
+    release(memory, mark);
+    return weakest / loudest;
+}
+
+/* Index of the tone of an only content that drawn plates prefer: level first, then contrast, of nearly the same the
+ * onset; -1 where that is missing. */
+SHARED int best_tone(const candidates *from, const float *own, const float *loudest, const plates *on, const rules *by,
+                     const question *of, const float *columns, arena *memory) {
+    const int count = from->count, draws = of->judging->count;
+    const arena mark = *memory;
+    float *least = floats(memory, count), *robust = floats(memory, count), *some = floats(memory, draws);
+    char *reaches = take(memory, count);
+    int any = 0;
+    for (int i = 0; i < count; i++) {
+        memcpy(some, own + i * draws, draws * sizeof(float));
+        least[i] = percentile(some, draws, by->judged);
+        any |= reaches[i] = least[i] >= of->level[0] * by->reached;
+    }
+    for (int i = 0; i < count; i++) {
+        if (of->quiet_count) {
+            for (int d = 0; d < draws; d++) {
+                float power = 0;
+                for (int q = 0; q < of->quiet_count; q++)
+                    power = fmaxf(power, loudest[(i * on->k + of->quiet[q]) * draws + d]);
+                some[d] = own[i * draws + d] / fmaxf(sqrtf(power), LEAST);
+            }
+            robust[i] = percentile(some, draws, by->judged);
+        } else {
+            memcpy(some, own + i * draws, draws * sizeof(float));
+            robust[i] = from->scores[i] * least[i] / percentile(some, draws, 50);
+        }
+        if (any && !reaches[i]) robust[i] = 0;
+    }
+    int chosen_tone = best_of(robust, count), near = 0;
+    const float close = by->onset_margin * robust[chosen_tone];
+    for (int i = 0; i < count; i++) near += robust[i] >= close;
+    if (of->quiet_count && of->with_onset && near > 1) {
+        if (!by->onsets) return -1;
+        for (int i = 0; i < count; i++) {
+            if (robust[i] < close) robust[i] = 0;
+            else {
+                float onset = onset_contrast(on, by, of, columns, from->rows[i], from->weights + 2 * on->n * i, memory);
+                robust[i] *= powf(onset, by->onset_weight);
+            }
+        }
+        chosen_tone = best_of(robust, count);
+    }
+    release(memory, mark);
+    return chosen_tone;
+}
+
+/* worst (count): percentile of the least power ratio of combinations (count, contents) of the first contents. */
+SHARED void worst_ratios(float *worst, const int *combinations, int count, size_t contents, int step, const float *own,
+                         const float *loudest, const int *content_of, size_t fingers, const rules *by, const question *of,
+                         arena *memory) {
+    const size_t draws = of->judging->count;
+    const arena mark = *memory;
+    float *ratios = floats(memory, draws + LANES), *part = floats(memory, draws);
+    for (int each = 0; each < count; each++) {
+        const int *tone = combinations + (size_t)each * of->contents;
+        for (size_t from = 0; from < draws; from += LANES) {
+            lanes least = filled(INFINITY), weakest = filled(INFINITY);
+            for (size_t j = 0; j < contents; j++) {
+                lanes amplitude = some(own + tone[j] * draws + from);
+                weakest = smaller(weakest, amplitude * amplitude);
+            }
+            for (size_t finger = 0; finger < fingers; finger++) {
+                const int own_content = content_of[finger];
+                if (own_content < 0 || (own_content < (int)contents && contents == 1)) continue;
+                if (own_content >= (int)contents && own_content < of->contents) continue;
+                lanes others = {0}, level = weakest;
+                for (size_t j = 0; j < contents; j++)
+                    if ((int)j != own_content) others += some(loudest + (tone[j] * fingers + finger) * draws + from);
+                if (own_content < (int)contents) {
+                    level = some(own + tone[own_content] * draws + from);
+                    level *= level;
+                }
+                least = smaller(least, level / larger(others, filled(FAINT)));
+            }
+            memcpy(ratios + from, &least, sizeof least);
+        }
+        int kept = 0;
+        for (size_t d = 0; d < draws; d += step) part[kept++] = ratios[d];
+        worst[each] = percentile(part, kept, by->judged);
+    }
+    release(memory, mark);
+}
+
+/* A tone of each content, of all combinations that exchange bands and are apart, else of all that exchange bands. */
+SHARED int best_combination(int *chosen_tones, const candidates *from, const float *own, const float *loudest,
+                            const plates *on, const rules *by, const question *of, arena *memory) {
+    const int contents = of->contents, most = by->max_combinations;
+    const arena mark = *memory;
+    int *content_of = integers(memory, on->k), *kept = integers(memory, most * contents);
+    for (int i = 0; i < on->k; i++) content_of[i] = -1;
+    for (int i = 0; i < of->quiet_count; i++) content_of[of->quiet[i]] = contents;
+    for (int j = 0; j < contents; j++)
+        for (int t = of->starts[j]; t < of->starts[j + 1]; t++) content_of[of->targets[t]] = j;
+    int *tried = integers(memory, (size_t)(most > from->count ? most : from->count) * from->count * contents);
+    float *worst = floats(memory, (size_t)(most > from->count ? most : from->count) * from->count);
+    int *order = integers(memory, (size_t)(most > from->count ? most : from->count) * from->count);
+    for (int pass = 0; pass < 2; pass++) {
+        const float gap = pass ? 0 : of->apart;
+        int count = 1, found = 0;
+        for (int j = 0; j < contents && count; j++) {
+            found = 0;
+            for (int before = 0; before < count; before++)
+                for (int tone = 0; tone < from->count; tone++) {
+                    int allowed = from->content[tone] == j;
+                    for (int other = 0; allowed && other < j; other++) {
+                        const int at = kept[before * contents + other];
+                        allowed &= fabsf(by->frequencies[from->rows[tone]] - by->frequencies[from->rows[at]]) >= gap;
+                        allowed &= of->bands == 1 || from->band[tone] != from->band[at];
+                    }
+                    if (!allowed) continue;
+                    memcpy(tried + (size_t)found * contents, kept + before * contents, j * sizeof(int));
+                    tried[(size_t)found++ * contents + j] = tone;
+                }
+            count = found;
+            if (count > most) {
+                worst_ratios(worst, tried, count, j + 1, by->pruning_step, own, loudest, content_of, on->k, by, of, memory);
+                best_first(order, worst, count, memory);
+                count = most;
+            } else
+                for (int i = 0; i < count; i++) order[i] = i;
+            for (int i = 0; i < count; i++)
+                memcpy(kept + i * contents, tried + (size_t)order[i] * contents, contents * sizeof(int));
+        }
+        if (!count) continue;
+        worst_ratios(worst, kept, count, contents, 1, own, loudest, content_of, on->k, by, of, memory);
+        memcpy(chosen_tones, kept + best_of(worst, count) * contents, contents * sizeof(int));
+        release(memory, mark);
+        return !pass;
+    }
+    release(memory, mark);
+    return -1;
+}
+
+/* Bring each candidate to its content's level on the plates that judge. */
+INLINE void bring_to_level(float *own, float *loudest, const candidates *from, size_t k, const rules *by,
+                           const question *of, arena *memory) {
+    const size_t draws = of->judging->count;
+    const arena mark = *memory;
+    float *some = floats(memory, draws);
+    for (int i = 0; i < from->count; i++) {
+        memcpy(some, own + i * draws, draws * sizeof(float));
+        float gain = of->level[from->content[i]] / fmaxf(percentile(some, draws, by->judged), FAINT);
+        for (size_t d = 0; d < draws; d++) own[i * draws + d] *= gain;
+        for (size_t d = 0; d < k * draws; d++) loudest[i * k * draws + d] *= gain * gain;
+    }
+    release(memory, mark);
+}
+
+static int answer_from(answered *to, const plates *on, const rules *by, const question *of, arena *memory) {
+    const size_t n = on->n, k = on->k, contents = of->contents;
+    const int *rows = of->row;
+    int count = of->rows, *some = integers(memory, count), *best_tones = integers(memory, contents);
+    if (of->is_ranked) {
+        const int kept = ranked_rows(some, on, by, of, memory);
+        if (kept && kept < count) rows = some, count = kept;
+    }
+    const size_t most = contents * of->bands * 2 * (by->candidates + contents / 2);
+    candidates from = {0, integers(memory, most), integers(memory, most), integers(memory, most), floats(memory, most),
+                       floats(memory, 2 * most * n)};
+    to->is_limited = find_candidates(&from, on, by, of, rows, count, memory);
+    if (count < of->rows && (!from.count || (to->is_limited && !of->is_strict)) && of->is_ranked) {
+        from.count = 0; /* among all frequencies */
+        to->is_limited = find_candidates(&from, on, by, of, of->row, of->rows, memory);
+    }
+    if (!from.count || (of->is_strict && to->is_limited)) return NOT_REACHED;
+    const float *columns = columns_of(of->fine_points, k * of->fine, on->r, memory);
+    const size_t draws = of->judging->count;
+    float *own = floats(memory, from.count * draws + LANES);
+    float *loudest = floats(memory, from.count * k * draws + LANES);
+    best_tones[0] = 0, to->is_apart = 1;
+    if (from.count > 1) judge(own, loudest, &from, on, by, of, columns, memory);
+    if (contents == 1 && from.count > 1) best_tones[0] = best_tone(&from, own, loudest, on, by, of, columns, memory);
+    if (best_tones[0] < 0) return NEEDS_ONSETS;
+    if (contents > 1) {
+        bring_to_level(own, loudest, &from, k, by, of, memory);
+        to->is_apart = best_combination(best_tones, &from, own, loudest, on, by, of, memory);
+        if (to->is_apart < 0) return NOT_REACHED;
+    }
+    for (size_t j = 0; j < contents; j++) {
+        to->rows[j] = from.rows[best_tones[j]];
+        memcpy(to->weights + 2 * n * j, from.weights + 2 * n * best_tones[j], 2 * n * sizeof(float));
+    }
+    promise(to, on, by, of, columns, memory);
+    return FOUND;
+}
+
+static int guarded(answered *to, const plates *on, const rules *by, const question *of, arena *memory) {
+    jmp_buf failed;
+    memory->failed = &failed;
+    return setjmp(failed) ? NO_MEMORY : answer_from(to, on, by, of, memory);
+}
+
+/* FOUND, NOT_REACHED where tones of one frequency do not do, NEEDS_ONSETS, or NO_MEMORY. */
+int answer(answered *to, const plates *on, const rules *by, const question *of) {
+    arena memory = {NULL, NULL, NULL};
+    const int status = guarded(to, on, by, of, &memory);
+    release(&memory, (arena){NULL, NULL, NULL});
+    return status;
+}

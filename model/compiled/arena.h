@@ -1,0 +1,53 @@
+/* Memory of one call: taken piece by piece, given back to a mark or all at the end. */
+#ifndef ARENA_H
+#define ARENA_H
+
+#include <setjmp.h>
+#include <stdlib.h>
+
+#include "lanes.h"
+
+enum { ALIGNMENT = 64, CHUNK = 1 << 20, NO_MEMORY = -1 };
+
+typedef struct chunk {
+    struct chunk *before;
+    char *end;
+} chunk;
+
+typedef struct {
+    chunk *last;
+    char *at;
+    jmp_buf *failed; /* where to go without memory */
+} arena;
+
+static __attribute__((unused)) void *take(arena *from, size_t bytes) {
+    bytes = (bytes + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
+    if (!from->last || (size_t)(from->last->end - from->at) < bytes) {
+        size_t size = ALIGNMENT + (bytes > CHUNK ? bytes : CHUNK);
+        void *more;
+        if (posix_memalign(&more, ALIGNMENT, size)) longjmp(*from->failed, 1);
+        *(chunk *)more = (chunk){from->last, (char *)more + size};
+        from->last = more, from->at = (char *)more + ALIGNMENT;
+    }
+    void *found = from->at;
+    from->at += bytes;
+    return found;
+}
+
+INLINE value *values(arena *from, size_t count) { return take(from, count * sizeof(value)); }
+
+INLINE float *floats(arena *from, size_t count) { return take(from, count * sizeof(float)); }
+
+INLINE int *integers(arena *from, size_t count) { return take(from, count * sizeof(int)); }
+
+/* Give back all that was taken since a copy of the arena was made. */
+static __attribute__((unused)) void release(arena *of, arena mark) {
+    while (of->last != mark.last) {
+        chunk *more = of->last;
+        of->last = more->before;
+        free(more);
+    }
+    of->at = mark.at;
+}
+
+#endif

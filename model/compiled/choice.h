@@ -1,0 +1,80 @@
+/* Choices that rounding cannot turn, as of `model.choice`, and percentiles. */
+#ifndef CHOICE_H
+#define CHOICE_H
+
+#include "arena.h"
+
+static const float NEARLY = 1e-5f;
+
+typedef struct {
+    float score;
+    int at, run;
+} ranked;
+
+static int by_score(const void *one, const void *other) {
+    const ranked *a = one, *b = other;
+    if (a->score != b->score) return a->score < b->score ? 1 : -1;
+    return a->at - b->at;
+}
+
+static int by_run(const void *one, const void *other) {
+    const ranked *a = one, *b = other;
+    return a->run != b->run ? a->run - b->run : a->at - b->at;
+}
+
+/* order (count) of scores, the highest first; of those nearly equal the first one first. */
+SHARED void best_first(int *order, const float *scores, int count, arena *memory) {
+    const arena mark = *memory;
+    ranked *each = take(memory, count * sizeof(ranked));
+    for (int i = 0; i < count; i++) each[i] = (ranked){scores[i], i, 0};
+    qsort(each, count, sizeof(ranked), by_score);
+    for (int i = 1; i < count; i++) {
+        float above = each[i - 1].score, below = each[i].score;
+        int is_near = below == above || below >= above - NEARLY * fabsf(above);
+        each[i].run = each[i - 1].run + !is_near;
+    }
+    qsort(each, count, sizeof(ranked), by_run);
+    for (int i = 0; i < count; i++) order[i] = each[i].at;
+    release(memory, mark);
+}
+
+/* Index of the first of the highest scores. */
+INLINE int best_of(const float *scores, int count) {
+    float highest = scores[0];
+    for (int i = 1; i < count; i++) highest = scores[i] > highest ? scores[i] : highest;
+    for (int i = 0; i < count; i++)
+        if (scores[i] == highest || scores[i] >= highest - NEARLY * fabsf(highest)) return i;
+    return 0;
+}
+
+/* The value of a rank of values (count), whose order is lost; those before it are no larger. */
+SHARED float of_rank(float *values, int count, int rank) {
+    int low = 0, high = count - 1;
+    while (low < high) {
+        float middle = values[(low + high) / 2];
+        int i = low, j = high;
+        while (i <= j) {
+            while (values[i] < middle) i++;
+            while (values[j] > middle) j--;
+            if (i <= j) {
+                float swapped = values[i];
+                values[i++] = values[j], values[j--] = swapped;
+            }
+        }
+        if (rank <= j) high = j;
+        else if (rank >= i) low = i;
+        else break;
+    }
+    return values[rank];
+}
+
+/* Percentile of values (count), linear between them; their order is lost. */
+SHARED float percentile(float *values, int count, float percent) {
+    double place = (double)percent / 100 * (count - 1);
+    int low = (int)place;
+    float below = of_rank(values, count, low), above = low + 1 < count ? INFINITY : below;
+    for (int i = low + 1; i < count; i++) above = values[i] < above ? values[i] : above;
+    return (float)(below + (place - low) * ((double)above - below));
+}
+
+#endif

@@ -1,0 +1,333 @@
+/* Tones on the plate as modelled and on drawn ones: `model.ensemble.touched_plate.TouchedPlate.drawn` in C. */
+#ifndef DRAWN_H
+#define DRAWN_H
+
+#include "arena.h"
+#include "fingers.h"
+
+/* Plates in the order of their thicknesses; width: floats of a row, a register more than plates. */
+typedef struct {
+    int count, bases, nodes, width; /* plates; thicknesses of changes; thicknesses of plates */
+    int first_base, first_node;     /* of these by index among those of the plate */
+    const int *node;                /* (count) */
+    const float *loss, *damping;    /* (width) */
+    const float *own, *gains;       /* (a, width); (2, a, width) real and imaginary parts */
+    const float *errors;            /* (2, k, width) */
+} draws;
+
+/* Points of all fingers, and what tones at them are measured by. */
+typedef struct {
+    int points;
+    const float *rows, *weights;     /* (points, r); (points) in the mean over each fingertip */
+    const float *error, *threshold;  /* (f, n) mean square of each ERA's error; (f) */
+} sensors;
+
+/* Tones (m), whose changes are those at some thicknesses (bases). */
+typedef struct {
+    const plates *on;
+    const draws *by;
+    const sensors *at;
+    size_t m, padded;
+    const int *rows;
+    float *error;      /* (m) */
+    float *at_nodes;   /* (m, 1 + nodes, points), that as modelled first */
+    float *by_force;   /* (m, bases, 2, a + 1, padded): real and imaginary parts; by the loss factor last */
+    float *forces;     /* (m, bases, 4, a): by loss, damping, own stiffness, and gain */
+} tones;
+
+INLINE size_t groups_of(const draws *by) { return by->count / by->bases / LANES + (by->count / by->bases % LANES > 0); }
+
+/* Groups of LANES plates, of which the first is the plate as modelled alone. */
+INLINE size_t group_count(const draws *by) { return 1 + by->bases * groups_of(by); }
+
+/* Which plates, from that as modelled on, are in a group; how many. */
+INLINE size_t plates_of(const draws *by, size_t group, size_t *first) {
+    const size_t each = by->count / by->bases, groups = groups_of(by);
+    if (!group) return *first = 0, 1;
+    const size_t base = (group - 1) / groups, from = (group - 1) % groups * LANES;
+    *first = 1 + base * each + from;
+    return each - from < LANES ? each - from : LANES;
+}
+
+/* found (count, 2, padded): real and imaginary parts at points of coordinates (count, r); columns (r, padded). */
+SHARED void at_points(float *found, const float *coordinates, size_t count, const float *columns, size_t padded,
+                      size_t r) {
+    for (size_t first = 0; first < count; first += 3)
+        for (size_t point = 0; point < padded; point += 2 * LANES) {
+            const float *of[3];
+            lanes s[3][4] = {{{0}}};
+            for (size_t i = 0; i < 3; i++) of[i] = coordinates + 2 * r * (first + i < count ? first + i : first);
+            for (size_t j = 0; j < r; j++) {
+                lanes a, b;
+                memcpy(&a, columns + j * padded + point, sizeof a);
+                memcpy(&b, columns + j * padded + point + LANES, sizeof b);
+                s[0][0] += a * of[0][2 * j], s[0][1] += b * of[0][2 * j];
+                s[0][2] += a * of[0][2 * j + 1], s[0][3] += b * of[0][2 * j + 1];
+                s[1][0] += a * of[1][2 * j], s[1][1] += b * of[1][2 * j];
+                s[1][2] += a * of[1][2 * j + 1], s[1][3] += b * of[1][2 * j + 1];
+                s[2][0] += a * of[2][2 * j], s[2][1] += b * of[2][2 * j];
+                s[2][2] += a * of[2][2 * j + 1], s[2][3] += b * of[2][2 * j + 1];
+            }
+            for (size_t i = 0; i < 3 && first + i < count; i++) {
+                float *to = found + 2 * padded * (first + i) + point;
+                memcpy(to, s[i], 2 * sizeof(lanes));
+                memcpy(to + padded, s[i] + 2, 2 * sizeof(lanes));
+            }
+        }
+}
+
+INLINE size_t padded_to(size_t points) { return (points + 2 * LANES - 1) / (2 * LANES) * (2 * LANES); }
+
+/* (r, padded) of rows (points, r). */
+SHARED float *columns_of(const float *rows, size_t points, size_t r, arena *memory) {
+    const size_t padded = padded_to(points);
+    float *found = floats(memory, r * padded);
+    for (size_t j = 0; j < r; j++)
+        for (size_t i = 0; i < padded; i++) found[j * padded + i] = i < points ? rows[i * r + j] : 0;
+    return found;
+}
+
+/* Drives (n) at weights, the fingers' motions (k) by them. */
+INLINE void driven(value *forces, value *fingers, const value *drives, const value *w, const touched *of,
+                   const plates *on) {
+    const size_t n = on->n, b = on->b, k = on->k;
+    memset(forces, 0, b * sizeof(value));
+    for (size_t e = 0; e < n; e++) forces[e] = times(drives[e], w[e]);
+    for (size_t i = 0; i < k; i++) {
+        value at = ZERO;
+        for (size_t e = 0; e < n; e++) at = add_product(at, of->resting[i * b + e], forces[e]);
+        fingers[i] = at;
+    }
+}
+
+/* Accelerations (count, points) in cases of tones by weights (m, n). */
+SHARED void find_at_nodes(tones *to, const float *weights, arena *memory) {
+    const plates *on = to->on;
+    const size_t n = on->n, b = on->b, k = on->k, r = on->r, each = 1 + to->by->nodes, points = to->at->points;
+    const arena mark = *memory;
+    value *space = values(memory, touched_space(on)), *modal = values(memory, r), *held = values(memory, k);
+    value *found = values(memory, points), *w = values(memory, n), *drives = values(memory, n);
+    value *forces = values(memory, b), *shared = values(memory, b);
+    for (size_t first = 0; first < to->m * each; first += LANES) {
+        size_t count = to->m * each - first < LANES ? to->m * each - first : LANES;
+        int rows[LANES], cases[LANES], given[LANES];
+        for (size_t l = 0; l < LANES; l++) {
+            size_t at = first + (l < count ? l : count - 1), node = at % each;
+            given[l] = at / each, rows[l] = to->rows[given[l]];
+            cases[l] = rows[l] * on->t + (node ? to->by->first_node + (int)node - 1 : 0);
+        }
+        touched of;
+        put_fingers(&of, on, rows, cases, space);
+        load(drives, on->drives, n, rows);
+        load(w, weights, n, given);
+        driven(forces, held, drives, w, &of, on);
+        for (size_t i = 0; i < k; i++) held[i] = times(of.D[i], held[i]);
+
+        /* Forces of the ERAs and of the fingers, and what the ERAs add to these. */
+        for (size_t j = 0; j < b; j++) {
+            value sum = ZERO;
+            for (size_t i = 0; i < k; i++) sum = add_product(sum, held[i], of.at[i * b + j]);
+            shared[j] = sum;
+        }
+        for (size_t j = 0; j < b; j++)
+            for (size_t s = 0; s < b; s++) forces[j] = subtract_product(forces[j], of.Y[j * b + s], shared[s]);
+        for (size_t s = 0; s < r; s++) {
+            value sum = ZERO, own = ZERO;
+            for (size_t i = 0; i < k; i++) {
+                own.re += held[i].re * on->centres[i * r + s];
+                own.im += held[i].im * on->centres[i * r + s];
+            }
+            for (size_t j = 0; j < b; j++) sum = add_product(sum, forces[j], of.T[j * r + s]);
+            modal[s] = subtract_product(sum, own, of.g[s]);
+        }
+        multiply(found, to->at->rows, modal, points, r, 1);
+        store(to->at_nodes + 2 * first * points, found, points, count);
+    }
+    release(memory, mark);
+}
+
+/* coordinates (b + k, r) by a force at each attachment and then each finger. */
+INLINE void by_each_force(value *coordinates, const touched *of, const plates *on, value *room) {
+    const size_t b = on->b, k = on->k, r = on->r;
+    value *G = room; /* (k, r) displacement by a force at each finger, without the others */
+    for (size_t i = 0; i < k; i++) {
+        row_product(G + i * r, of->through + i, k, of->T, b, r, 0, 0);
+        for (size_t s = 0; s < r; s++) {
+            G[i * r + s].re += of->g[s].re * on->centres[i * r + s];
+            G[i * r + s].im += of->g[s].im * on->centres[i * r + s];
+        }
+    }
+    for (size_t j = 0; j < b; j++) {
+        row_product(coordinates + j * r, of->held + j, b, G, k, r, 0, 0);
+        add(coordinates + j * r, of->T + j * r, r);
+    }
+    for (size_t i = 0; i < k; i++) {
+        value *own = coordinates + (b + i) * r;
+        row_product(own, of->P + i * k, 1, G, k, r, 0, 0);
+        for (size_t s = 0; s < r; s++) own[s] = scaled(own[s], of->minus_omega2);
+    }
+}
+
+/* Forces (4, a) that a standard deviation of loss, damping, own stiffness and gain adds at attachments and
+ * fingers, and the reduced coordinates (r) by the loss factor beside those. */
+INLINE void find_changes(value *forces, value *lost, const touched *of, const plates *on, const int *rows,
+                         const int *cases, const value *w, arena *memory) {
+    const size_t n = on->n, b = on->b, k = on->k, a = b + k, r = on->r;
+    const arena mark = *memory;
+    value *drives = values(memory, n), *strokes = values(memory, n), *by_damping = values(memory, n);
+    value *by_stiffness = values(memory, n), *without = values(memory, b * n), *attached = values(memory, b);
+    value *moved = values(memory, a), *held = values(memory, a), *by_loss = values(memory, r);
+    value *loss = forces, *damping = loss + a, *own = damping + a, *gains = own + a;
+    load(drives, on->drives, n, rows);
+    load(strokes, on->strokes, n, rows);
+    load(by_damping, on->by_damping, n, rows);
+    load(by_stiffness, on->by_stiffness, n, rows);
+    load(attached, on->attached, b, rows);
+    load(without, on->moved, b * n, cases);
+    load(by_loss, on->by_loss, r, cases);
+    memset(forces, 0, 4 * a * sizeof(value));
+    lanes by_motion = inverse(of->minus_omega2);
+    driven(gains, moved + b, drives, w, of, on);
+    for (size_t i = b; i < a; i++) moved[i] = scaled(moved[i], by_motion);
+    for (size_t j = 0; j < b; j++) {
+        value sum = ZERO;
+        for (size_t i = 0; i < k; i++)
+            sum = subtract_product(sum, times(of->at[i * b + j], of->D[i]), moved[b + i]);
+        moved[j] = scaled(sum, by_motion);
+        for (size_t e = 0; e < n; e++) moved[j] = add_product(moved[j], without[j * n + e], w[e]);
+    }
+    for (size_t e = 0; e < n; e++) {
+        value stretched = subtract_product(times(strokes[e], w[e]), (value){filled(1), ZERO.im}, moved[e]);
+        damping[e] = times(by_damping[e], stretched), own[e] = times(by_stiffness[e], stretched);
+    }
+    for (size_t j = 0; j < a; j++) {
+        value by = j < b ? attached[j] : of->D[j - b];
+        if (j >= b) own[j] = scaled(times(by, moved[j]), filled(-on->load_std));
+        held[j] = subtract_product(gains[j], by, moved[j]);
+    }
+    for (size_t s = 0; s < r; s++) {
+        value sum = ZERO;
+        for (size_t j = 0; j < a; j++) {
+            lanes shape = filled(j < b ? on->shapes[j * r + s] : on->centres[(j - b) * r + s]);
+            sum.re += held[j].re * shape, sum.im += held[j].im * shape;
+        }
+        lost[s] = times(by_loss[s], sum);
+    }
+    for (size_t j = 0; j < a; j++) {
+        const float *shape = j < b ? on->shapes + j * r : on->centres + (j - b) * r;
+        value sum = ZERO, by = j < b ? attached[j] : of->D[j - b];
+        for (size_t s = 0; s < r; s++) sum.re += lost[s].re * shape[s], sum.im += lost[s].im * shape[s];
+        loss[j] = subtract_product(ZERO, by, sum);
+    }
+    for (size_t s = 0; s < r; s++) lost[s] = scaled(lost[s], of->minus_omega2);
+    release(memory, mark);
+}
+
+/* What tones change by, at points (r, padded), of weights (m, n). */
+SHARED void find_by_force(tones *to, const float *columns, const float *weights, arena *memory) {
+    const plates *on = to->on;
+    const size_t n = on->n, k = on->k, a = on->b + k, r = on->r, bases = to->by->bases, cases_in_all = to->m * bases;
+    const arena mark = *memory;
+    value *space = values(memory, touched_space(on)), *room = values(memory, k * r);
+    value *coordinates = values(memory, (a + 1) * r), *forces = values(memory, 4 * a), *w = values(memory, n);
+    float *each = floats(memory, 2 * LANES * (a + 1) * r);
+    for (size_t first = 0; first < cases_in_all; first += LANES) {
+        size_t count = cases_in_all - first < LANES ? cases_in_all - first : LANES;
+        int rows[LANES], cases[LANES], given[LANES];
+        for (size_t l = 0; l < LANES; l++) {
+            size_t at = first + (l < count ? l : count - 1);
+            given[l] = at / bases, rows[l] = to->rows[given[l]];
+            cases[l] = rows[l] * on->t + to->by->first_base + (int)(at % bases);
+        }
+        touched of;
+        put_fingers(&of, on, rows, cases, space);
+        load(w, weights, n, given);
+        by_each_force(coordinates, &of, on, room);
+        find_changes(forces, coordinates + a * r, &of, on, rows, cases, w, memory);
+        store(to->forces + 2 * 4 * a * first, forces, 4 * a, count);
+        store(each, coordinates, (a + 1) * r, count);
+        for (size_t l = 0; l < count; l++)
+            at_points(to->by_force + 2 * (a + 1) * to->padded * (first + l), each + 2 * (a + 1) * r * l, a + 1, columns,
+                      to->padded, r);
+    }
+    release(memory, mark);
+}
+
+/* Tones at rows (m) of weights (m, n). */
+SHARED tones respond(const plates *on, const draws *by, const sensors *at, const float *columns, size_t m,
+                     const int *rows, const float *weights, arena *memory) {
+    const size_t n = on->n, a = on->b + on->k, padded = padded_to(at->points), cases = m * by->bases;
+    tones found = {on, by, at, m, padded, rows, floats(memory, m), floats(memory, 2 * m * (1 + by->nodes) * at->points),
+                   floats(memory, 2 * cases * (a + 1) * padded), floats(memory, 2 * 4 * cases * a)};
+    for (size_t tone = 0; tone < m; tone++) {
+        float sum = 0;
+        for (size_t e = 0; e < n; e++) {
+            const float *w = weights + 2 * (tone * n + e);
+            sum += at->error[rows[tone] * n + e] * (w[0] * w[0] + w[1] * w[1]);
+        }
+        found.error[tone] = sqrtf(sum);
+    }
+    find_at_nodes(&found, weights, memory);
+    find_by_force(&found, columns, weights, memory);
+    return found;
+}
+
+INLINE lanes some(const float *from) {
+    lanes found;
+    memcpy(&found, from, sizeof found);
+    return found;
+}
+
+/* sensed (points): squared amplitudes to threshold of a tone on a group of plates. */
+SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, value *found, value *force) {
+    const draws *by = of->by;
+    const size_t a = of->on->b + of->on->k, points = of->at->points, k = of->on->k, width = by->width, padded = of->padded;
+    const size_t each = points / k, nodes = tone * (1 + by->nodes);
+    const float threshold = of->at->threshold[of->rows[tone]], above = 1 / (threshold * threshold);
+    size_t first, count = plates_of(by, group, &first);
+    int rows[LANES];
+    for (size_t l = 0; l < LANES; l++)
+        rows[l] = nodes + (group ? 1 + by->node[first - 1 + (l < count ? l : 0)] : 0);
+    load(found, of->at_nodes, points, rows);
+    if (!group) {
+        for (size_t i = 0; i < points; i++) sensed[i] = above * power(found[i]);
+        return;
+    }
+    const size_t from = first - 1, base = tone * by->bases + (group - 1) / groups_of(by);
+    const float *loss = of->forces + 2 * 4 * a * base, *damping = loss + 2 * a, *own = damping + 2 * a, *gain = own + 2 * a;
+    const float *T = of->by_force + 2 * (a + 1) * padded * base;
+    lanes by_loss = some(by->loss + from), by_damping = some(by->damping + from);
+    for (size_t j = 0; j < a; j++) {
+        lanes by_own = some(by->own + j * width + from);
+        lanes re = some(by->gains + j * width + from), im = some(by->gains + (a + j) * width + from);
+        force[j].re = loss[2 * j] * by_loss + damping[2 * j] * by_damping + own[2 * j] * by_own + gain[2 * j] * re -
+                      gain[2 * j + 1] * im;
+        force[j].im = loss[2 * j + 1] * by_loss + damping[2 * j + 1] * by_damping + own[2 * j + 1] * by_own +
+                      gain[2 * j] * im + gain[2 * j + 1] * re;
+    }
+    force[a] = (value){by_loss, ZERO.im};
+    for (size_t i = 0; i < points; i += 4) {
+        const size_t last = points - 1 - i; /* padded points are read, and not kept */
+        value s0 = found[i], s1 = found[i + (last > 0)], s2 = found[i + (last > 1 ? 2 : 0)], s3 = found[i + (last > 2 ? 3 : 0)];
+        for (size_t j = 0; j <= a; j++) {
+            value f = force[j];
+            const float *re = T + 2 * j * padded + i, *im = re + padded;
+            s0.re += re[0] * f.re - im[0] * f.im, s0.im += re[0] * f.im + im[0] * f.re;
+            s1.re += re[1] * f.re - im[1] * f.im, s1.im += re[1] * f.im + im[1] * f.re;
+            s2.re += re[2] * f.re - im[2] * f.im, s2.im += re[2] * f.im + im[2] * f.re;
+            s3.re += re[3] * f.re - im[3] * f.im, s3.im += re[3] * f.im + im[3] * f.re;
+        }
+        found[i] = s0;
+        if (last > 0) found[i + 1] = s1;
+        if (last > 1) found[i + 2] = s2;
+        if (last > 2) found[i + 3] = s3;
+    }
+    for (size_t finger = 0; finger < k; finger++) {
+        lanes re = of->error[tone] * some(by->errors + finger * width + from);
+        lanes im = of->error[tone] * some(by->errors + (k + finger) * width + from);
+        for (size_t i = finger * each; i < (finger + 1) * each; i++)
+            sensed[i] = above * power((value){found[i].re + re, found[i].im + im});
+    }
+}
+
+#endif

@@ -1,0 +1,189 @@
+/* What fingers feel of all contents together, on the plate as modelled and on drawn ones. */
+#ifndef PROMISE_H
+#define PROMISE_H
+
+#include "answer.h"
+
+/* Powers to threshold of contents: (contents, groups, points). */
+typedef struct {
+    const plates *on;
+    const rules *by;
+    const question *of;
+    const int *rows;
+    const lanes *powers;
+    const float *gains;
+    size_t groups, plates;
+} felt;
+
+static const float FAINT = 1e-20f;
+
+INLINE lanes root_of(const felt *of, size_t content, size_t group, size_t point) {
+    const size_t points = of->on->k * of->of->fine;
+    return of->gains[content] * root(of->powers[(content * of->groups + group) * points + point]);
+}
+
+/* Mean amplitude of a content over a fingertip, less what others of its frequency may cancel. */
+SHARED lanes own_amplitude(const felt *of, size_t content, size_t group, size_t finger, int alone) {
+    const size_t fine = of->of->fine;
+    lanes mean = {0};
+    for (size_t i = finger * fine; i < (finger + 1) * fine; i++) {
+        lanes own = root_of(of, content, group, i);
+        for (size_t other = 0; !alone && other < (size_t)of->of->contents; other++)
+            if (other != content && of->rows[other] == of->rows[content]) own -= root_of(of, other, group, i);
+        mean += of->of->fine_weights[i] * larger(own, ZERO.re);
+    }
+    return mean;
+}
+
+/* Power of all contents but one at the loudest point of a finger; amplitudes of one frequency add. */
+SHARED lanes foreign_power(const felt *of, size_t without, size_t group, size_t finger) {
+    const size_t fine = of->of->fine, contents = of->of->contents, points = of->on->k * fine;
+    lanes loudest = {0};
+    for (size_t i = finger * fine; i < (finger + 1) * fine; i++) {
+        lanes total = {0};
+        for (size_t content = 0; content < contents; content++) {
+            int is_first = content != without, is_single = 1;
+            for (size_t other = 0; other < contents; other++) {
+                if (other == content || other == without || of->rows[other] != of->rows[content]) continue;
+                is_single = 0, is_first &= other > content;
+            }
+            if (!is_first) continue;
+            lanes power = of->gains[content] * of->gains[content] * of->powers[(content * of->groups + group) * points + i];
+            if (!is_single) {
+                lanes sum = {0};
+                for (size_t other = content; other < contents; other++)
+                    if (other != without && of->rows[other] == of->rows[content]) sum += root_of(of, other, group, i);
+                power = sum * sum;
+            }
+            total += power;
+        }
+        loudest = larger(loudest, total);
+    }
+    return loudest;
+}
+
+INLINE lanes weakest_target(const felt *of, size_t content, size_t group, int alone) {
+    lanes found = filled(INFINITY);
+    for (int t = of->of->starts[content]; t < of->of->starts[content + 1]; t++)
+        found = smaller(found, own_amplitude(of, content, group, of->of->targets[t], alone));
+    return found;
+}
+
+INLINE void keep(float *values, lanes found, const draws *by, size_t group) {
+    size_t first, count = plates_of(by, group, &first);
+    memcpy(values + first, &found, count * sizeof(float));
+}
+
+/* Factors on the gains to the levels: those of one priority take one of what is left of the stroke. */
+SHARED float share_stroke(float *gains, const question *of, const float *weights, size_t n, arena *memory) {
+    const size_t contents = of->contents;
+    const arena mark = *memory;
+    float *left = floats(memory, n), *full = floats(memory, n), least = 1;
+    int *done = integers(memory, contents);
+    for (size_t e = 0; e < n; e++) left[e] = 1;
+    memset(done, 0, contents * sizeof(int));
+    for (;;) {
+        int highest = 0, any = 0;
+        for (size_t j = 0; j < contents; j++)
+            if (!done[j] && (!any || of->priority[j] > highest)) highest = of->priority[j], any = 1;
+        if (!any) break;
+        float factor = 1;
+        for (size_t e = 0; e < n; e++) {
+            full[e] = 0;
+            for (size_t j = 0; j < contents; j++)
+                if (!done[j] && of->priority[j] == highest)
+                    full[e] += gains[j] * hypotf(weights[2 * (j * n + e)], weights[2 * (j * n + e) + 1]);
+            factor = fminf(factor, left[e] / fmaxf(full[e], LEAST));
+        }
+        for (size_t e = 0; e < n; e++) left[e] = fmaxf(left[e] - factor * full[e], 0);
+        for (size_t j = 0; j < contents; j++)
+            if (!done[j] && of->priority[j] == highest) gains[j] *= factor, done[j] = 1;
+        least = fminf(least, factor);
+    }
+    release(memory, mark);
+    return least;
+}
+
+INLINE float promised(float *values, const felt *of, float percent) {
+    return percentile(values + 1, of->plates - 1, percent);
+}
+
+/* Figures of tones at rows, of weights (contents, n). */
+SHARED void promise(answered *to, const plates *on, const rules *by, const question *of, const float *columns,
+                    arena *memory) {
+    const size_t contents = of->contents, k = on->k, points = k * of->fine, groups = group_count(of->promise);
+    const arena mark = *memory;
+    const size_t plates = 1 + of->promise->count;
+    const sensors at = {points, of->fine_points, of->fine_weights, by->error, by->threshold};
+    const tones drawn = respond(on, of->promise, &at, columns, contents, to->rows, to->weights, memory);
+    lanes *powers = take(memory, contents * groups * points * sizeof(lanes));
+    value *found = values(memory, points), *force = values(memory, on->b + k + 1);
+    for (size_t content = 0; content < contents; content++)
+        for (size_t group = 0; group < groups; group++)
+            sense(powers + (content * groups + group) * points, &drawn, content, group, found, force);
+    felt now = {on, by, of, to->rows, powers, to->gains, groups, plates};
+
+    float *own = floats(memory, contents * plates), *some = floats(memory, plates), *worst = floats(memory, plates);
+    float *loudest = floats(memory, plates);
+    for (size_t j = 0; j < contents; j++) {
+        to->gains[j] = 1;
+        for (size_t group = 0; group < groups; group++) keep(own, weakest_target(&now, j, group, 1), of->promise, group);
+        to->gains[j] = of->level[j] / fmaxf(promised(own, &now, by->promised), LEAST);
+    }
+    to->of_all[1] = share_stroke(to->gains, of, to->weights, on->n, memory);
+
+    for (size_t i = 0; i < 3 * k; i++) to->contrast[i] = NAN;
+    for (size_t i = 0; i < 2 * k; i++) to->level[i] = NAN;
+    for (size_t i = 0; i < k; i++) to->foreign[i] = NAN;
+    for (size_t i = 0; i < plates; i++) worst[i] = INFINITY, loudest[i] = 0;
+    int any = 0;
+    for (size_t j = 0; j < contents; j++)
+        for (size_t group = 0; group < groups; group++)
+            keep(own + j * plates, weakest_target(&now, j, group, 0), of->promise, group);
+    for (size_t each = 0; each < (size_t)of->starts[contents] + of->quiet_count; each++) {
+        const int is_quiet = each >= (size_t)of->starts[contents];
+        const size_t finger = is_quiet ? of->quiet[each - of->starts[contents]] : of->targets[each];
+        size_t j = 0;
+        while (!is_quiet && each >= (size_t)of->starts[j + 1]) j++;
+        if (is_quiet) {
+            memcpy(some, own, plates * sizeof(float));
+            for (size_t other = 1; other < contents; other++)
+                for (size_t i = 0; i < plates; i++) some[i] = fminf(some[i], own[other * plates + i]);
+        } else {
+            for (size_t group = 0; group < groups; group++)
+                keep(some, own_amplitude(&now, j, group, finger, 0), of->promise, group);
+            const arena before = *memory;
+            float *same = floats(memory, plates);
+            memcpy(same, some, plates * sizeof(float));
+            to->level[2 * finger] = same[0], to->level[2 * finger + 1] = promised(same, &now, by->promised);
+            release(memory, before);
+            if (contents == 1) continue;
+        }
+        const arena before = *memory;
+        float *power = floats(memory, plates);
+        for (size_t group = 0; group < groups; group++)
+            keep(power, foreign_power(&now, is_quiet ? contents : j, group, finger), of->promise, group);
+        for (size_t i = 0; i < plates; i++) {
+            some[i] /= sqrtf(fmaxf(power[i], FAINT));
+            worst[i] = fminf(worst[i], some[i]);
+            if (is_quiet) loudest[i] = fmaxf(loudest[i], sqrtf(power[i]));
+        }
+        any = 1;
+        to->foreign[finger] = sqrtf(promised(power, &now, 100 - by->promised));
+        float *contrast = to->contrast + 3 * finger;
+        contrast[0] = some[0], contrast[1] = promised(some, &now, 50), contrast[2] = promised(some, &now, by->promised);
+        release(memory, before);
+    }
+    to->of_all[0] = NAN, to->of_all[2] = promised(loudest, &now, 100 - by->promised);
+    if (any) {
+        const float modelled = worst[0], half = promised(worst, &now, 50);
+        to->of_all[0] = promised(worst, &now, by->promised);
+        for (int t = 0; contents == 1 && t < of->starts[1]; t++) { /* an only content has that of the loudest finger */
+            float *contrast = to->contrast + 3 * of->targets[t];
+            contrast[0] = modelled, contrast[1] = half, contrast[2] = to->of_all[0];
+        }
+    }
+    release(memory, mark);
+}
+
+#endif

@@ -1,0 +1,115 @@
+"""Structures of the kernels in C, whose headers say what is in them."""
+
+import ctypes
+from ctypes import c_float, c_int, c_void_p
+from typing import Any
+
+from numpy.typing import NDArray
+
+from model.compiled.lanes import as_given
+
+FOUND, NO_MEMORY = 0, -1
+
+
+def _fields(**names: str) -> list[tuple[str, Any]]:
+    """Names of fields by the first letter of their kind: integers, floats, pointers."""
+    kinds = {"i": c_int, "f": c_float, "p": c_void_p}
+    return [(name, kinds[kind[0]]) for kind, all_ in names.items() for name in all_.split()]
+
+
+class Structure(ctypes.Structure):
+    """A structure that keeps the arrays to which it points."""
+
+    arrays: list[NDArray[Any]]
+
+    def point(self, **given: NDArray[Any] | None) -> None:
+        """Point to arrays as kernels read them; to none where there is none."""
+        self.arrays = [*getattr(self, "arrays", [])]
+        for name, array in given.items():
+            if array is not None:
+                self.arrays.append(as_given(array))
+                setattr(self, name, self.arrays[-1].ctypes.data)
+
+
+class Plates(Structure):
+    """`plates`: the plate on its ERAs, with fingers on it."""
+
+    _fields_ = [
+        *_fields(i="n b k r t", f="load_std"),
+        *_fields(p="receptance by_force coupling moved minus_omega2 forces strokes by_damping"),
+        *_fields(p="by_stiffness by_loss attached shapes centres stiffness"),
+    ]
+
+
+class Grouped(Structure):
+    """`grouped`: groups of points whose expected powers are wanted."""
+
+    _fields_ = [
+        *_fields(i="groups p fine others", f="gain_variance ridge"),
+        *_fields(p="points fine_points weights error"),
+    ]
+
+
+class Drawn(Structure):
+    """`draws`: plates within the uncertainty."""
+
+    _fields_ = _fields(
+        i="count bases nodes width first_base first_node",
+        p="node loss damping own gains errors",
+    )
+
+
+class Sensors(Structure):
+    """`sensors`: points of all fingers."""
+
+    _fields_ = _fields(i="points", p="rows weights error threshold")
+
+
+class Method(Structure):
+    """`method`: weights that are tried at each frequency."""
+
+    _fields_ = _fields(i="steps limited", f="variance gain reserve growth most")
+
+
+class GivenForms(Structure):
+    """`given_forms`: forms to search."""
+
+    _fields_ = [
+        *_fields(i="n targets q few fine", f="wanted margin", integers="starts iterations"),
+        *_fields(p="of_targets target_power quiet threshold few_fields fine_fields"),
+    ]
+
+
+class Rules(Structure):
+    """`rules`: how tones are chosen."""
+
+    _fields_ = [
+        *_fields(i="kept missing max_by_point candidates max_combinations pruning_step"),
+        *_fields(i="rim_count is_deep others times"),
+        *_fields(f="gain_variance ridge margin highest reached onset_margin onset_weight"),
+        *_fields(f="judged promised", i="starts iterations"),
+        ("one_finger", Method),
+        ("several", Method),
+        ("within", 3 * Method),
+        *_fields(p="rim threshold error frequencies onsets"),
+    ]
+
+
+class GivenQuestion(Structure):
+    """`question`: fingers, and what each is to feel."""
+
+    _fields_ = [
+        *_fields(i="contents bands rows quiet_count few fine is_ranked is_strict with_onset"),
+        *_fields(
+            f="apart", p="row starts targets quiet priority band level few_points fine_points"
+        ),
+        *_fields(p="few_weights fine_weights background judging promise"),
+    ]
+
+
+class FoundTones(Structure):
+    """`answered`: tones, and what is felt of them."""
+
+    _fields_ = _fields(
+        i="is_apart is_limited", p="rows weights gains contrast level foreign of_all"
+    )

@@ -1,0 +1,210 @@
+"""Tones of contents: of ranked frequencies, and by the kernel in C as in numpy."""
+
+import pickle
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+
+from model.ensemble.touched_by_kernel import touch
+from model.rig.uncertainty import Uncertainty
+from model.structure.attachments import PointLoad
+from model.table import contents_kernel, contents_numpy
+from model.table.build import build_table
+from model.table.contents import KEPT, MISSING, Contents, Stream
+from model.table.contents_kernel import choose_tones
+from model.table.contents_numpy import choose_by_numpy, ranked, share_stroke, worst_ratios
+from model.table.question import Question
+from model.table.table import LocalizationTable
+from paper_table import contact_sets, smooth_rig
+
+RNG = np.random.default_rng(5)
+PLACES = [(float(x), float(y)) for x, y in RNG.uniform([0.02, 0.02], [0.29, 0.21], (8, 2))]
+IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5)
+FLAT = Uncertainty(0.02, 1.0, 0.0, 0.02, 1.2, 0.3)  # of a thickness that is certain
+
+
+@cache
+def table() -> LocalizationTable:
+    """Of four ERAs and a mass."""
+    return build_table(replace(smooth_rig(), masses=(PointLoad(0.2, 0.05, mass=0.03),)))
+
+
+@cache
+def random_table(seed: int) -> LocalizationTable:
+    """Of three to seven ERAs anywhere, unequal in stiffness and stroke, known or not."""
+    rng, rig = np.random.default_rng(seed), smooth_rig()
+    eras = tuple(
+        replace(
+            rig.eras[0],
+            name=f"E{number}",
+            x=float(rng.uniform(0, rig.plate.length)),
+            y=float(rng.uniform(0, rig.plate.width)),
+            stiffness=rig.eras[0].stiffness * float(rng.uniform(0.7, 1.4)),
+            stroke=rig.eras[0].stroke * float(rng.uniform(0.7, 1.4)),
+        )
+        for number in range(3 + 2 * seed)
+    )
+    masses = (PointLoad(0.2, 0.05, mass=0.03),) * (seed % 2)
+    uncertainty = (rig.uncertainty, IDENTIFIED, FLAT)[seed]
+    rig = replace(rig, eras=eras, masses=masses, uncertainty=uncertainty)
+    return build_table(rig, frequencies=np.linspace(40, 320, 29), drive_mode="phased")
+
+
+def only(of: LocalizationTable, question: Question) -> Contents:
+    """The content of a question at all frequencies."""
+    return Contents.of(
+        question, of.read_fingertips(question.contacts), np.arange(len(of.frequencies))
+    )
+
+
+SETS = {
+    "one, and a quiet finger": (1, 1, {}),
+    "one, and many quiet fingers": (1, 9, {}),
+    "one alone": (1, 0, {}),
+    "two, and two quiet fingers": (2, 2, {}),
+    "four": (4, 0, {}),
+    "two that share": (2, 2, {"shared": True}),
+    "bands that may be exchanged": (3, 0, {"bands": ((0, 9), (10, 20), (19, 29))}),
+    "more than the stroke": (2, 1, {"level": 60.0}),
+    "one band for both": (2, 1, {"bands": ((3, 4),)}),
+    "fingers that press": (2, 2, {"loads": (0.4, 1.0, 2.5, 1.0)}),
+}
+
+
+@pytest.mark.usefixtures("kernels_or_numpy")
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", SETS)
+def test_kernel_finds_what_numpy_finds(name: str, seed: int) -> None:
+    """Frequencies, weights and all figures, on random rigs: within 0.02 dB."""
+    count, quiet, given = SETS[name]
+    of = random_table(seed)
+    (places,) = contact_sets(1, fingers=max(2, count + quiet), seed=seed) if quiet < 9 else (GRID,)
+    places = places[: count + quiet]
+    bands = given.get("bands", ((0, len(of.frequencies)),))
+    level = given.get("level", 15.0)
+    groups = [tuple(range(count))] if "shared" in given else [(each,) for each in range(count)]
+    streams = tuple(Stream(fingers, level, bands, n) for n, fingers in enumerate(groups))
+    contents = Contents(
+        of.read_fingertips(places),
+        given.get("loads", ()),
+        streams,
+        tuple(range(count, count + quiet)),
+        np.arange(len(of.frequencies)),
+        apart_hz=30.0,
+        background=None if count + quiet > 1 else of.background(places[:1]),
+        is_ranked=count == 1 and quiet > 0,
+    )
+    found, expected = choose_tones(of, contents), choose_by_numpy(of, contents)
+    assert found is not None
+    assert expected is not None
+    assert found.rows.tolist() == expected.rows.tolist()
+    assert found.is_apart == expected.is_apart
+    assert np.abs(found.weights) == pytest.approx(np.abs(expected.weights), abs=0.02)
+    for key in (
+        "gains",
+        "contrast",
+        "level",
+        "foreign_amplitudes",
+        "worst",
+        "stroke_factor",
+        "loudest",
+    ):
+        one, other = np.asarray(getattr(found, key)), np.asarray(getattr(expected, key))
+        np.testing.assert_array_equal(np.isnan(one), np.isnan(other))
+        np.testing.assert_allclose(one, other, rtol=2e-3, err_msg=key)
+
+
+GRID = [(0.03 + 0.06 * x, 0.05 + 0.12 * y) for x in range(5) for y in range(2)]
+
+
+def test_bound_and_level_are_those_of_the_best_weights_for_the_mean() -> None:
+    """The frequency of the highest bound that reaches the level is kept, few that miss it.
+
+    Bounds by a general optimiser: the largest eigenvalue of the target's form to the mean one.
+    """
+    of = table()
+    question = Question((PLACES[0],), tuple(PLACES[1:4]), level_db_sl=20.0)
+    forms, contents = of.forms(question), only(of, question)
+    c = forms.targets[0].conj().astype(complex)
+    R = forms.quiet.mean(axis=1).astype(complex)
+    bounds, levels = [], []
+    for target, form in zip(c, R, strict=True):
+        values, vectors = eigh(np.outer(target, target.conj()), form)
+        bounds.append(values[-1])
+        levels.append(abs(target.conj() @ vectors[:, -1]) / np.abs(vectors[:, -1]).max())
+    reaches = np.array(levels) >= forms.wanted * forms.threshold
+    kept = ranked(of, touch(of.on_eras, contents.tips.few[:, 0]), contents)
+    assert len(kept) == min(KEPT, int(reaches.sum()) + int((~reaches[kept]).sum()))
+    assert int((~reaches[kept]).sum()) <= MISSING
+    best = np.argsort(-np.array(bounds)[reaches])[: int(reaches[kept].sum())]
+    assert set(np.flatnonzero(reaches)[best]) == set(kept[reaches[kept]])
+
+
+def test_answers_lose_little() -> None:
+    """Against a search of all frequencies: 0.1 dB in the mean, and the level is as high."""
+    of, lost = table(), []
+    for at in range(4):
+        for more in (1, 2, 4):
+            quiet = (*PLACES[:at], *PLACES[at + 1 : at + 1 + more])
+            contents = only(of, Question((PLACES[at],), quiet))
+            some = choose_tones(of, contents)
+            every = choose_tones(of, replace(contents, is_ranked=False))
+            assert some is not None
+            assert every is not None
+            lost.append(20 * np.log10(every.worst / some.worst))
+            assert some.level[0, 1] > 0.99 * every.level[0, 1]
+    assert np.mean(lost) < 0.1
+
+
+@pytest.mark.usefixtures("kernels_or_numpy")
+def test_level_that_no_kept_frequency_reaches_is_sought_at_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where the ranking keeps only a frequency that is too weak the answer is that of all."""
+    for module in (contents_kernel, contents_numpy):
+        monkeypatch.setattr(module, "KEPT", 1)
+        monkeypatch.setattr(module, "MISSING", 1)
+    of = replace(table())  # that keeps no rules yet
+    contents = only(of, Question((PLACES[0],), (PLACES[1],), level_db_sl=50.0))
+    touched = touch(of.on_eras, contents.tips.few[:, 0])
+    (kept,) = ranked(of, touched, contents)
+    assert choose_tones(of, replace(contents, rows=np.array([kept]))) is None
+    found = choose_tones(of, replace(contents, is_strict=False))
+    assert found is not None
+    assert found.rows[0] != kept
+
+
+def test_prepared_table_goes_to_another_process() -> None:
+    """With what it has computed ahead; its answers are the same there."""
+    of = table()
+    question = Question((PLACES[0],), (PLACES[1],))
+    pattern = of.query(question)
+    assert pickle.loads(pickle.dumps(of)).query(question).excitation == pattern.excitation
+
+
+def test_worst_finger_of_combinations_is_counted_plate_by_plate() -> None:
+    """By hand: two contents, a quiet finger and one that counts for nothing, on eleven plates.
+
+    The percentile of eleven plates is the second smallest; the first of the contents alone counts
+    at the quiet finger only.
+    """
+    own = np.array([[2.0] * 11, [3.0] * 11])
+    loudest = np.ones((2, 4, 11))
+    loudest[1, 0] = np.arange(1, 12)  # of the second content at the first one's finger
+    loudest[:, 3] = 1e6
+    streams = [Stream((0,), 20.0, ()), Stream((1,), 20.0, ())]
+    both = worst_ratios(np.array([[0, 1]]), streams, [2], own, loudest)
+    assert both == pytest.approx([4 / 10])
+    alone = worst_ratios(np.array([[0], [1]]), streams, [2], own, loudest)
+    assert alone == pytest.approx([4.0, 9.0])
+
+
+def test_stroke_is_shared_by_one_factor_for_each_priority() -> None:
+    """By hand: the higher priority has all of it, two others half of what is left."""
+    weights = np.array([[0.5, 0.1], [0.5, 1.0], [0.5, 1.0]], dtype=np.complex64)
+    gains, factor = share_stroke(np.ones(3), weights, [1, 0, 0])
+    assert gains == pytest.approx([1.0, 0.45, 0.45])
+    assert factor == pytest.approx(0.45)

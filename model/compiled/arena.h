@@ -23,7 +23,9 @@ typedef struct {
 static __attribute__((unused)) void *take(arena *from, size_t bytes) {
     bytes = (bytes + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
     if (!from->last || (size_t)(from->last->end - from->at) < bytes) {
-        size_t size = ALIGNMENT + (bytes > CHUNK ? bytes : CHUNK);
+        /* Each twice the one before: what was once given back is kept by the C library. */
+        size_t before = from->last ? (size_t)(from->last->end - (char *)from->last) : CHUNK / 2;
+        size_t size = ALIGNMENT + bytes > 2 * before ? ALIGNMENT + bytes : 2 * before;
         void *more;
         if (posix_memalign(&more, ALIGNMENT, size)) longjmp(*from->failed, 1);
         *(chunk *)more = (chunk){from->last, (char *)more + size};

@@ -83,7 +83,7 @@ def _touch(
         envelope_support=RAMPS_ONLY,
     )
     started = time.perf_counter()
-    answer = query_table(table, [(contacts[0], target)], contacts[1:], capabilities, levels)
+    answer = query_table(table, contacts[0], target, contacts[1:], capabilities, levels)
     elapsed = time.perf_counter() - started
     return _felt_db_sl(table, answer, duration) - answer.felt_db_sl, elapsed
 

@@ -19,15 +19,12 @@ _DIGITS = 4  # of a metre
 
 
 def _remembering_query(
-    table: Any, targets: Any, quiet: Sequence[Contact], *others: Any
+    table: Any, contact: Contact, target: Any, quiet: Sequence[Contact], *others: Any
 ) -> TableAnswer:
     """Answer as `query_table`, from memory where possible."""
-    fingers = tuple(
-        (round(each.x, _DIGITS), round(each.y, _DIGITS))
-        for each in (*(contact for contact, _ in targets), *quiet)
-    )
+    fingers = tuple((round(each.x, _DIGITS), round(each.y, _DIGITS)) for each in (contact, *quiet))
     if fingers not in _known:
-        _known[fingers] = table_query.query_table(table, targets, quiet, *others)
+        _known[fingers] = table_query.query_table(table, contact, target, quiet, *others)
     return _known[fingers]
 
 

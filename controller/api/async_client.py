@@ -32,7 +32,6 @@ from controller.api.methods import (
     ArmResult,
     EffectsResult,
     HelloResult,
-    PlayResult,
     RenewResult,
     StatusResult,
     StopResult,
@@ -157,12 +156,10 @@ class AsyncClient:
 
     async def play(
         self, effect: str, position: tuple[float, float], *, level_db_sl: float | None = None
-    ) -> PlayResult:
-        """Play an effect at the finger nearest to x, y [m]; say whether it is held back."""
+    ) -> None:
+        """Play an effect at the finger nearest to x, y [m]; its status says what it feels."""
         x, y = as_position(position)
-        return await self._call(
-            PlayResult, "play", effect=effect, x_m=x, y_m=y, level_db_sl=level_db_sl
-        )
+        await self._call(Empty, "play", effect=effect, x_m=x, y_m=y, level_db_sl=level_db_sl)
 
     async def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
         """Receive notifications of topics; see `events`."""

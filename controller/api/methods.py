@@ -165,16 +165,6 @@ class PlayParams(Message):
     level_db_sl: float | None = Field(None, description="at most, and by default, the effect's own")
 
 
-class PlayResult(Message):
-    """Whether the effect plays as requested."""
-
-    held_back: str | None = Field(
-        None,
-        description="why only the vibration of another finger's effect plays, as for a frequency "
-        "that differs; null if its own does. See `held_back` of the contact for what follows",
-    )
-
-
 class SubscribeParams(Message):
     """Topics to receive, and the rate of the periodic ones."""
 
@@ -258,7 +248,7 @@ METHODS: dict[str, Method] = {
     ),
     "effects": Method(Empty, EffectsResult, "list the effects"),
     "play": Method(
-        PlayParams, PlayResult, "play an effect at a finger; only while armed", is_repeated=False
+        PlayParams, Empty, "play an effect at a finger; only while armed", is_repeated=False
     ),
     "subscribe": Method(SubscribeParams, Empty, "receive notifications of topics", over_http=False),
     "unsubscribe": Method(

@@ -165,9 +165,20 @@ class ContactStatus(Message):
     contrast_db: float | None = Field(
         None, description="predicted, target over loudest quiet finger; null for a single finger"
     )
-    effect: str | None = Field(None, description="the effect requested for it, if any")
+    effect: str | None = Field(None, description="what it is to feel: an effect, if any")
+    verdict: Literal["own", "mixed", "shared", "held back"] | None = Field(
+        None,
+        description="what a target feels: its own, mixed with the contents of others (promised "
+        "contrast below 12 dB), the content of another finger, or none",
+    )
+    frequency_hz: float | None = Field(None, description="of what it feels; null for several")
+    foreign_level_db_sl: float | None = Field(
+        None,
+        description="of the contents of others at a target, which nine of ten plates do not "
+        "exceed; null where it is the only content",
+    )
     held_back: str | None = Field(
-        None, description="why its effect does not play although it is a target; null if it does"
+        None, description="why a target does not feel its own; null if it does"
     )
     load: float = Field(
         1.0,

@@ -339,7 +339,8 @@ def show_status(status: "StatusResult") -> str:
         promised = contact.robust_felt_contrast_db
         contrast = "" if promised is None else f", at least {promised:.1f} dB over the others"
         effect = "" if contact.effect is None else f", effect {contact.effect}"
-        held_back = "" if contact.held_back is None else f" (held back: {contact.held_back})"
+        verdict = "" if contact.verdict in (None, "own") else f", {contact.verdict}"
+        held_back = verdict if contact.held_back is None else f"{verdict}: {contact.held_back}"
         load = "" if contact.load == 1 else f", load {contact.load:.1f}"
         lines.append(
             f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "

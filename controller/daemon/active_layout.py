@@ -4,12 +4,11 @@ import math
 from collections.abc import Iterable
 
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.methods import EffectsResult, PlayParams, PlayResult
+from controller.api.methods import EffectsResult, PlayParams
 from controller.api.schema import EffectDescription
 from controller.effects.player import EffectPlayer
-from controller.loop.table_query import MAX_DB_SL, common_band, why_held_back
+from controller.loop.table_query import MAX_DB_SL
 from controller.sources.contacts import Contact
-from model.arrays import FloatArray
 
 PLAY_RADIUS = 0.020
 """Largest distance [m] from the position of a requested effect to the finger that feels it."""
@@ -37,13 +36,12 @@ class ActiveLayout(EffectPlayer):
         params: PlayParams,
         contacts: Iterable[Contact],
         *,
-        frequencies: FloatArray,
         now: float,
-    ) -> PlayResult:
+    ) -> None:
         """Start an effect at the contact nearest to a position, at its own level or below.
 
-        frequencies [Hz]: of the table. Raises RpcError for an unknown effect, a level above its
-        own, and a position without a contact within `PLAY_RADIUS`.
+        Raises RpcError for an unknown effect, a level above its own, and a position without a
+        contact within `PLAY_RADIUS`.
         """
         effect = self.layout.effects.get(params.effect)
         if effect is None:
@@ -76,7 +74,3 @@ class ActiveLayout(EffectPlayer):
                 remedy="touch the plate there, or send a touch over the API",
             )
         self.play(params.effect, nearest, now, level_db_sl=params.level_db_sl)
-        band = effect.tuned_band
-        before = self.bands_before(nearest.key)
-        played, is_shared = common_band([*before, band], frequencies)
-        return PlayResult(held_back=None if is_shared else why_held_back(band, played, frequencies))

@@ -18,7 +18,6 @@ from controller.api.methods import (
     HelloParams,
     HelloResult,
     PlayParams,
-    PlayResult,
     RenewParams,
     RenewResult,
     RequestedBy,
@@ -230,18 +229,13 @@ class ApiService:
     def _effects(self, client: Connection, params: Empty) -> EffectsResult:
         return self._layout.effects()
 
-    def _play(self, client: Connection, params: PlayParams) -> PlayResult:
+    def _play(self, client: Connection, params: PlayParams) -> Empty:
         machine = self._supervisor.machine
         if machine.state is not _ENABLED or machine.is_degraded:
             raise _wrong_state(machine)
-        result = self._layout.play_nearest(
-            params,
-            self._publisher.view.contacts,
-            frequencies=self._table.frequencies,
-            now=clock.now(),
-        )
+        self._layout.play_nearest(params, self._publisher.view.contacts, now=clock.now())
         self._controller.request_update()
-        return result
+        return Empty()
 
     def _subscribe(self, client: Connection, params: SubscribeParams) -> Empty:
         # After the reply, so that no event precedes it.

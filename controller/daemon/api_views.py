@@ -23,6 +23,7 @@ from controller.api.topics import ContactsEvent, PatternEvent, PlateEvent, Silen
 from controller.daemon.config import DaemonConfig
 from controller.learning.learning_status import LearningStatus
 from controller.loop.observer import Applied, Silenced
+from controller.loop.routing import Drive
 from controller.sources.contacts import Contact, ContactKey
 from drivers import clock
 from drivers.host.amplifier import Amplifier
@@ -72,6 +73,9 @@ class PlateView:
                 for contact in applied.contacts
             ],
             drive=self.drive(),
+            layers={
+                str(number): played_tones(one.drive) for number, one in applied.contents.items()
+            },
             robust_felt_contrast_db=_finite(applied.pattern.robust_felt_contrast_db),
             predicted_felt_contrast_db=_finite(applied.pattern.felt_contrast_db),
             robust_contrast_db=_finite(applied.pattern.robust_contrast_db),
@@ -92,13 +96,16 @@ class PlateView:
         )
 
     def drive(self) -> dict[str, PlayedTone]:
-        """The tones that play, by ERA."""
-        if self.applied is None:
-            return {}
-        return {
-            era: PlayedTone(frequency_hz=tone.frequency, level=tone.level, phase_deg=tone.phase)
-            for era, tone in self.applied.drive.items()
-        }
+        """The tones of the newest content, by ERA."""
+        return {} if self.applied is None else played_tones(self.applied.drive)
+
+
+def played_tones(drive: Drive) -> dict[str, PlayedTone]:
+    """Describe what ERAs play in one layer."""
+    return {
+        era: PlayedTone(frequency_hz=tone.frequency, level=tone.level, phase_deg=tone.phase)
+        for era, tone in drive.items()
+    }
 
 
 def contact_status(
@@ -119,13 +126,17 @@ def contact_status(
                 status |= {
                     "role": "target",
                     "level_db_sl": _finite(felt.level_db_sl),
-                    "robust_felt_contrast_db": _finite(applied.pattern.robust_felt_contrast_db),
+                    "robust_felt_contrast_db": _finite(felt.promised_contrast_db),
                     "contrast_db": _finite(felt.contrast_db),
+                    "verdict": felt.verdict,
+                    "frequency_hz": felt.frequency,
+                    "foreign_level_db_sl": _finite(felt.foreign_level_db_sl),
                     "held_back": felt.held_back,
                 }
         if any(quiet.key == contact.key for quiet in applied.quiet):
-            # With several quiet contacts only the level of the loudest is known.
-            level = applied.pattern.quiet_level_db_sl if len(applied.quiet) == 1 else None
+            # Of several quiet contacts only the level of the loudest is known.
+            is_known = len(applied.quiet) == len(applied.contents) == 1
+            level = applied.pattern.quiet_level_db_sl if is_known else None
             status |= {"role": "quiet", "level_db_sl": _finite(level)}
     return ContactStatus.model_validate(status)
 

@@ -17,7 +17,6 @@ def _check(document: Document) -> CheckedFile:
     rig = config.rig
     wired = Counter(channel.amplifier for channel in rig.wiring.values())
     _, warnings = check_links(config.urls, channels=wired, limits=rig.limits)
-    layout_warnings = config.layout.warnings() if config.layout else []
     daemon = f"era daemon {document.source}"
     hint = "" if config.table is None else f". {daemon} --check reads its table, too"
     line = (
@@ -27,7 +26,7 @@ def _check(document: Document) -> CheckedFile:
         f"socket {config.socket}{hint}"
     )
     note = rig.uncertainty.note
-    notes = [*layout_warnings, *gain_notes(rig), *([note] if note else [])]
+    notes = [*gain_notes(rig), *([note] if note else [])]
     return CheckedFile(line, [*warnings, *notes])
 
 

@@ -64,7 +64,6 @@ class LayoutSection(Section):
         dict[Identifier, RegionSection], Field(max_length=_MAX_REGIONS, default_factory=dict)
     ]
     elsewhere: Identifier | None = BUZZ
-    most_at_once: Annotated[int, Field(ge=1, le=4)] = 1
 
 
 def load_layout(
@@ -93,13 +92,12 @@ def layout_of(
         regions=tuple(_region(name, region) for name, region in section.regions.items()),
         effects={name: effect for name, effect in effects.items() if effect is not None},
         elsewhere=section.elsewhere,
-        most_at_once=section.most_at_once,
     )
 
 
 def is_layout_document(document: Document) -> bool:
     """Whether a configuration file is a surface layout."""
-    own = {"effects", "regions", "elsewhere", "most_at_once"}
+    own = {"effects", "regions", "elsewhere"}
     return bool(document.data.keys() & own) and not document.data.keys() & {"plate", "rig"}
 
 

@@ -16,7 +16,6 @@ def _check(document: Document) -> CheckedFile:
         f"good: regions {', '.join(region.name for region in layout.regions) or 'none'}; "
         f"effects {', '.join(layout.effects)}; elsewhere {layout.elsewhere or 'nothing'}. "
         "Check the daemon's file that names it to see whether it fits the plate",
-        layout.warnings(),
     )
 
 

@@ -8,8 +8,9 @@ from controller.effects.band import Band
 from controller.effects.effect import EffectRun, NoSensation, Sensation
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
-from controller.loop.intent import NO_CONTACTS, HapticIntent, Target
+from controller.loop.intent import NO_CONTACTS, HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
+from model.table.effect_level import SHAPED_FROM
 from registry.plugins import WrongResultError
 
 # A finger on the edge of a region must not flip between regions with sensor noise: it stays in one
@@ -19,16 +20,23 @@ _NOISE = 0.001
 REQUESTED_PRIORITY = 1_000_000
 """Priority of an effect requested by name, above all regions."""
 
+CLICKS_APART = 0.060
+"""Pause [s] between the starts of short pulses at two fingers: together they would be one."""
+
 
 @dataclass
 class _Play:
-    """A run of an effect at one finger, numbered in order of start."""
+    """A run of an effect at one finger, numbered in order of start.
+
+    is_elsewhere: whether it is the effect outside of all regions.
+    """
 
     name: str
     run: EffectRun
     number: int
     priority: int
     band: Band | None
+    is_elsewhere: bool
 
 
 @dataclass
@@ -43,9 +51,10 @@ class _Finger:
 class EffectPlayer:
     """Plays the effects of a layout. Deterministic: times are arguments.
 
-    A finger feels its newest play; when that is over, the one before continues. Only the fingers of
-    highest priority are driven, as many as the layout allows; ties go to the newest. All others are
-    quiet. A play without a sensation at the moment (no detent passed, no movement) does not count.
+    Every finger feels its newest play; when that is over, the one before continues. Of the fingers
+    that feel the effect outside of all regions only the newest does. Short pulses of two fingers
+    are 60 ms apart. A play without a sensation at the moment (no detent passed, no movement) does
+    not count.
     """
 
     def __init__(self, layout: SurfaceLayout) -> None:
@@ -53,6 +62,7 @@ class EffectPlayer:
         self._already_pressed: set[ContactKey] = set()  # under another layout
         self._fingers: dict[ContactKey, _Finger] = {}
         self._number = 0
+        self._last_click: tuple[ContactKey, Pulse] | None = None
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
         """Return which contacts shall feel what at a time [s]."""
@@ -65,9 +75,13 @@ class EffectPlayer:
             play, sensation = self._current_sensation(contact, now, ends)
             if play is not None and sensation is not None:
                 felt.append((play, contact, sensation))
-        felt.sort(key=lambda one: (one[0].priority, one[0].number), reverse=True)
-        highest = [one for one in felt if one[0].priority == felt[0][0].priority]
-        chosen = highest[: self.layout.most_at_once]
+        felt.sort(key=lambda one: one[0].number)
+        newest = max((play.number for play, _, _ in felt if play.is_elsewhere), default=0)
+        driven = [
+            (play, contact, sensation)
+            for play, contact, sensation in felt
+            if not play.is_elsewhere or play.number == newest
+        ]
         return HapticIntent(
             tuple(
                 Target(
@@ -76,8 +90,11 @@ class EffectPlayer:
                     allow_weaker=sensation.allow_weaker,
                     pulse=sensation.pulse,
                     band=play.band,
+                    priority=play.priority,
+                    content=play.name,
                 )
-                for play, contact, sensation in chosen
+                for play, contact, sensation in driven
+                if not self._waits(contact.key, sensation.pulse, now, ends)
             ),
             "no effect plays for the contacts on the plate",
             until=min(ends, default=None),
@@ -97,21 +114,6 @@ class EffectPlayer:
         finger = self._fingers.get(key)
         return finger.plays[-1].name if finger and finger.plays else None
 
-    def bands_before(self, key: ContactKey) -> list[Band | None]:
-        """Bands of requested effects that have precedence over the one of a finger.
-
-        Those that are driven together with it, at fingers that came before it.
-        """
-        requested = {
-            each: finger.plays[-1]
-            for each, finger in self._fingers.items()
-            if finger.plays and finger.plays[-1].priority == REQUESTED_PRIORITY
-        }
-        newest = sorted(requested, key=lambda each: requested[each].number, reverse=True)
-        driven = newest[: self.layout.most_at_once]
-        before = list(requested)[: list(requested).index(key)]
-        return [requested[each].band for each in before if each in driven]
-
     def play(self, name: str, contact: Contact, now: float, *, level_db_sl: float | None) -> None:
         """Start a named effect at a finger, again if it was requested there before.
 
@@ -127,6 +129,20 @@ class EffectPlayer:
             if (play.name, play.priority) != (name, REQUESTED_PRIORITY)
         ]
         self._start(finger, name, contact, now, level=level, priority=REQUESTED_PRIORITY)
+
+    def _waits(self, key: ContactKey, pulse: Pulse | None, now: float, ends: list[float]) -> bool:
+        """Whether a pulse must wait at a time [s] for its turn after one of another finger."""
+        if pulse is None or pulse.duration >= SHAPED_FROM or pulse.started_at is not None:
+            return False
+        if math.isinf(pulse.due_at):
+            pulse.due_at = pulse.requested_at
+            if self._last_click is not None and self._last_click[0] != key:
+                pulse.due_at = max(pulse.due_at, self._last_click[1].start + CLICKS_APART)
+            self._last_click = key, pulse
+        if now >= pulse.due_at:
+            return False
+        ends.append(pulse.due_at)
+        return True
 
     def _update_regions(self, contacts: Sequence[Contact], now: float) -> None:
         """Start and end effects as fingers enter and leave regions."""
@@ -175,7 +191,7 @@ class EffectPlayer:
             name = self.layout.elsewhere
             if name is not None:
                 level = self.layout.effects[name].level_db_sl
-                self._start(finger, name, contact, now, level=level, priority=0)
+                self._start(finger, name, contact, now, level=level, priority=0, is_elsewhere=True)
             return
         # The effect for motion starts first: the press is felt, then the movement after it.
         for name in (region.on_move, region.on_press):
@@ -202,6 +218,7 @@ class EffectPlayer:
         level: float | None,
         priority: int,
         region: Region | None = None,
+        is_elsewhere: bool = False,
     ) -> None:
         """Start an effect in a region, by default the one that the finger is in."""
         self._number += 1
@@ -211,7 +228,7 @@ class EffectPlayer:
         if not isinstance(run, EffectRun):
             raise WrongResultError(effect, run, EffectRun)
         band = self.layout.band_of(name, region)
-        finger.plays.append(_Play(name, run, self._number, priority, band))
+        finger.plays.append(_Play(name, run, self._number, priority, band, is_elsewhere))
 
     def _current_sensation(
         self, contact: Contact, now: float, ends: list[float]

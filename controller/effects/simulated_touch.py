@@ -91,7 +91,8 @@ class TouchSimulator:
         try:
             answer = query_table(
                 self._table,
-                [(Contact(finger, *at, since=0.0), target)],
+                Contact(finger, *at, since=0.0),
+                target,
                 quiet,
                 self._capabilities,
                 self._levels,

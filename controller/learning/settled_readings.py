@@ -65,7 +65,8 @@ class SettledReadings:
     def pattern_applied(self, applied: Applied) -> None:
         """Follow a pattern that the amplifiers have confirmed, if it can be read."""
         frequencies = {command.frequency for command in applied.drive.values()}
-        is_read = applied.lasts and len(frequencies) == 1 and max(frequencies) <= self._highest
+        is_one = len(applied.contents) == len(frequencies) == 1
+        is_read = applied.lasts and is_one and max(frequencies) <= self._highest
         self._playing = applied if is_read else None
         self._contacts = applied.contacts
         self._wait_for(applied.time + applied.settled_after)

@@ -22,7 +22,7 @@ class PlaybackCapabilities:
     drive_mode: of the questions to the table; playable: the drive modes that every amplifier can
     play; frequencies: the lowest and highest [Hz]; max_amplitudes [m] by ERA;
     envelope_support: knots that every amplifier plays; max_power: sum of squared levels of
-    all ERAs; slew [1/s]: highest rise of a level; ramp_max [s].
+    all ERAs; slew [1/s]: highest rise of a level; ramp_max [s]; layers: contents at once.
     """
 
     drive_mode: str
@@ -33,6 +33,7 @@ class PlaybackCapabilities:
     max_power: float = math.inf
     slew: float = math.inf
     ramp_max: float = math.inf
+    layers: int = 1
 
 
 def playback_capabilities(
@@ -79,4 +80,5 @@ def playback_capabilities(
         max_power=min(one.power for one in limits.values()),
         slew=min(one.slew for one in limits.values()),
         ramp_max=min(_RAMP.from_wire(one.capabilities["ramp_max"]) for one in amplifiers.values()),
+        layers=min(one.capabilities["layers"] for one in amplifiers.values()),
     )

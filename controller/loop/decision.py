@@ -1,20 +1,20 @@
 """Decisions of the control loop, without waiting: touch frames in, sets of all amplifiers out.
 
-take(frame)  ->  contacts
-decide(now)  ->  contacts -> intent -> selection -> routing -> a set of every amplifier
+update(frame) ->  contacts
+decide(now)  ->  contacts -> intent -> contents -> the layers that change, on every amplifier
 """
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.content import Content, Selection
 from controller.loop.intent import IntentSource
 from controller.loop.plate_set import FADE_RAMP, PlateSet, SetBuilder
 from controller.loop.routing import Drive, tones_by_era
-from controller.loop.selection import Selection, Selector
-from controller.loop.table_query import is_short
+from controller.loop.selection import Selector
 from controller.loop.validity import Validity, first_lasts, valid_for
 from controller.sources.contacts import Change, Contact, ContactTracker
 from controller.sources.touch import TouchFrame
@@ -48,49 +48,44 @@ class Decision:
 
     from_rest: whether nothing has played for 0.4 s, so that the plate is at rest;
     triggered_at [s]: when the change arrived.
-    set: None if all channels are silent already; pattern: with the ramp and onset of the set, None
-    for silence; refusal: why a ledger refused the pattern, which makes it silence; retry_at [s]:
-    when the ledger would admit it, None for never.
+    sets: of the layers that change, by number, all from one moment on; started: those that play a
+    content; silence: ramp [s] along which all layers fall silent instead. Neither if all channels
+    are silent already. refusal: why a ledger refused the contents, which makes it silence;
+    retry_at [s]: when the ledger would admit them, None for never.
     """
 
     contacts: tuple[Contact, ...]
     selection: Selection
     from_rest: bool
     triggered_at: float
-    set: PlateSet | None = None
-    pattern: Pattern | None = None
+    sets: Mapping[int, PlateSet] = field(default_factory=dict)
+    started: frozenset[int] = frozenset()
+    silence: float | None = None
     refusal: str | None = None
     retry_at: float | None = None
 
 
 @dataclass(frozen=True)
-class _Playback:
-    """Playback of the amplifiers since the last decision with a set.
+class PlayedContent:
+    """A content in its layer.
 
-    drive: by ERA, as confirmed; settled_at [s]: when its onset has ended.
+    pattern: with the ramp, onset and ending of its set; drive: by ERA, as confirmed; settled_at
+    [s]: when its onset has ended.
     """
 
-    decision: Decision | None = None
+    content: Content
+    set: PlateSet
+    pattern: Pattern
     drive: Drive = field(default_factory=dict)
     settled_at: float = math.inf
     validity: Validity = field(default_factory=Validity)
-
-    @property
-    def is_silent(self) -> bool:
-        """Whether it is certain that nothing plays."""
-        found = None if self.decision is None else self.decision.set
-        return found is not None and found.is_silence
-
-    @property
-    def retry_at(self) -> float | None:
-        """When [s] a ledger would admit what it refused."""
-        return None if self.decision is None else self.decision.retry_at
 
 
 class Decider:
     """Intent, selection and sets for the contacts on one plate; synchronous, times are arguments.
 
-    A decision never raises: it falls back to silence on any exception.
+    A decision never raises: it falls back to silence on any exception. arrived: called when several
+    contents have been chosen, which a decision does not wait for.
     """
 
     def __init__(
@@ -102,6 +97,7 @@ class Decider:
         capabilities: PlaybackCapabilities,
         intent_source: IntentSource,
         timing: Timing | None = None,
+        arrived: Callable[[], None] = lambda: None,
     ) -> None:
         self._rig = rig
         self._table = table
@@ -110,15 +106,24 @@ class Decider:
         self._tracker = tracker
         self._intent_source = intent_source
         self._intent_due: float | None = None  # when the intent may change without a touch
-        self._selector = Selector(table, None if timing is None else timing.levels)
         self._builder = SetBuilder(
             rig,
             support=capabilities.envelope_support,
             ramp_max=capabilities.ramp_max,
             timing=timing,
         )
+        self._selector = Selector(
+            table,
+            None if timing is None else timing.levels,
+            shape=self._builder.shape,
+            arrived=arrived,
+        )
         self._selected: Selection | None = None
-        self._playing = _Playback()
+        self._decided: Decision | None = None  # the last one with something to send
+        self._playing: Mapping[int, PlayedContent] = {}
+        self._may_play: frozenset[int] = frozenset()  # layers, since all were silent
+        self._is_silent = False  # for certain
+        self._retry_at: float | None = None
         self._triggered_at: float | None = None
         self._played_until = -math.inf  # s; as far as known
 
@@ -166,13 +171,18 @@ class Decider:
 
         A source times out then, an intent expires, or a ledger would admit what it refused.
         """
-        moments = (self._tracker.next_expiry, self._intent_due, self._playing.retry_at)
+        moments = (self._tracker.next_expiry, self._intent_due, self._retry_at)
         return min((moment for moment in moments if moment is not None), default=None)
 
     @property
     def is_silence_pending(self) -> bool:
         """Whether the last contact has lifted and silence has not been commanded yet."""
-        return not self._tracker.contacts and not self._playing.is_silent
+        return not self._tracker.contacts and not self._is_silent
+
+    @property
+    def playing(self) -> Mapping[int, PlayedContent]:
+        """The contents that play, by layer."""
+        return self._playing
 
     def update(self, frame: TouchFrame, *, keeps_taps: bool = False) -> Change:
         """Apply a touch frame to the contacts; keeps_taps: as of `ContactTracker.update`."""
@@ -188,114 +198,133 @@ class Decider:
 
     def forget(self) -> None:
         """Discard the known playback: the next decision has a set."""
-        self._selected = None
-        self._playing = _Playback()
+        self._selected, self._decided, self._retry_at = None, None, None
+        self._playing, self._is_silent = {}, False
 
-    def confirm(self, played: Played, *, now: float) -> Drive:
-        """Note what the amplifiers play for the last decision; returns it by ERA.
+    def confirm_silence(self) -> None:
+        """Note that all layers have fallen silent."""
+        self._may_play = frozenset()
+
+    def confirm(self, decision: Decision, played: Played, *, now: float) -> None:
+        """Note what the amplifiers play for the last decision.
 
         Pulses start when the last commit was sent.
         """
-        drive = tones_by_era(played.layers, self._rig)
-        decision = self._playing.decision
-        self._playing = replace(self._playing, drive=drive)
-        if decision is None or decision.set is None or decision.pattern is None:
-            return drive
-        for _, target in decision.selection.targets:
-            if target.pulse is not None and target.pulse.started_at is None:
-                target.pulse.started_at = played.sent_at
-        self._playing = replace(
-            self._playing,
-            settled_at=now + decision.set.settled_after,
-            validity=self._validity(played, decision.selection, now),
-        )
-        return drive
+        self._may_play = self._may_play.difference(decision.sets).union(decision.started)
+        playing = dict(self._playing)
+        for number in decision.started:
+            one = playing[number]
+            for _, target in one.content.targets:
+                if target.pulse is not None and target.pulse.started_at is None:
+                    target.pulse.started_at = played.sent_at
+            playing[number] = replace(
+                one,
+                drive=tones_by_era(played.layers, self._rig, number),
+                settled_at=now + one.set.settled_after,
+                validity=self._validity(played, number, one.content, now),
+            )
+        self._playing = playing
 
     def without_shapes(self, decision: Decision) -> Decision | None:
-        """Return the last decision along its plain ramp; None where it has no shapes."""
-        plain = None if decision.set is None else decision.set.plain
-        if plain is None or decision.pattern is None:
+        """Return the last decision along its plain ramps; None where it has no shapes."""
+        if not any(each.plain for each in decision.sets.values()):
             return None
-        pattern = replace(decision.pattern, onset=None, ending=None)
-        decision = replace(decision, set=plain, pattern=pattern)
-        self._playing = replace(self._playing, decision=decision)
+        sets = {number: each.plain or each for number, each in decision.sets.items()}
+        decision = self._decided = replace(decision, sets=sets)
+        playing = dict(self._playing)
+        for number in decision.started:
+            one = playing[number]
+            pattern = replace(one.pattern, onset=None, ending=None)
+            playing[number] = replace(one, set=sets[number], pattern=pattern)
+        self._playing = playing
         return decision
 
     def refused(self, decision: Decision, error: CommandRefused) -> Decision:
         """Return silence in place of the last decision, which a ledger has refused."""
-        decision = replace(
+        self._retry_at = error.until
+        self._playing, self._is_silent = {}, True
+        self._decided = replace(
             decision,
-            set=PlateSet(ramp=FADE_RAMP),
-            pattern=None,
+            sets={},
+            started=frozenset(),
+            silence=FADE_RAMP,
             refusal=str(error),
             retry_at=error.until,
         )
-        self._playing = _Playback(decision)
-        return decision
+        return self._decided
 
-    def renewal(self, now: float) -> PlateSet | None:
-        """Return the set that prolongs the playback, if due at a time [s]; else None."""
-        decision = self._playing.decision
-        if decision is None or decision.set is None:
-            return None
-        confirmed_until = self._confirmed_until(decision.selection)
-        if not self._playing.validity.is_renewal_due(now, confirmed_until=confirmed_until):
-            return None
-        lasts = valid_for(decision.selection, confirmed_until=confirmed_until, now=now)
-        return self._builder.build_renewal(decision.set, valid_for=lasts)
+    def renewal(self, now: float) -> dict[int, PlateSet]:
+        """Return the sets that prolong what plays, by layer, where that is due at a time [s]."""
+        due = {}
+        for number, one in self._playing.items():
+            targets = one.content.targets
+            until = self._confirmed_until(one.content)
+            if one.validity.is_renewal_due(now, confirmed_until=until):
+                lasts = valid_for(targets, confirmed_until=until, now=now)
+                due[number] = self._builder.build_renewal(one.set, valid_for=lasts)
+        return due
 
-    def confirm_renewal(self, played: Played, *, now: float) -> None:
-        """Note that the amplifiers have accepted a renewal."""
-        if self._playing.decision is not None:
-            validity = self._validity(played, self._playing.decision.selection, now)
-            self._playing = replace(self._playing, validity=validity)
+    def confirm_renewal(self, numbers: Iterable[int], played: Played, *, now: float) -> None:
+        """Note that the amplifiers have accepted a renewal of layers."""
+        playing = dict(self._playing)
+        for number in numbers:
+            validity = self._validity(played, number, playing[number].content, now)
+            playing[number] = replace(playing[number], validity=validity)
+        self._playing = playing
 
-    def refuse_renewal(self, until: float | None) -> None:
+    def refuse_renewal(self, numbers: Iterable[int], until: float | None) -> None:
         """Note that a ledger has refused a renewal until a time [s], None: the playback ends."""
         due = math.inf if until is None else until
-        validity = replace(self._playing.validity, renewal_due=due)
-        self._playing = replace(self._playing, validity=validity)
+        playing = dict(self._playing)
+        for number in numbers:
+            validity = replace(playing[number].validity, renewal_due=due)
+            playing[number] = replace(playing[number], validity=validity)
+        self._playing = playing
 
     def ended(self, now: float) -> Decision | None:
-        """Return the end of a playback that has come by itself at a time [s], once; else None."""
-        decision = self._playing.decision
-        if decision is None or not self._playing.drive or now < self._playing.validity.ends_at:
+        """Return the end of all playback that has come by itself at a time [s], once; else None."""
+        over = {
+            number: replace(one, drive={})
+            for number, one in self._playing.items()
+            if one.drive and now >= one.validity.ends_at
+        }
+        if not over or self._decided is None:
             return None
-        self._playing = replace(self._playing, drive={})
-        return replace(decision, set=None, pattern=None, refusal=ENDED, triggered_at=now)
+        self._playing = {**self._playing, **over}
+        if any(each.drive for each in self._playing.values()):
+            return None
+        return replace(self._decided, sets={}, started=frozenset(), refusal=ENDED, triggered_at=now)
 
     def decide(self, now: float) -> Decision | None:
         """Decide at a time [s]; None if nothing changes."""
         self.expire(now)
-        contacts, playing = self._tracker.contacts, self._playing
+        contacts = self._tracker.contacts
         triggered_at = now if self._triggered_at is None else min(self._triggered_at, now)
-        self._triggered_at = None
-        if playing.drive:
+        if any(each.drive for each in self._playing.values()):
             self._played_until = now
         from_rest = now - self._played_until >= _RING_DOWN
         decision, has_failed = None, False
         try:
             selection = self._select(contacts, now)
-            is_new = selection != self._selected or _is_due(playing.retry_at, now)
+            is_new = selection != self._selected or _is_due(self._retry_at, now)
             draft = Decision(contacts, selection, from_rest, triggered_at)
-            decision = self._with_pattern(draft, now) if is_new else None
+            if is_new and selection.contents:
+                decision = self._with_sets(draft, now)
         except Exception as error:
             has_failed = True
-            selection = Selection((), contacts, None, failure_text(error))
+            selection = Selection((), contacts, (), failure_text(error))
             is_new = selection != self._selected
             draft = Decision(contacts, selection, from_rest, triggered_at)
             if is_new:
                 _logger.exception("loop: decision failed, silencing all channels")
-        if decision is None and is_new:
-            decision = draft
-            if not playing.is_silent:
-                end = self._end(contacts, now, has_failed=has_failed)
-                decision = replace(draft, set=end)
-        if decision is not None and decision.set is not None:
-            self._playing = _Playback(decision)
-        elif is_new and playing.decision is not None:
-            self._playing = replace(playing, decision=replace(playing.decision, retry_at=None))
-        self._selected = selection
+        self._triggered_at = triggered_at if self._selector.is_choosing else None
+        if is_new and not selection.contents:
+            is_awaited = selection.is_pending and not self._may_play
+            decision = None if is_awaited else self._ended(draft, now, has_failed=has_failed)
+        if is_new:
+            self._selected, self._retry_at = selection, None
+        if decision is not None and (decision.sets or decision.silence is not None):
+            self._decided = decision
         return decision
 
     def _select(self, contacts: tuple[Contact, ...], now: float) -> Selection:
@@ -305,41 +334,83 @@ class Decider:
         self._intent_due = intent.due(now)
         return self._selector.select(contacts, intent, self._capabilities)
 
-    def _with_pattern(self, draft: Decision, now: float) -> Decision | None:
-        """Return a draft with the set of its pattern; None without a pattern."""
-        selection = draft.selection
-        if selection.pattern is None or selection.question is None:
+    def _with_sets(self, draft: Decision, now: float) -> Decision | None:
+        """Return a draft with the sets of all layers that change; None if none does."""
+        numbers = self._numbered(draft.selection.contents)
+        playing: dict[int, PlayedContent] = {}
+        sets: dict[int, PlateSet] = {}
+        for number, content in numbers.items():
+            before = self._playing.get(number)
+            if before is not None and before.content == content:
+                playing[number] = before
+                continue
+            targets, until = content.targets, self._confirmed_until(content)
+            sets[number], pattern = self._builder.build_pattern(
+                number,
+                content.pattern,
+                content.question,
+                playing={} if before is None else before.drive,
+                valid_for=valid_for(targets, confirmed_until=until, now=now),
+                is_shaped=not targets[0][1].is_short,
+                lasts=first_lasts(targets, now),
+            )
+            playing[number] = PlayedContent(content, sets[number], pattern)
+        started = frozenset(sets)
+        for number in self._may_play - numbers.keys():
+            has_endings = self._may_end_shaped(number, now)
+            sets[number] = self._builder.build_end(number, has_endings=has_endings)
+        if not sets:
             return None
-        until = self._confirmed_until(selection)
-        found, pattern = self._builder.build_pattern(
-            selection.pattern,
-            selection.question,
-            playing=self._playing.drive,
-            valid_for=valid_for(selection, confirmed_until=until, now=now),
-            is_shaped=not is_short(selection.targets),
-            lasts=first_lasts(selection, now),
-        )
-        return replace(draft, set=found, pattern=pattern)
+        self._playing, self._is_silent = playing, False
+        self._may_play |= started
+        return replace(draft, sets=sets, started=started)
 
-    def _end(self, contacts: tuple[Contact, ...], now: float, *, has_failed: bool) -> PlateSet:
-        """Return what ends the playback: along endings only under fingers that stay."""
-        if not contacts:
-            return PlateSet(ramp=RELEASE_RAMP)
-        decision = self._playing.decision
-        has_endings = decision is not None and decision.set is not None and decision.set.has_endings
-        if has_endings and not has_failed and now >= self._playing.settled_at:
-            return self._builder.build_end()
-        return PlateSet(ramp=FADE_RAMP)
+    def _numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
+        """Contents by layer: a finger's in the layer that it has, new ones in free layers."""
+        of_finger = {one.content.targets[0][0].key: number for number, one in self._playing.items()}
+        numbers = {}
+        new = []
+        for content in contents:
+            number = of_finger.get(content.targets[0][0].key)
+            if number is None:
+                new.append(content)
+            else:
+                numbers[number] = content
+        every = range(self._capabilities.layers)
+        free = [number for number in every if number not in numbers]
+        free.sort(key=self._may_play.__contains__)  # layers that end are the last to be taken
+        return {**numbers, **dict(zip(free, new, strict=False))}
 
-    def _confirmed_until(self, selection: Selection) -> float:
-        """Return when [s] the first target is lifted unless a frame arrives."""
-        expiries = [self._tracker.expiry_of(contact.key) for contact, _ in selection.targets]
+    def _may_end_shaped(self, number: int, now: float) -> bool:
+        """Whether a layer has settled, so that its endings lead from what plays."""
+        one = self._playing.get(number)
+        return one is not None and one.set.has_endings and now >= one.settled_at
+
+    def _ended(self, draft: Decision, now: float, *, has_failed: bool) -> Decision:
+        """Return a draft that ends all playback: along endings only under fingers that stay."""
+        if self._is_silent:
+            return draft
+        numbers = self._may_play
+        is_shaped = bool(numbers) and not has_failed and bool(draft.contacts)
+        if is_shaped and all(self._may_end_shaped(number, now) for number in numbers):
+            ends = {n: self._builder.build_end(n, has_endings=True) for n in sorted(numbers)}
+            self._playing = {}
+            return replace(draft, sets=ends)
+        self._playing, self._is_silent = {}, True
+        if not draft.contacts:
+            return replace(draft, silence=RELEASE_RAMP)
+        return replace(draft, silence=FADE_RAMP)
+
+    def _confirmed_until(self, content: Content) -> float:
+        """Return when [s] the first target of a content is lifted unless a frame arrives."""
+        expiries = [self._tracker.expiry_of(contact.key) for contact, _ in content.targets]
         return min(expiries, default=-math.inf)
 
-    def _validity(self, played: Played, selection: Selection, now: float) -> Validity:
-        """Return how long a set that has been played by now [s] lasts."""
-        until = self._confirmed_until(selection)
-        return Validity.started(_shortest(played.layers), confirmed_until=until, now=now)
+    def _validity(self, played: Played, number: int, content: Content, now: float) -> Validity:
+        """Return how long a layer lasts whose set has been played by now [s]."""
+        until = self._confirmed_until(content)
+        lasts = _shortest(played.layers, number)
+        return Validity.started(lasts, confirmed_until=until, now=now)
 
     def _note(self, change: Change, time: float) -> None:
         """Note when the first change since the last decision arrived."""
@@ -347,8 +418,8 @@ class Decider:
             self._triggered_at = time
 
 
-def _shortest(played: Mapping[str, Sequence[LayerSet]]) -> float:
-    """Return the time [s] after the commit when the first amplifier ends its vibration by itself.
+def _shortest(played: Mapping[str, Sequence[LayerSet]], number: int) -> float:
+    """Return the time [s] after the commit when the first amplifier ends a layer by itself.
 
     Infinite where none does.
     """
@@ -356,7 +427,7 @@ def _shortest(played: Mapping[str, Sequence[LayerSet]]) -> float:
         _VALID_FOR.from_wire(one.valid_for)
         for layers in played.values()
         for one in layers
-        if one.valid_for and is_vibrating(one)
+        if one.layer == number and one.valid_for and is_vibrating(one)
     ]
     return min(times, default=math.inf)
 

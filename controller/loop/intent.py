@@ -3,12 +3,14 @@
 The interface between the meaning of touches and their playback. All other contacts are kept quiet.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 from controller.sources.contacts import Contact, ContactKey
 from model.finger.perception import STRONG_DB_SL
+from model.table.effect_level import SHAPED_FROM
 
 _MIN_WAIT = 0.001  # s
 
@@ -20,19 +22,23 @@ class Pulse:
     """A vibration of limited duration [s], requested at a time [s]; a later one is another.
 
     Its duration counts from started_at [s], when the amplifiers have been sent its commit; until
-    then, and if they never are, from requested_at. is_raised: whether the drive is raised so
-    that the level is felt over the duration, onset included; else the level is the steady one.
+    then, and if they never are, from when it is due: requested_at, or due_at [s] where it waits its
+    turn. is_raised: whether the drive is raised so that the level is felt over the duration, onset
+    included; else the level is the steady one.
     """
 
     duration: float
     requested_at: float
     is_raised: bool = True
+    due_at: float = field(default=-math.inf, init=False, compare=False)
     started_at: float | None = field(default=None, init=False, compare=False)
 
     @property
     def start(self) -> float:
         """When [s] its duration starts, as far as known."""
-        return self.requested_at if self.started_at is None else self.started_at
+        if self.started_at is None:
+            return max(self.requested_at, self.due_at)
+        return self.started_at
 
     @property
     def end(self) -> float:
@@ -42,12 +48,13 @@ class Pulse:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A contact that shall feel something.
+    """A contact that shall feel something of its own.
 
-    level_db_sl: how strongly; None for as strongly as the neighbours allow. Among targets with a
-    level, one without gets the highest of theirs. allow_weaker: where the plate cannot reach the
-    level, as strongly as the neighbours allow instead of nothing. pulse: None without an end of its
-    own. band: lowest and highest frequency [Hz]; equal ones stand for the nearest of the table.
+    level_db_sl: how strongly; None for as strongly as the neighbours allow. allow_weaker: where the
+    plate cannot reach the level, as strongly as the neighbours allow instead of nothing. pulse:
+    None without an end of its own. band: lowest and highest frequency [Hz]; equal ones stand for
+    the nearest of the table. priority: lower ones give way first. content: a name; fingers of one
+    name may share one vibration where the plate cannot give each its own. None: of this one alone.
     """
 
     key: ContactKey
@@ -55,6 +62,13 @@ class Target:
     allow_weaker: bool = False
     pulse: Pulse | None = None
     band: tuple[float, float] | None = None
+    priority: int = 0
+    content: str | None = None
+
+    @property
+    def is_short(self) -> bool:
+        """Whether it ends before a shaped onset would have settled."""
+        return self.pulse is not None and self.pulse.duration < SHAPED_FROM
 
 
 @dataclass(frozen=True)

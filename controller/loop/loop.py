@@ -184,6 +184,7 @@ class Controller:
                 ),
                 intent_source=self._intent_source,
                 timing=self._timing,
+                arrived=self._wake.set,
             )
             decider.prepare()
         except BaseException:
@@ -211,6 +212,7 @@ class Controller:
         decider = self._decider
         await self._group.arm()
         decider.forget()
+        decider.confirm_silence()
         self._heartbeat_due = clock.now()
         self._schedule_expiry()  # fingers may have rested since before
         self._wake.set()
@@ -352,37 +354,36 @@ class Controller:
             if ended is not None:
                 silenced = silenced_by(ended, sent_at=None, now=now)
                 self._report(lambda each: each.silenced(silenced))
-        elif decision.pattern is not None and self._group.degraded:
+        elif decision.started and self._group.degraded:
             self._decider.forget()  # decided again once all amplifiers reply
         else:
             await self._execute(decision)
 
     async def _execute(self, decision: Decision) -> None:
-        """Send the set of a decision and report the outcome; raises DriverError."""
-        played, sent_at = None, None
-        if decision.set is not None:
-            try:
-                played, sent_at = await self._play(decision.set)
-            except Preempted:
+        """Send the sets of a decision and report the outcome; raises DriverError."""
+        sent_at = None
+        try:
+            if decision.silence is not None:
+                sent_at = await self._silence(decision.silence)
+            elif decision.sets:
+                played = await self._play(decision.sets)
+                sent_at = played.sent_at
+                self._decider.confirm(decision, played, now=clock.now())
+        except Preempted:
+            raise
+        except CommandRefused as error:
+            if self.group_state is not GroupState.ARMED:
                 raise
-            except CommandRefused as error:
-                if self.group_state is not GroupState.ARMED:
-                    raise
-                plain = self._decider.without_shapes(decision)
-                if plain is not None:
-                    _logger.info("loop: plain ramps instead of envelopes: %s", error)
-                    await self._execute(plain)
-                else:
-                    await self._execute(self._decider.refused(decision, error))
-                return
-        if played is not None and decision.pattern is not None and sent_at is not None:
-            drive = self._decider.confirm(played, now=clock.now())
+            plain = self._decider.without_shapes(decision)
+            if plain is not None:
+                _logger.info("loop: plain ramps instead of envelopes: %s", error)
+                await self._execute(plain)
+            else:
+                await self._execute(self._decider.refused(decision, error))
+            return
+        if sent_at is not None and decision.selection.contents and decision.refusal is None:
             applied = applied_by(
-                decision,
-                decision.pattern,
-                drive=drive,
-                sent_at=sent_at,
-                timing=self._timing,
+                decision, self._decider.playing, sent_at=sent_at, timing=self._timing
             )
             self._report(lambda each: each.pattern_applied(applied))
             return
@@ -393,38 +394,46 @@ class Controller:
         self._report(lambda each: each.silenced(silenced))
 
     async def _renew(self, now: float) -> None:
-        """Prolong the playback if due; raises DriverError."""
-        found = self._decider.renewal(now)
-        if found is None:
+        """Prolong the layers that are due; raises DriverError."""
+        due = self._decider.renewal(now)
+        if not due:
             return
         try:
-            played, _ = await self._play(found)
+            played = await self._play(due)
         except Preempted:
             raise
         except CommandRefused as error:
             if self.group_state is not GroupState.ARMED:
                 raise
             _logger.debug("loop: vibration not renewed: %s", error)
-            self._decider.refuse_renewal(error.until)
+            self._decider.refuse_renewal(due, error.until)
         else:
-            if played is not None:
-                self._decider.confirm_renewal(played, now=clock.now())
+            self._decider.confirm_renewal(due, played, now=clock.now())
 
-    async def _play(self, found: PlateSet) -> tuple[Played | None, float]:
-        """Play a set on all amplifiers; what plays, and when [s] it was sent."""
+    async def _silence(self, ramp: float) -> float:
+        """Silence all layers of all amplifiers; returns when [s] that was sent."""
         is_known = False
         try:
-            if found.is_silence:
-                sent_at = await self._group.silence(found.ramp)
-                is_known = True
-                return None, sent_at
+            sent_at = await self._group.silence(ramp)
+            is_known = True
+        finally:
+            if not is_known:
+                self._decider.forget()
+        self._decider.confirm_silence()
+        return sent_at
+
+    async def _play(self, sets: Mapping[int, PlateSet]) -> Played:
+        """Play the sets of layers on all amplifiers, from one moment on."""
+        is_known = False
+        try:
             if self._group.is_set_incomplete:
                 await self._group.silence(RELEASE_RAMP)  # before the next pattern
-            played = await self._group.apply(
-                {name: [layer] for name, layer in found.layers.items()}
-            )
+            layers = {
+                name: [each.layers[name] for each in sets.values()] for name in self._rig.amplifiers
+            }
+            played = await self._group.apply(layers)
             is_known = True
-            return played, played.sent_at
+            return played
         except CommandRefused as error:
             is_known = self.group_state is GroupState.ARMED and not isinstance(error, Preempted)
             raise

@@ -1,12 +1,12 @@
 """Reports of the control loop to a demo, a log or a dashboard."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from controller.loop.decision import Decision
+from controller.loop.content import Prediction
+from controller.loop.decision import Decision, PlayedContent
 from controller.loop.routing import Drive
-from controller.loop.selection import Prediction
 from controller.sources.contacts import Change, Contact
 from model.table.pattern import Pattern
 from model.table.question import Question
@@ -15,27 +15,45 @@ from model.table.timing import Timing
 
 @dataclass(frozen=True)
 class Applied:
-    """A pattern that the amplifiers have confirmed.
+    """The contents that amplifiers play since their last confirmed set.
 
     contacts: all, in order of arrival; targets: a prediction for each; quiet: quiet contacts;
-    pattern: as it is played, with its ramp and envelopes; drive: what the amplifiers play, by ERA,
-    without silent ones; latency [s]: from the touch frame to the last byte of the command on the
-    wire; time [s] of that byte; from_rest: whether the plate was at rest; settled_after [s]: when
-    its last fade or envelope has ended; lasts: whether it plays until its contacts change.
+    contents: as they are played, by layer, the newest one last; latency [s]: from the touch frame
+    to the last byte of the command on the wire; time [s] of that byte; from_rest: whether the plate
+    was at rest; settled_after [s]: when the last fade or envelope has ended; lasts: whether all
+    play until their contacts change.
     """
 
     contacts: tuple[Contact, ...]
     targets: tuple[Prediction, ...]
     quiet: tuple[Contact, ...]
-    pattern: Pattern
-    drive: Drive
+    contents: Mapping[int, PlayedContent]
     latency: float
     time: float
     from_rest: bool = True
     settled_after: float = 0.0
     lasts: bool = True
-    question: Question | None = field(default=None, repr=False)
     timing: Timing | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def newest(self) -> PlayedContent:
+        """The content that changed last."""
+        return [*self.contents.values()][-1]
+
+    @property
+    def pattern(self) -> Pattern:
+        """The pattern of the newest content."""
+        return self.newest.pattern
+
+    @property
+    def drive(self) -> Drive:
+        """What the amplifiers play of the newest content, by ERA, without silent ones."""
+        return self.newest.drive
+
+    @property
+    def question(self) -> Question:
+        """The question of the newest content."""
+        return self.newest.content.question
 
     @cached_property
     def transient_contrast_db(self) -> float | None:
@@ -43,9 +61,10 @@ class Applied:
 
         Computed when it is first read, in about two milliseconds, so that no touch waits for it.
         None without quiet contacts, within 0.4 s of another pattern, whose ringing it does not
-        include, or without `timing`.
+        include, beside other contents, or without `timing`.
         """
-        if self.timing is None or self.question is None or not (self.from_rest and self.quiet):
+        is_alone = self.from_rest and len(self.contents) == 1
+        if self.timing is None or not (is_alone and self.quiet):
             return None
         measured = self.timing.with_transient_measures(self.question, self.pattern)
         return measured.transient_contrast_db
@@ -68,25 +87,25 @@ class Silenced:
 
 def applied_by(
     decision: Decision,
-    pattern: Pattern,
+    playing: Mapping[int, PlayedContent],
     *,
-    drive: Drive,
     sent_at: float,
     timing: Timing | None,
 ) -> Applied:
-    """Report a decision whose pattern plays; sent_at [s]: of its last byte."""
+    """Report what plays after a decision, by layer; sent_at [s]: of its last byte."""
+    order = sorted(playing, key=decision.started.__contains__)
     return Applied(
         contacts=decision.contacts,
         targets=decision.selection.predictions,
         quiet=decision.selection.quiet,
-        pattern=pattern,
-        drive=drive,
+        contents={number: playing[number] for number in order},
         latency=sent_at - decision.triggered_at,
         time=sent_at,
         from_rest=decision.from_rest,
-        settled_after=0.0 if decision.set is None else decision.set.settled_after,
-        lasts=all(target.pulse is None for _, target in decision.selection.targets),
-        question=decision.selection.question,
+        settled_after=max(each.settled_after for each in decision.sets.values()),
+        lasts=all(
+            target.pulse is None for one in playing.values() for _, target in one.content.targets
+        ),
         timing=timing,
     )
 

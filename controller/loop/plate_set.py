@@ -1,11 +1,11 @@
-"""What all amplifiers of a rig are to play: routed, and shaped where possible."""
+"""What one layer of all amplifiers of a rig is to play: routed, and shaped where possible."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from controller.loop.envelopes import EnvelopeSupport, duration_of, thinned
-from controller.loop.routing import LAYER, Drive, continues_any_tone, route, shaped
+from controller.loop.routing import Drive, continues_any_tone, route, shaped
 from drivers.contents import Layer
 from model.rig.rig import Rig
 from model.table.pattern import Pattern
@@ -20,20 +20,15 @@ FADE_RAMP = 0.020
 
 @dataclass(frozen=True)
 class PlateSet:
-    """The layer of every amplifier, by name; without layers all fall silent along `ramp` [s].
+    """What one layer plays on every amplifier, by name; ramp [s]: the longest of them.
 
     plain: the same along its ramp, where an amplifier's ledger refuses its onset or ending; None
     without either.
     """
 
-    layers: Mapping[str, Layer] = field(default_factory=dict)
-    ramp: float = FADE_RAMP
+    layers: Mapping[str, Layer]
+    ramp: float
     plain: "PlateSet | None" = None
-
-    @property
-    def is_silence(self) -> bool:
-        """Whether all channels fall silent along the ramp, without endings."""
-        return not self.layers
 
     @property
     def has_endings(self) -> bool:
@@ -65,8 +60,34 @@ class SetBuilder:
         """Shape by another timing from now on."""
         self._timing = timing
 
+    def shape(
+        self,
+        question: Question,
+        pattern: Pattern,
+        is_continued: bool,
+        *,
+        is_ended: bool = True,
+    ) -> Pattern:
+        """Add the onset and the ending of a pattern, unless it has them; takes milliseconds.
+
+        is_continued: whether it needs no onset; is_ended: whether it may have an ending.
+        """
+        has_onset = self._support.onset_knots > 0 and not is_continued
+        has_ending = self._support.ending_knots > 0 and is_ended
+        pattern = replace(
+            pattern,
+            onset=pattern.onset if has_onset else None,
+            ending=pattern.ending if has_ending else None,
+        )
+        adds_onset = has_onset and pattern.onset is None
+        adds_ending = has_ending and pattern.ending is None
+        if self._timing is None or not (adds_onset or adds_ending):
+            return pattern
+        return self._timing.with_envelopes(question, pattern, onset=adds_onset, ending=adds_ending)
+
     def build_pattern(
         self,
+        number: int,
         pattern: Pattern,
         question: Question,
         *,
@@ -75,25 +96,29 @@ class SetBuilder:
         is_shaped: bool = True,
         lasts: float = math.inf,
     ) -> tuple[PlateSet, Pattern]:
-        """Build the set of a pattern; returns it and the pattern as it is played.
+        """Build the set of a pattern in a layer; returns it and the pattern as it is played.
 
-        playing: what each ERA plays now; a tone that continues needs no onset. valid_for [s]: for
-        how long it plays unless it is renewed. is_shaped: whether it may have an onset and an
-        ending, which it has only if its first pulse lasts [s] until the onset is over.
+        playing: what each ERA plays now in this layer; a tone that continues needs no onset.
+        valid_for [s]: for how long it plays unless it is renewed. is_shaped: whether it may have an
+        onset and an ending, which it has only if its first pulse lasts [s] until the onset is over.
         """
-        ramp = min(pattern.ramp, self._ramp_max)
         layers = route(
-            pattern.excitation, self._rig, ramp=ramp, playing=playing, valid_for=valid_for
+            pattern.excitation,
+            self._rig,
+            ramp=min(pattern.ramp, self._ramp_max),
+            number=number,
+            playing=playing,
+            valid_for=valid_for,
         )
         ramp = max(layer.ramp for layer in layers.values())
-        pattern = replace(pattern, ramp=ramp, onset=None, ending=None)
+        pattern = replace(pattern, ramp=ramp)
         plain = PlateSet(layers, ramp)
-        has_onset = self._support.onset_knots > 0
-        has_onset = has_onset and not continues_any_tone(pattern.excitation, playing)
-        has_ending = self._support.ending_knots > 0 and lasts > KNOT_STEP * ONSET_KNOTS
-        if self._timing is None or not is_shaped or not (has_onset or has_ending):
+        if is_shaped:
+            is_continued = continues_any_tone(pattern.excitation, playing)
+            is_ended = lasts > KNOT_STEP * ONSET_KNOTS
+            pattern = self.shape(question, pattern, is_continued, is_ended=is_ended)
+        if not (pattern.onset or pattern.ending):
             return plain, pattern
-        pattern = self._timing.with_envelopes(question, pattern, onset=has_onset, ending=has_ending)
         if pattern.onset:
             onset = thinned(pattern.onset, knots=self._support.onset_knots)
             pattern = replace(pattern, onset=onset)
@@ -103,12 +128,16 @@ class SetBuilder:
     def build_renewal(self, playing: PlateSet, *, valid_for: float) -> PlateSet:
         """Build the set that prolongs another for a time [s]."""
         layers = {
-            name: Layer(LAYER, ramp=layer.ramp, valid_for=valid_for, renew=True)
+            name: Layer(layer.number, ramp=layer.ramp, valid_for=valid_for, renew=True)
             for name, layer in playing.layers.items()
         }
         return PlateSet(layers, playing.ramp)
 
-    def build_end(self) -> PlateSet:
-        """Build the set that ends every ERA along its ending."""
+    def build_end(self, number: int, *, has_endings: bool) -> PlateSet:
+        """Build the set that ends a layer along its endings, or along a ramp."""
         ramp = min(FADE_RAMP, self._ramp_max)
-        return PlateSet({name: Layer(LAYER, ramp=ramp) for name in self._rig.amplifiers}, ramp)
+        if has_endings:
+            layers = {name: Layer(number, ramp=ramp) for name in self._rig.amplifiers}
+        else:
+            layers = route({}, self._rig, ramp=ramp, number=number)
+        return PlateSet(layers, ramp)

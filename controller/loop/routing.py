@@ -17,9 +17,6 @@ from model.rig.rig import Channel, Rig
 from model.transients.base_motion import Envelopes
 from model.vibration import excitation as physics
 
-LAYER = 0
-"""The one layer that is used."""
-
 Drive = Mapping[str, Tone]
 """What ERAs play, by name, without silent ones."""
 
@@ -31,16 +28,18 @@ def route(
     rig: Rig,
     *,
     ramp: float,
+    number: int = 0,
     playing: Drive | None = None,
     valid_for: float = 0.0,
 ) -> dict[str, Layer]:
-    """Return a layer for every amplifier of the rig, by name.
+    """Return the layer of a number for every amplifier of the rig, by name.
 
     Every wired channel has a tone: level = amplitude / stroke, phase in degrees within (-180, 180],
     level 0 for an ERA that is not driven. ramp [s]: lengthened to the rig's slew limit, on all
-    amplifiers alike. playing: what each ERA plays now (`tones_by_era`); a frequency keeps its phase
-    if all its ERAs play it already. valid_for [s]: of the layers. All other limits belong to the
-    ledgers of the amplifiers. Raises InputError for an ERA that the rig does not have.
+    amplifiers alike. playing: what each ERA plays now in this layer (`tones_by_era`); a frequency
+    keeps its phase if all its ERAs play it already. valid_for [s]: of the layers. All other limits
+    belong to the ledgers of the amplifiers. Raises InputError for an ERA that the rig does not
+    have.
     """
     unknown = sorted(excitation.keys() - rig.wiring.keys())
     if unknown:
@@ -61,7 +60,7 @@ def route(
     for name, channel in rig.wiring.items():
         wired[channel.amplifier].append(drive[name])
     return {
-        name: Layer(LAYER, tuple(tones), ramp=ramp, valid_for=valid_for)
+        name: Layer(number, tuple(tones), ramp=ramp, valid_for=valid_for)
         for name, tones in wired.items()
     }
 
@@ -94,14 +93,16 @@ def shaped(
     return found
 
 
-def tones_by_era(played: Mapping[str, Sequence[LayerSet]], rig: Rig) -> dict[str, Tone]:
-    """Return what each ERA plays, by name, from layers of amplifiers; without silent ones."""
+def tones_by_era(
+    played: Mapping[str, Sequence[LayerSet]], rig: Rig, number: int = 0
+) -> dict[str, Tone]:
+    """Return what each ERA plays in the layer of a number, by name; without silent ones."""
     playing = {
         (amplifier, command.channel): command
         for amplifier, layers in played.items()
         for one in layers
         for command in one.commands
-        if command.level > 0
+        if one.layer == number and command.level > 0
     }
     return {
         name: Tone(

@@ -1,25 +1,25 @@
-"""Selection: from a haptic intent to the pattern of the table that realises it."""
+"""Selection: from a haptic intent to the contents of a table that realise it."""
 
 import contextlib
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
+from controller.loop.answer_thread import AnswerThread
 from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.content import Content, Prediction, Selection, not_served, verdict_of
 from controller.loop.intent import HapticIntent, Target
-from controller.loop.table_query import TableAnswer, is_short, query_table, why_held_back
-from controller.sources.contacts import Contact
+from controller.loop.joint_answer import Shape, query_jointly
+from controller.loop.table_query import TableAnswer, query_table
+from controller.sources.contacts import Contact, ContactKey
+from model.drive_modes import UNRESTRICTED
 from model.errors import InputError
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import contrast_db, mean_level_db_sl
+from model.finger.perception import decibels
 from model.table.effect_level import EffectLevels
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
-from model.vibration.excitation import peak_acceleration
 from registry.plugins import failure_text
 
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
@@ -31,56 +31,60 @@ _STEP_SHORT_OF = 1.0
 
 _logger = logging.getLogger(__name__)
 
+Targets = tuple[tuple[Contact, Target], ...]
+_NOTHING = Selection((), ())
 
-@dataclass(frozen=True)
-class Prediction:
-    """Predicted vibration at a target.
 
-    contact: as it was when the pattern was chosen; level_db_sl: over the duration of the effect,
-    onset included, or the steady one where it has none; contrast_db: of the steady vibration to the
-    loudest quiet point, None without quiet contacts. held_back: why another vibration than that of
-    its own effect plays; None if its own does.
-    """
-
-    contact: Contact
-    level_db_sl: float
-    contrast_db: float | None
-    held_back: str | None = None
+def unshaped(question: Question, pattern: Pattern, is_continued: bool) -> Pattern:
+    """Return a pattern as it is."""
+    return pattern
 
 
 @dataclass(frozen=True)
-class Selection:
-    """The pattern for some contacts, or None and the reason for silence.
+class _Chosen:
+    """What lasts, chosen together, and each short pulse that began with it.
 
-    targets, quiet: contacts as they were when the pattern was chosen, targets with their
-    intents; question: the query as sent; predictions: one per target.
+    lasting: None where what lasts was kept.
     """
 
-    targets: tuple[tuple[Contact, Target], ...]
-    quiet: tuple[Contact, ...]
-    pattern: Pattern | None
-    reason: str | None
-    question: Question | None = None
-    predictions: tuple[Prediction, ...] = ()
+    lasting: Selection | None
+    short: Mapping[ContactKey, Selection]
 
 
 class Selector:
-    """Chooses the pattern of a table that realises an intent for the contacts on its plate.
+    """Chooses the contents of a table that realise an intent for the contacts on its plate.
 
-    A pattern stays as long as its targets and their levels do, no contact has moved more than 8 mm,
-    and none has another load, which changes by a factor of 1.5 or more. A quiet contact that lifts
-    leaves it as it is: a change would be felt. So does any move, any load and any new quiet contact
-    while a short pulse plays. levels: None for steady levels only.
+    Each target has its own: all that last are chosen together, in a thread where they are several;
+    a short pulse is chosen alone beside them, and never changed. What lasts stays as long as its
+    targets and their levels do, no contact has moved more than 8 mm, and none has another load,
+    which changes by a factor of 1.5 or more. A contact that lifts, or whose effect ends, leaves the
+    others as they are: a change would be felt. levels: None for steady levels only; shape: adds
+    envelopes to what is chosen in the thread, which calls arrived when it is done.
     """
 
-    def __init__(self, table: LocalizationTable, levels: EffectLevels | None = None) -> None:
-        self._table = table
-        self._levels = levels
-        self._current = Selection((), (), None, None)
+    def __init__(
+        self,
+        table: LocalizationTable,
+        levels: EffectLevels | None = None,
+        *,
+        shape: Shape = unshaped,
+        arrived: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._table, self._levels, self._shape = table, levels, shape
+        self._thread: AnswerThread[_Chosen] = AnswerThread(arrived)
+        self._lasting = _NOTHING
+        self._short: Mapping[ContactKey, Selection] = {}
+        self._current = _NOTHING
+        self._asked: tuple[Selection, Targets] = (_NOTHING, ())
 
     def replace(self, table: LocalizationTable, levels: EffectLevels | None) -> None:
         """Answer by another table of this plate; the selection stays until its contacts change."""
         self._table, self._levels = table, levels
+
+    @property
+    def is_choosing(self) -> bool:
+        """Whether the thread computes."""
+        return self._thread.is_busy
 
     def select(
         self,
@@ -88,130 +92,290 @@ class Selector:
         intent: HapticIntent,
         capabilities: PlaybackCapabilities,
     ) -> Selection:
-        """Return the selection for contacts in their order of arrival; the same object if kept."""
+        """Return the selection for contacts in their order of arrival; the same object if kept.
+
+        While the thread computes, what played and is still to be felt stays.
+        """
         by_key = {target.key: target for target in intent.targets}
         targets = tuple((each, by_key[each.key]) for each in contacts if each.key in by_key)
-        quiet = tuple(each for each in contacts if each.key not in by_key)
-        if not self._still_fits(intent, targets, quiet):
-            self._current = self._choose(intent, targets, quiet, capabilities)
+        served, left_out = _within_layers(targets, capabilities)
+        lasting = tuple(each for each in served if not each[1].is_short)
+        short = tuple(each for each in served if each[1].is_short)
+        self._adopt(lasting, contacts)
+        self._lasting = _remaining(self._lasting, lasting)
+        pulses = self._short
+        self._short = {
+            contact.key: pulses[contact.key]
+            for contact, target in short
+            if contact.key in pulses and pulses[contact.key].targets[0][1] == target
+        }
+        new = tuple(each for each in short if each[0].key not in self._short)
+        is_kept = not lasting or _fits(self._lasting, lasting, contacts)
+        if new or not is_kept:
+            self._choose(None if is_kept else lasting, new, tuple(contacts), capabilities, pulses)
+        found = self._together(contacts, targets, left_out, intent.reason)
+        if found != self._current:
+            self._current = found
         return self._current
 
-    def _still_fits(
-        self,
-        intent: HapticIntent,
-        targets: tuple[tuple[Contact, Target], ...],
-        quiet: tuple[Contact, ...],
-    ) -> bool:
-        """Whether the current selection also serves these contacts."""
-        current = self._current
-        if not targets or not current.targets:
-            return not targets and not current.targets and current.reason == intent.reason
-        if {target for _, target in targets} != {target for _, target in current.targets}:
-            return False
-        if current.pattern and is_short(current.targets):
-            return True
-        then = {each.key: each for each in (*(c for c, _ in current.targets), *current.quiet)}
-        now = {each.key: each for each in (*(c for c, _ in targets), *quiet)}
-        same = now.keys() <= then.keys() if current.pattern else now.keys() == then.keys()
-        return same and all(
-            math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
-            and contact.load == then[key].load
-            for key, contact in now.items()
-        )
+    def _adopt(self, lasting: Targets, contacts: Sequence[Contact]) -> None:
+        """Take what the thread has chosen, unless other fingers are on the plate by now."""
+        chosen = self._thread.take()
+        if chosen is None:
+            return
+        self._short = {**self._short, **chosen.short}
+        if chosen.lasting is not None:
+            targets, quiet = chosen.lasting.targets, chosen.lasting.quiet
+            then = {each.key for each in (*(contact for contact, _ in targets), *quiet)}
+            is_for_all = {each.key for each in contacts} <= then
+            if is_for_all and _intents(lasting) <= _intents(targets):
+                self._lasting = chosen.lasting
 
     def _choose(
         self,
-        intent: HapticIntent,
-        targets: tuple[tuple[Contact, Target], ...],
-        quiet: tuple[Contact, ...],
+        lasting: Targets | None,
+        short: Targets,
+        contacts: tuple[Contact, ...],
         capabilities: PlaybackCapabilities,
+        pulses: Mapping[ContactKey, Selection],
+    ) -> None:
+        """Choose for what lasts, None where it is kept, and for new short pulses.
+
+        Several in the thread, and what comes while it is busy, which has the table for itself.
+        pulses: before these.
+        """
+        if self._thread.is_busy and self._is_asked(lasting, short, contacts):
+            return
+        table, levels, before = self._table, self._levels, self._lasting
+
+        def chosen() -> _Chosen:
+            found = None
+            if lasting is not None:
+                found = self._lasting_of(table, levels, lasting, contacts, capabilities, before)
+            left = _left_by((found or before).contents, capabilities)
+            new = {
+                contact.key: _alone(
+                    table, levels, contact, target, contacts, left, pulses.get(contact.key)
+                )
+                for contact, target in short
+            }
+            return _Chosen(found, new)
+
+        if self._thread.is_busy or (lasting is not None and len(lasting) > 1):
+            self._asked = Selection(lasting or (), contacts), short
+            self._thread.ask(chosen)
+            return
+        found = chosen()
+        self._lasting = found.lasting or self._lasting
+        self._short = {**self._short, **found.short}
+
+    def _is_asked(
+        self, lasting: Targets | None, short: Targets, contacts: tuple[Contact, ...]
+    ) -> bool:
+        """Whether the thread computes this already."""
+        asked, pulses = self._asked
+        if lasting is not None and not _fits(asked, lasting, contacts):
+            return False
+        return _intents(short) <= _intents(pulses)
+
+    def _lasting_of(
+        self,
+        table: LocalizationTable,
+        levels: EffectLevels | None,
+        lasting: Targets,
+        contacts: Sequence[Contact],
+        capabilities: PlaybackCapabilities,
+        before: Selection,
     ) -> Selection:
-        """Query the table; any failure there selects silence until the intent changes."""
-        if not targets:
-            return Selection((), quiet, None, intent.reason)
+        """Choose for all targets that last; any failure is their reason for silence."""
+        if len(lasting) == 1:
+            return _alone(table, levels, *lasting[0], contacts, capabilities, before)
+        keys = {contact.key for contact, _ in lasting}
+        quiet = tuple(each for each in contacts if each.key not in keys)
+        felt = {content.targets[0][0].key: content for content in before.contents}
         try:
-            answer = self._query(targets, quiet, capabilities)
-            predictions = self._held_back(targets, self._predict(targets, quiet, answer), answer)
-        except InputError as error:
-            return Selection(targets, quiet, None, str(error))
+            return query_jointly(
+                table, lasting, quiet, capabilities, before=felt, shape=self._shape
+            )
         except Exception as error:
-            _logger.exception("loop: table failed, silencing all channels")
-            return Selection(targets, quiet, None, failure_text(error))
-        return Selection(targets, quiet, answer.pattern, None, answer.question, predictions)
+            return _failed(lasting, quiet, error)
 
-    def _query(
+    def _together(
         self,
-        targets: tuple[tuple[Contact, Target], ...],
-        quiet: tuple[Contact, ...],
-        capabilities: PlaybackCapabilities,
-    ) -> TableAnswer:
-        """Query the table; a level that changes keeps its frequency where that reaches it."""
-        kept = self._continued(targets)
-        if kept is not None:
-            tuned = [(contact, replace(each, band=(kept, kept))) for contact, each in targets]
-            with contextlib.suppress(InputError):
-                answer = query_table(self._table, tuned, quiet, capabilities, self._levels)
-                levels = [each.level_db_sl or 0.0 for _, each in targets]
-                if answer.felt_db_sl >= max(levels) - _STEP_SHORT_OF:
-                    return answer
-        return query_table(self._table, targets, quiet, capabilities, self._levels)
+        contacts: Sequence[Contact],
+        targets: Targets,
+        left_out: tuple[Prediction, ...],
+        reason: str,
+    ) -> Selection:
+        """Join what lasts and the short pulses beside it."""
+        keys = {contact.key for contact, _ in targets}
+        quiet = tuple(each for each in contacts if each.key not in keys)
+        if not targets:
+            return Selection((), quiet, (), reason)
+        parts = [part for part in (self._lasting, *self._short.values()) if part != _NOTHING]
+        if len(parts) == 1 and {each.key for each, _ in parts[0].targets} == keys:
+            return parts[0]
+        reasons = [part.reason for part in parts if part.reason is not None]
+        return Selection(
+            targets,
+            quiet,
+            tuple(content for part in parts for content in part.contents),
+            reasons[0] if reasons else None,
+            (*(each for part in parts for each in part.not_served), *left_out),
+            is_pending=self._thread.is_busy,
+        )
 
-    def _continued(self, targets: tuple[tuple[Contact, Target], ...]) -> float | None:
-        """Return the frequency [Hz] that plays if only levels of its targets change; else None."""
-        current = self._current
-        if current.pattern is None or len(targets) != len(current.targets):
-            return None
-        for (_, new), (_, old) in zip(targets, current.targets, strict=True):
+
+def _intents(targets: Targets) -> set[Target]:
+    return {target for _, target in targets}
+
+
+def _fits(chosen: Selection, lasting: Targets, contacts: Sequence[Contact]) -> bool:
+    """Whether what was chosen also serves these targets among these contacts."""
+    if _intents(lasting) != _intents(chosen.targets):
+        return False
+    then = {each.key: each for each in (*(c for c, _ in chosen.targets), *chosen.quiet)}
+    now = {each.key: each for each in contacts}
+    same = now.keys() <= then.keys() if _is_whole(chosen) else now.keys() == then.keys()
+    return same and all(
+        math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
+        and contact.load == then[key].load
+        for key, contact in now.items()
+    )
+
+
+def _is_whole(chosen: Selection) -> bool:
+    """Whether every target feels its own, so that one finger less changes nothing for others."""
+    is_each_alone = all(len(content.targets) == 1 for content in chosen.contents)
+    return bool(chosen.contents) and is_each_alone and not chosen.not_served
+
+
+def _remaining(chosen: Selection, lasting: Targets) -> Selection:
+    """Return what was chosen, without the contents of fingers that are to feel it no more."""
+    keys = {contact.key for contact, _ in lasting}
+    gone = tuple(contact for contact, _ in chosen.targets if contact.key not in keys)
+    contents = tuple(
+        content
+        for content in chosen.contents
+        if any(contact.key in keys for contact, _ in content.targets)
+    )
+    if not gone and contents == chosen.contents:
+        return chosen
+    targets = tuple(each for each in chosen.targets if each[0].key in keys)
+    return replace(
+        chosen,
+        targets=targets if _is_whole(chosen) else (),  # else answered anew: more may be served
+        quiet=(*chosen.quiet, *gone),
+        contents=contents,
+    )
+
+
+def _within_layers(
+    targets: Targets, capabilities: PlaybackCapabilities
+) -> tuple[Targets, tuple[Prediction, ...]]:
+    """Leave out targets for which there is no layer: of the lowest priority, then the earliest."""
+    count, cause = capabilities.layers, "no layer is free: the amplifiers play"
+    if capabilities.drive_mode != UNRESTRICTED:
+        count, cause = 1, f"the drive mode {capabilities.drive_mode} plays"
+    if len(targets) <= count:
+        return targets, ()
+    order = sorted(range(len(targets)), key=lambda at: (targets[at][1].priority, at), reverse=True)
+    served = {*order[:count]}
+    reason = f"{cause} {count} contents at once; lift a finger"
+    return (
+        tuple(each for at, each in enumerate(targets) if at in served),
+        tuple(
+            not_served(contact, reason)
+            for at, (contact, _) in enumerate(targets)
+            if at not in served
+        ),
+    )
+
+
+def _left_by(
+    contents: Sequence[Content], capabilities: PlaybackCapabilities
+) -> PlaybackCapabilities:
+    """The capabilities with the amplitudes that contents leave."""
+    left = dict(capabilities.max_amplitudes)
+    for content in contents:
+        for name, tone in content.pattern.excitation.items():
+            left[name] = max(left[name] - tone.amplitude, 1e-12)
+    return replace(capabilities, max_amplitudes=left)
+
+
+def _alone(
+    table: LocalizationTable,
+    levels: EffectLevels | None,
+    contact: Contact,
+    target: Target,
+    contacts: Sequence[Contact],
+    capabilities: PlaybackCapabilities,
+    before: Selection | None,
+) -> Selection:
+    """Choose for one target, all others quiet; any failure is its reason for silence."""
+    targets = ((contact, target),)
+    quiet = tuple(each for each in contacts if each.key != contact.key)
+    try:
+        answer = _query(table, levels, contact, target, quiet, capabilities, before)
+    except Exception as error:
+        return _failed(targets, quiet, error)
+    pattern, change = answer.pattern, 0.0
+    if target.is_short:
+        left = [
+            capabilities.max_amplitudes[name] / tone.amplitude
+            for name, tone in pattern.excitation.items()
+            if tone.amplitude > 0
+        ]
+        change = min(0.0, float(decibels(min(left, default=1.0))))
+    content = Content(targets, answer.question, pattern.scaled(change) if change else pattern, ())
+    promised = pattern.robust_felt_contrast_db
+    predicted = Prediction(
+        contact,
+        answer.felt_db_sl + change,
+        pattern.contrast_db,
+        verdict_of(promised),
+        promised_contrast_db=promised,
+        frequency=content.frequency,
+    )
+    return Selection(targets, quiet, (replace(content, predictions=(predicted,)),))
+
+
+def _query(
+    table: LocalizationTable,
+    levels: EffectLevels | None,
+    contact: Contact,
+    target: Target,
+    quiet: Sequence[Contact],
+    capabilities: PlaybackCapabilities,
+    before: Selection | None,
+) -> TableAnswer:
+    """Query the table; a level that changes keeps its frequency where that reaches it."""
+    kept = None if before is None else _continued(target, before)
+    if kept is not None:
+        tuned = replace(target, band=(kept, kept))
+        with contextlib.suppress(InputError):
+            answer = query_table(table, contact, tuned, quiet, capabilities, levels)
+            if answer.felt_db_sl >= (target.level_db_sl or 0.0) - _STEP_SHORT_OF:
+                return answer
+    return query_table(table, contact, target, quiet, capabilities, levels)
+
+
+def _continued(new: Target, before: Selection) -> float | None:
+    """Return the frequency [Hz] that plays if only the level of its target changes; else None."""
+    for content in before.contents:
+        for _, old in content.targets:
             is_step = new != old and new == replace(old, level_db_sl=new.level_db_sl)
-            if not is_step or new.level_db_sl is None or (new.pulse and new.pulse.is_raised):
-                return None
-        frequencies = {tone.frequency for tone in current.pattern.excitation.values()}
-        return frequencies.pop() if len(frequencies) == 1 else None
+            if is_step and new.level_db_sl is not None and not (new.pulse and new.pulse.is_raised):
+                return content.frequency
+    return None
 
-    def _held_back(
-        self,
-        targets: tuple[tuple[Contact, Target], ...],
-        predictions: tuple[Prediction, ...],
-        answer: TableAnswer,
-    ) -> tuple[Prediction, ...]:
-        """Say of each target whether the vibration of its own effect plays."""
-        played = [tone.frequency for tone in answer.pattern.excitation.values()]
-        band = min(played), max(played)
-        return tuple(
-            replace(each, held_back=why_held_back(target.band, band, self._table.frequencies))
-            for each, (_, target) in zip(predictions, targets, strict=True)
-        )
 
-    def _predict(
-        self,
-        targets: tuple[tuple[Contact, Target], ...],
-        quiet: tuple[Contact, ...],
-        answer: TableAnswer,
-    ) -> tuple[Prediction, ...]:
-        """Predict what each target will feel; a pattern states it for a single target."""
-        pattern = answer.pattern
-        if len(targets) == 1:
-            ((contact, _),) = targets
-            return (Prediction(contact, answer.felt_db_sl, pattern.contrast_db),)
-        onset_gain = answer.felt_db_sl - pattern.level_db_sl
-        fingers = [*(contact for contact, _ in targets), *quiet]
-        discs = [fingertip_points(each.x, each.y, self._table.plate) for each in fingers]
-        points, question = np.concatenate(discs), answer.question
-        frequencies, all_fields = self._table.amplitudes(
-            pattern.excitation, points, contacts=question.contacts, loads=question.loads
-        )
-        ends = np.cumsum([len(disc) for disc in discs])[: len(targets)]
-        *fields, at_quiet = np.split(all_fields, ends, axis=1)
-        loudest = peak_acceleration(at_quiet)
-        predictions = []
-        for (contact, _), field in zip(targets, fields, strict=True):
-            weights = fingertip_weights(contact.x, contact.y, self._table.plate)
-            level = mean_level_db_sl(frequencies, field, weights, self._table.threshold)
-            level += onset_gain
-            contrast = (
-                contrast_db([peak_acceleration(field)], loudest, [weights]) if quiet else None
-            )
-            predictions.append(
-                Prediction(contact, level, None if contrast is None else float(contrast))
-            )
-        return tuple(predictions)
+def _failed(targets: Targets, quiet: tuple[Contact, ...], error: Exception) -> Selection:
+    """What is selected where a question fails: silence, and why."""
+    if isinstance(error, InputError):
+        reason = str(error)
+    else:
+        _logger.error("loop: table failed, silencing its targets", exc_info=error)
+        reason = failure_text(error)
+    left_out = tuple(not_served(contact, reason) for contact, _ in targets)
+    return Selection(targets, quiet, (), reason, left_out)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from model.arrays import FloatArray
 from model.choice import best_of
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, decibels
-from model.table.effect_level import SHAPED_FROM, DriveLimits, EffectLevels
+from model.table.effect_level import DriveLimits, EffectLevels
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, Pattern
 from model.table.pattern_choice import UnreachableLevel
 from model.table.pulse_gains import OverEffect
@@ -45,18 +46,29 @@ class TableAnswer:
 
 def query_table(
     table: LocalizationTable,
-    targets: Sequence[tuple[Contact, Target]],
+    contact: Contact,
+    target: Target,
     quiet: Sequence[Contact],
     capabilities: PlaybackCapabilities,
     levels: EffectLevels | None,
 ) -> TableAnswer:
-    """Query a table for targets, and scale its answer to what each shall feel.
+    """Query a table for the only target, and scale its answer to what that shall feel.
 
     levels: None for steady levels only. Raises InputError where nothing can be played.
     """
-    question = _question(targets, quiet, capabilities, table.frequencies)
-    duration = _felt_duration(targets)
-    if all(target.level_db_sl is None for _, target in targets):
+    question = question_of(
+        contact,
+        quiet,
+        level_db_sl=FELT_DB_SL if target.level_db_sl is None else target.level_db_sl,
+        drive_mode=capabilities.drive_mode,
+        playable=capabilities.playable,
+        frequencies=playable_band(target.band, table.frequencies, capabilities.frequencies),
+        envelopes=capabilities.envelope_support.onset_knots > 0 and not target.is_short,
+    )
+    duration = None
+    if target.pulse is not None and target.pulse.is_raised:
+        duration = target.pulse.duration  # over which the level is felt
+    if target.level_db_sl is None:
         rated = _over_effect(levels, question, duration)
         pattern = strongest(table.query(question, rated), capabilities.max_amplitudes)
         felt = pattern.level_db_sl
@@ -71,9 +83,9 @@ def query_table(
             )
             pattern, felt = raised.pattern, raised.level_db_sl
         return TableAnswer(question, pattern, felt)
-    if duration is None and all(target.allow_weaker for _, target in targets):
+    if duration is None and target.allow_weaker:
         return _as_neighbours_allow(table, question, capabilities)
-    is_fixed = any(target.band is not None for _, target in targets)
+    is_fixed = target.band is not None
     if duration is None or levels is None:
         allow_weaker = is_fixed or duration is not None
         question, pattern = _query(table, question, allow_weaker=allow_weaker)
@@ -87,76 +99,31 @@ def query_table(
     return _over_duration(table, question, duration, capabilities, levels)
 
 
-def is_short(targets: Sequence[tuple[Contact, Target]]) -> bool:
-    """Whether the vibration of some targets ends before a shaped onset would have settled."""
-    return all(target.pulse and target.pulse.duration < SHAPED_FROM for _, target in targets)
-
-
-def _question(
-    targets: Sequence[tuple[Contact, Target]],
-    quiet: Sequence[Contact],
-    capabilities: PlaybackCapabilities,
-    frequencies: FloatArray,
-) -> Question:
-    """Return the question that puts an intent to the table."""
-    given = [target.level_db_sl for _, target in targets if target.level_db_sl is not None]
-    level = max(given, default=FELT_DB_SL)
-    loads = tuple(contact.load for contact in (*(each for each, _ in targets), *quiet))
-    levels = [level if t.level_db_sl is None else t.level_db_sl for _, t in targets]
+def question_of(contact: Contact, quiet: Sequence[Contact], **others: Any) -> Question:
+    """Return the question for a target among quiet contacts; others: of its fields."""
+    loads = tuple(each.load for each in (contact, *quiet))
     return Question(
-        targets=tuple((contact.x, contact.y) for contact, _ in targets),
-        quiet=tuple((contact.x, contact.y) for contact in quiet),
-        level_db_sl=level,
-        softer_db=tuple(level - each for each in levels),
-        drive_mode=capabilities.drive_mode,
-        playable=capabilities.playable,
-        frequencies=common_band(
-            [target.band for _, target in targets], frequencies, playable=capabilities.frequencies
-        )[0],
-        envelopes=capabilities.envelope_support.onset_knots > 0 and not is_short(targets),
+        targets=((contact.x, contact.y),),
+        quiet=tuple((each.x, each.y) for each in quiet),
         loads=() if all(load == 1 for load in loads) else loads,
+        **others,
     )
 
 
-def common_band(
-    bands: Sequence[tuple[float, float] | None],
-    frequencies: FloatArray,
-    *,
-    playable: tuple[float, float] = (0.0, math.inf),
-) -> tuple[tuple[float, float], bool]:
-    """Return the lowest and highest frequency [Hz] that all bands allow, and if the last one does.
+def playable_band(
+    band: tuple[float, float] | None, frequencies: FloatArray, playable: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the lowest and highest frequency [Hz] of a band that can be played.
 
-    A band that shares no frequency of a table with those before it is ignored.
+    A band that shares no frequency of a table with what is playable is ignored.
     """
     low, high = playable
-    is_shared = True
-    for each in bands:
-        if each is None:
-            is_shared = True
-            continue
-        band = band_of_table(each, frequencies)
-        together = max(low, band[0]), min(high, band[1])
-        is_shared = bool(((frequencies >= together[0]) & (frequencies <= together[1])).any())
-        if is_shared:
+    if band is not None:
+        of_table = band_of_table(band, frequencies)
+        together = max(low, of_table[0]), min(high, of_table[1])
+        if ((frequencies >= together[0]) & (frequencies <= together[1])).any():
             low, high = together
-    return (low, high), is_shared
-
-
-def why_held_back(
-    band: tuple[float, float] | None, played: tuple[float, float], frequencies: FloatArray
-) -> str | None:
-    """Return why an effect with a band does not play while others [Hz] do; None if it does."""
-    if band is None:
-        return None
-    low, high = band_of_table(band, frequencies)
-    if low <= played[1] and played[0] <= high:
-        return None
-    return f"its effect needs {_shown(band)}, and {_shown(played)} plays: one frequency at a time"
-
-
-def _shown(band: tuple[float, float]) -> str:
-    low, high = band
-    return f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
+    return low, high
 
 
 def band_of_table(band: tuple[float, float], frequencies: FloatArray) -> tuple[float, float]:
@@ -167,13 +134,6 @@ def band_of_table(band: tuple[float, float], frequencies: FloatArray) -> tuple[f
     middle = np.sqrt(low * high)
     nearest = float(frequencies[best_of(-np.abs(np.log(frequencies / middle)))])
     return nearest, nearest
-
-
-def _felt_duration(targets: Sequence[tuple[Contact, Target]]) -> float | None:
-    """Return the duration [s] over which the level is felt; None where it is the steady one."""
-    pulses = [target.pulse for _, target in targets]
-    durations = [pulse.duration for pulse in pulses if pulse is not None and pulse.is_raised]
-    return min(durations) if durations and len(durations) == len(pulses) else None
 
 
 def _over_duration(

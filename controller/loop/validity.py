@@ -5,17 +5,19 @@ contacts that it is for.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from controller.loop.intent import Pulse
-from controller.loop.selection import Selection
-from controller.sources.contacts import MAX_CONTACT_TIMEOUT
+from controller.loop.intent import Pulse, Target
+from controller.sources.contacts import MAX_CONTACT_TIMEOUT, Contact
 
 # Shortest time [s] until a vibration ends by itself on the amplifier, so that a slow wire or a rate
 # limit of one set a second does not interrupt it. It is renewed at half its time.
 _MIN_VALID_FOR = 2.0
 _MARGIN = 0.2  # s; after the contact is lifted, for late frames
 _MIN_LEFT = 0.001  # s; of a pulse that is about to end
+
+Targets = Sequence[tuple[Contact, Target]]
 
 
 @dataclass(frozen=True)
@@ -52,23 +54,23 @@ class Validity:
         return is_due and confirmed_until > self.confirmed_until
 
 
-def valid_for(selection: Selection, *, confirmed_until: float, now: float) -> float:
-    """Return for how long [s] a vibration at a time [s] may last by itself.
+def valid_for(targets: Targets, *, confirmed_until: float, now: float) -> float:
+    """Return for how long [s] the vibration of targets at a time [s] may last by itself.
 
     The amplifiers end a pulse; the last one, where several play.
     """
     unlimited = min(max(confirmed_until - now + _MARGIN, _MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
-    return min(unlimited, max(_all_left(selection, now), default=math.inf))
+    return min(unlimited, max(_all_left(targets, now), default=math.inf))
 
 
-def first_lasts(selection: Selection, now: float) -> float:
+def first_lasts(targets: Targets, now: float) -> float:
     """Return how long [s] from a time [s] the first pulse lasts; infinite without any."""
-    return min(_all_left(selection, now), default=math.inf)
+    return min(_all_left(targets, now), default=math.inf)
 
 
-def _all_left(selection: Selection, now: float) -> list[float]:
+def _all_left(targets: Targets, now: float) -> list[float]:
     """Return how long [s] each target is driven from a time [s]."""
-    return [_left(target.pulse, now) for _, target in selection.targets]
+    return [_left(target.pulse, now) for _, target in targets]
 
 
 def _left(pulse: Pulse | None, now: float) -> float:

@@ -222,8 +222,7 @@ const HANDLERS = {
 async function play(effect) {
   const { rig, cursor, contacts } = overlay;
   const { x_m, y_m } = cursor ?? contacts.at(-1) ?? { x_m: rig.length_m / 2, y_m: rig.width_m / 2 };
-  const result = await attempt(() => connection.call("play", { effect, x_m, y_m }));
-  if (result?.held_back) at("problem").textContent = `${effect}: ${result.held_back}`;
+  await attempt(() => connection.call("play", { effect, x_m, y_m }));
 }
 
 function updateEffects() {

@@ -168,12 +168,12 @@ export class PlateOverlay {
   }
 
   contact(contact) {
-    const { x_m, y_m, role, level_db_sl, held_back, robust_felt_contrast_db: promised } = contact;
+    const { x_m, y_m, role, level_db_sl, held_back, verdict, robust_felt_contrast_db: promised } = contact;
     const ring = this.circle(contact, `contact ${role ?? ""}`, this.ringRadius);
     ring.setAttribute("data-role", role ?? "");
     const isKnown = (value) => value !== null && value !== undefined;
     const above = isKnown(level_db_sl) ? `${fixed(level_db_sl)} dB SL` : role === "quiet" ? "quiet" : "";
-    const below = held_back ? "held back" : role === "target" && isKnown(promised) ? `≥ ${fixed(promised)} dB over others` : "";
+    const below = held_back ? verdict ?? "held back" : role === "target" && isKnown(promised) ? `≥ ${fixed(promised)} dB over others` : "";
     return [ring, this.besideRing(contact, above, 0), this.besideRing(contact, below, 1)];
   }
 

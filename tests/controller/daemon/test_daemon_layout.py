@@ -1,19 +1,10 @@
 """A surface layout in the daemon: effects of touches, and the events of clients."""
 
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from controller.api.jsonrpc import ErrorCode
-from controller.api.methods import PlayParams
-from controller.daemon.active_layout import ActiveLayout
-from controller.effects.buzz import Buzz
-from controller.effects.layout import SurfaceLayout
-from controller.effects.region import Region
-from controller.effects.shapes import Circle
-from controller.sources.contacts import Contact, ContactKey
 from daemon_bench import error_code, holding, next_event, ready_daemon, until
 
 LAYOUT = """\
@@ -102,48 +93,3 @@ async def test_daemon_publishes_layouts_and_rejects_invalid_ones(tmp_path: Path)
         layout = await published()
         assert [region["name"] for region in layout["regions"]] == ["field", "quiet"]
         assert (await era.hello("test")).layout == layout
-
-
-@pytest.mark.parametrize(
-    ("most", "second", "is_held_back"),
-    [(2, "high", True), (2, "wide", False), (2, "any", False), (1, "high", False)],
-)
-def test_play_is_held_back_while_another_frequency_plays(
-    most: int, second: str, is_held_back: bool
-) -> None:
-    """The reply to the second of two requests at two fingers; alone it plays its own."""
-    effects = {
-        "low": Buzz(frequency=80.0),
-        "high": Buzz(frequency=250.0),
-        "wide": Buzz(band=(70.0, 300.0)),
-        "any": Buzz(),
-    }
-    active = ActiveLayout(SurfaceLayout(effects=effects, elsewhere=None, most_at_once=most))
-    fingers = [Contact(ContactKey("a", n), 0.1 * n, 0.1, since=0.0) for n in (1, 2)]
-    active.intent(fingers, 0.0)
-    held_back = [
-        active.play_nearest(
-            PlayParams(effect=name, x_m=finger.x, y_m=finger.y, level_db_sl=None),
-            fingers,
-            frequencies=np.array([80.0, 120.0, 250.0]),
-            now=0.1,
-        ).held_back
-        for name, finger in zip(("low", second), fingers, strict=True)
-    ]
-    assert [each is not None for each in held_back] == [False, is_held_back]
-    assert len(active.intent(fingers, 0.2).targets) == most
-
-
-def test_layout_warns_of_effects_that_cannot_sound_together() -> None:
-    """Requested ones, and those of regions of one priority, if several fingers may be driven."""
-    effects = {"low": Buzz(frequency=80.0), "any": Buzz()}
-    regions = [
-        Region("a", Circle(0.1, 0.1, 0.02), on_press="any", priority=priority, band=band)
-        for priority, band in [(0, (70.0, 100.0)), (0, (200.0, 250.0)), (1, (300.0, 400.0))]
-    ]
-    layout = SurfaceLayout(effects=effects, elsewhere="low", regions=tuple(regions))
-    assert layout.warnings() == []
-    assert len(replace(layout, most_at_once=2).warnings()) == 2  # low and 200 Hz; 70 and 200 Hz
-    effects["high"] = Buzz(frequency=250.0)
-    requested = SurfaceLayout(effects=effects, elsewhere=None, most_at_once=2)
-    assert len(requested.warnings()) == 1

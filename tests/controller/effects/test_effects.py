@@ -204,52 +204,65 @@ def test_player_follows_a_sliding_finger_through_regions() -> None:
     assert wanted(player, [], 0.5) == {}
 
 
-def test_player_prefers_priority_then_the_newest() -> None:
-    """The highest priority is felt; among equals the play that began last; then the one before."""
-    regions = (
-        Region("left", LEFT, on_press="buzz"),
-        Region("right", RIGHT, on_press="click", priority=1),
-    )
-    player = EffectPlayer(
-        SurfaceLayout(regions, {"buzz": Buzz(), "click": Click(level=12.0)}, None)
-    )
+def test_outside_of_all_regions_only_the_newest_finger_feels() -> None:
+    """Then the one before, also beside a finger that feels the effect of a region."""
+    region = Region("right", RIGHT, on_press="click", priority=1)
+    player = EffectPlayer(SurfaceLayout((region,), {"buzz": Buzz(), "click": Click(level=12.0)}))
     first, second, urgent = finger(1, 0.02), finger(2, 0.08), finger(3, 0.15)
     assert wanted(player, [first], 0.0) == {1: 20.0}
     assert wanted(player, [first, second], 0.1) == {2: 20.0}
-    assert wanted(player, [first, second, urgent], 0.2) == {3: 12.0}
+    assert wanted(player, [first, second, urgent], 0.2) == {2: 20.0, 3: 12.0}
     assert wanted(player, [first, second, urgent], 0.25) == {2: 20.0}
     assert wanted(player, [first, urgent], 0.3) == {1: 20.0}
 
 
 def test_intent_expires_at_the_first_end() -> None:
-    """A detent of 30 ms ends before a click of 40 ms at another finger."""
+    """Of a detent of 30 ms, then the turn and the end of a click of 40 ms at another finger."""
     slider = Region("slider", LEFT, on_move="dots")
     effects: dict[str, Effect] = {"dots": Detents(duration=0.03), "click": Click(duration=0.04)}
     player = EffectPlayer(SurfaceLayout((slider,), effects, elsewhere="click"))
     player.intent([finger(1, 0.05)], 0.0)
     fingers = [finger(1, 0.056), finger(2, 0.15)]
     assert player.intent(fingers, 1.0).until == pytest.approx(1.03)
-    assert player.intent(fingers, 1.03).until == pytest.approx(1.04)
-    assert player.intent(fingers, 1.04).until is None
+    assert player.intent(fingers, 1.03).until == pytest.approx(1.06)
+    assert player.intent(fingers, 1.0601).until == pytest.approx(1.1)
+    assert player.intent(fingers, 1.1001).until is None
 
 
-def test_player_plays_several_fingers_at_once() -> None:
-    """Where the layout allows two, the two newest of the highest priority feel their own levels."""
-    region = Region("left", LEFT, on_press="soft", on_move=None)
-    player = EffectPlayer(
-        SurfaceLayout((region,), {"soft": Buzz(level=9.0), "buzz": Buzz()}, most_at_once=2)
-    )
-    fingers = [finger(1, 0.15), finger(2, 0.05), finger(3, 0.16)]
-    assert wanted(player, fingers, 0.0) == {2: 9.0, 3: 20.0}
+def test_every_finger_in_a_region_feels_its_own() -> None:
+    """And outside of all regions the newest alone; each with its level, priority and content."""
+    region = Region("left", LEFT, on_press="soft", on_move=None, priority=3)
+    player = EffectPlayer(SurfaceLayout((region,), {"soft": Buzz(level=9.0), "buzz": Buzz()}))
+    fingers = [finger(1, 0.15), finger(2, 0.05), finger(3, 0.16), finger(4, 0.06)]
+    targets = player.intent(fingers, 0.0).targets
+    assert [(each.key.id, each.level_db_sl, each.priority, each.content) for each in targets] == [
+        (2, 9.0, 3, "soft"),
+        (3, 20.0, 0, "buzz"),
+        (4, 9.0, 3, "soft"),
+    ]
+
+
+def test_clicks_of_two_fingers_are_60_ms_apart() -> None:
+    """The second waits, plays for its whole duration, and is never left out."""
+    pads = (Region("left", LEFT, on_press="click"), Region("right", RIGHT, on_press="click"))
+    player = EffectPlayer(SurfaceLayout(pads, {"click": Click(duration=0.04)}, elsewhere=None))
+    fingers = [finger(1, 0.05), finger(2, 0.15), finger(3, 0.16)]
+    assert wanted(player, fingers, 1.0).keys() == {1}
+    assert player.intent(fingers, 1.01).until == pytest.approx(1.04)
+    assert wanted(player, fingers, 1.059).keys() == set()
+    assert wanted(player, fingers, 1.0601).keys() == {2}
+    assert wanted(player, fingers, 1.0999).keys() == {2}
+    assert wanted(player, fingers, 1.1201).keys() == {3}
+    assert wanted(player, fingers, 1.1601).keys() == set()
 
 
 def test_player_ignores_plays_without_sensation() -> None:
-    """A finger between detents of a region of high priority leaves the others what they feel."""
+    """A finger between detents of a region feels nothing, and leaves the others what they feel."""
     slider = Region("slider", LEFT, on_move="detents", priority=9)
     player = EffectPlayer(SurfaceLayout((slider,), {"detents": Detents(), "buzz": Buzz()}))
     other = finger(1, 0.15)
     assert wanted(player, [other, finger(2, 0.05)], 0.0) == {1: 20.0}
-    assert wanted(player, [other, finger(2, 0.056)], 0.1) == {2: 20.0}
+    assert wanted(player, [other, finger(2, 0.056)], 0.1) == {1: 20.0, 2: 20.0}
     assert wanted(player, [other, finger(2, 0.056)], 0.2) == {1: 20.0}
 
 
@@ -259,7 +272,7 @@ def test_player_plays_an_effect_by_name() -> None:
     here, other = finger(1), finger(2)
     assert wanted(player, [here, other], 0.0) == {2: 20.0}
     player.play("alert", here, 0.05, level_db_sl=24.0)
-    assert wanted(player, [here, other], 0.05) == {1: 24.0}
+    assert wanted(player, [here, other], 0.05) == {1: 24.0, 2: 20.0}
     assert player.effect_of(here.key) == "alert"
     assert wanted(player, [here, other], 0.16) == {2: 20.0}
     with pytest.raises(KeyError):
@@ -323,9 +336,9 @@ def test_new_layout_repeats_no_press(times: int) -> None:
     clicks = Region("left", LEFT, on_press="click", on_move="dots")
     player = EffectPlayer(SurfaceLayout((clicks,), effects))
     fingers = [finger(1, 0.05), finger(2, 0.15)]
-    assert wanted(player, fingers, 0.0) == {2: 10.0}
+    assert wanted(player, fingers, 0.0) == {1: 20.0, 2: 10.0}
     for _ in range(times):
-        player.replace(SurfaceLayout((clicks,), effects, most_at_once=2))
+        player.replace(SurfaceLayout((clicks,), effects))
     assert wanted(player, fingers, 1.0) == {2: 10.0}
     assert wanted(player, [finger(1, 0.056), finger(2, 0.15)], 1.1) == {1: 20.0, 2: 10.0}
     assert wanted(player, [], 2.0) == {}
@@ -348,7 +361,7 @@ def test_new_layout_repeats_no_press(times: int) -> None:
 def test_player_invariants_for_any_movement(
     steps: list[tuple[float, dict[int, tuple[float, float]]]],
 ) -> None:
-    """Only fingers that are there are targets, no more than allowed, and no intent ran out before.
+    """Only fingers that are there are targets, each once, and no intent ran out before.
 
     The same sequence gives the same intents.
     """
@@ -363,7 +376,7 @@ def test_player_invariants_for_any_movement(
         "texture": Texture(),
         "detents": Detents(),
     }
-    players = [EffectPlayer(SurfaceLayout(regions, effects, most_at_once=2)) for _ in range(2)]
+    players = [EffectPlayer(SurfaceLayout(regions, effects)) for _ in range(2)]
     now = 0.0
     for pause, places in steps:
         now += pause
@@ -371,7 +384,7 @@ def test_player_invariants_for_any_movement(
         first, again = (player.intent(contacts, now) for player in players)
         assert first == again
         assert {target.key for target in first.targets} <= {each.key for each in contacts}
-        assert len(first.targets) <= 2
+        assert len({target.key for target in first.targets}) == len(first.targets)
         assert first.until is None or first.until > now
 
 

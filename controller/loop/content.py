@@ -1,0 +1,98 @@
+"""What layers play: one content each, for its own finger and those that share it."""
+
+from dataclasses import dataclass
+
+from controller.loop.intent import Target
+from controller.sources.contacts import Contact
+from model.table.pattern import Pattern
+from model.table.question import Question
+from model.table.request import OWN_CONTRAST_DB
+
+OWN, MIXED, SHARED, HELD_BACK = "own", "mixed", "shared", "held back"
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a finger that is to feel something is predicted to feel.
+
+    contact: as it was when the content was chosen; verdict: whether it feels its own content, that
+    mixed with others', that of another finger, or none; held_back: why not its own, None if it
+    does. level_db_sl: over the duration of the effect, onset included, or the steady one where it
+    has none; contrast_db: of the steady vibration to the loudest quiet point, in peak acceleration;
+    promised_contrast_db: of levels, to the loudest quiet finger or to the contents of others here,
+    on nine of ten plates; foreign_level_db_sl: of others' contents here. None where there is
+    nothing to compare with. frequency [Hz]: None where several or none play.
+    """
+
+    contact: Contact
+    level_db_sl: float | None
+    contrast_db: float | None = None
+    verdict: str = OWN
+    held_back: str | None = None
+    promised_contrast_db: float | None = None
+    foreign_level_db_sl: float | None = None
+    frequency: float | None = None
+
+
+@dataclass(frozen=True)
+class Content:
+    """The pattern of one layer, with the contacts as they were when it was chosen.
+
+    targets: the finger whose content it is, then those that share it; question: by which its onset
+    and ending are shaped; predictions: one per target.
+    """
+
+    targets: tuple[tuple[Contact, Target], ...]
+    question: Question
+    pattern: Pattern
+    predictions: tuple[Prediction, ...]
+
+    @property
+    def frequency(self) -> float | None:
+        """Its frequency [Hz]; None of several."""
+        frequencies = {tone.frequency for tone in self.pattern.excitation.values()}
+        return frequencies.pop() if len(frequencies) == 1 else None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The contents of some contacts, or none and the reason for silence.
+
+    targets, quiet: contacts as they were when the contents were chosen, targets with their
+    intents; not_served: targets that feel nothing, with the reason; is_pending: whether the
+    contents of some targets are still being chosen.
+    """
+
+    targets: tuple[tuple[Contact, Target], ...]
+    quiet: tuple[Contact, ...]
+    contents: tuple[Content, ...] = ()
+    reason: str | None = None
+    not_served: tuple[Prediction, ...] = ()
+    is_pending: bool = False
+
+    @property
+    def predictions(self) -> tuple[Prediction, ...]:
+        """What each target feels, those that are not served at the end."""
+        served = [each for content in self.contents for each in content.predictions]
+        return (*served, *self.not_served)
+
+    @property
+    def pattern(self) -> Pattern | None:
+        """The pattern of the last content."""
+        return self.contents[-1].pattern if self.contents else None
+
+    @property
+    def question(self) -> Question | None:
+        """The question of the last content."""
+        return self.contents[-1].question if self.contents else None
+
+
+def not_served(contact: Contact, reason: str, **others: float | None) -> Prediction:
+    """Return the prediction for a target that feels nothing of its own; others: of its fields."""
+    return Prediction(contact, None, verdict=HELD_BACK, held_back=reason, **others)
+
+
+def verdict_of(promised_contrast_db: float | None) -> str:
+    """Return whether a content with a contrast is a finger's own or mixed with others."""
+    is_own = promised_contrast_db is None or promised_contrast_db >= OWN_CONTRAST_DB
+    return OWN if is_own else MIXED

@@ -1,0 +1,258 @@
+"""Several contents at once: the requests of all fingers, one answer, and a layer for each content.
+
+A frequency that a finger feels is content: it is kept, and its phase at that finger, unless another
+one promises 3 dB more to the worst finger, or serves more of them.
+"""
+
+import cmath
+import math
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.content import HELD_BACK, SHARED, Content, Prediction, Selection, not_served
+from controller.loop.intent import Target
+from controller.loop.table_query import playable_band, question_of
+from controller.sources.contacts import Contact, ContactKey
+from model.arrays import Complex64Array
+from model.finger.perception import FELT_DB_SL, decibels
+from model.table import request
+from model.table.answer import answer
+from model.table.pattern import ONSET_RAMP, Pattern
+from model.table.question import Question
+from model.table.request import OWN_CONTRAST_DB, Answer, Finger, Layer, Request
+from model.table.table import LocalizationTable
+from model.vibration.excitation import Excitation, base_amplitudes
+
+KEPT_WITHIN = 3.0
+"""How much more [dB] another frequency must promise to take the place of one that is felt."""
+
+Shape = Callable[[Question, Pattern, bool], Pattern]
+"""Adds the envelopes of a pattern; whether it continues what its layer plays, without an onset."""
+
+
+def query_jointly(
+    table: LocalizationTable,
+    targets: Sequence[tuple[Contact, Target]],
+    quiet: Sequence[Contact],
+    capabilities: PlaybackCapabilities,
+    *,
+    before: Mapping[ContactKey, Content],
+    shape: Shape,
+) -> Selection:
+    """Answer the requests of several targets with a content for each; takes some 20 ms.
+
+    before: what fingers feel now. Raises InputError for fingers that are too close.
+    """
+    requests = _requests(table, targets, capabilities)
+    fingers = [Finger((each.x, each.y), each.load) for each in quiet]
+    found = _answer(table, requests, fingers, _kept(requests, targets, before))
+    places = [each.at for each in requests]
+    fields = table.unit_fields(np.array(places), contacts=places)
+    factor = _factor_within(found, capabilities)
+    contents: list[Content] = []
+    left_out: list[Prediction] = []
+    for number, ((contact, target), layer) in enumerate(zip(targets, found.layers, strict=True)):
+        if layer.verdict == HELD_BACK:
+            left_out.append(_held_back(contact, layer))
+        elif layer.verdict != SHARED:
+            sharing = [
+                (*targets[other], one)
+                for other, one in enumerate(found.layers)
+                if one.verdict == SHARED and one.excitation == layer.excitation
+            ]
+            then = before.get(contact.key)
+            pattern = _pattern(table, layer, capabilities)
+            pattern = pattern.scaled(float(decibels(factor)))
+            if then is not None:
+                pattern = _in_phase(pattern, then.pattern, fields[:, :, number], table)
+            served = [(contact, target, layer), *sharing]
+            contents.append(
+                _content(served, targets, quiet, pattern, then, factor=factor, shape=shape)
+            )
+    return Selection(tuple(targets), tuple(quiet), tuple(contents), None, tuple(left_out))
+
+
+def _requests(
+    table: LocalizationTable,
+    targets: Sequence[tuple[Contact, Target]],
+    capabilities: PlaybackCapabilities,
+) -> list[Request]:
+    """One request per finger; those of the name that most have may share."""
+    names = Counter(target.content for _, target in targets if target.content is not None)
+    shared = [name for name, count in names.most_common(1) if count > 1]
+    return [
+        Request(
+            (contact.x, contact.y),
+            playable_band(target.band, table.frequencies, capabilities.frequencies),
+            FELT_DB_SL if target.level_db_sl is None else target.level_db_sl,
+            target.priority,
+            may_share=target.content in shared,
+            load=contact.load,
+        )
+        for contact, target in targets
+    ]
+
+
+def _kept(
+    requests: Sequence[Request],
+    targets: Sequence[tuple[Contact, Target]],
+    before: Mapping[ContactKey, Content],
+) -> list[Request]:
+    """The requests with the frequencies that fingers feel now, where their bands allow it."""
+    kept = []
+    for requested, (contact, _) in zip(requests, targets, strict=True):
+        each = requested
+        then = before.get(contact.key)
+        frequency = None if then is None else then.frequency
+        low, high = each.band_hz
+        if frequency is not None and low <= frequency <= high:
+            each = replace(each, band_hz=(frequency, frequency))
+        kept.append(each)
+    return kept
+
+
+def _answer(
+    table: LocalizationTable,
+    requests: Sequence[Request],
+    fingers: Sequence[Finger],
+    kept: Sequence[Request],
+) -> Answer:
+    """Answer with the kept frequencies, or with any where that is so much better."""
+    found = answer(table, kept, fingers)
+    worst, served = found.promised_worst_db, _served(found)
+    is_good = served == len(requests) and (worst is None or worst >= OWN_CONTRAST_DB)
+    if is_good or list(kept) == list(requests):
+        return found
+    other = answer(table, requests, fingers)
+    gain = _worst(other) - _worst(found)
+    is_better = _served(other) > served or (_served(other) == served and gain >= KEPT_WITHIN)
+    return other if is_better else found
+
+
+def _served(found: Answer) -> int:
+    return sum(layer.verdict not in (HELD_BACK, SHARED) for layer in found.layers)
+
+
+def _worst(found: Answer) -> float:
+    return math.inf if found.promised_worst_db is None else found.promised_worst_db
+
+
+def _factor_within(found: Answer, capabilities: PlaybackCapabilities) -> float:
+    """The factor, 1 at most, by which all contents together are within the amplifiers' limits."""
+    full: dict[str, float] = defaultdict(float)
+    for layer in found.layers:
+        if layer.verdict not in (HELD_BACK, SHARED):
+            for name, tone in layer.excitation.items():
+                full[name] += tone.amplitude / capabilities.max_amplitudes[name]
+    power = sum(level**2 for level in full.values())
+    highest = max(1.0, *full.values(), math.sqrt(power / capabilities.max_power))
+    return 1.0 / highest
+
+
+def _pattern(table: LocalizationTable, layer: Layer, capabilities: PlaybackCapabilities) -> Pattern:
+    """A layer of an answer as a pattern; its quiet level is that which the contrast compares."""
+    nominal, promised = layer.felt_contrast_db, layer.promised_contrast_db
+    level, robust = layer.level_db_sl, layer.promised_level_db_sl
+    return Pattern(
+        layer.excitation,
+        ONSET_RAMP,
+        level,
+        None,
+        None if nominal is None else level - nominal,
+        capabilities.drive_mode,
+        robust_level_db_sl=robust,
+        robust_quiet_level_db_sl=None if promised is None else robust - promised,
+        robust_felt_contrast_db=promised,
+        median_felt_contrast_db=layer.median_felt_contrast_db,
+        threshold=table.threshold,
+    )
+
+
+def _content(
+    served: Sequence[tuple[Contact, Target, Layer]],
+    targets: Sequence[tuple[Contact, Target]],
+    quiet: Sequence[Contact],
+    pattern: Pattern,
+    then: Content | None,
+    *,
+    factor: float,
+    shape: Shape,
+) -> Content:
+    """The content of one finger and those that share it."""
+    own = {contact.key for contact, _, _ in served}
+    others = [contact for contact, _ in targets if contact.key not in own]
+    first = served[0][0]
+    question = question_of(
+        first, [*others, *quiet], level_db_sl=pattern.level_db_sl, drive_mode=pattern.drive_mode
+    )
+    frequencies = {tone.frequency for tone in pattern.excitation.values()}
+    (frequency,) = frequencies if len(frequencies) == 1 else (None,)
+    is_continued = then is not None and then.frequency == frequency
+    change = float(decibels(factor))
+    predictions = tuple(
+        Prediction(
+            contact,
+            layer.promised_level_db_sl + change,
+            verdict=layer.verdict,
+            held_back=None if layer is served[0][2] else f"shares the content of {first.key}",
+            promised_contrast_db=layer.promised_contrast_db,
+            foreign_level_db_sl=_changed(layer.foreign_level_db_sl, change),
+            frequency=frequency,
+        )
+        for contact, _, layer in served
+    )
+    return Content(
+        tuple((contact, target) for contact, target, _ in served),
+        question,
+        shape(question, pattern, is_continued),
+        predictions,
+    )
+
+
+def _changed(level_db_sl: float | None, change_db: float) -> float | None:
+    return None if level_db_sl is None else level_db_sl + change_db
+
+
+def _held_back(contact: Contact, layer: Layer) -> Prediction:
+    """What is said of a finger whose content is held back, and by how much."""
+    had = layer.promised_contrast_db
+    figure = "" if had is None or not math.isfinite(had) else f", only {had:.1f} dB"
+    return not_served(
+        contact,
+        f"too many contents for this plate: beside the others it would not have had "
+        f"{request.MIN_CONTRAST_DB:g} dB of contrast{figure}; lift a finger, or move it away",
+        promised_contrast_db=had,
+        foreign_level_db_sl=layer.foreign_level_db_sl,
+    )
+
+
+def _in_phase(
+    pattern: Pattern, before: Pattern, fields: Complex64Array, table: LocalizationTable
+) -> Pattern:
+    """Turn a pattern so that its finger feels it in the phase of the one before.
+
+    fields (f, eras): at the finger, of each ERA at full stroke.
+    """
+    felt = _felt(pattern.excitation, fields, table)
+    felt_before = _felt(before.excitation, fields, table)
+    turned = {}
+    for name, tone in pattern.excitation.items():
+        now, then = felt[tone.frequency], felt_before.get(tone.frequency)
+        change = cmath.phase(then / now) if now and then else 0.0
+        turned[name] = replace(tone, phase=tone.phase + change)
+    return replace(pattern, excitation=turned)
+
+
+def _felt(
+    excitation: Excitation, fields: Complex64Array, table: LocalizationTable
+) -> dict[float, complex]:
+    """Complex acceleration at a finger, by frequency [Hz]."""
+    frequencies, bases = base_amplitudes(excitation, table.eras)
+    rows = np.searchsorted(table.frequencies, frequencies)
+    weights = bases / [era.stroke for era in table.eras]
+    felt = (weights * fields[rows]).sum(axis=1)
+    return dict(zip(frequencies.tolist(), felt.tolist(), strict=True))

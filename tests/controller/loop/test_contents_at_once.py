@@ -1,0 +1,207 @@
+"""Several fingers, each with a content of its own, on the plate in virtual time."""
+
+import asyncio
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from controller.effects.buzz import Buzz
+from controller.effects.click import Click
+from controller.effects.layout import SurfaceLayout
+from controller.effects.region import Region
+from controller.effects.shapes import Rectangle
+from controller.loop.decision import PlayedContent
+from model.table.build import build_table
+from model.table.table import LocalizationTable
+from paper_table import smooth_rig
+from several_fingers import fingers_on
+from virtual_loop import in_virtual_time
+
+LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)
+
+LAYOUT = SurfaceLayout(
+    (
+        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="low"),
+        Region("right", Rectangle(0.16, 0.0, 0.14, 0.12), on_press="high"),
+        Region("above", Rectangle(0.0, 0.13, 0.3, 0.09), on_press="any"),
+    ),
+    {"low": Buzz(level=14.0), "high": Buzz(level=14.0), "any": Buzz(level=14.0)},
+    elsewhere=None,
+)
+
+
+@cache
+def table() -> LocalizationTable:
+    """The paper's plate at 29 frequencies."""
+    return build_table(smooth_rig(), frequencies=np.linspace(40.0, 320.0, 29))
+
+
+@in_virtual_time
+async def test_two_fingers_each_feel_their_own_within_1_db_of_the_promise() -> None:
+    """Measured at the fingertips over the wire, against the answer for the plate as modelled."""
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(1.0)
+        (applied,) = fingers.applied
+        first, second = (one.content for one in applied.contents.values())
+        assert abs(first.frequency - second.frequency) >= 30
+        assert [each.verdict for each in applied.targets] == ["own", "own"]
+        predicted = {
+            one.content.targets[0][0].key.id: one.pattern.felt_contrast_db
+            for one in applied.contents.values()
+        }
+        assert fingers.contrasts() == pytest.approx(predicted, abs=1.0)
+
+
+@in_virtual_time
+async def test_a_third_finger_joins_and_all_are_weighted_anew_in_one_commit() -> None:
+    """Each keeps its layer and what it feels keeps its frequency, unless 3 dB more are promised."""
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(0.5)
+        before = {number: one.content for number, one in fingers.applied[-1].contents.items()}
+        count = len(fingers.committed)
+        fingers.at[3] = ABOVE
+        await fingers.hold(0.5)
+        ((_, _, sent),) = [each for each in fingers.committed[count:] if not each[2][0].renew]
+        assert sorted(one.layer for one in sent) == [0, 1, 2]
+        after = {number: one.content for number, one in fingers.applied[-1].contents.items()}
+        for number, content in before.items():
+            assert after[number].targets[0][0].key == content.targets[0][0].key
+        assert [each.held_back for each in fingers.applied[-1].targets] == [None] * 3
+        kept = [n for n, content in before.items() if after[n].frequency == content.frequency]
+        for one in sent:
+            keeps = {command.keep_phase for command in one.commands}
+            assert keeps == {one.layer in kept}
+
+
+@in_virtual_time
+async def test_one_finger_leaves_and_the_layer_of_the_other_is_not_touched() -> None:
+    """One set, of its layer alone; what the other feels has the same amplitude before and after."""
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(0.6)
+        (other,) = (n for n, one in fingers.applied[-1].contents.items() if _id(one) == 2)
+        count = len(fingers.committed)
+        del fingers.at[1]
+        await fingers.hold(0.5)
+        ((_, _, sent),) = [each for each in fingers.committed[count:] if not each[2][0].renew]
+        (one,) = sent
+        assert one.layer != other
+        assert not any(command.level for command in one.commands)
+        assert [each.contact.key.id for each in fingers.applied[-1].targets] == [2]
+        await fingers.hold(3.0)  # renewed alone
+        renewed = [each for _, _, layers in fingers.committed for each in layers if each.renew]
+        assert renewed
+        assert {each.layer for each in renewed} == {other}
+        assert fingers.contrasts() == {}  # only its own content is left
+        fingers.at.clear()
+        count = len(fingers.committed)
+        await fingers.hold(0.1)
+        assert fingers.committed[count][2] == ()  # a Silence of all layers, at once
+
+
+@in_virtual_time
+async def test_a_slide_keeps_the_content_and_its_layer() -> None:
+    """0.2 m/s over 10 cm beside another: same layer, one frequency, phases kept, never silent."""
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(0.5)
+        count, applied = len(fingers.committed), len(fingers.applied)
+
+        def slide(since: float) -> None:
+            fingers.at[1] = (0.03 + 0.2 * since, 0.06)
+
+        slide(0.0)
+        await fingers.hold(0.2)
+        await fingers.hold(0.5, slide)
+        numbers = {n for each in fingers.applied[applied:] for n in each.contents}
+        assert numbers == {0, 1}
+        assert len(fingers.applied) - applied >= 5
+        assert all(len(each.targets) == 2 for each in fingers.applied[applied:])
+        for _, _, layers in fingers.committed[count:]:
+            assert all(one.renew or any(c.level for c in one.commands) for one in layers)
+
+
+@pytest.mark.parametrize("what", ["stop", "lift"])
+@in_virtual_time
+async def test_stop_and_lift_do_not_wait_for_an_answer(
+    what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While one is computed for 0.2 s: silent as soon as without, and what it says is dropped."""
+    loop = asyncio.get_running_loop()
+
+    def slowly(executor: Any, work: Callable[[], Any]) -> "asyncio.Future[Any]":
+        future = loop.create_future()
+        loop.call_later(0.2, lambda: future.set_result(work()))
+        return future
+
+    monkeypatch.setattr(type(loop), "run_in_executor", lambda self, *args: slowly(*args))
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT}
+        await fingers.hold(0.3)
+        assert len(fingers.applied) == 1
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.05)  # an answer is being computed
+        assert len(fingers.applied) == 1
+        begin, count = loop.time(), len(fingers.committed)
+        if what == "stop":
+            stopped = await fingers.controller.stop()
+            assert all(each.is_confirmed for each in stopped.values())
+            assert loop.time() - begin < 0.02
+        else:
+            fingers.at.clear()
+            fingers.report()
+            await asyncio.sleep(0.02)
+            assert fingers.committed[count][2] == ()
+            assert fingers.committed[count][0] - begin < 0.005
+        await fingers.hold(0.5)
+        assert len(fingers.applied) == 1
+        assert len(fingers.committed) <= count + 1
+
+
+@in_virtual_time
+async def test_a_click_plays_beside_what_lasts() -> None:
+    """On a layer of its own, in the commit by which what lasts is kept away from its finger."""
+    layout = SurfaceLayout(
+        LAYOUT.regions, {**LAYOUT.effects, "high": Click(level=14.0)}, elsewhere=None
+    )
+    async with fingers_on(table(), layout) as fingers:
+        fingers.at = {1: LEFT}
+        await fingers.hold(0.5)
+        count = len(fingers.committed)
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.3)
+        started, ended = (layers for _, _, layers in fingers.committed[count:])
+        assert sorted(one.layer for one in started) == [0, 1]  # what lasts is kept away from it
+        (one,) = ended
+        assert one.layer == 1
+        assert not any(command.level for command in one.commands)
+
+
+@in_virtual_time
+async def test_what_is_not_served_says_why() -> None:
+    """Of six fingers the four newest have the four layers; the plate cannot serve all of these."""
+    async with fingers_on(table(), LAYOUT, layers=4) as fingers:
+        x = (0.03, 0.08, 0.13, 0.18, 0.23, 0.28)
+        fingers.at = {id: (at, 0.05 + 0.12 * (id % 2)) for id, at in enumerate(x, start=1)}
+        await fingers.hold(0.5)
+        felt = {each.contact.key.id: each for each in fingers.applied[-1].targets}
+        assert felt.keys() == fingers.at.keys()
+        for each in felt.values():
+            assert each.verdict in ("own", "mixed", "shared", "held back")
+            assert (each.held_back is None) == (each.verdict in ("own", "mixed"))
+        assert {felt[id].verdict for id in (1, 2)} == {"held back"}  # the earliest
+        assert felt[1].held_back == (
+            "no layer is free: the amplifiers play 4 contents at once; lift a finger"
+        )
+        others = [felt[id] for id in (3, 4, 5, 6) if felt[id].verdict == "held back"]
+        assert others
+        assert all("6 dB of contrast" in (each.held_back or "") for each in others)
+
+
+def _id(one: PlayedContent) -> int:
+    return one.content.targets[0][0].key.id

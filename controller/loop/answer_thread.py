@@ -19,7 +19,7 @@ class AnswerThread(Generic[T]):
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="answers")
         self._running: asyncio.Future[T] | None = None
         self._next: Callable[[], T] | None = None
-        self._found: T | None = None
+        self._answered: asyncio.Future[T] | None = None
 
     @property
     def is_busy(self) -> bool:
@@ -27,15 +27,15 @@ class AnswerThread(Generic[T]):
         return self._running is not None
 
     def ask(self, question: Callable[[], T]) -> None:
-        """Compute in the thread, after what is being computed; it must not raise."""
+        """Compute in the thread, after what is being computed."""
         self._next = question
         if not self.is_busy:
             self._start()
 
     def take(self) -> T | None:
-        """Return the newest answer that was not taken yet; None without any."""
-        found, self._found = self._found, None
-        return found
+        """Return the newest answer that was not taken yet; None without any; raises its error."""
+        answered, self._answered = self._answered, None
+        return None if answered is None else answered.result()
 
     def _start(self) -> None:
         question, self._next = self._next, None
@@ -46,6 +46,6 @@ class AnswerThread(Generic[T]):
     def _done(self, answered: "asyncio.Future[T]") -> None:
         self._running = None
         if not answered.cancelled():
-            self._found = answered.result()
+            self._answered = answered
         self._start()
         self._arrived()

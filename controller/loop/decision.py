@@ -50,8 +50,7 @@ class Decision:
     triggered_at [s]: when the change arrived.
     sets: of the layers that change, by number, all from one moment on; started: those that play a
     content; silence: ramp [s] along which all layers fall silent instead. Neither if all channels
-    are silent already. refusal: why a ledger refused the contents, which makes it silence;
-    retry_at [s]: when the ledger would admit them, None for never.
+    are silent already. refusal: why a ledger refused the contents, which makes it silence.
     """
 
     contacts: tuple[Contact, ...]
@@ -62,7 +61,6 @@ class Decision:
     started: frozenset[int] = frozenset()
     silence: float | None = None
     refusal: str | None = None
-    retry_at: float | None = None
 
 
 @dataclass(frozen=True)
@@ -249,7 +247,6 @@ class Decider:
             started=frozenset(),
             silence=FADE_RAMP,
             refusal=str(error),
-            retry_at=error.until,
         )
         return self._decided
 

@@ -152,10 +152,16 @@ class Selector:
             found = None
             if lasting is not None:
                 found = self._lasting_of(table, levels, lasting, contacts, capabilities, before)
-            left = _left_by((found or before).contents, capabilities)
             new = {
                 contact.key: _alone(
-                    table, levels, contact, target, contacts, left, pulses.get(contact.key)
+                    table,
+                    levels,
+                    contact,
+                    target,
+                    contacts,
+                    capabilities,
+                    pulses.get(contact.key),
+                    beside=(found or before).contents,
                 )
                 for contact, target in short
             }
@@ -311,11 +317,17 @@ def _alone(
     contacts: Sequence[Contact],
     capabilities: PlaybackCapabilities,
     before: Selection | None,
+    *,
+    beside: Sequence[Content] = (),
 ) -> Selection:
-    """Choose for one target, all others quiet; any failure is its reason for silence."""
+    """Choose for one target, all others quiet; any failure is its reason for silence.
+
+    before: what was chosen for it; beside: contents that leave less of the stroke.
+    """
     targets = ((contact, target),)
     quiet = tuple(each for each in contacts if each.key != contact.key)
     try:
+        capabilities = _left_by(beside, capabilities)
         answer = _query(table, levels, contact, target, quiet, capabilities, before)
     except Exception as error:
         return _failed(targets, quiet, error)

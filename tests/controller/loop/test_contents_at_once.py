@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -13,8 +14,16 @@ from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.effects.shapes import Rectangle
+from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.decision import PlayedContent
+from controller.loop.envelopes import RAMPS_ONLY
+from controller.loop.intent import Target
+from controller.loop.joint_answer import query_jointly
+from controller.loop.selection import unshaped
+from controller.sources.contacts import Contact, ContactKey
+from model.arrays import Complex64Array
 from model.table.build import build_table
+from model.table.pattern import Pattern
 from model.table.table import LocalizationTable
 from paper_table import smooth_rig
 from several_fingers import fingers_on
@@ -201,6 +210,50 @@ async def test_what_is_not_served_says_why() -> None:
         others = [felt[id] for id in (3, 4, 5, 6) if felt[id].verdict == "held back"]
         assert others
         assert all("6 dB of contrast" in (each.held_back or "") for each in others)
+
+
+def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
+    """As it moves by 1 cm and another joins, at its new place; by the fields of the table."""
+    contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
+    targets = [(each, Target(each.key, 14.0)) for each in contacts]
+    capabilities = PlaybackCapabilities(
+        "phased",
+        ("phased",),
+        (40.0, 320.0),
+        {era.name: era.stroke for era in table().eras},
+        RAMPS_ONLY,
+        layers=4,
+    )
+    first = query_jointly(table(), targets, (), capabilities, before={}, shape=unshaped)
+    before = {each.targets[0][0].key: each for each in first.contents}
+    moved = replace(contacts[0], x=contacts[0].x + 0.01)
+    third = Contact(ContactKey("a", 2), *ABOVE, since=0.0)
+    joined = [(moved, targets[0][1]), targets[1], (third, Target(third.key, 14.0))]
+    second = query_jointly(table(), joined, (), capabilities, before=before, shape=unshaped)
+    places = [(each.x, each.y) for each, _ in joined]
+    fields = table().unit_fields(np.array(places), contacts=places)
+    kept = 0
+    for content in second.contents:
+        then = before.get(content.targets[0][0].key)
+        if then is not None and then.frequency == content.frequency:
+            at = places.index((content.targets[0][0].x, content.targets[0][0].y))
+            now, old = (_felt(each.pattern, fields[:, :, at]) for each in (content, then))
+            assert np.angle(now / old) == pytest.approx(0.0, abs=1e-3)
+            kept += 1
+    assert kept
+
+
+def _felt(pattern: Pattern, fields: Complex64Array) -> complex:
+    """Acceleration at a finger of a pattern of one frequency, by each ERA's field (f, eras)."""
+    (frequency,) = {tone.frequency for tone in pattern.excitation.values()}
+    row = int(np.flatnonzero(table().frequencies == frequency)[0])
+    eras = {era.name: (number, era.stroke) for number, era in enumerate(table().eras)}
+    return complex(
+        sum(
+            tone.amplitude / eras[name][1] * np.exp(1j * tone.phase) * fields[row, eras[name][0]]
+            for name, tone in pattern.excitation.items()
+        )
+    )
 
 
 def _id(one: PlayedContent) -> int:

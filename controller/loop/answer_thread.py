@@ -26,7 +26,7 @@ class AnswerThread(Generic[T]):
         """Whether a question is being answered, so that no other must use the table."""
         return self._running is not None
 
-    def ask(self, question: Callable[[], T]) -> None:
+    def compute(self, question: Callable[[], T]) -> None:
         """Compute in the thread, after what is being computed."""
         self._next = question
         if not self.is_busy:

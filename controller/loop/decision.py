@@ -363,7 +363,7 @@ class Decider:
         return replace(draft, sets=sets, started=started)
 
     def _numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
-        """Contents by layer: a finger's in the layer that it has, new ones in free layers."""
+        """Contents by layer: a finger's in the layer that it has, new ones in those that end."""
         of_finger = {one.content.targets[0][0].key: number for number, one in self._playing.items()}
         numbers = {}
         new = []
@@ -375,7 +375,7 @@ class Decider:
                 numbers[number] = content
         every = range(self._capabilities.layers)
         free = [number for number in every if number not in numbers]
-        free.sort(key=self._may_play.__contains__)  # layers that end are the last to be taken
+        free.sort(key=lambda number: (number not in self._playing, number in self._may_play))
         return {**numbers, **dict(zip(free, new, strict=False))}
 
     def _may_end_shaped(self, number: int, now: float) -> bool:

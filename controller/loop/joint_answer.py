@@ -54,10 +54,10 @@ def query_jointly(
     fields = table.unit_fields(np.array(places), contacts=places)
     factor = _factor_within(found, capabilities)
     contents: list[Content] = []
-    left_out: list[Prediction] = []
+    skipped: list[Prediction] = []
     for number, ((contact, target), layer) in enumerate(zip(targets, found.layers, strict=True)):
         if layer.verdict == HELD_BACK:
-            left_out.append(_held_back(contact, layer))
+            skipped.append(_held_back(contact, layer))
         elif layer.verdict != SHARED:
             sharing = [
                 (*targets[other], one)
@@ -73,7 +73,7 @@ def query_jointly(
             contents.append(
                 _content(served, targets, quiet, pattern, then, factor=factor, shape=shape)
             )
-    return Selection(tuple(targets), tuple(quiet), tuple(contents), None, tuple(left_out))
+    return Selection(tuple(targets), tuple(quiet), tuple(contents), None, tuple(skipped))
 
 
 def _requests(

@@ -75,7 +75,7 @@ class Selector:
         self._lasting = _NOTHING
         self._short: Mapping[ContactKey, Selection] = {}
         self._current = _NOTHING
-        self._asked: tuple[Selection, Targets] = (_NOTHING, ())
+        self._requested: tuple[Selection, Targets] = (_NOTHING, ())
 
     def replace(self, table: LocalizationTable, levels: EffectLevels | None) -> None:
         """Answer by another table of this plate; the selection stays until its contacts change."""
@@ -98,7 +98,7 @@ class Selector:
         """
         by_key = {target.key: target for target in intent.targets}
         targets = tuple((each, by_key[each.key]) for each in contacts if each.key in by_key)
-        served, left_out = _within_layers(targets, capabilities)
+        served, skipped = _within_layers(targets, capabilities)
         lasting = tuple(each for each in served if not each[1].is_short)
         short = tuple(each for each in served if each[1].is_short)
         self._adopt(lasting, contacts)
@@ -113,7 +113,7 @@ class Selector:
         is_kept = not lasting or _fits(self._lasting, lasting, contacts)
         if new or not is_kept:
             self._choose(None if is_kept else lasting, new, tuple(contacts), capabilities, pulses)
-        found = self._together(contacts, targets, left_out, intent.reason)
+        found = self._together(contacts, targets, skipped, intent.reason)
         if found != self._current:
             self._current = found
         return self._current
@@ -144,7 +144,7 @@ class Selector:
         Several in the thread, and what comes while it is busy, which has the table for itself.
         pulses: before these.
         """
-        if self._thread.is_busy and self._is_asked(lasting, short, contacts):
+        if self._thread.is_busy and self._is_requested(lasting, short, contacts):
             return
         table, levels, before = self._table, self._levels, self._lasting
 
@@ -168,19 +168,19 @@ class Selector:
             return _Chosen(found, new)
 
         if self._thread.is_busy or (lasting is not None and len(lasting) > 1):
-            self._asked = Selection(lasting or (), contacts), short
-            self._thread.ask(chosen)
+            self._requested = Selection(lasting or (), contacts), short
+            self._thread.compute(chosen)
             return
         found = chosen()
         self._lasting = found.lasting or self._lasting
         self._short = {**self._short, **found.short}
 
-    def _is_asked(
+    def _is_requested(
         self, lasting: Targets | None, short: Targets, contacts: tuple[Contact, ...]
     ) -> bool:
         """Whether the thread computes this already."""
-        asked, pulses = self._asked
-        if lasting is not None and not _fits(asked, lasting, contacts):
+        requested, pulses = self._requested
+        if lasting is not None and not _fits(requested, lasting, contacts):
             return False
         return _intents(short) <= _intents(pulses)
 
@@ -210,7 +210,7 @@ class Selector:
         self,
         contacts: Sequence[Contact],
         targets: Targets,
-        left_out: tuple[Prediction, ...],
+        skipped: tuple[Prediction, ...],
         reason: str,
     ) -> Selection:
         """Join what lasts and the short pulses beside it."""
@@ -227,7 +227,7 @@ class Selector:
             quiet,
             tuple(content for part in parts for content in part.contents),
             reasons[0] if reasons else None,
-            (*(each for part in parts for each in part.not_served), *left_out),
+            (*(each for part in parts for each in part.not_served), *skipped),
             is_pending=self._thread.is_busy,
         )
 
@@ -389,5 +389,5 @@ def _failed(targets: Targets, quiet: tuple[Contact, ...], error: Exception) -> S
     else:
         _logger.error("loop: table failed, silencing its targets", exc_info=error)
         reason = failure_text(error)
-    left_out = tuple(not_served(contact, reason) for contact, _ in targets)
-    return Selection(targets, quiet, (), reason, left_out)
+    skipped = tuple(not_served(contact, reason) for contact, _ in targets)
+    return Selection(targets, quiet, (), reason, skipped)

@@ -237,7 +237,6 @@ class _ContactsSection(Section):
     sets: Annotated[list[_SetSection], Field(min_length=1, max_length=1000, default_factory=list)]
     effects: Any = None
     elsewhere: Any = None
-    most_at_once: Any = None
 
 
 def _shape(region: _RegionSection) -> _Shape:

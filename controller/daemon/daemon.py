@@ -7,6 +7,7 @@ import signal
 from collections.abc import Callable, Mapping
 from functools import partial
 
+from controller.api.schema import headline
 from controller.api.server import ApiServer
 from controller.daemon.active_layout import ActiveLayout
 from controller.daemon.api_service import ApiService
@@ -80,7 +81,7 @@ class Daemon:
         self._supervisor = Supervisor(
             state_changed=(
                 lambda old, new: self._publisher.state_changed(old, new),
-                lambda old, new: manager.status(f"{new.state.value}: {new.cause}"),
+                lambda old, new: manager.status(headline(new.state.value, new.cause)),
                 self._dump_fault,
                 self._follow_state,
             ),
@@ -300,7 +301,7 @@ class Daemon:
 
     def _status_line(self) -> str:
         machine = self._supervisor.machine
-        return f"{machine.state.value}: {machine.cause}"
+        return headline(machine.state.value, machine.cause)
 
 
 def _read(old: DaemonConfig) -> tuple[DaemonConfig, list[str], bool]:

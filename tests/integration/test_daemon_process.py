@@ -117,6 +117,7 @@ async def test_daemon_notifies_systemd(tmp_path: Path) -> None:
 
             await until(lambda: has_heard("READY=1"))
             await until(lambda: has_heard("WATCHDOG=1"))
+            await until(lambda: has_heard("STATUS=ready: "))
             daemon.process.send_signal(signal.SIGHUP)
             await until(lambda: has_heard("RELOADING=1"))
             daemon.process.send_signal(signal.SIGTERM)

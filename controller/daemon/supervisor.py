@@ -432,10 +432,9 @@ class Supervisor:
                 if await self._reopen():
                     break
                 await self._pause(pause)
-            epoch = self.machine.epoch
             while self.assume_energised(clock.now()) and not self._closing.is_set():
                 await self._pause(_RECHECK)
-            if epoch == self.machine.epoch:  # none was lost again meanwhile
+            if self._controller.group_state is GroupState.DISARMED:  # none was lost again
                 await self.handle(DaemonEvent(Trigger.RECONNECTED))
         except DriverError as error:
             _rate_limited_logger.info("failed: %s", error)
@@ -484,7 +483,10 @@ class Supervisor:
                 _rate_limited_logger.exception("status read failed")
 
     async def _check_disarmed(self, group: Group) -> None:
+        epoch = self.machine.epoch
         statuses = await group.statuses()
+        if epoch != self.machine.epoch:
+            return  # they may have been read before
         problem, state = find_problem(statuses, group.amplifiers), self.machine.state
         if problem is not None and state is DaemonState.READY_TO_SWITCH_ON:
             fault = DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE)

@@ -178,7 +178,6 @@ class Heartbeats:
         amplifiers = self._members.amplifiers.values()
         for amplifier in amplifiers:  # before the others are waited for: they are stopped then
             if is_lost(amplifier):
-                self._members.lose()
                 raise LinkTimeout(amplifier.line.loss or amplifier.silence_cause)
         before = self._members.silences
         await self._members.all([self._beat(each, before) for each in amplifiers])

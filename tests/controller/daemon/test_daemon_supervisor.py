@@ -332,6 +332,20 @@ async def test_loss_while_reopened_amplifiers_are_waited_for_opens_them_again() 
 
 
 @in_virtual_time
+async def test_stop_while_a_lost_amplifier_is_waited_for_opens_none_again() -> None:
+    """It reaches those that were reopened, and is latched."""
+    async with watched() as daemon:
+        daemon.far_end.attempts.clear()
+        await daemon.handle(DaemonEvent(Trigger.LINK_LOST))
+        await asyncio.sleep(0.1)
+        stopped = await daemon.supervisor.stop("a test")
+        assert [each.is_confirmed for each in stopped.values()] == [True]
+        assert daemon.state is DaemonState.COMM_LOST
+        await asyncio.sleep(0.5)
+        assert (daemon.state, len(daemon.far_end.attempts)) == (DaemonState.FAULT, 1)
+
+
+@in_virtual_time
 async def test_amplifiers_that_cannot_be_disarmed_are_opened_again() -> None:
     """None that may be armed stays open, and each attempt is reported."""
     async with watched() as daemon:

@@ -19,7 +19,7 @@ from controller.daemon.states import (
     step,
 )
 from controller.daemon.supervisor import Supervisor
-from daemon_bench import error_code, ready_daemon, until_state
+from daemon_bench import ready_daemon, until_state
 
 
 def expire(supervisor: Supervisor) -> None:
@@ -46,21 +46,6 @@ async def test_client_that_arms_after_the_end_of_a_lease_inherits_nothing(
             await other.arm("you", lease_s=60)
             assert (await other.status()).state == "OPERATION_ENABLED"
         assert "READY_TO_SWITCH_ON" in states
-
-
-@pytest.mark.parametrize("trigger", [Trigger.DISARM, Trigger.LEASE_LOST, Trigger.FAULT])
-async def test_lease_ends_within_the_transition_from_armed(
-    tmp_path: Path, trigger: Trigger
-) -> None:
-    """Not with the next look at it; its token is refused from that moment on."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        supervisor = bench.daemon._supervisor
-        lease = await era.arm("me", lease_s=60)
-        assert supervisor.machine.lease is not None
-        supervisor.post(DaemonEvent(trigger, "a test"))
-        assert supervisor.machine.state not in ENERGISED
-        assert supervisor.machine.lease is None
-        assert await error_code(era.renew(lease.lease)) is ErrorCode.LEASE
 
 
 async def test_arming_that_is_cancelled_leaves_nothing_armed_without_a_lease(

@@ -10,14 +10,20 @@ ones.
 import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
-from benchmarks.localization.cases import contact_sets, paper_table, question_of
-from benchmarks.setting import use_one_thread
+from benchmarks.localization.cases import FREQUENCIES, contact_sets, question_of
+from benchmarks.setting import RIG, use_one_thread
 from model.arrays import FloatArray
 from model.finger import fingertip
 from model.finger.perception import contrast_db
+from model.rig.file import load_rig
+from model.rig.uncertainty import Uncertainty
+from model.table.build import build_table
+from model.table.table import LocalizationTable
 
 RADII = (0.005, 0.0075, 0.010, 0.013)
 QUIET = (1, 2, 3)
@@ -28,7 +34,6 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=60)
     sets = parser.parse_args().sets
     use_one_thread()
-    paper_table()
     print(f"median contrast in dB, {sets} sets each   1 / 2 / 3 quiet fingers")
     for radius in RADII:
         found = [_median(sets, quiet, answered=radius, judged=radius) for quiet in QUIET]
@@ -49,7 +54,7 @@ def _median(sets: int, quiet: int, *, answered: float, judged: float) -> float:
 
 def _contrast(places: FloatArray, answered: float, judged: float) -> float:
     """Contrast [dB] of the answer for discs of one radius [m] on discs of another."""
-    table = paper_table()
+    table = _table(answered)
     with _radius(answered):
         pattern = table.query(question_of(places, drive_mode="phased"))
     with _radius(judged):
@@ -59,6 +64,14 @@ def _contrast(places: FloatArray, answered: float, judged: float) -> float:
     peak = table.amplitudes(pattern.excitation, points.reshape(-1, 2))[1].sum(axis=0)
     target, *quiet = peak.reshape(len(places), -1)
     return float(contrast_db([target], np.concatenate(quiet), [weights[0]]))
+
+
+@cache
+def _table(radius: float) -> LocalizationTable:
+    """A table for discs of this radius [m]: what it has read of a place it keeps."""
+    with _radius(radius):
+        rig = replace(load_rig(RIG), fingertip=None, uncertainty=Uncertainty.none())
+        return build_table(rig, frequencies=FREQUENCIES)
 
 
 @contextmanager

@@ -262,11 +262,6 @@ def _starts(targets: int, phases: tuple[int, int]) -> Complex64Array:
     return np.array(list(product(*circles)), dtype=np.complex64)
 
 
-def _solve(R: Complex64Array, c: Complex64Array) -> Complex64Array:
-    """Weights R^-1 c: the largest |c^H w| for their w^H R w."""
-    return np.asarray(np.linalg.solve(R, c[..., None])[..., 0])
-
-
 def _optimise_target_phases(
     R: Complex64Array,
     targets: Complex64Array,
@@ -281,30 +276,24 @@ def _optimise_target_phases(
     """
     _, n, eras = targets.shape
     conjugate = targets.conj()
-    if len(starts) == 1 and iterations == 1:
-        c = conjugate[0] if len(targets) == 1 else conjugate.sum(axis=0)
-        w = _solve(R, c)
-        # At the solution w^H R w = |c^H w|.
-        value = np.sqrt(np.abs(np.vecdot(c, w)))
-    else:
-        s = len(starts)
-        target_factors = np.repeat(starts[:, :, None], n, axis=2)
-        forms = np.broadcast_to(R, (s, *R.shape)).reshape(-1, eras, eras)
-        tried, magnitudes = [], []
-        for _ in range(iterations):
-            c = np.add.reduce(target_factors[..., None] * conjugate, axis=1)
-            w = _solve(forms, c.reshape(-1, eras)).reshape(s, n, eras)
-            reached = np.vecdot(conjugate, w[:, None])  # (s, t, n)
-            magnitude = np.maximum(np.abs(reached), 1e-20)
-            tried.append(w)
-            magnitudes.append(np.minimum.reduce(magnitude, axis=1))
-            if len(tried) < iterations:
-                lacking = np.sqrt(magnitude.mean(axis=1, keepdims=True) / magnitude)
-                target_factors = np.abs(target_factors) * lacking * reached / magnitude
-        every = np.concatenate(tried)
-        cost = np.vecdot(every, np.matvec(R, every)).real
-        values = np.concatenate(magnitudes) / np.sqrt(np.maximum(cost, 1e-30))
-        best = (best_along(values, axis=0), np.arange(n))
-        w, value = every[best], values[best]
+    s = len(starts)
+    target_factors = np.repeat(starts[:, :, None], n, axis=2)
+    forms = np.broadcast_to(R, (s, *R.shape)).reshape(-1, eras, eras)
+    tried, magnitudes = [], []
+    for _ in range(iterations):
+        c = np.add.reduce(target_factors[..., None] * conjugate, axis=1)
+        w = np.linalg.solve(forms, c.reshape(-1, eras, 1)).reshape(s, n, eras)
+        reached = np.vecdot(conjugate, w[:, None])  # (s, t, n)
+        magnitude = np.maximum(np.abs(reached), 1e-20)
+        tried.append(w)
+        magnitudes.append(np.minimum.reduce(magnitude, axis=1))
+        if len(tried) < iterations:
+            lacking = np.sqrt(magnitude.mean(axis=1, keepdims=True) / magnitude)
+            target_factors = np.abs(target_factors) * lacking * reached / magnitude
+    every = np.concatenate(tried)
+    cost = np.vecdot(every, np.matvec(R, every)).real
+    values = np.concatenate(magnitudes) / np.sqrt(np.maximum(cost, 1e-30))
+    best = (best_along(values, axis=0), np.arange(n))
+    w, value = every[best], values[best]
     size = np.maximum.reduce(np.abs(w), axis=-1, keepdims=True)
     return np.asarray(w / np.maximum(size, 1e-30), dtype=np.complex64), value

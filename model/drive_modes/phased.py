@@ -26,12 +26,5 @@ class Phased(Coherent):
             return super().search(forms)
         return phased_kernel.search(by, self, forms)
 
-    def search_all(self, forms: Forms) -> CoherentResult:
-        """As of `Coherent`."""
-        by = kernels()
-        if by is None or len(forms.targets) > MAX_TARGETS:
-            return super().search_all(forms)
-        return phased_kernel.search_all(by, self, forms)
-
 
 PHASED = Phased(phases=(1, 5), iterations=8)

@@ -35,24 +35,12 @@ WITHIN_STROKE = (
 
 
 def search(kernels: Kernels, coherent: Coherent, forms: Forms) -> CoherentResult:
-    """As `Coherent.search`."""
-    return _searched(kernels, coherent, forms, WITHIN_STROKE)
-
-
-def search_all(kernels: Kernels, coherent: Coherent, forms: Forms) -> CoherentResult:
-    """As `Coherent.search_all`."""
-    return _searched(kernels, coherent, forms, ())
-
-
-def _searched(
-    kernels: Kernels, coherent: Coherent, forms: Forms, further: tuple[Method, ...]
-) -> CoherentResult:
-    """The best by the first method, and by further ones where that misses the level."""
+    """As `Coherent.search`: by the first method, by further ones where that misses the level."""
     given = _given(coherent, forms)
     first = SEVERAL if forms.quiet.shape[1] > 1 else ONE_FINGER
     found = _tried(kernels, given, np.arange(forms.frequency_count), first)
     score, missed = found.score, found.missed
-    for method in further:
+    for method in WITHIN_STROKE:
         open_ = _level_limited(score, missed)
         if len(open_) == 0:
             break

@@ -1,6 +1,7 @@
 """Tones of contents by one call of a kernel in C, or in numpy where there is no compiler."""
 
 from ctypes import addressof
+from itertools import chain
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
@@ -88,21 +89,20 @@ def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones | None
 def _question(contents: Contents) -> GivenQuestion:
     """Contents as kernels read them."""
     tips, streams, rows = contents.tips, contents.streams, contents.rows
-    bands = [end for stream in streams for band in stream.bands for end in band]
-    targets = [finger for stream in streams for finger in stream.targets]
-    starts = np.cumsum([0, *(len(stream.targets) for stream in streams)])
+    whole: dict[str, list[int]] = {"row": rows.tolist(), "quiet": [*contents.quiet]}
+    whole |= {"starts": [0], "targets": [], "band": []}
+    for stream in streams:
+        whole["targets"] += stream.targets
+        whole["starts"].append(len(whole["targets"]))
+        whole["band"] += chain.from_iterable(stream.bands)
+    whole["priority"] = [stream.priority for stream in streams]
     given = GivenQuestion(
         *(len(streams), len(streams[0].bands), len(rows), len(contents.quiet)),
         *(tips.few.shape[1], tips.fine.shape[1], contents.is_ranked, contents.is_strict),
         *(contents.with_onset, contents.apart_hz),
     )
     given.point(
-        row=rows,
-        starts=starts,
-        targets=np.array(targets),
-        quiet=np.array(contents.quiet, dtype=np.int32),
-        priority=np.array([stream.priority for stream in streams]),
-        band=np.array(bands),
+        row=np.array([*chain.from_iterable(whole.values())]),
         level=contents.levels,
         few_points=tips.few,
         fine_points=tips.fine,
@@ -110,6 +110,10 @@ def _question(contents: Contents) -> GivenQuestion:
         fine_weights=tips.fine_weights,
         background=contents.background,
     )
+    at = given.row
+    for name, values in whole.items():
+        setattr(given, name, at)
+        at += 4 * len(values)
     return given
 
 

@@ -33,6 +33,7 @@ from model.table.contents import (
     Tones,
 )
 from model.table.fingers_on_plate import MAX_FINGERS_BY_POINT, FingersOnPlate
+from model.table.fingertip_shapes import FingertipShapes
 
 if TYPE_CHECKING:
     from model.table.table import LocalizationTable
@@ -199,18 +200,38 @@ def _best_tone(
     loud = np.sqrt(loudest[:, quiet].max(axis=1))
     robust = np.where(reaches, percentile(own / np.maximum(loud, 1e-30)), 0.0)
     near = np.flatnonzero(robust >= 10 ** (-ONSET_MARGIN_DB / 20) * robust.max())
-    if len(near) == 1 or not contents.with_onset or table.onsets is None:
+    contrast = None
+    if contents.with_onset and len(near) > 1:
+        drives, targets = (found.rows[near], found.weights[near]), [*contents.streams[0].targets]
+        contrast = onset_contrast(table, tips, targets, quiet, np.ones(len(targets)), *drives)
+    if contrast is None:
         return best_of(robust)
-    targets, count = [*contents.streams[0].targets], tips.fine.shape[1]
+    return int(near[best_of(robust[near] * contrast**ONSET_WEIGHT)])
+
+
+def onset_contrast(
+    table: "LocalizationTable",
+    tips: FingertipShapes,
+    targets: list[int],
+    quiet: list[int],
+    gains: FloatArray,
+    rows: IntArray,
+    weights: Complex64Array,
+) -> FloatArray | None:
+    """Contrast (m,) along a plain ramp of tones at rows (m,), weights (m, n); None if unsolved.
+
+    gains: factors on the targets.
+    """
+    if table.onsets is None:
+        return None
     # An onset's target counts by the plain mean over its points.
-    scales = (count * tips.fine_weights[targets])[:, :, None]
-    contrast = table.onsets.contrast(
-        found.rows[near],
-        found.weights[near],
-        targets=list(tips.fine[targets] * scales),
+    scales = tips.fine.shape[1] * tips.fine_weights[targets] * gains[:, None]
+    return table.onsets.contrast(
+        rows,
+        weights,
+        targets=list(tips.fine[targets] * scales[:, :, None].astype(np.float32)),
         quiet=tips.fine[quiet].reshape(-1, tips.fine.shape[2]),
     )
-    return int(near[best_of(robust[near] * contrast**ONSET_WEIGHT)])
 
 
 def best_combination(
@@ -282,8 +303,9 @@ def _promised(
     given = tips.fine.reshape(-1, tips.fine.shape[2]), shares, table.error_power, table.thresholds
     powers = touched.drawn(PROMISED_DRAWS, rows, weights, *given, with_powers=True).powers
     power = np.asarray(powers).reshape(len(rows), *shares.shape, -1)
+    alone = np.arange(len(rows))  # as if each had a frequency of its own
     own = [
-        promise(own_amplitudes(p, shares, s.targets)) for p, s in zip(power, streams, strict=True)
+        promise(felt_amplitudes(power, shares, alone, j, s.targets)) for j, s in enumerate(streams)
     ]
     gains = levels / np.maximum(own, 1e-30)
     gains, factor = share_stroke(gains, weights, [stream.priority for stream in streams])
@@ -341,17 +363,6 @@ def share_stroke(
     return gains * factors, float(factors.min())
 
 
-def own_amplitudes(
-    power: Float32Array, weights: Float32Array, targets: Sequence[int]
-) -> Float32Array:
-    """Mean amplitude over the weakest target fingertip, (..., d), of powers (..., k, p, d).
-
-    weights (k, p): of the points in the mean.
-    """
-    means = [weights[t] @ np.sqrt(power[..., t, :, :]) for t in targets]
-    return np.asarray(np.minimum.reduce(means))
-
-
 def felt_amplitudes(
     power: Float32Array,
     weights: Float32Array,
@@ -361,13 +372,14 @@ def felt_amplitudes(
 ) -> Float32Array:
     """The least that a content's fingertips feel of it, (d,), of power (K, k, p, d).
 
-    Tones of other contents at its frequency, by rows (K,), may cancel part of it.
+    weights (k, p): of the points in the mean. Tones of other contents at its frequency, by rows
+    (K,), may cancel part of it.
     """
     amplitude = np.sqrt(power[number])
     for other in np.flatnonzero(rows == rows[number]).tolist():
         if other != number:
             amplitude = amplitude - np.sqrt(power[other])
-    return own_amplitudes(np.maximum(amplitude, 0) ** 2, weights, targets)
+    return np.asarray(np.min([weights[t] @ np.maximum(amplitude[t], 0) for t in targets], axis=0))
 
 
 def loudest_power(power: Float32Array, rows: IntArray, finger: int) -> Float32Array:

@@ -12,7 +12,7 @@ from model.arrays import Complex64Array, Float32Array, IntArray
 from model.drive_modes.forms import Forms, Weights
 from model.ensemble.draws import Drawing
 from model.ensemble.measures import Felt, Fingertips, felt, felt_at
-from model.ensemble.touched_plate import LoadedContacts, Sensed, TouchedPlate, gram, outer
+from model.ensemble.touched_plate import LoadedContacts, TouchedPlate, gram, outer
 from model.table.fingertip_shapes import FingertipShapes
 from model.table.pulse_gains import PulseResponses
 from model.table.question import Question
@@ -66,7 +66,7 @@ class FingersOnPlate:
         threshold (all,) [m/s²], at all of them.
         """
         t, fingers = len(question.targets), np.arange(len(tips.few))
-        fine = tips.fine if len(fingers) <= 1 + MAX_FINGERS_BY_POINT else None
+        fine = tips.fine if len(question.quiet) <= MAX_FINGERS_BY_POINT else None
         return cls(
             touched,
             rows,
@@ -125,11 +125,7 @@ class FingersOnPlate:
     @cached_property
     def _fine_fields(self) -> Complex64Array:
         """Fields of each ERA at the fine points of the quiet fingers, (f, q, p, n)."""
-        found, tips = self.contacts.fine_fields, self.tips
-        if found is None:
-            found = self.touched.forms(
-                self.rows, tips.few, tips.few_weights, self.error_power, tips.fine
-            ).fine_fields
+        found = self.contacts.fine_fields
         if found is None:
             raise AssertionError("fine points must be given")
         return found.take(self.quiet, axis=1)
@@ -189,17 +185,26 @@ class FingersOnPlate:
         quiet = uncertain[:, :, None] + outer(at_points)
         return replace(forms, quiet=quiet.reshape(len(rows), -1, n, n), few=None, fine=None)
 
-    def respond(self, drives: Sequence[Weights]) -> "DriveResponses":
-        """Responses of the fingertips to drives."""
+    def felt(self, drives: Sequence[Weights], by: Drawing) -> Felt:
+        """What is felt of drives on drawn plates; the fingers' targets must come first."""
         each = [drive.tones() for drive in drives]
-        ends = list(accumulate(len(tones) for tones in each))
-        rows = np.array([index for tones in each for index, _ in tones])
-        return DriveResponses(
-            self,
-            self.rows.take(rows),
+        starts = np.array([0, *accumulate(map(len, each))][:-1])
+        rows = self.rows.take([index for tones in each for index, _ in tones])
+        tips, threshold = self.tips, self.threshold
+        sensed = self.touched.drawn(
+            by,
+            rows,
             np.array([weights for tones in each for _, weights in tones]),
-            np.array([0, *ends[:-1]]),
+            tips.fine.reshape(-1, tips.fine.shape[2]),
+            tips.fine_weights,
+            self.error_power,
+            threshold,
+            with_powers=len(starts) < len(rows),
         )
+        if sensed.powers is None:
+            return felt_at(sensed.means, sensed.loudest, self.gains)
+        power = sensed.powers * (threshold.take(rows) ** 2)[:, None, None]
+        return felt(power, threshold.take(rows), starts, Fingertips(tips.fine_weights, self.gains))
 
     def _expected(self, background: Complex64Array) -> Complex64Array:
         """The mean power under errors of the gains, (f, eras, eras)."""
@@ -207,51 +212,3 @@ class FingersOnPlate:
         diagonal = expected.reshape(len(expected), -1)[:, :: expected.shape[1] + 1]
         diagonal *= 1 + np.float32(self.touched.on.plate.gain_variance)
         return expected
-
-
-@dataclass(frozen=True, eq=False)
-class DriveResponses:
-    """Responses of the fingertips' points to m tones of c drives.
-
-    rows (m,): of the plate's frequencies; weights (m, n): of the ERAs; starts (c,): the first tone
-    of each drive.
-    """
-
-    fingers: FingersOnPlate
-    rows: IntArray
-    weights: Complex64Array
-    starts: IntArray
-
-    def of(self, drive: int) -> "DriveResponses":
-        """Responses to one of the drives, by index."""
-        start, *end = self.starts[drive : drive + 2]
-        tones = slice(start, *end or [None])
-        return replace(
-            self,
-            rows=self.rows[tones],
-            weights=self.weights[tones],
-            starts=np.zeros(1, dtype=int),
-        )
-
-    def drawn(self, by: Drawing) -> Sensed:
-        """What is felt on the plate as modelled, and on drawn ones."""
-        touched, tips = self.fingers.touched, self.fingers.tips
-        return touched.drawn(
-            by,
-            self.rows,
-            self.weights,
-            tips.fine.reshape(-1, tips.fine.shape[2]),
-            tips.fine_weights,
-            self.fingers.error_power,
-            self.fingers.threshold,
-            with_powers=len(self.starts) < len(self.rows),
-        )
-
-    def felt(self, sensed: Sensed) -> Felt:
-        """Measures of the drives where the fingers' targets come first, (c, plates)."""
-        weights, gains = self.fingers.tips.fine_weights, self.fingers.gains
-        if sensed.powers is None:
-            return felt_at(sensed.means, sensed.loudest, gains)
-        threshold = self.fingers.threshold.take(self.rows)
-        power = sensed.powers * (threshold**2)[:, None, None]
-        return felt(power, threshold, self.starts, Fingertips(weights, gains))

@@ -37,7 +37,6 @@ from model.table.contents import (
 from model.table.fingers_on_plate import (
     CENTRE_AND_FOUR,
     MAX_FINGERS_BY_POINT,
-    DriveResponses,
     FingersOnPlate,
 )
 from model.table.pattern import ONSET_RAMP, Pattern
@@ -184,9 +183,8 @@ def _best(
     drives = [each for _, each in found]
     if len(playable) < len(candidates.frequencies):
         drives = [replace(each, frequencies=_rows(each, playable)) for each in drives]
-    responses = candidates.fingers.respond(drives)
-    best = _judged(question, drives, scores, candidates, responses)
-    return _pattern(question, drive_mode, candidates, drives[best], responses.of(best), gap_db)
+    best = _judged(question, drives, scores, candidates)
+    return _pattern(question, drive_mode, candidates, drives[best], gap_db)
 
 
 def _by_point(
@@ -279,7 +277,6 @@ def _judged(
     drives: Sequence[Weights],
     scores: FloatArray,
     candidates: Candidates,
-    responses: DriveResponses,
 ) -> int:
     """Index of the drive that drawn plates prefer.
 
@@ -287,7 +284,7 @@ def _judged(
     """
     if len(drives) == 1:
         return 0
-    judged = responses.felt(responses.drawn(JUDGING_DRAWS))
+    judged = candidates.fingers.felt(drives, JUDGING_DRAWS)
     if candidates.over_effect is not None:
         return _judged_over_effect(question, drives, scores, judged, candidates.over_effect)
     least = percentile(judged.level[:, 1:])
@@ -352,11 +349,10 @@ def _pattern(
     drive_mode: str,
     candidates: Candidates,
     drive: Weights,
-    responses: DriveResponses,
     gap_db: float | None,
 ) -> Pattern:
     """The pattern of a drive, turned down to the wanted level at nine of ten plates."""
-    drawn = responses.felt(responses.drawn(PROMISED_DRAWS))
+    drawn = candidates.fingers.felt([drive], PROMISED_DRAWS)
     measures = [drawn.level]
     if drawn.contrast is not None:
         measures += [drawn.contrast.loudest, drawn.contrast.acceleration, drawn.contrast.felt]

@@ -8,7 +8,7 @@ that any fingertips can be queried in any drive mode.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,10 +37,11 @@ from model.structure.dispersion import Dispersion
 from model.structure.plate import Plate
 from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS, Contents
 from model.table.contents_kernel import choose_tones
+from model.table.contents_numpy import onset_contrast
 from model.table.fingers_on_plate import FingersOnPlate
 from model.table.fingertip_shapes import FingertipReader, FingertipShapes
 from model.table.pattern import ONSET_RAMP, Pattern
-from model.table.pattern_choice import Candidates, OnsetContrast, choose_pattern, pattern_of
+from model.table.pattern_choice import Candidates, choose_pattern, pattern_of
 from model.table.pulse_gains import OverEffect
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
 from model.table.raster import Raster
@@ -154,6 +155,7 @@ class LocalizationTable:
             found = self._tone(question, tips, playable)
             if found is not None:
                 return found
+        count = len(question.targets)
         candidates = Candidates(
             eras=self.eras,
             frequencies=self.frequencies,
@@ -162,7 +164,14 @@ class LocalizationTable:
             background=None if question.quiet else self.background(question.targets),
             threshold=self.thresholds,
             threshold_name=self.threshold,
-            onset_contrast=self._onset_contrast(question, tips),
+            onset_contrast=partial(
+                onset_contrast,
+                self,
+                tips,
+                [*range(count)],
+                [*range(count, len(tips.fine))],
+                np.array(question.gains),
+            ),
             over_effect=over_effect,
             ringing=self._ringing(over_effect.duration) if over_effect else None,
         )
@@ -411,21 +420,3 @@ class LocalizationTable:
             frequencies=self.frequencies,
             threshold=self.threshold,
         )
-
-    def _onset_contrast(self, question: Question, tips: FingertipShapes) -> OnsetContrast:
-        """Contrast of plain ramps at the fingertips, by row of the table's frequencies."""
-
-        def contrast(rows: IntArray, weights: Complex64Array) -> FloatArray | None:
-            if self.onsets is None:
-                return None
-            discs, count = tips.fine, len(question.targets)
-            # An onset's target counts by the plain mean over its points.
-            scales = discs.shape[1] * tips.fine_weights[:count] * np.array(question.gains)[:, None]
-            return self.onsets.contrast(
-                rows,
-                weights,
-                targets=list(discs[:count] * scales[:, :, None].astype(np.float32)),
-                quiet=discs[count:].reshape(-1, discs.shape[-1]),
-            )
-
-        return contrast

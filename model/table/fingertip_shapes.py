@@ -34,14 +34,15 @@ class FingertipReader:
         self._kept: dict[Point, tuple[Float32Array, ...]] = {}
 
     def __call__(self, places: Sequence[Point]) -> FingertipShapes:
-        """Read at fingertips centred at places [m] of the plate."""
-        missing = [place for place in places if place not in self._kept]
+        """Read at fingertips centred at places [m] of the plate; from any thread."""
+        kept = self._kept
+        missing = [place for place in places if place not in kept]
         if missing:
-            if len(self._kept) > MAX_KEPT:
-                self._kept.clear()
+            if len(kept) > MAX_KEPT:
+                kept = self._kept = {}  # another thread may still read the one before
                 missing = list(places)
             tips = self._raster.fingertips(np.array(missing))
             read = (*tips.read(self._shapes), tips.few_weights, tips.fine_weights)
-            self._kept.update(zip(missing, zip(*read, strict=True), strict=True))
-        found = [self._kept[place] for place in places]
+            kept.update(zip(missing, zip(*read, strict=True), strict=True))
+        found = [kept[place] for place in places]
         return FingertipShapes(*(np.array(each) for each in zip(*found, strict=True)))

@@ -1,12 +1,14 @@
 """Several fingers on the paper's plate in virtual time: controller, wire, amplifier, fingertips.
 
-Everything is the project's own but the memory of the serial line. Fingers are reported every 10 ms.
+Everything is the project's own but the memory of the serial line, whose bytes a witness reads and
+judges at the end. Fingers are reported every 10 ms.
 """
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -27,8 +29,11 @@ from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.wires import Wire, open_wires
 from sim.faults.fault_window import Faults
+from sim.witness.witness import Witness
+from witness_config import witness_config
 
 Position = tuple[float, float]
+LEVEL_LIMIT = 1.0  # of the paper's rig, written by hand
 
 
 @dataclass
@@ -41,6 +46,7 @@ class Fingers:
 
     controller: Controller
     bench: Bench
+    witness: Witness
     at: dict[int, Position] = field(default_factory=dict)
     applied: list[Applied] = field(default_factory=list)
     silenced: list[Silenced] = field(default_factory=list)
@@ -52,6 +58,7 @@ class Fingers:
         plate, now = self.bench.rig.plate, asyncio.get_running_loop().time()
         places = {str(id): position for id, position in self.at.items()}
         self.bench.place_fingers(places, now=now)
+        self.witness.contacts(now, tuple(self.at))
         touches = tuple(
             Touch(id, x / plate.length, 1 - y / plate.width) for id, (x, y) in self.at.items()
         )
@@ -112,7 +119,7 @@ async def fingers_on(
     table: LocalizationTable, layout: SurfaceLayout, *, layers: int = 8
 ) -> AsyncIterator[Fingers]:
     """Fingers on a layout, armed, over a serial line with an amplifier of four channels."""
-    loop = asyncio.get_running_loop()
+    loop: Any = asyncio.get_running_loop()
     live_in_memory()
     rig = smooth_rig()
     bench = Bench(rig, now=loop.time())
@@ -129,7 +136,12 @@ async def fingers_on(
             intent_source=EffectPlayer(layout),
             timing=Timing(table),
         )
-        fingers = Fingers(controller, bench)
+        config = witness_config(on, times_s={}, level=LEVEL_LIMIT)
+        witness = Witness(config)
+        for link in config["wires"]:
+            witness.opened(link, loop.time())
+        loop.seen = lambda link, toward, data: witness.record_bytes(link, toward, loop.time(), data)
+        fingers = Fingers(controller, bench, witness)
         controller.observers.append(
             Observer(pattern_applied=fingers.applied.append, silenced=fingers.silenced.append)
         )
@@ -142,11 +154,15 @@ async def fingers_on(
 
         device.handle = handle  # type: ignore[method-assign]
         await controller.open()
+        witness.operator_command(loop.time(), "arm")
         await controller.arm()
         running = asyncio.create_task(controller.run())
         await fingers.hold(0.5)
         yield fingers
+        witness.operator_command(loop.time(), "disarm")
+        await controller.close()
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
-        await controller.close()
         device.close()
+        assert witness.finish(loop.time()) == []
+        assert witness.frames > 10

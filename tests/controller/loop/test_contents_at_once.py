@@ -158,6 +158,7 @@ async def test_stop_and_lift_do_not_wait_for_an_answer(
         assert len(fingers.applied) == 1
         begin, count = loop.time(), len(fingers.committed)
         if what == "stop":
+            fingers.witness.operator_command(begin, "stop")
             stopped = await fingers.controller.stop()
             assert all(each.is_confirmed for each in stopped.values())
             assert loop.time() - begin < 0.02

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from controller.daemon.api_views import PlateView
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
@@ -211,6 +212,59 @@ async def test_what_is_not_served_says_why() -> None:
         others = [felt[id] for id in (3, 4, 5, 6) if felt[id].verdict == "held back"]
         assert others
         assert all("6 dB of contrast" in (each.held_back or "") for each in others)
+
+
+@in_virtual_time
+async def test_an_answer_that_fails_silences_all_and_says_why(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Asked once, not in every turn of the loop; fingers that move are asked for again."""
+    calls = 0
+
+    def fail(*_: Any, **__: Any) -> None:
+        nonlocal calls
+        calls += 1
+        raise ZeroDivisionError("by no finger")
+
+    async with fingers_on(table(), LAYOUT, breaks="touch") as fingers:
+        fingers.at = {1: LEFT}
+        await fingers.hold(0.3)
+        with monkeypatch.context() as patched:
+            patched.setattr("controller.loop.selection.query_jointly", fail)
+            fingers.at[2] = RIGHT
+            await fingers.hold(0.5)
+        assert calls == 1
+        (one,) = fingers.committed[-1][2]
+        assert (one.commands, one.renew) == ((), False)  # ends along its ending
+        assert fingers.contrasts() == {}
+        assert fingers.silenced[-1].reason == "ZeroDivisionError: by no finger"
+        fingers.at[2] = (RIGHT[0] + 0.01, RIGHT[1])
+        await fingers.hold(0.3)
+        assert [each.held_back for each in fingers.applied[-1].targets] == [None, None]
+
+
+@in_virtual_time
+async def test_status_says_what_each_finger_feels() -> None:
+    """Keys of the API: by finger its content and verdict; by layer what the ERAs play."""
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT, 3: ABOVE}
+        await fingers.hold(0.5)
+        applied = fingers.applied[-1]
+        view = PlateView(lambda key: "buzz", applied.contacts, applied)
+        event = view.pattern_event()
+        assert event is not None
+        assert len(event.layers) == 3
+        for contact, (number, one) in zip(event.contacts, applied.contents.items(), strict=True):
+            assert (contact.role, contact.held_back) == ("target", None)
+            promised = contact.robust_felt_contrast_db
+            assert promised is not None
+            assert contact.verdict == ("own" if promised >= 12 else "mixed")
+            assert contact.level_db_sl == pytest.approx(14.0, abs=0.5)
+            assert contact.foreign_level_db_sl == pytest.approx(14.0 - promised, abs=2.0)
+            assert contact.frequency_hz == one.content.frequency
+            tones = event.layers[str(number)].values()
+            assert {tone.frequency_hz for tone in tones} == {contact.frequency_hz}
+        assert len({contact.frequency_hz for contact in event.contacts}) == 3
 
 
 def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:

@@ -233,7 +233,9 @@ class ApiServer:
         if call.method != "stop" and len(connection.pending) >= MAX_PENDING:
             raise RpcError(ErrorCode.BUSY, "too many pending requests", remedy="await responses")
         if method.needs_reply:
-            return _for_one_who_stays(connection, lambda: handle(connection, call.params))
+            return _for_one_who_stays(
+                connection, connection.silenced, lambda: handle(connection, call.params)
+            )
         connection.silenced += call.method in ("stop", "disarm")
         return handle(connection, call.params)
 
@@ -255,10 +257,12 @@ class ApiServer:
 
 
 async def _for_one_who_stays(
-    connection: Connection, handle: Callable[[], Message | Awaitable[Message]]
+    connection: Connection, silenced: int, handle: Callable[[], Message | Awaitable[Message]]
 ) -> Message:
-    """Handle a request of a client that has not left, or silenced all, with the same bytes."""
-    silenced = connection.silenced
+    """Handle a request of a client that has not left, or silenced all, with the same bytes.
+
+    silenced: its stops and disarms before the request.
+    """
     for _ in range(2):  # iterations in which its end is received
         await asyncio.sleep(0)
     if connection.silenced != silenced:

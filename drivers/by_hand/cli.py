@@ -239,6 +239,8 @@ def conformance(
             print(f"Next: era amp conformance {shlex.quote(url)} --write")
     if report.overall == "failed":
         raise typer.Exit(1)
+    if write and report.overall == "incomplete":
+        raise typer.Exit(EXIT_STATUS[LinkError])
 
 
 def _show_result(result: "CheckResult") -> None:

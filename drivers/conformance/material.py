@@ -83,7 +83,11 @@ class Material:
         ]
 
     def envelope(self, step: float, *amplitudes: complex) -> Envelope:
-        """Make an envelope of knots in fractions of the test level, or the nearest step [s]."""
+        """Make an envelope of knots in fractions of the test level, or the nearest step [s].
+
+        Of as many knots as there can be.
+        """
+        amplitudes = amplitudes[: self.can["knots"]]
         low, high = self.can["envelope_step_min"], self.can["envelope_step_max"]
         steps = min(max(QUANTITIES["envelope_step"].to_wire(step), low), high)
         phases = [math.degrees(math.atan2(each.imag, each.real)) for each in amplitudes]

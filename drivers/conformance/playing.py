@@ -69,7 +69,7 @@ def renew(subject: Subject) -> Rows:
 @driving(_SETS)
 def after(subject: Subject) -> Rows:
     """It starts commands with *after* once the onsets of the layer have ended, at once without."""
-    first = subject.one(subject.tone(onset=subject.envelope(0.05, 0.5, 1, 0.5)))
+    first = subject.one(subject.tone(onset=subject.long_onset))
     waiting = layer(0, subject.tone(0, 0.25, frequency=subject.other), after=True)
     newer = layer(0, subject.tone(0, 0.75), after=True)
 
@@ -234,6 +234,7 @@ async def voices(subject: Subject) -> None:
         subject.tone(0, 1 / sets, frequency=subject.near(at), onset=onset) for at in range(sets)
     ]
     await subject.arm()
+    subject.require_ramp(sets * (_PAUSE + onset.step / 10_000 + subject.exchange_time) / 0.8)
     began = clock.now()
     for tone in tones:
         last = await subject.play(layer(0, tone, ramp=ramp))
@@ -274,6 +275,8 @@ async def limited(subject: Subject) -> None:
     """It limits the sum of its layers to full level, and says once that it was limited."""
     if subject.level * 2 <= 1.0:
         raise Optional("tried above half of full level only; see --level")
+    if abs(subject.other - subject.frequency) < subject.can["frequency_step"]:
+        raise Optional("it has one frequency, whose tones interfere")
     await subject.arm()
     over = layer(1, subject.tone(frequency=subject.other))
     for sets, is_limited in (

@@ -37,7 +37,10 @@ class Result(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """Result of a check; reason, seen, expected: of a violation, or why it was skipped."""
+    """Result of a check; reason, seen, expected: of a violation, or why it was skipped.
+
+    has_verdict: unless this machine or the line was always too slow for it.
+    """
 
     check: Check
     number: int
@@ -47,6 +50,7 @@ class CheckResult:
     expected: str = ""
     seconds: float = 0.0
     attempts: int = 1
+    has_verdict: bool = True
 
     def to_json(self) -> dict[str, Any]:
         """Make a row with stable keys."""
@@ -81,7 +85,8 @@ class Report:
         """The worst result: failed, incomplete or passed."""
         if any(each.result is Result.FAILED for each in self.results):
             return "failed"
-        return "incomplete" if self.not_run else "passed"
+        is_incomplete = self.not_run or not all(each.has_verdict for each in self.results)
+        return "incomplete" if is_incomplete else "passed"
 
     @property
     def summary(self) -> str:

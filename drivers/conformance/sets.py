@@ -86,7 +86,8 @@ async def steps_as_stated(subject: Subject) -> None:
     }
     await subject.arm()
     for name in coarse:
-        step, found = subject.can[f"{name}_step"], set()
+        found: set[int] = set()
+        step = subject.can[f"{name}_step"]
         lowest, start, highest = ranges[name]
         for number in range(_SCANNED):
             value = min(max(start + number * step // _SCANNED, lowest), highest)
@@ -194,7 +195,7 @@ def accepts_its_ranges(subject: Subject) -> Rows:
     shapes = [
         Envelope(can[f"envelope_step_{end}"], ((quiet, _PHASE.maximum),) * count)
         for end in ("min", "max")
-        for count in {0, 1, can["knots"]}
+        for count in {0, min(1, can["knots"]), can["knots"]}
     ]
     loud = [
         Command(number, limits[end], limits["level_max"], _PHASE.minimum)

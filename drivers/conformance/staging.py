@@ -19,8 +19,9 @@ def set_of(material: Material, room: int) -> list[LayerSet]:
     """Make a set of this many words, or of as many as there can be."""
     channels, max_knots = len(material.channels), material.can["knots"]
     # All but the heads of layers has an even number of words.
-    counts = [each for each in range(1, len(material.layers) + 1) if each % 2 == room % 2]
     bare = _LAYER_HEAD + _SHAPED * channels
+    most = min(len(material.layers), room // bare)
+    counts = [each for each in range(1, most + 1) if each % 2 == room % 2] or [most]
     full = bare + 4 * channels * max_knots
     count = next((each for each in counts if each * full >= room), counts[-1])
     left = max(room - count * bare, 0) // 2  # knots
@@ -46,8 +47,11 @@ def parts_of_sets(subject: Subject) -> Rows:
     """It takes parts in any order and again, says which is missing, and plays a whole set alone."""
     made = long_set(subject)
 
+    def cut(token: int, now: int = 0) -> list[Values]:
+        return subject.parts(*made, token=token, now=now, count=3)
+
     def parts(token: int, now: int = 0) -> Rows:
-        return [send("Set", **each) for each in subject.parts(*made, token=token, now=now)]
+        return [send("Set", **each) for each in cut(token, now)]
 
     def backwards(token: int, now: int) -> Rows:
         first, *others = parts(token, now)
@@ -57,7 +61,7 @@ def parts_of_sets(subject: Subject) -> Rows:
         return [*late, first, *again, 0.05]
 
     def second(**changed: int) -> Values:
-        return {**subject.parts(*made, token=5, now=0)[1], **changed}
+        return {**cut(5)[1], **changed}
 
     count = len(parts(5))
     others = play(subject.one(), *(layer(each) for each in subject.layers[1:]), token=3)
@@ -85,7 +89,7 @@ def max_set(subject: Subject) -> Rows:
 @driving(_PLACE)
 def sets_expire(subject: Subject) -> Rows:
     """It discards a set that is not committed, or not complete, 1 s after its first part."""
-    parts = subject.parts(*long_set(subject), token=3, now=0)
+    parts = subject.parts(*long_set(subject), token=3, now=0, count=3)
     first, *others, last = (send("Set", **each) for each in parts)
     return [
         *(subject.arm, stage(subject.one()), 0.9 * STAGED_LIFE, send("Commit", token=1)),
@@ -163,5 +167,6 @@ def newer_sets_replace(subject: Subject) -> Rows:
 def committed_together(subject: Subject) -> Rows:
     """It starts all layers and channels of a set at one moment."""
     tones = [subject.tone(each, 1 / len(subject.layers)) for each in subject.channels]
-    layers = [layer(each, *tones, ramp=subject.ramp) for each in subject.layers]
+    room = subject.can["set_words"] // (_LAYER_HEAD + 4 * len(tones))
+    layers = [layer(each, *tones, ramp=subject.ramp) for each in subject.layers[:room]]
     return [[stage(*layers), send("Commit", token=1)]]

@@ -122,6 +122,7 @@ def stop_ramps(subject: Subject) -> Rows:
 @driving(_STATES)
 def silence_never_later(subject: Subject) -> Rows:
     """It is silent by the sooner of two Stops; a later one prolongs nothing, nor does a fault."""
+    subject.require_ramp()
     slow, quick = send("Stop", ramp=min(400, subject.can["ramp_max"])), send("Stop", ramp=50)
     fading = layer(0, ramp=50)
     return [
@@ -134,6 +135,7 @@ def silence_never_later(subject: Subject) -> Rows:
 @driving(_STATES)
 def stop_ends_all(subject: Subject) -> Rows:
     """It ends fades, onsets, endings, waiting sets and all layers by Stop, skipping endings."""
+    subject.require_ramp()
     stopped = send("Stop", ramp=10), 0.05, subject.clear
     return [(*rows, *stopped) for rows in subject.transitions(subject.can["ramp_max"])]
 
@@ -153,6 +155,7 @@ def stops_are_numbered(subject: Subject) -> Rows:
 @driving(_STATES)
 def clear_too_early(subject: Subject) -> Rows:
     """It stays stopped by a Clear amid its fade."""
+    subject.require_ramp()
     ramp = subject.can["ramp_max"]
     slow = send("Stop", ramp=ramp)
     return [subject.arm, subject.one(), slow, subject.clear, ramp / 1000 + 0.02, subject.clear]

@@ -20,8 +20,8 @@ from drivers.conformance.findings import (
 from drivers.conformance.material import FULL, Material, layer
 from drivers.conformance.rows import Rows, Send, play, send
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, pack_layers, parts
-from drivers.protocol.table import MESSAGES, STATES
+from drivers.protocol.sets import Envelope, LayerSet, pack_layers, parts
+from drivers.protocol.table import MESSAGES, QUANTITIES, STATES
 
 LEVEL = 0.2
 """Level of driven channels unless another is given: perceptible, and far from any limit."""
@@ -210,12 +210,17 @@ class Subject(Material):
         expect_equal(NAMES.get(status["state"]), OFF, "state after Clear")
         self.expected = Expected(self.can, status.values, status.when)
 
-    def parts(self, *layers: LayerSet, token: int = 0, now: int = 1) -> list[Values]:
-        """Make the parts of a set but for their session; token: 0 for the next."""
+    def parts(
+        self, *layers: LayerSet, token: int = 0, now: int = 1, count: int = 1
+    ) -> list[Values]:
+        """Make the parts of a set but for their session; token: 0 for the next; count: at least."""
         if not token:
             token = self.token = self.token % 0xFFFF + 1
+        ramp_max = self.can["ramp_max"]
+        layers = tuple([replace(one, ramp=min(one.ramp, ramp_max)) for one in layers])
         self.shown.sets[token] = layers
-        made = parts(pack_layers(layers), session=1, token=token, now=bool(now))
+        stream = pack_layers(layers)
+        made = parts(stream, session=1, token=token, now=bool(now), longest=len(stream) // count)
         return [{name: each[name] for name in each if name != "session"} for each in made]
 
     def words_of(self, *layers: LayerSet) -> tuple[int, list[int]]:
@@ -234,6 +239,22 @@ class Subject(Material):
         """A ramp [ms] that is long against an exchange."""
         required = max(200, math.ceil(30_000 * min(self.exchange_time, 0.03)))
         return int(min(required, self.can["ramp_max"]))
+
+    def require_ramp(self, duration: float = 0.0) -> None:
+        """Raise Optional where no ramp lasts as long as a time [s], or as a few exchanges."""
+        duration = max(duration, 0.03 + 2 * min(self.exchange_time, 1.0))
+        if self.can["ramp_max"] < 1000 * duration:
+            raise Optional(f"its ramps are shorter than {duration:.2g} s")
+
+    @property
+    def long_onset(self) -> Envelope:
+        """An onset with knots that is long against an exchange, as far as there are knots."""
+        duration = max(0.2, 16 * min(self.exchange_time, 1.0))
+        longest = QUANTITIES["envelope_step"].from_wire(self.can["envelope_step_max"])
+        count = min(max(math.ceil(duration / longest) - 1, 3), self.can["knots"])
+        if not count:
+            raise Optional("it has no knots")
+        return self.envelope(duration / (count + 1), *([0.5, 1.0] * count)[:count])
 
     async def pause(self, duration: float) -> None:
         """Wait for a time [s], feeding the watchdog."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import COMMAND, ENVELOPE, KNOT, LAYER, MAX_WORDS, MESSAGES, STAGED_LIFE
 
-_PART_WORDS = MAX_WORDS - len(MESSAGES["Set"].request.fields) + 1
+PART_WORDS = MAX_WORDS - len(MESSAGES["Set"].request.fields) + 1
 MAX_PARTS = 127
 
 
@@ -130,15 +130,21 @@ def _envelope(words: Sequence[int], at: int) -> tuple[Envelope, int]:
     return Envelope(head["step"], tuple(knots)), at
 
 
-def parts(stream: Sequence[int], *, session: int, token: int, now: bool) -> list[Values]:
-    """Return the Set messages of a stream; now: it plays when it is complete."""
-    cuts = range(0, max(len(stream), 1), _PART_WORDS)
+def parts(
+    stream: Sequence[int], *, session: int, token: int, now: bool, longest: int = PART_WORDS
+) -> list[Values]:
+    """Return the Set messages of a stream, of at most so many words each.
+
+    now: it plays when it is complete.
+    """
+    longest = min(max(longest, 1), PART_WORDS)
+    cuts = range(0, max(len(stream), 1), longest)
     if len(cuts) > MAX_PARTS:
         raise ValueError(f"a set must have at most {MAX_PARTS} parts, got {len(cuts)}")
     made: list[Values] = []
     for index, at in enumerate(cuts):
         values = {"session": session, "token": token, "index": index, "parts": len(cuts)}
-        made.append({**values, "now": int(now), "stream": list(stream[at : at + _PART_WORDS])})
+        made.append({**values, "now": int(now), "stream": list(stream[at : at + longest])})
     return made
 
 

@@ -220,7 +220,7 @@ class Subject(Material):
         layers = tuple([replace(one, ramp=min(one.ramp, ramp_max)) for one in layers])
         self.shown.sets[token] = layers
         stream = pack_layers(layers)
-        made = parts(stream, session=1, token=token, now=bool(now), longest=len(stream) // count)
+        made = parts(stream, session=1, token=token, now=bool(now), max_words=len(stream) // count)
         return [{name: each[name] for name in each if name != "session"} for each in made]
 
     def words_of(self, *layers: LayerSet) -> tuple[int, list[int]]:
@@ -250,8 +250,8 @@ class Subject(Material):
     def long_onset(self) -> Envelope:
         """An onset with knots that is long against an exchange, as far as there are knots."""
         duration = max(0.2, 16 * min(self.exchange_time, 1.0))
-        longest = QUANTITIES["envelope_step"].from_wire(self.can["envelope_step_max"])
-        count = min(max(math.ceil(duration / longest) - 1, 3), self.can["knots"])
+        step_max = QUANTITIES["envelope_step"].from_wire(self.can["envelope_step_max"])
+        count = min(max(math.ceil(duration / step_max) - 1, 3), self.can["knots"])
         if not count:
             raise Optional("it has no knots")
         return self.envelope(duration / (count + 1), *([0.5, 1.0] * count)[:count])

@@ -131,20 +131,20 @@ def _envelope(words: Sequence[int], at: int) -> tuple[Envelope, int]:
 
 
 def parts(
-    stream: Sequence[int], *, session: int, token: int, now: bool, longest: int = PART_WORDS
+    stream: Sequence[int], *, session: int, token: int, now: bool, max_words: int = PART_WORDS
 ) -> list[Values]:
     """Return the Set messages of a stream, of at most so many words each.
 
     now: it plays when it is complete.
     """
-    longest = min(max(longest, 1), PART_WORDS)
-    cuts = range(0, max(len(stream), 1), longest)
+    max_words = min(max(max_words, 1), PART_WORDS)
+    cuts = range(0, max(len(stream), 1), max_words)
     if len(cuts) > MAX_PARTS:
         raise ValueError(f"a set must have at most {MAX_PARTS} parts, got {len(cuts)}")
     made: list[Values] = []
     for index, at in enumerate(cuts):
         values = {"session": session, "token": token, "index": index, "parts": len(cuts)}
-        made.append({**values, "now": int(now), "stream": list(stream[at : at + longest])})
+        made.append({**values, "now": int(now), "stream": list(stream[at : at + max_words])})
     return made
 
 

@@ -2,30 +2,21 @@
 
 import asyncio
 from collections.abc import Callable, Sequence
-from functools import partial
 
 from drivers.conformance import CHECKS, LEVEL, CheckResult, of_kind
-from drivers.conformance.can_client import CanClient
 from drivers.conformance.check import run_checks
-from drivers.conformance.client import Client
-from drivers.conformance.modbus_client import ModbusClient
-from drivers.conformance.serial_client import SerialClient
+from drivers.conformance.opening import CLIENTS as BY_PROTOCOL
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
-from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
-from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from virtual_loop import run_virtual
+from words_line import KINDS as WIRES
 
-KINDS = ("serial", "rtu", "tcp", "can")
+PROTOCOLS = {"serial": "serial", "rtu": "Modbus RTU", "tcp": "Modbus TCP", "can": "CAN"}
+KINDS = tuple(PROTOCOLS)
+CLIENTS = {kind: BY_PROTOCOL[protocol] for kind, protocol in PROTOCOLS.items()}
+"""Clients of the kinds of wires."""
 DELAY = 0.0002  # s; of bytes on their way
 _TURN = 0.0005  # s; between looks at what is due
-CLIENTS: dict[str, Callable[[int], Client]] = {
-    "serial": SerialClient,
-    "can": CanClient,
-    "rtu": partial(ModbusClient, is_rtu=True),
-    "tcp": partial(ModbusClient, is_rtu=False),
-}
-"""Clients of the kinds of wires."""
 
 
 class JudgedLine:
@@ -35,15 +26,9 @@ class JudgedLine:
         self._loop = asyncio.get_running_loop()
         self.client = CLIENTS[kind](1)
         self.client.port = self
-        ends = {1: far}
-        if kind == "can":
-            self._end: SerialAmplifiers | ModbusAmplifiers | CanAmplifiers
-            self._end = bus = CanAmplifiers(ends, self._send)
-            bus.start(self._loop.time())
-        elif kind == "serial":
-            self._end = SerialAmplifiers(ends, self._send)
-        else:
-            self._end = ModbusAmplifiers(ends, self._send, is_rtu=kind == "rtu")
+        self._end = WIRES[kind].far_end({1: far}, self._send)
+        if isinstance(self._end, CanAmplifiers):
+            self._end.start(self._loop.time())
         self._far = far
         self._ticking = self._loop.create_task(self._tick())
 

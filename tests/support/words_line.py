@@ -45,6 +45,9 @@ class FarEnd(Protocol):
     def receive(self, data: bytes, now: float) -> None:
         """Take bytes from the host at a time [s]."""
 
+    def tick(self, now: float) -> None:
+        """Let happen what is due by itself."""
+
 
 @dataclass(frozen=True)
 class Kind:

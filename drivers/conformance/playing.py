@@ -12,7 +12,6 @@ from drivers.conformance.findings import Late, Optional, expect
 from drivers.conformance.material import layer
 from drivers.conformance.rows import Rows, play, send
 from drivers.conformance.subject import Subject
-from drivers.protocol.sets import Command
 from drivers.protocol.table import SHORTENED_FADE
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
@@ -260,12 +259,10 @@ def voices_of_layers(subject: Subject) -> Rows:
     ramp, share = subject.can["ramp_max"], 1 / (2 * len(subject.layers))
     others = subject.layers[1:]
     count = len(others) + min(subject.can["voices"], _MAX_VOICES) + 3
-
-    def near(fraction: float, at: int) -> Command:
-        return subject.tone(0, fraction, frequency=subject.near(at))
-
-    lasting = play(*(layer(number, near(share, number)) for number in others))
-    quiet = [near(share / 4, at) for at in range(len(others) + 1, count)]
+    near = [subject.tone(0, share, frequency=subject.near(at)) for at in range(count)]
+    least = max(near[0].level // 4, subject.can["level_step"])
+    quiet = [replace(each, level=least) for each in near[len(others) + 1 :]]
+    lasting = play(*(layer(number, near[number]) for number in others))
 
     async def fade() -> None:
         for tone in quiet:

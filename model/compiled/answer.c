@@ -168,9 +168,9 @@ SHARED int best_combination(int *chosen_tones, const candidates *from, const flo
     for (int i = 0; i < of->quiet_count; i++) content_of[of->quiet[i]] = contents;
     for (int j = 0; j < contents; j++)
         for (int t = of->starts[j]; t < of->starts[j + 1]; t++) content_of[of->targets[t]] = j;
-    int *tried = integers(memory, (size_t)(most > from->count ? most : from->count) * from->count * contents);
-    float *worst = floats(memory, (size_t)(most > from->count ? most : from->count) * from->count);
-    int *order = integers(memory, (size_t)(most > from->count ? most : from->count) * from->count);
+    const size_t each = (size_t)of->bands * 2 * (by->candidates + contents / 2); /* tones of a content */
+    int *tried = integers(memory, most * each * contents), *order = integers(memory, most * each);
+    float *worst = floats(memory, most * each);
     for (int pass = 0; pass < 2; pass++) {
         const float gap = pass ? 0 : of->apart;
         int count = 1, found = 0;

@@ -64,7 +64,7 @@ class Group(Members):
         self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
         self._sets = JointSets(self, draw(_TOKEN.minimum, _TOKEN.maximum))
-        self._stops = self._cleared = 0  # stops so far, and at the last clear
+        self._stopped = 0  # epoch of the last stop, until it is cleared
         self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # of stops
         self._limit: asyncio.Timeout | None = None  # of an exchange in progress
 
@@ -83,12 +83,12 @@ class Group(Members):
 
         Raises LinkError, and CommandError for a wire that is too slow for the watchdog.
         """
-        stops = self._stops  # each amplifier says itself what it has latched before
+        stopped = self._stopped  # each amplifier says itself what it has latched before
         await self.all([each.open() for each in self.amplifiers.values()])
         for amplifier in self.amplifiers.values():
             check_watchdog(self._watchdog, amplifier.exchange_time("Set"))
         self.state = GroupState.DISARMED
-        self._cleared = stops
+        self._note_cleared(stopped)
 
     async def arm(self) -> None:
         """Switch the high voltage on at level zero: on all amplifiers, or none stays armed.
@@ -97,14 +97,14 @@ class Group(Members):
         that came first, nothing changes. Raises DriverError, LinkDegraded where one only does not
         reply for now.
         """
-        before = self.silences
+        before = self.epoch
         async with self._arming:
             if self.state in (GroupState.CLOSED, GroupState.LOST):
                 raise CommandError(
                     f"amplifiers must be open to be armed, got {self.state.name}; close and open "
                     "all of them again"
                 )
-            if self._stops > self._cleared:  # an amplifier that restarted does not know
+            if self._stopped:  # an amplifier that restarted does not know
                 raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
             if self.silencing:  # the result would depend on the order of frames
                 raise CommandRefused(
@@ -118,7 +118,7 @@ class Group(Members):
                 if all(each["state"] == ENABLED for each in statuses.values()):
                     return
                 self._leave_armed()
-                before = self.silences
+                before = self.epoch
                 await self.silenced(self._disarm(amplifiers, STOP_RAMP))
                 self.check_none_since(before)
             for amplifier in amplifiers:
@@ -207,7 +207,7 @@ class Group(Members):
 
     async def _exchange(self, exchange: Coroutine[Any, Any, _T]) -> _T:
         """Run an exchange of the control loop; any unexplained failure stops all amplifiers."""
-        before = self.silences
+        before = self.epoch
         limit = asyncio.timeout(None)
         try:
             try:
@@ -221,7 +221,7 @@ class Group(Members):
                 raise Preempted("given up, since silence comes first") from error
             if self.is_degraded_only(error):
                 raise LinkDegraded(str(error)) from error
-            is_explained = self.silences != before and self.state is not GroupState.LOST
+            is_explained = self.epoch != before and self.state is not GroupState.LOST
             if is_explained and isinstance(error, DriverError):
                 raise Preempted("a stop or disarm came first") from error
             replying = [name for name, each in self.amplifiers.items() if not each.silence_cause]
@@ -253,7 +253,7 @@ class Group(Members):
         some names, None for all. It goes on to its end if its caller is cancelled.
         """
         self._leave_armed()
-        self._stops += 1
+        self._stopped = self.epoch
         for line in {each.line for each in self.amplifiers.values()}:
             if len(line.members) > 1:
                 try:
@@ -299,17 +299,22 @@ class Group(Members):
         """
         if self.silencing:
             raise Preempted("amplifiers are being stopped or disarmed; clear again afterwards")
-        count = self._stops
+        stopped = self._stopped
         try:
             await self.all([each.clear() for each in self.amplifiers.values()])
         except LinkError:
             await self.stop()
             raise
         except CommandRefused as error:
-            if self._stops != count:  # the stop of now is another one
+            if self._stopped != stopped:  # the stop of now is another one
                 raise Preempted("a stop came first; find the cause, then clear again") from error
             raise
-        self._cleared = count
+        self._note_cleared(stopped)
+
+    def _note_cleared(self, stopped: int) -> None:
+        """Note that the last stop is cleared, if it is that of an epoch."""
+        if self._stopped == stopped:
+            self._stopped = 0
 
     async def statuses(self) -> dict[str, Values]:
         """Read the status of every amplifier, by name; again while one does not reply.
@@ -348,7 +353,7 @@ class Group(Members):
 
     def _leave_armed(self) -> None:
         """Leave ARMED for DISARMED, if armed, so that nothing more is played."""
-        self.silences += 1
+        self.epoch += 1
         if self.is_armed:
             self.state = GroupState.DISARMED
 

@@ -48,7 +48,7 @@ class JointSets:
     async def play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | CommandRefused:
         """Stage and commit layers by amplifier; a refusal before the first commit is returned."""
         amplifiers = self._members.amplifiers
-        before = self._members.silences
+        before = self._members.epoch
         if self.token % INTERVAL == 0:
             self.token = await close_gaps(amplifiers.values(), self.token)
         self.token = token = token_after(self.token)

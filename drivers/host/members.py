@@ -25,8 +25,8 @@ class Members:
 
     def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
         self.amplifiers = dict(amplifiers)
-        self.silences = 0
-        """Stops, disarms and closes so far."""
+        self.epoch = 0
+        """Stops, disarms and closes so far: nothing from before arms, plays or feeds after one."""
         self.silencing: set[asyncio.Future[Any]] = set()
         """Stops and disarms in progress."""
 
@@ -72,8 +72,8 @@ class Members:
             self.lose()
 
     def check_none_since(self, before: int) -> None:
-        """Raise Preempted if a silence was asked for since there were so many."""
-        if self.silences != before:
+        """Raise Preempted if a stop, disarm or close has come since an epoch."""
+        if self.epoch != before:
             raise Preempted(
                 "amplifiers were disarmed, stopped or closed meanwhile; arm again if that is still "
                 "wanted"
@@ -179,7 +179,7 @@ class Heartbeats:
         for amplifier in amplifiers:  # before the others are waited for: they are stopped then
             if is_lost(amplifier):
                 raise LinkTimeout(amplifier.line.loss or amplifier.silence_cause)
-        before = self._members.silences
+        before = self._members.epoch
         await self._members.all([self._beat(each, before) for each in amplifiers])
 
     async def _beat(self, amplifier: Amplifier, before: int) -> None:

@@ -334,13 +334,15 @@ class Decider:
     def _with_sets(self, draft: Decision, now: float) -> Decision | None:
         """Return a draft with the sets of all layers that change; None if none does."""
         numbers = self._numbered(draft.selection.contents)
-        playing: dict[int, PlayedContent] = {}
+        playing = {
+            number: before
+            for number, before in self._playing.items()
+            if before.content == numbers.get(number)
+        }
+        changed = {n: content for n, content in numbers.items() if n not in playing}
         sets: dict[int, PlateSet] = {}
-        for number, content in numbers.items():
+        for number, content in changed.items():
             before = self._playing.get(number)
-            if before is not None and before.content == content:
-                playing[number] = before
-                continue
             targets, until = content.targets, self._confirmed_until(content)
             sets[number], pattern = self._builder.build_pattern(
                 number,
@@ -350,6 +352,7 @@ class Decider:
                 valid_for=valid_for(targets, confirmed_until=until, now=now),
                 is_shaped=not targets[0][1].is_short,
                 lasts=first_lasts(targets, now),
+                among=len(changed),
             )
             playing[number] = PlayedContent(content, sets[number], pattern)
         started = frozenset(sets)

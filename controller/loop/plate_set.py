@@ -95,12 +95,14 @@ class SetBuilder:
         valid_for: float,
         is_shaped: bool = True,
         lasts: float = math.inf,
+        among: int = 1,
     ) -> tuple[PlateSet, Pattern]:
         """Build the set of a pattern in a layer; returns it and the pattern as it is played.
 
         playing: what each ERA plays now in this layer; a tone that continues needs no onset.
         valid_for [s]: for how long it plays unless it is renewed. is_shaped: whether it may have an
         onset and an ending, which it has only if its first pulse lasts [s] until the onset is over.
+        among: layers that change at once, which share the time on the wires.
         """
         layers = route(
             pattern.excitation,
@@ -120,7 +122,8 @@ class SetBuilder:
         if not (pattern.onset or pattern.ending):
             return plain, pattern
         if pattern.onset:
-            onset = thinned(pattern.onset, knots=self._support.onset_knots)
+            knots = max(1, self._support.onset_knots // among)
+            onset = thinned(pattern.onset, knots=knots)
             pattern = replace(pattern, onset=onset)
         layers = shaped(layers, self._rig, onset=pattern.onset, ending=pattern.ending)
         return PlateSet(layers, ramp, plain), pattern

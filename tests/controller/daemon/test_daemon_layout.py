@@ -93,3 +93,21 @@ async def test_daemon_publishes_layouts_and_rejects_invalid_ones(tmp_path: Path)
         layout = await published()
         assert [region["name"] for region in layout["regions"]] == ["field", "quiet"]
         assert (await era.hello("test")).layout == layout
+
+
+@pytest.mark.usefixtures("resting")
+async def test_status_says_what_the_plate_cannot_serve(tmp_path: Path) -> None:
+    """The few frequencies of this table keep one of two contents away; the thread is a real one."""
+    two = LAYOUT.replace("0.15]}}\nelsewhere", "0.15]}, on_press: alert}\nelsewhere")
+    (tmp_path / "layout.yaml").write_text(two, encoding="utf-8")
+    async with ready_daemon(tmp_path, "layout: layout.yaml\n") as (bench, era):
+        view = bench.daemon._publisher.view
+        await era.arm("me", lease_s=60)
+        await era.touch([ON_PAD, ON_QUIET])
+        await until(lambda: view.applied is not None and len(view.applied.targets) == 2)
+        first, second = (await era.status()).contacts
+        assert (first.effect, first.role, first.verdict) == ("hum", "target", "mixed")
+        assert (first.held_back, first.level_db_sl) == (None, pytest.approx(14, abs=0.5))
+        assert (second.effect, second.role, second.verdict) == ("alert", "target", "held back")
+        assert second.level_db_sl is None
+        assert (second.held_back or "").startswith("too many contents for this plate")

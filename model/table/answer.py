@@ -166,14 +166,19 @@ class _Answering:
             (*plan.applied, f"content of {_at(requests[given_up[0]])} {verb}"),
         )
 
-    @property
+    @cached_property
     def _every(self) -> list[Request | Finger]:
         return [*self.requests, *self.fingers]
 
     @cached_property
     def _rows(self) -> IntArray:
         """Rows of the table's frequencies that any band holds."""
-        return np.unique(np.concatenate([self._band(each) for each in self.requests]))
+        return np.unique(np.concatenate(self._bands))
+
+    @cached_property
+    def _bands(self) -> list[IntArray]:
+        """Rows that each request may have."""
+        return [self._band(each) for each in self.requests]
 
     def _band(self, request: Request) -> IntArray:
         frequencies, (low, high) = self.table.frequencies, request.band_hz
@@ -191,8 +196,8 @@ class _Answering:
         """A plan for a kernel."""
         table, every = self.table, self._every
         bands = []
-        for each in self.requests:
-            rows = np.searchsorted(self._rows, self._band(each)).tolist()
+        for band in self._bands:
+            rows = np.searchsorted(self._rows, band).tolist()
             bands.append((rows[0], rows[-1] + 1))
         streams = []
         for fingers in plan.contents:
@@ -204,6 +209,7 @@ class _Answering:
             streams.append(Stream(fingers, level, own, priority))
         first = streams[0]
         is_plain = len(streams) == len(first.targets) == len(first.bands) == 1
+        is_ranked = is_plain and bool(plan.quiet)
         others = [finger for stream in streams[1:] for finger in stream.targets]
         rest = (
             None if plan.quiet or others else [self.requests[finger].at for finger in first.targets]
@@ -213,10 +219,10 @@ class _Answering:
             tuple(each.load for each in every),
             tuple(streams),
             plan.quiet,
-            self._rows,
+            self._bands[first.targets[0]] if is_ranked else self._rows,
             self.apart_hz,
             background=None if rest is None else table.background(rest),
-            is_ranked=is_plain and bool(plan.quiet),
+            is_ranked=is_ranked,
         )
 
     def _measure(self, plan: _Plan) -> _Measured:

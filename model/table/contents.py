@@ -80,9 +80,10 @@ class Contents:
     tips: of the fingers; loads: of each relative to the rig's fingertip, empty for 1; quiet: by
     index; rows (f,): of the table's frequencies that may be played, ascending; apart_hz: distance
     of the contents' frequencies where bands allow it; background: form of the rest of the plate at
-    all of the table's frequencies, for no other finger; is_ranked: whether an only content is
-    searched at the KEPT frequencies first; is_strict: whether nothing is to be found where tones of
-    one frequency hardly reach the level; with_onset: whether onsets along a plain ramp count.
+    all of the table's frequencies, for no other finger; is_ranked: whether an only content, which
+    may have any of the rows, is searched at the KEPT frequencies first; is_strict: whether nothing
+    is to be found where tones of one frequency hardly reach the level; with_onset: whether onsets
+    along a plain ramp count.
     """
 
     tips: FingertipShapes

@@ -233,6 +233,18 @@ def test_the_lowest_priority_is_held_back():
     assert all(each.excitation for each in found.layers if each is not held)
 
 
+def test_a_content_that_is_left_alone_keeps_its_band():
+    """The band of the one that is held back is not its own."""
+    bands = ((470, 500), (40, 320))
+    requests = [
+        Request(at, band, priority=-n)
+        for n, (at, band) in enumerate(zip((NEAR, FAR), bands, strict=True))
+    ]
+    found = answer(smooth_table(), requests, min_contrast_db=99)
+    assert found.layers[1].verdict == "held back"
+    assert {470 <= tone.frequency <= 500 for tone in found.layers[0].excitation.values()} == {True}
+
+
 def test_a_finger_without_protection_gives_way_to_more_contrast():
     """The others have more than where the finger is kept quiet."""
     places, contrast = (NEAR, FAR, THIRD), []

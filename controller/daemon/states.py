@@ -87,23 +87,28 @@ class DaemonEvent:
 class StateMachine:
     """The operation of the plate: its state and everything that the next transition depends on.
 
-    is_latched: an acknowledgement is required before arming; is_acknowledged: it was given, and the
-    amplifiers are being read back; lost_at [s]: when the link was lost; is_degraded: whether an
-    amplifier does not reply while armed, so that nothing new is played; watchdog [s]: of armed
-    amplifiers; lease: of who armed, in the states of ENERGISED alone. epoch: rises with every stop,
-    disarm, fault, loss and close: what began before must not go on.
+    is_latched: an acknowledgement is required before arming; acknowledged: epoch in which it was
+    given, and since which the amplifiers are being read back; lost_at [s]: when the link was lost;
+    is_degraded: whether an amplifier does not reply while armed, so that nothing new is played;
+    watchdog [s]: of armed amplifiers; lease: of who armed, in the states of ENERGISED alone. epoch:
+    rises with every stop, disarm, fault, loss and close: what began before must not go on.
     """
 
     state: DaemonState = DaemonState.NOT_READY
     cause: str = "the daemon is starting"
     remedy: str | None = None
     is_latched: bool = False
-    is_acknowledged: bool = False
+    acknowledged: int | None = None
     lost_at: float = 0.0
     is_degraded: bool = False
     watchdog: float = WATCHDOG
     lease: Lease | None = None
     epoch: int = 0
+
+    @property
+    def is_acknowledged(self) -> bool:
+        """Whether an acknowledgement was given, and no stop, fault or loss came since."""
+        return self.acknowledged == self.epoch
 
     def lease_at(self, now: float) -> Lease | None:
         """The lease, unless it has expired at a time [s]."""
@@ -248,7 +253,7 @@ def failed(machine: StateMachine, cause: str) -> StateMachine:
     """Return the state machine after an unexpected exception: latched, and in FAULT if open."""
     epoch = machine.epoch + 1
     if machine.state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):
-        return replace(machine, is_latched=True, is_acknowledged=False, epoch=epoch)
+        return replace(machine, is_latched=True, epoch=epoch)
     return StateMachine(
         DaemonState.FAULT,
         cause,
@@ -269,11 +274,9 @@ def _with_event(machine: StateMachine, event: DaemonEvent, now: float) -> StateM
         case Trigger.ARMED if machine.lease is not None:  # arming may have taken longer than it
             return replace(machine, lease=machine.lease.renewed(now))
         case Trigger.CLEAR:
-            return replace(machine, is_acknowledged=True)
-        case Trigger.FAULT:
-            return replace(machine, is_acknowledged=False)
+            return replace(machine, acknowledged=machine.epoch)
         case Trigger.STOP:
-            return replace(machine, is_acknowledged=False, is_latched=True)
+            return replace(machine, is_latched=True)
         case Trigger.NOT_FOUND:
             return replace(machine, lost_at=now)
         case Trigger.LINK_LOST if machine.state is not DaemonState.COMM_LOST:
@@ -281,7 +284,6 @@ def _with_event(machine: StateMachine, event: DaemonEvent, now: float) -> StateM
                 machine,
                 lost_at=now,
                 is_latched=machine.is_latched or machine.state in ENERGISED,
-                is_acknowledged=False,
             )
         case Trigger.LINK_DEGRADED | Trigger.LINK_RESTORED:
             return replace(machine, is_degraded=event.trigger is Trigger.LINK_DEGRADED)
@@ -310,7 +312,7 @@ def _enter(
         cause=cause,
         remedy=remedy,
         is_latched=is_latched,
-        is_acknowledged=False,
+        acknowledged=None,
         is_degraded=False,
         lease=updated.lease if to in ENERGISED else None,
     )

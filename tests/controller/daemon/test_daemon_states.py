@@ -73,7 +73,7 @@ def machines(state: DaemonState) -> list[StateMachine]:
     """All machines in a state, with every combination of flags."""
     return [
         StateMachine(state, "why", None, latched, acknowledged, LOST_AT)
-        for latched, acknowledged in product((False, True), repeat=2)
+        for latched, acknowledged in product((False, True), (None, 0))
         if latched or state not in LATCHED
     ]
 

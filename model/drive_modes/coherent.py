@@ -9,11 +9,9 @@ the minimax of expected powers is not the best percentile). A mean is at most th
 |c^H w| / sqrt(w^H R w) bounds the score at a frequency.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
-from typing import TypeAlias
 
 import numpy as np
 
@@ -38,9 +36,31 @@ MAX_GROWTH, MAX_MULTIPLIER = 100.0, 1e12
 LEVEL_RESERVE = 1.02
 """Level aimed at, since the iterations come near to full stroke from above."""
 
-# Sigma and gain, tried in turn where the iterations fail: the quiet points count less against each
-# ERA's own power, and weights are raised up to full stroke.
-LEVEL_RELAXATION = ((1.0, 3.0), (1000.0, 1e6))
+
+@dataclass(frozen=True)
+class Method:
+    """Weights that are tried at each frequency.
+
+    steps: of Lawson's algorithm; is_limited: whether each is brought to the level within full
+    stroke, by multipliers; variance: of each ERA's contribution beyond that of the forms; gain: by
+    which weights are raised up to full stroke, 0 for none.
+    """
+
+    steps: int
+    is_limited: bool = False
+    variance: float = 0.0
+    gain: float = 0.0
+
+
+ONE_FINGER, SEVERAL = Method(1), Method(1 + LAWSON_STEPS)
+
+WITHIN_STROKE = (
+    Method(LIMITED_STEPS, is_limited=True, gain=1.0),
+    Method(1, variance=1.0, gain=3.0),
+    Method(1, variance=1e6, gain=1e6),
+)
+"""Tried in turn where the first weights miss the level: such within full stroke, and then such for
+which the quiet points count less against each ERA's own power."""
 
 _TINY, _LEAST = 1e-7, np.float32(1e-30)
 
@@ -58,89 +78,73 @@ class Coherent:
 
     def search(self, forms: Forms) -> "CoherentResult":
         """Find the best weights at each frequency, brought within full stroke where they must."""
-        found = self._tried(forms)
-        if found.is_level_limited:
-            self._limit_weights(forms, found)
-            self._relax_level(forms, found)
-        return found.search()
+        found = self.search_all(forms)
+        for method in WITHIN_STROKE:
+            open_ = found.level_limited
+            if len(open_) == 0:
+                break
+            more = self.tried(forms.at(open_), method)
+            found.score[open_], found.weights[open_] = more.score, more.weights
+            found.missed[open_] = np.maximum(found.missed[open_], more.missed)
+        return found
 
     def search_all(self, forms: Forms) -> "CoherentResult":
         """Find the best weights at every frequency, none raised to the level."""
-        return self._tried(forms).search()
-
-    def _tried(self, forms: Forms) -> "_BestCandidates":
-        """The best of the first weights, and of Lawson's where there are several constraints."""
-        found = _BestCandidates(forms)
-        weights, bound = self._weights(forms, _mean(forms))
-        expected = forms.quiet_power(weights)
-        tried: list[_Tried] = [(weights, expected, bound)]
-        if expected.shape[1] > 1:
-            tried += self._iterate(forms, expected)
-        found.add(np.arange(forms.frequency_count), forms, tried)
-        return found
-
-    def _iterate(self, forms: Forms, expected: Float32Array) -> "list[_Tried]":
-        """Lawson's iterations from expected powers (f, q) at the quiet fingertips."""
-        tried: list[_Tried] = []
-        shares = np.ones_like(expected)
-        for _ in range(LAWSON_STEPS):
-            shares = _moved(shares, expected)
-            weights, bound = self._weights(forms, _weighted(forms, shares))
-            expected = forms.quiet_power(weights)
-            tried.append((weights, expected, bound))
-        return tried
+        return self.tried(forms, SEVERAL if forms.quiet.shape[1] > 1 else ONE_FINGER)
 
     def max_sensation(self, forms: Forms) -> float:
         """Return the highest amplitude to threshold found at the weakest target."""
-        sigma, gain = LEVEL_RELAXATION[-1]
-        weights, _ = self._weights(forms, _mean(forms, sigma=sigma))
-        peak = forms.amplitude(_saturated(weights, gain))
+        any_level = replace(forms, wanted=0.0, level_margin=0.0)
+        peak = forms.amplitude(self.tried(any_level, WITHIN_STROKE[-1]).weights)
         return float((peak / forms.threshold).max())
 
-    def _limit_weights(self, forms: Forms, found: "_BestCandidates") -> None:
-        """Find the best weights within full stroke where the best of all do not reach the level.
+    def tried(self, forms: Forms, method: Method) -> "CoherentResult":
+        """Find the best of the weights of a method at every frequency.
 
-        The optimum has R + diag(d) in place of R, with multipliers d that are zero but for ERAs at
-        full stroke; they are multiplied by the squared magnitudes of the weights until they fit.
+        Within full stroke the optimum has R + diag(d) in place of R, with multipliers d that are
+        zero but for ERAs at full stroke; they are multiplied by the squared magnitudes of the
+        weights until they fit.
         """
-        open_ = found.level_limited()
-        if len(open_) == 0:
-            return
-        some = forms.at(open_)
-        R = _mean(some)
-        shares = np.ones_like(some.quiet[:, :, 0, 0].real)
-        multipliers = np.zeros((len(open_), 1), dtype=np.float32)
-        tried: list[_Tried] = []
-        for step in range(LIMITED_STEPS):
-            held = R.copy()
-            held.reshape(len(R), -1)[:, :: some.era_count + 1] += multipliers
-            weights, _ = self._weights(some, held)
-            weights = weights * (LEVEL_RESERVE * some.gain_to_level(weights))[:, None]
-            fitting = _saturated(weights, 1.0)
-            expected = some.quiet_power(fitting)
-            tried.append((fitting, expected, None))
+        f, q, n, _ = forms.quiet.shape
+        shares = np.full((f, q), 1 / q, dtype=np.float32)
+        multipliers = limit = np.zeros((f, 1), dtype=np.float32)
+        bound = np.full(f, np.inf, dtype=np.float32)
+        tried, powers = [], []
+        for step in range(method.steps):
+            R = _weighted(forms, shares)
+            diagonal = R.reshape(f, -1)[:, :: n + 1]
+            diagonal *= 1 + np.float32(method.variance)
+            diagonal += multipliers
+            weights, highest = self._weights(forms, R)
+            bound = np.minimum(bound, highest)
+            if method.is_limited:
+                gain = LEVEL_RESERVE * forms.gain_to_level(weights)
+                weights = (weights * gain[:, None]).astype(np.complex64)
+            fitting = weights
+            if method.gain:
+                saturated = weights / np.maximum(np.abs(weights), np.float32(1 / method.gain))
+                fitting = np.asarray(saturated, dtype=np.complex64)
+            expected = forms.quiet_power(fitting)
+            tried.append(fitting)
+            powers.append(np.maximum.reduce(expected, axis=1))
+            shares = _moved(shares, expected)
+            if not method.is_limited:
+                continue
             power = np.abs(weights) ** 2
             if step == 0:
-                own = np.maximum.reduce(some.quiet_power(weights), axis=1)
+                own = np.maximum.reduce(forms.quiet_power(weights), axis=1)
                 multipliers = (own / np.maximum(np.add.reduce(power, axis=1), _LEAST))[:, None]
                 limit = np.float32(MAX_MULTIPLIER) * multipliers
             # Beyond any level that can be reached they would grow without end.
             multipliers = np.minimum(multipliers * np.minimum(power, MAX_GROWTH), limit)
-            if shares.shape[1] > 1:
-                shares = _moved(shares, expected)
-                R = _weighted(some, shares)
-        found.add(open_, some, tried)
-
-    def _relax_level(self, forms: Forms, found: "_BestCandidates") -> None:
-        """Raise the level where the best weights do not reach it, for less contrast."""
-        for sigma, gain in LEVEL_RELAXATION:
-            open_ = found.level_limited()
-            if len(open_) == 0:
-                return
-            some = forms if len(open_) == forms.frequency_count else forms.at(open_)
-            weights, _ = self._weights(some, _mean(some, sigma=sigma))
-            weights = _saturated(weights, gain)
-            found.add(open_, some, [(weights, some.quiet_power(weights), None)])
+        every = np.array(tried)
+        peak, reaches = forms.reached(every)
+        each = peak / np.sqrt(np.maximum(powers, _LEAST) + _TINY * (peak * peak))
+        score = np.where(reaches, each, 0)
+        best = (best_along(score, axis=0), np.arange(f))
+        best_weights = np.where(score[best][:, None] > 0, every[best], 0).astype(np.complex64)
+        missed = np.maximum.reduce(np.where(reaches, 0, each), axis=0)
+        return CoherentResult(score[best], best_weights, bound, missed)
 
     def _weights(self, forms: Forms, R: Complex64Array) -> tuple[Complex64Array, Float32Array]:
         """Weights (n, eras), and their bound |c^H w| / sqrt(w^H R w), (n,)."""
@@ -154,73 +158,25 @@ class Coherent:
 class CoherentResult:
     """The best weights (f, eras) at each frequency, and their robust score (f,).
 
-    The score is 0 where none were found that reach the level. bound (f,): upper bound of the score.
-    is_level_limited: weights of a better score were found at a frequency where none reach the
-    level.
+    The score is 0 where none were found that reach the level. bound (f,): upper bound of the score;
+    missed (f,): the best score of weights that miss the level.
     """
 
     score: Float32Array
     weights: Complex64Array
     bound: Float32Array
-    is_level_limited: bool
+    missed: Float32Array
 
-
-_Tried: TypeAlias = tuple[Complex64Array, Float32Array, Float32Array | None]
-"""Weights (n, eras), their expected power at the quiet fingertips (n, q), bound of scores (n,)."""
-
-
-class _BestCandidates:
-    """The best candidate weights so far; score: the best of those that reach the level."""
-
-    def __init__(self, forms: Forms) -> None:
-        count = forms.frequency_count
-        self._scores = np.zeros(count, dtype=np.float32)
-        self._infeasible_scores = np.zeros(count, dtype=np.float32)
-        self._weights = np.zeros((count, forms.era_count), dtype=np.complex64)
-        self.bound = np.full(count, np.inf, dtype=np.float32)
-        self.score = 0.0
-
-    def add(self, frequencies: IntArray, forms: Forms, tried: Sequence[_Tried]) -> None:
-        """Add what was tried at frequencies, by index (n,); forms: at these only."""
-        weights = np.array([each for each, _, _ in tried])
-        expected = np.array([each for _, each, _ in tried])
-        power = np.maximum.reduce(expected, axis=-1)
-        peak, reaches = forms.reached(weights)
-        score = peak / np.sqrt(np.maximum(power, _LEAST) + _TINY * (peak * peak))
-        if not reaches.all():
-            missed = np.maximum.reduce(np.where(reaches, 0, score), axis=0)
-            self._infeasible_scores[frequencies] = np.maximum(
-                self._infeasible_scores[frequencies], missed
-            )
-            score = np.where(reaches, score, 0)
-        at = (best_along(score, axis=0), np.arange(len(frequencies)))
-        highest = score[at]
-        better = highest > self._scores[frequencies]
-        self._scores[frequencies[better]] = highest[better]
-        self._weights[frequencies[better]] = weights[at][better]
-        for _, _, bound in tried:
-            if bound is not None:
-                self.bound[frequencies] = np.minimum(self.bound[frequencies], bound)
-        self.score = max(self.score, float(highest.max()))
+    @property
+    def level_limited(self) -> IntArray:
+        """Frequencies without weights that reach the level, but of a better score than the best."""
+        is_missed = (self.score == 0) & (self.missed > self.score.max(initial=0))
+        return np.asarray(is_missed.nonzero()[0])
 
     @property
     def is_level_limited(self) -> bool:
-        """Whether there are `level_limited` frequencies."""
-        return len(self.level_limited()) > 0
-
-    def level_limited(self) -> IntArray:
-        """Frequencies without weights that reach the level, but of a better score than the best."""
-        is_missed = (self._scores == 0) & (self._infeasible_scores > self.score)
-        return np.asarray(is_missed.nonzero()[0])
-
-    def search(self) -> "CoherentResult":
-        """Return the best weights at each frequency."""
-        return CoherentResult(self._scores, self._weights, self.bound, self.is_level_limited)
-
-
-def _saturated(weights: Complex64Array, gain: float) -> Complex64Array:
-    """Weights times a gain, limited to full stroke."""
-    return np.asarray(weights / np.maximum(np.abs(weights), 1 / gain), dtype=np.complex64)
+        """Whether there are such frequencies."""
+        return len(self.level_limited) > 0
 
 
 def _moved(shares: Float32Array, expected: Float32Array) -> Float32Array:
@@ -231,18 +187,6 @@ def _moved(shares: Float32Array, expected: Float32Array) -> Float32Array:
     moved = shares * np.sqrt(np.maximum(expected, 0))
     total = np.add.reduce(moved, axis=-1, keepdims=True)
     return np.where(total > _LEAST, moved / np.maximum(total, _LEAST), shares)
-
-
-def _mean(forms: Forms, *, sigma: float = 0.0) -> Complex64Array:
-    """R (f, eras, eras) for equal weights of the quiet fingertips.
-
-    sigma: relative error of each ERA's contribution beyond that of the forms.
-    """
-    quiet = forms.quiet
-    R = np.add.reduce(quiet, axis=1) / np.float32(quiet.shape[1])
-    if sigma:
-        R.reshape(len(R), -1)[:, :: R.shape[1] + 1] *= 1 + np.float32(sigma**2)
-    return np.asarray(R)
 
 
 def _weighted(forms: Forms, shares: Float32Array) -> Complex64Array:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from model.compiled.kernels import kernels
 from model.drive_modes import phased_kernel
-from model.drive_modes.coherent import Coherent, CoherentResult
+from model.drive_modes.coherent import Coherent, CoherentResult, Method
 from model.drive_modes.forms import Forms
 
 MAX_TARGETS = 4
@@ -19,12 +19,12 @@ MAX_TARGETS = 4
 class Phased(Coherent):
     """The search for any weights, by a kernel in C where it can be compiled."""
 
-    def search(self, forms: Forms) -> CoherentResult:
+    def tried(self, forms: Forms, method: Method) -> CoherentResult:
         """As of `Coherent`."""
         by = kernels()
         if by is None or len(forms.targets) > MAX_TARGETS:
-            return super().search(forms)
-        return phased_kernel.search(by, self, forms)
+            return super().tried(forms, method)
+        return phased_kernel.tried(by, self, forms, method)
 
 
 PHASED = Phased(phases=(1, 5), iterations=8)

@@ -96,7 +96,10 @@ class Expected:
         if token == self.token:
             expect_equal((shown["token"], shown["played"]), (token, 1), "token, played of a repeat")
             return
-        if token != self._incoming or when.earliest > self._first.latest + STAGED_LIFE:
+        lived = when.earliest - self._first.latest, when.latest - self._first.earliest
+        if token == self._incoming and lived[0] <= STAGED_LIFE <= lived[1]:
+            raise Late("a part came as its set expired")
+        if token != self._incoming or lived[0] > STAGED_LIFE:
             self._incoming, self._received, self._first = token, set(), when
         self._received.add(values["index"])
         missing = [each for each in range(values["parts"]) if each not in self._received]

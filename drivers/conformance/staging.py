@@ -1,6 +1,7 @@
 """Checks of sets in parts and by tokens: staged, committed once, in their order, for a second."""
 
 from drivers.conformance.check import driving
+from drivers.conformance.findings import Optional
 from drivers.conformance.material import Material, layer
 from drivers.conformance.rows import Rows, play, send, stage
 from drivers.conformance.subject import Subject
@@ -11,7 +12,8 @@ from drivers.protocol.table import STAGED_LIFE
 _PLACE = "protocol.md#sets"
 _LAYER_HEAD, _SHAPED = 3, 8  # words of a layer, of a command with two empty envelopes
 _MAX_TRIED = 2000  # words of a set: more take a slow wire longer than a set lives
-_LONG = 600  # words of a set of several parts
+_LONG, _SHORT = 600, 60  # words of a set of several parts
+_SLOW = 0.03  # s; of a line, for an exchange of the longest messages
 _OLD = "BAD_TOKEN"
 
 
@@ -20,8 +22,8 @@ def set_of(material: Material, room: int) -> list[LayerSet]:
     channels, max_knots = len(material.channels), material.can["knots"]
     # All but the heads of layers has an even number of words.
     bare = _LAYER_HEAD + _SHAPED * channels
-    most = min(len(material.layers), room // bare)
-    counts = [each for each in range(1, most + 1) if each % 2 == room % 2] or [most]
+    max_layers = min(len(material.layers), room // bare)
+    counts = [each for each in range(1, max_layers + 1) if each % 2 == room % 2] or [max_layers]
     full = bare + 4 * channels * max_knots
     count = next((each for each in counts if each * full >= room), counts[-1])
     left = max(room - count * bare, 0) // 2  # knots
@@ -38,13 +40,16 @@ def set_of(material: Material, room: int) -> list[LayerSet]:
 
 
 def long_set(subject: Subject) -> list[LayerSet]:
-    """Make a set of several parts."""
-    return set_of(subject, min(subject.can["set_words"], _LONG))
+    """Make a set of several parts, a short one on a slow line, lest it expires on its way."""
+    words = _LONG if subject.client.transit < _SLOW else _SHORT
+    return set_of(subject, min(subject.can["set_words"], words))
 
 
 @driving(_PLACE)
 def parts_of_sets(subject: Subject) -> Rows:
     """It takes parts in any order and again, says which is missing, and plays a whole set alone."""
+    if 12 * subject.exchange_time > STAGED_LIFE:
+        raise Optional("the line is too slow for a set in several parts")
     made = long_set(subject)
 
     def cut(token: int, now: int = 0) -> list[Values]:
@@ -91,8 +96,9 @@ def sets_expire(subject: Subject) -> Rows:
     """It discards a set that is not committed, or not complete, 1 s after its first part."""
     parts = subject.parts(*long_set(subject), token=3, now=0, count=3)
     first, *others, last = (send("Set", **each) for each in parts)
+    shorter = 0.9 * STAGED_LIFE - 4 * min(subject.exchange_time, 0.1)
     return [
-        *(subject.arm, stage(subject.one()), 0.9 * STAGED_LIFE, send("Commit", token=1)),
+        *(subject.arm, stage(subject.one()), shorter, send("Commit", token=1)),
         *(stage(subject.one()), 1.1 * STAGED_LIFE, send("Commit", token=2, code=_OLD)),
         last,
         0.6 * STAGED_LIFE,

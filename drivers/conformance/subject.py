@@ -249,7 +249,7 @@ class Subject(Material):
     @property
     def long_onset(self) -> Envelope:
         """An onset with knots that is long against an exchange, as far as there are knots."""
-        duration = max(0.2, 16 * min(self.exchange_time, 1.0))
+        duration = max(0.2, 16 * min(max(self.exchange_time, self.client.transit / 2), 1.0))
         step_max = QUANTITIES["envelope_step"].from_wire(self.can["envelope_step_max"])
         count = min(max(math.ceil(duration / step_max) - 1, 3), self.can["knots"])
         if not count:
@@ -288,12 +288,13 @@ class Subject(Material):
         began = self.shown.began
         end = self.shown.settled_at(clock.now()) + _SETTLING
         end = end if duration is None else began.earliest + duration
+        end = max(end, clock.now() + 3 * min(self.exchange_time, 1.0))  # of a slow line: a few
         time, seen = end - self.heard_at, 0
         pause = max(time / (2 * _SAMPLES) - min(self.exchange_time, 1.0), 0.0)
         while clock.now() < end:
             reply = await self.status()
             width = reply.when.latest - reply.when.earliest + began.latest - began.earliest
-            is_narrow = width <= _NARROW + 2 * self.exchange_time
+            is_narrow = width <= _NARROW + 2 * max(self.exchange_time, self.client.transit)
             seen += is_narrow
             await asyncio.sleep(pause * is_narrow)
         if seen < max(min(_SAMPLES / 3, time / _EACH, time / (4 * self.exchange_time)), 2):

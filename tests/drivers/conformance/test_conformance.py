@@ -219,6 +219,13 @@ async def test_machine_that_is_always_late_has_no_verdict() -> None:
     assert Report("x", 0.2, (late, good), 0).overall == "incomplete"
 
 
+def test_set_that_waits_is_judged_on_a_slow_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 40 ms for an exchange: the onset that it waits for lasts until all has been sent."""
+    monkeypatch.setattr("judged_line.DELAY", 0.02)
+    (result,) = judged("serial", ["after"])
+    assert (result.result, result.attempts) == (Result.PASSED, 1), result.reason
+
+
 def test_request_that_comes_after_an_onset_is_no_violation(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

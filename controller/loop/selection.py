@@ -128,7 +128,10 @@ class Selector:
             targets, quiet = chosen.lasting.targets, chosen.lasting.quiet
             then = {each.key for each in (*(contact for contact, _ in targets), *quiet)}
             is_for_all = {each.key for each in contacts} <= then
-            if is_for_all and _intents(lasting) <= _intents(targets):
+            # Levels and places may have changed since: else a finger that moves would get nothing.
+            if is_for_all and {each.key for each, _ in lasting} <= {
+                each.key for each, _ in targets
+            }:
                 self._lasting = chosen.lasting
 
     def _choose(

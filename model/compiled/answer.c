@@ -162,17 +162,18 @@ SHARED void worst_ratios(float *worst, const int *combinations, int count, size_
 SHARED int best_combination(int *chosen_tones, const candidates *from, const float *own, const float *loudest,
                             const plates *on, const rules *by, const question *of, arena *memory) {
     const int contents = of->contents, most = by->max_combinations;
+    const size_t each = (size_t)of->bands * 2 * (by->candidates + contents / 2); /* tones of a content */
+    const size_t room = each > (size_t)most ? each : (size_t)most;
     const arena mark = *memory;
-    int *content_of = integers(memory, on->k), *kept = integers(memory, most * contents);
+    int *content_of = integers(memory, on->k), *kept = integers(memory, room * contents);
     for (int i = 0; i < on->k; i++) content_of[i] = -1;
     for (int i = 0; i < of->quiet_count; i++) content_of[of->quiet[i]] = contents;
     for (int j = 0; j < contents; j++)
         for (int t = of->starts[j]; t < of->starts[j + 1]; t++) content_of[of->targets[t]] = j;
-    const size_t each = (size_t)of->bands * 2 * (by->candidates + contents / 2); /* tones of a content */
-    int *tried = integers(memory, most * each * contents), *order = integers(memory, most * each);
-    float *worst = floats(memory, most * each);
+    int *tried = integers(memory, room * each * contents), *order = integers(memory, room * each);
+    float *worst = floats(memory, room * each);
     for (int pass = 0; pass < 2; pass++) {
-        const float gap = pass ? 0 : of->apart;
+        const float gap = pass ? 0 : of->apart - SAME_FREQUENCY;
         int count = 1, found = 0;
         for (int j = 0; j < contents && count; j++) {
             found = 0;
@@ -189,7 +190,7 @@ SHARED int best_combination(int *chosen_tones, const candidates *from, const flo
                     tried[(size_t)found++ * contents + j] = tone;
                 }
             count = found;
-            if (count > most) {
+            if (j && count > most) { /* a content alone has no ratio to others */
                 worst_ratios(worst, tried, count, j + 1, by->pruning_step, own, loudest, content_of, on->k, by, of, memory);
                 best_first(order, worst, count, memory);
                 count = most;

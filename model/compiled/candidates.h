@@ -221,7 +221,7 @@ SHARED void keep_apart(candidates *to, const rows_found *found, const rules *by,
         int is_apart = 1;
         if (found->score[at] <= 0) break;
         for (int other = start; other < to->count; other++)
-            is_apart &= fabsf(by->frequencies[to->rows[other]] - by->frequencies[rows[at]]) >= of->apart;
+            is_apart &= fabsf(by->frequencies[to->rows[other]] - by->frequencies[rows[at]]) >= of->apart - SAME_FREQUENCY;
         if (!is_apart && of->contents > 1 && to->count - start >= 2) continue;
         to->content[to->count] = content, to->band[to->count] = band, to->rows[to->count] = rows[at];
         to->scores[to->count] = found->score[at];

@@ -4,7 +4,7 @@
 
 #include "arena.h"
 
-static const float NEARLY = 1e-5f;
+static const float NEARLY = 1e-5f, SAME_FREQUENCY = 1e-3f; /* Hz */
 
 typedef struct {
     float score;

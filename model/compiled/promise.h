@@ -95,7 +95,10 @@ SHARED float share_stroke(float *gains, const question *of, const float *weights
                     full[e] += gains[j] * hypotf(weights[2 * (j * n + e)], weights[2 * (j * n + e) + 1]);
             factor = fminf(factor, left[e] / fmaxf(full[e], LEAST));
         }
-        for (size_t e = 0; e < n; e++) left[e] = fmaxf(left[e] - factor * full[e], 0);
+        for (size_t e = 0; e < n; e++) {
+            const float used = factor * full[e];
+            left[e] = used >= left[e] * (1 - NEARLY) ? 0 : left[e] - used; /* rounding leaves no stroke */
+        }
         for (size_t j = 0; j < contents; j++)
             if (!done[j] && of->priority[j] == highest) gains[j] *= factor, done[j] = 1;
         least = fminf(least, factor);

@@ -27,8 +27,9 @@ class Structure(ctypes.Structure):
         self.arrays = [*getattr(self, "arrays", [])]
         for name, array in given.items():
             if array is not None:
-                self.arrays.append(as_given(array))
-                setattr(self, name, self.arrays[-1].ctypes.data)
+                kept = as_given(array)
+                self.arrays.append(kept)
+                setattr(self, name, kept.ctypes.data)
 
 
 class Plates(Structure):

@@ -106,7 +106,7 @@ def _of_table(on: PlateOnEras) -> Plates:
             **{name: getattr(plate, name) for name in _OF_ROWS},
             attached=plate.stiffness,
         )
-        _kept[on] = found
+        return _kept.setdefault(on, found)  # of threads at once all take the first one's
     return found
 
 

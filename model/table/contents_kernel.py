@@ -50,9 +50,9 @@ def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones | None
         return choose_by_numpy(table, contents)
     count, n, k = len(contents.streams), len(table.eras), len(touched.centres)
     given = _question(contents)
-    given.judging, given.promise = (
-        addressof(draws_structure(table.on_eras, k, by)) for by in (JUDGING_DRAWS, PROMISED_DRAWS)
-    )
+    # Kept here until the kernel has ended: another thread may take their place in the cache.
+    drawn = [draws_structure(table.on_eras, k, by) for by in (JUDGING_DRAWS, PROMISED_DRAWS)]
+    given.judging, given.promise = map(addressof, drawn)
     rows = np.empty(count, dtype=np.int32)
     found = np.empty(count * (2 * n + 1) + 6 * k + 3, dtype=np.float32)
     sizes = np.cumsum([2 * n * count, count, 3 * k, 2 * k, k]) * 4

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
-from model.choice import best_few, best_first, best_of
+from model.choice import NEARLY, best_few, best_first, best_of
 from model.drive_modes.coherent import Coherent
 from model.drive_modes.forms import Forms
 from model.drive_modes.phased import PHASED
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from model.table.table import LocalizationTable
 
 _SEARCH = Coherent(PHASED.phases, PHASED.iterations)
-_TINY = 1e-20
+_TINY, _SAME_FREQUENCY = 1e-20, 1e-3  # -, Hz
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +152,8 @@ def _apart(score: Float32Array, frequencies: FloatArray, count: int, apart_hz: f
     for at in best_first(score).tolist():
         if score[at] <= 0 or len(found) == count:
             break
-        if len(found) < 2 or (np.abs(frequencies[found] - frequencies[at]) >= apart_hz).all():
+        gaps = np.abs(frequencies[found] - frequencies[at])
+        if len(found) < 2 or (gaps >= apart_hz - _SAME_FREQUENCY).all():
             found.append(at)
     return found
 
@@ -252,7 +253,8 @@ def best_combination(
             own_candidates = np.flatnonzero(found.streams == number)
             before = np.repeat(combinations, len(own_candidates), axis=0)
             last = np.tile(own_candidates, len(combinations))[:, None]
-            allowed = (np.abs(hertz[last] - hertz[before]) >= gap).all(axis=1)
+            gaps = np.abs(hertz[last] - hertz[before])
+            allowed = (gaps >= gap - _SAME_FREQUENCY).all(axis=1)
             if len(streams[0].bands) > 1:
                 allowed &= (found.bands[last] != found.bands[before]).all(axis=1)
             combinations = np.concatenate([before, last], axis=1)[allowed]
@@ -359,7 +361,8 @@ def share_stroke(
         of = np.array(priorities) == priority
         full = np.maximum(amplitudes[of].sum(axis=0), 1e-30)
         factors[of] = min(1.0, float((left / full).min()))
-        left = np.maximum(left - factors[of] @ amplitudes[of], 0.0)
+        used = factors[of] @ amplitudes[of]
+        left = np.where(used >= left * (1 - NEARLY), 0.0, left - used)  # rounding leaves no stroke
     return gains * factors, float(factors.min())
 
 

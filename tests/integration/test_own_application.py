@@ -27,6 +27,7 @@ from gateway_bench import (
 )
 
 FOLDER = Path(__file__).parents[2] / "examples" / "application"
+GATEWAY = "http://127.0.0.1:8137/"
 SAID = "document.querySelector('#state').textContent"
 FELT = "document.querySelector('#felt').textContent"
 
@@ -86,9 +87,13 @@ class Network:
 
 
 @contextmanager
-def pages() -> Iterator[str]:
-    """The origin of a server of the example's page, which is not the gateway."""
-    handler = partial(SimpleHTTPRequestHandler, directory=str(FOLDER))
+def pages(folder: Path, network: Network) -> Iterator[str]:
+    """The origin of a server of the example's page, which is not the gateway but names it."""
+    page = (FOLDER / "plate.html").read_text(encoding="utf-8")
+    assert page.count(GATEWAY) == 1
+    own = page.replace(GATEWAY, f"http://127.0.0.1:{network.port}/")
+    (folder / "plate.html").write_text(own, encoding="utf-8")
+    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"
@@ -98,19 +103,20 @@ def pages() -> Iterator[str]:
 @asynccontextmanager
 async def shown(tmp_path: Path) -> AsyncIterator[tuple[Page, Network, ExitStack, str]]:
     """A tab, the network, what ends at the end, and the origin of the page."""
-    with ExitStack() as ended:
-        origin = ended.enter_context(pages())
-        async with (
-            Network().serving() as network,
-            open_browser(tmp_path / "profile") as browser,
-            browser.open_page() as tab,
-        ):
-            yield tab, network, ended, origin
+    page = tmp_path / "page"
+    page.mkdir()
+    async with (
+        Network().serving() as network,
+        open_browser(tmp_path / "profile") as browser,
+        browser.open_page() as tab,
+    ):
+        with ExitStack() as ended:
+            yield tab, network, ended, ended.enter_context(pages(page, network))
 
 
-def url(origin: str, network: Network) -> str:
-    """The page's address, with that of its gateway."""
-    return f"{origin}/plate.html?gateway=http://127.0.0.1:{network.port}/#{TOKEN}"
+def url(origin: str) -> str:
+    """The page's address; it takes no gateway from a link."""
+    return f"{origin}/plate.html?gateway=http://127.0.0.1:1/#{TOKEN}"
 
 
 async def test_page_plays_and_comes_back_after_every_loss(tmp_path: Path) -> None:
@@ -124,7 +130,7 @@ async def test_page_plays_and_comes_back_after_every_loss(tmp_path: Path) -> Non
             network.target = gateway.port
             with real_daemon(tmp_path) as socket, Client.connect(socket) as era:
                 wait_for_state(era, "READY_TO_SWITCH_ON")
-                await tab.show(url(origin, network))
+                await tab.show(url(origin))
                 await until_said("ready: ")
                 await tab.click("#arm")
                 await until_said("on: armed by 'my application'")
@@ -184,7 +190,7 @@ async def test_page_leaves_a_silent_network_and_repeats_no_arm(tmp_path: Path) -
         options = ("--allow-origin", origin)
         gateway = ended.enter_context(gateway_process(tmp_path, daemon.socket, *options))
         network.target = gateway.port
-        await tab.show(url(origin, network))
+        await tab.show(url(origin))
         await tab.until(SAID, lambda text: text.startswith("ready: "))
         with daemon.holding():
             await tab.click("#arm")
@@ -200,3 +206,20 @@ async def test_page_leaves_a_silent_network_and_repeats_no_arm(tmp_path: Path) -
         daemon.publish("state", cut)
         await tab.until(f"{SAID} === 'fault: a cable was cut'")
         assert daemon.methods.count("arm") == 1
+
+
+async def test_stop_of_a_page_needs_nothing_that_old_browsers_lack(tmp_path: Path) -> None:
+    """Without AbortSignal.timeout it goes both ways; where HTTP throws, over the WebSocket."""
+    async with shown(tmp_path) as (tab, network, ended, origin):
+        daemon = ended.enter_context(ScriptedDaemon(tmp_path))
+        options = ("--allow-origin", origin)
+        gateway = ended.enter_context(gateway_process(tmp_path, daemon.socket, *options))
+        network.target = gateway.port
+        await tab.show(url(origin))
+        await tab.until(SAID, lambda text: text.startswith("ready: "))
+        await tab.evaluate("delete AbortSignal.timeout")
+        await tab.click("#stop")
+        await asyncio.to_thread(wait_for, lambda: daemon.methods.count("stop") == 2)
+        await tab.evaluate("window.fetch = () => { throw new Error('none'); }; undefined")
+        await tab.click("#stop")
+        await asyncio.to_thread(wait_for, lambda: daemon.methods.count("stop") == 3)

@@ -170,11 +170,17 @@ export class Connection {
   // Stop over the WebSocket and over HTTP; a promise that all amplifiers are confirmed silent.
   stop() {
     this.lease = null;
-    const overHttp = this.post("stop").then(async (response) => {
-      const { error, code, data } = await response.json();
-      if (!response.ok) throw new RpcError({ message: error, code, data });
-    });
-    return Promise.any([this.call("stop"), overHttp]);
+    const overWebSocket = this.call("stop");  // first: it needs nothing of what a browser may lack
+    return Promise.any([overWebSocket, this.callOverHttp("stop")]);
+  }
+
+  // Call a method without parameters over HTTP; a promise of its result.
+  async callOverHttp(method) {
+    const response = await this.post(method);
+    const result = await response.json();
+    const { error, code, data } = result;
+    if (!response.ok) throw new RpcError({ message: error, code, data });
+    return result;
   }
 
   // Find out why the WebSocket was refused: browsers do not report it.
@@ -184,10 +190,11 @@ export class Connection {
       .then((why) => this.isOpen || this.handlers.failed?.(why));
   }
 
-  post(method) {
+  async post(method) {
     const headers = { Authorization: `Bearer ${this.token}`, "Content-Type": "application/json" };
-    const signal = AbortSignal.timeout(RESPONSE_TIMEOUT_MS);
+    const given = new AbortController();  // AbortSignal.timeout is missing in browsers before 2022
+    setTimeout(() => given.abort(), RESPONSE_TIMEOUT_MS);
     const url = new URL(`api/v1/${method}`, this.gateway);
-    return fetch(url, { method: "POST", headers, body: "{}", keepalive: true, signal });
+    return fetch(url, { method: "POST", headers, body: "{}", keepalive: true, signal: given.signal });
   }
 }

@@ -16,7 +16,7 @@ from controller.loop.plate_set import FADE_RAMP, PlateSet, SetBuilder
 from controller.loop.routing import Drive, tones_by_era
 from controller.loop.selection import Selector
 from controller.loop.validity import Validity, first_lasts, valid_for
-from controller.sources.contacts import Change, Contact, ContactTracker
+from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
 from controller.sources.touch import TouchFrame
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
@@ -119,6 +119,7 @@ class Decider:
         self._selected: Selection | None = None
         self._decided: Decision | None = None  # the last one with something to send
         self._playing: Mapping[int, PlayedContent] = {}
+        self._layer_of: Mapping[ContactKey, int] = {}  # also where what plays is unknown
         self._may_play: frozenset[int] = frozenset()  # layers, since all were silent
         self._is_silent = False  # for certain
         self._retry_at: float | None = None
@@ -178,6 +179,11 @@ class Decider:
         return not self._tracker.contacts and not self._is_silent
 
     @property
+    def is_end_pending(self) -> bool:
+        """Whether a layer may play that no finger is to feel any more."""
+        return self.is_silence_pending or not self._may_play <= {*self._layer_of.values()}
+
+    @property
     def playing(self) -> Mapping[int, PlayedContent]:
         """The contents that play, by layer."""
         return self._playing
@@ -195,9 +201,15 @@ class Decider:
         return change
 
     def forget(self) -> None:
-        """Discard the known playback: the next decision has a set."""
+        """Discard the known playback: the next decision has a set; fingers keep their layers."""
         self._selected, self._decided, self._retry_at = None, None, None
         self._playing, self._is_silent = {}, False
+
+    def only_ends(self, decision: Decision) -> Decision:
+        """Return the last decision without what it starts, which is decided again later."""
+        self.forget()
+        sets = {n: each for n, each in decision.sets.items() if n not in decision.started}
+        return replace(decision, sets=sets, started=frozenset())
 
     def confirm_silence(self) -> None:
         """Note that all layers have fallen silent."""
@@ -362,23 +374,23 @@ class Decider:
         if not sets:
             return None
         self._playing, self._is_silent = playing, False
+        self._layer_of = {each.targets[0][0].key: number for number, each in numbers.items()}
         self._may_play |= started
         return replace(draft, sets=sets, started=started)
 
     def _numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
         """Contents by layer: a finger's in the layer that it has, new ones in those that end."""
-        of_finger = {one.content.targets[0][0].key: number for number, one in self._playing.items()}
         numbers = {}
         new = []
         for content in contents:
-            number = of_finger.get(content.targets[0][0].key)
+            number = self._layer_of.get(content.targets[0][0].key)
             if number is None:
                 new.append(content)
             else:
                 numbers[number] = content
         every = range(self._capabilities.layers)
         free = [number for number in every if number not in numbers]
-        free.sort(key=lambda number: (number not in self._playing, number in self._may_play))
+        free.sort(key=lambda number: number not in self._may_play)
         return {**numbers, **dict(zip(free, new, strict=False))}
 
     def _may_end_shaped(self, number: int, now: float) -> bool:
@@ -390,7 +402,7 @@ class Decider:
         """Return a draft that ends all playback: along endings only under fingers that stay."""
         if self._is_silent:
             return draft
-        numbers = self._may_play
+        numbers, self._layer_of = self._may_play, {}
         is_shaped = bool(numbers) and not has_failed and bool(draft.contacts)
         if is_shaped and all(self._may_end_shaped(number, now) for number in numbers):
             ends = {n: self._builder.build_end(n, has_endings=True) for n in sorted(numbers)}

@@ -303,8 +303,8 @@ class Controller:
 
     @property
     def _is_heartbeat_due(self) -> bool:
-        """Whether to feed the watchdogs now; pending silence has priority."""
-        if self.group_state is not GroupState.ARMED or self._decider.is_silence_pending:
+        """Whether to feed the watchdogs now; what is to end has priority."""
+        if self.group_state is not GroupState.ARMED or self._decider.is_end_pending:
             return False
         return clock.now() >= min(self._heartbeat_due, self._group.lost_from)
 
@@ -355,9 +355,15 @@ class Controller:
                 silenced = silenced_by(ended, sent_at=None, now=now)
                 self._report(lambda each: each.silenced(silenced))
         elif decision.started and self._group.degraded:
-            self._decider.forget()  # decided again once all amplifiers reply
+            await self._end(self._decider.only_ends(decision))
         else:
             await self._execute(decision)
+
+    async def _end(self, decision: Decision) -> None:
+        """Send a decision that only ends layers, unreported; raises DriverError."""
+        if decision.sets:
+            played = await self._play(decision.sets)
+            self._decider.confirm(decision, played, now=clock.now())
 
     async def _execute(self, decision: Decision) -> None:
         """Send the sets of a decision and report the outcome; raises DriverError."""

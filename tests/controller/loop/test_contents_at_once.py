@@ -22,6 +22,7 @@ from controller.loop.intent import Target
 from controller.loop.joint_answer import query_jointly
 from controller.loop.selection import unshaped
 from controller.sources.contacts import Contact, ContactKey
+from drivers.errors import LinkDegraded
 from model.arrays import Complex64Array
 from model.table.build import build_table
 from model.table.pattern import Pattern
@@ -134,6 +135,65 @@ async def test_a_slide_keeps_the_content_and_its_layer() -> None:
         assert all(len(each.targets) == 2 for each in fingers.applied[applied:])
         for _, _, layers in fingers.committed[count:]:
             assert all(one.renew or any(c.level for c in one.commands) for one in layers)
+
+
+@in_virtual_time
+async def test_a_lifted_finger_falls_silent_while_an_amplifier_is_degraded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its layer alone, within 20 ms, though the other moves, which begins anew in its layer."""
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(0.6)
+        layers = {_id(one): number for number, one in fingers.applied[-1].contents.items()}
+        group, count = fingers.controller.group, len(fingers.committed)
+        with monkeypatch.context() as patched:
+            patched.setattr(type(group), "degraded", ("main",))
+            fingers.at[2] = (RIGHT[0] + 0.01, RIGHT[1])
+            await fingers.hold(0.03)  # what plays is unknown by now
+            del fingers.at[1]
+            lifted = asyncio.get_running_loop().time()
+            await fingers.hold(0.1)
+            ((ended, _, sent),) = fingers.committed[count:]
+            assert [(one.layer, one.renew) for one in sent] == [(layers[1], False)]
+            assert not any(command.level for one in sent for command in one.commands)
+            assert ended - lifted <= 0.020
+        await fingers.hold(0.1)
+        _, _, sent = fingers.committed[count + 1]
+        assert [one.layer for one in sent] == [layers[2]]
+
+
+@in_virtual_time
+async def test_no_watchdog_is_fed_until_the_end_of_a_lifted_finger_is_confirmed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One reply is missed for 50 ms: its end is repeated meanwhile, heartbeats wait."""
+    async with fingers_on(table(), LAYOUT, breaks="heartbeat") as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(0.6)
+        group, fed, tried = fingers.controller.group, 0, 0
+        beat = group.beat
+
+        async def miss(layers: object) -> None:
+            nonlocal tried
+            tried += 1
+            await asyncio.sleep(0.010)
+            raise LinkDegraded("no reply")
+
+        async def feed() -> None:
+            nonlocal fed
+            fed += 1
+            await beat()
+
+        monkeypatch.setattr(group, "beat", feed)
+        with monkeypatch.context() as patched:
+            patched.setattr(group, "apply", miss)
+            del fingers.at[1]
+            await fingers.hold(0.05)
+            assert fed == 0
+            assert tried >= 4
+        await fingers.hold(0.3)
+        assert fed > 0
 
 
 @pytest.mark.parametrize("what", ["stop", "lift"])

@@ -114,6 +114,7 @@ class Supervisor:
 
         def cycle_completed() -> None:
             self.tick()
+            self._check_own_stop()
             self._check_degraded()
             self._alive()
             observer.cycle_completed()
@@ -498,6 +499,13 @@ class Supervisor:
         ):
             _rate_limited_logger.error("stop repeated: %s", problem)
             await self._stop()
+
+    def _check_own_stop(self) -> None:
+        """Post a fault where amplifiers of an armed plate are armed no longer, without a reason."""
+        is_armed = self.machine.state is DaemonState.OPERATION_ENABLED
+        if is_armed and self._controller.group_state is not GroupState.ARMED:
+            cause = "the control loop has stopped the amplifiers, because an exchange failed"
+            self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
 
     def _check_degraded(self) -> None:
         """Note that armed amplifiers have ceased to reply, or that all reply again."""

@@ -54,7 +54,7 @@ class JointStart:
         """
         self._ready.append(_Ready(takes, result, send))
         if self._failure is not None:
-            self.fail(self._failure)
+            self._keep_back(self._failure)
         elif len(self._ready) == self._count:
             self._ready.sort(key=attrgetter("takes"))
             self._arrival = self._loop.time() + self._ready[-1].takes
@@ -66,17 +66,22 @@ class JointStart:
 
     def fail(self, error: Exception) -> None:
         """Note that one will not be sent: those that were not sent yet are not sent either."""
+        self._keep_back(Preempted(f"one of several commits failed: {error}"))
+
+    def _give_up(self) -> None:
+        refusal = CommandRefused("commits must be sent together; one of the lines is too busy")
+        self._keep_back(refusal)
+
+    def _keep_back(self, error: Exception) -> None:
+        """Send none that waits or comes later: each has the first error of them as its result."""
         self._timer.cancel()
-        self._failure = error
+        self._failure = self._failure or error
         ready, self._ready = self._ready, []
         for each in ready:
             if not each.result.done():
-                each.result.set_exception(Preempted(f"one of several commits failed: {error}"))
+                each.result.set_exception(self._failure)
                 each.result.exception()  # retrieved, where nobody waits for it
             each.send()  # nothing, but its line is held no longer
-
-    def _give_up(self) -> None:
-        self.fail(CommandRefused("commits must be sent together; one of the lines is too busy"))
 
     def _send_due(self) -> None:
         now = self._loop.time()

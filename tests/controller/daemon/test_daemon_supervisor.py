@@ -510,6 +510,46 @@ async def test_clear_while_stopping_is_refused_and_no_fault() -> None:
         assert DaemonState.FAULT not in daemon.states
 
 
+@in_virtual_time
+async def test_clear_that_is_refused_ends_no_repetition_of_a_stop() -> None:
+    """A level stays: the stop goes on for as long as it does, whoever clears meanwhile."""
+    async with watched() as daemon:
+        await daemon.handle(ARM)
+        daemon.answer("Stop", "GetStatus", levels=[1000, 0])
+        stopping = asyncio.create_task(daemon.handle(STOP))
+        await asyncio.sleep(0.05)
+        with pytest.raises(CommandRefused):
+            await daemon.handle(CLEAR)
+        await stopping
+        daemon.far_end.asked.clear()
+        await asyncio.sleep(2)
+        assert len(daemon.far_end.requests("Stop")) > 2
+        assert not daemon.far_end.requests("Clear")
+
+
+@in_virtual_time
+async def test_second_clear_leaves_a_plate_alone_that_the_first_has_cleared() -> None:
+    """Its own comes late: what was armed meanwhile stays so, and it is no fault."""
+    async with watched() as daemon:
+        await daemon.handle(STOP)
+        clear = daemon.controller.clear
+        pauses = [0.0, 0.035]
+
+        async def clear_late() -> None:
+            await asyncio.sleep(pauses.pop(0))
+            await clear()
+
+        daemon.controller.clear = clear_late
+        clears = [asyncio.create_task(daemon.handle(CLEAR)) for _ in range(2)]
+        await clears[0]
+        assert daemon.state is DaemonState.READY_TO_SWITCH_ON
+        await daemon.handle(ARM)
+        await asyncio.gather(*clears, return_exceptions=True)
+        await asyncio.sleep(0.1)
+        assert daemon.state is ENABLED
+        assert daemon.far_end.state == ARMED
+
+
 @pytest.mark.parametrize("delay", [0.001, 0.005, 0.009, 0.013])
 @in_virtual_time
 async def test_stop_while_disarming_is_no_fault(delay: float) -> None:
@@ -649,3 +689,24 @@ async def test_amplifier_that_plays_another_set_after_a_stall_is_stopped() -> No
         await asyncio.sleep(0.2)
         assert daemon.state is DaemonState.FAULT
         assert daemon.far_end.requests("Stop")
+
+
+@in_virtual_time
+async def test_set_that_was_not_staged_stops_all_and_is_a_fault() -> None:
+    """An amplifier says so of one set: no request says more, and the plate does not stay armed."""
+    async with watched() as daemon:
+        await daemon.handle(ARM)
+        await asyncio.sleep(0.01)
+
+        def stage_nothing(name: str, values: Values) -> Values | None:
+            if name != "Set":
+                return None
+            reply = daemon.far_end.obey(name, values, asyncio.get_running_loop().time())
+            return {**reply, "staged": 0, "played": 0}
+
+        daemon.far_end.answer = stage_nothing
+        daemon.touch()
+        await asyncio.sleep(0.1)
+        assert daemon.far_end.state == STOPPED
+        assert daemon.state is DaemonState.FAULT
+        assert "era clear" in (daemon.supervisor.machine.remedy or "")

@@ -7,7 +7,7 @@ from itertools import combinations
 import pytest
 
 from drivers.contents import Layer, Tone
-from drivers.errors import DriverError, LinkTimeout
+from drivers.errors import DriverError, LinkTimeout, Preempted
 from drivers.host.can_wire import CanWire
 from drivers.host.group import Group
 from drivers.host.jobs import JointStart
@@ -78,8 +78,9 @@ async def test_line_that_is_busy_for_too_long_commits_nothing() -> None:
     await group.arm()
     ends[1].outward = lambda name, data: [] if name == "GetStatus" else [(0.0002, data)]
     reads = [asyncio.ensure_future(hosts["b"].read_status()) for _ in range(3)]
-    with pytest.raises(DriverError):
+    with pytest.raises(DriverError, match="commits must be sent together") as refused:
         await group.apply({name: [LAYER] for name in hosts})
+    assert not isinstance(refused.value, Preempted)  # nothing came first: it is to be told
     await asyncio.gather(*reads, return_exceptions=True)
     assert [started(end) for end in ends] == [[], []]
     assert not group.is_armed
@@ -120,7 +121,7 @@ async def test_commits_that_would_arrive_too_late_are_not_sent() -> None:
         start.arrive(0.01, result, lambda: None)
     await asyncio.sleep(0.02)
     assert [str(each.exception()).split(": ")[0] for each in results] == [
-        "one of several commits failed"
+        "commits must be sent together; one of the lines is too busy"
     ] * 2
 
 

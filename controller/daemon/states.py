@@ -91,7 +91,8 @@ class StateMachine:
     given, and since which the amplifiers are being read back; lost_at [s]: when the link was lost;
     is_degraded: whether an amplifier does not reply while armed, so that nothing new is played;
     watchdog [s]: of armed amplifiers; lease: of who armed, in the states of ENERGISED alone. epoch:
-    rises with every stop, disarm, fault, loss and close: what began before must not go on.
+    rises with every change of state, and with a stop, fault or loss that changes none: what began
+    before must not go on.
     """
 
     state: DaemonState = DaemonState.NOT_READY
@@ -309,6 +310,7 @@ def _enter(
     return replace(
         updated,
         state=to,
+        epoch=before.epoch + 1,
         cause=cause,
         remedy=remedy,
         is_latched=is_latched,

@@ -100,6 +100,7 @@ class Supervisor:
         self._control_loop: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[Any]] = set()
         self._loss_lock = asyncio.Lock()  # held until the lost amplifiers are closed
+        self._clears = 0  # in progress
 
     def observe(self, observer: Observer) -> Observer:
         """Wrap an observer so that the supervisor sees refusals and cycles first."""
@@ -366,11 +367,12 @@ class Supervisor:
 
     async def _verify(self, epoch: int) -> None:
         """Disarm what still plays, then read back all amplifiers."""
-        if is_any_armed(await self._controller.group.statuses()):
+        is_armed = is_any_armed(await self._controller.group.statuses())
+        if is_armed and epoch == self.machine.epoch:
             await self._controller.disarm()
         problem = await self._read_back(epoch)
         if epoch != self.machine.epoch:
-            return  # stopped in the meantime, so they need not be disarmed yet
+            return  # stopped, or verified and armed, in the meantime
         if problem is None:
             cause = "all amplifiers are disarmed, at level zero and without a fault"
             await self.handle(DaemonEvent(Trigger.VERIFIED, cause))
@@ -378,7 +380,11 @@ class Supervisor:
             await self.handle(DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE))
 
     async def _clear(self, epoch: int) -> None:
-        problem = await self._read_back(epoch, clears=True)
+        self._clears += 1
+        try:
+            problem = await self._read_back(epoch, clears=True)
+        finally:
+            self._clears -= 1
         self._check_none_since(epoch)
         if problem is None:
             await self.handle(DaemonEvent(Trigger.VERIFIED, "acknowledged, and the cause is gone"))
@@ -387,11 +393,11 @@ class Supervisor:
         raise CommandRefused(f"{problem}; the cause persists, so nothing was cleared")
 
     def _check_none_since(self, epoch: int) -> None:
-        """Raise Preempted if a stop or fault came after an acknowledgement."""
+        """Raise Preempted if a stop, fault or other clear came after an acknowledgement."""
         if epoch != self.machine.epoch:
             raise Preempted(
-                "not cleared: a stop or fault came after the request; find the cause, then clear "
-                "again"
+                "not cleared: a stop, fault or other clear came after the request; find the cause "
+                "of what is latched, then clear again"
             )
 
     async def _read_back(self, epoch: int, *, clears: bool = False) -> str | None:
@@ -495,7 +501,7 @@ class Supervisor:
         elif (
             not are_silent(statuses, group.amplifiers)
             and state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
-            and not self.machine.is_acknowledged  # a clear reads back for itself
+            and not (self._clears and self.machine.is_acknowledged)  # it reads back for itself
         ):
             _rate_limited_logger.error("stop repeated: %s", problem)
             await self._stop()

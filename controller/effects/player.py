@@ -10,7 +10,6 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.loop.intent import NO_CONTACTS, HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
-from model.table.effect_level import SHAPED_FROM
 from registry.plugins import WrongResultError
 
 # A finger on the edge of a region must not flip between regions with sensor noise: it stays in one
@@ -22,6 +21,9 @@ REQUESTED_PRIORITY = 1_000_000
 
 CLICKS_APART = 0.060
 """Pause [s] between the starts of short pulses at two fingers: together they would be one."""
+
+# A short pulse that would have to wait longer [s], two turns with rounding, is left out.
+_MAX_WAIT = 0.125
 
 
 @dataclass
@@ -53,8 +55,8 @@ class EffectPlayer:
 
     Every finger feels its newest play; when that is over, the one before continues. Of the fingers
     that feel the effect outside of all regions only the newest does. Short pulses of two fingers
-    are 60 ms apart. A play without a sensation at the moment (no detent passed, no movement) does
-    not count.
+    are 60 ms apart: of each finger the newest waits its turn, for 0.12 s at most. A play without a
+    sensation at the moment (no detent passed, no movement) does not count.
     """
 
     def __init__(self, layout: SurfaceLayout) -> None:
@@ -63,6 +65,7 @@ class EffectPlayer:
         self._fingers: dict[ContactKey, _Finger] = {}
         self._number = 0
         self._last_click: tuple[ContactKey, Pulse] | None = None
+        self._waiting: dict[ContactKey, Pulse] = {}  # short ones before their turn
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
         """Return which contacts shall feel what at a time [s]."""
@@ -77,25 +80,23 @@ class EffectPlayer:
                 felt.append((play, contact, sensation))
         felt.sort(key=lambda one: one[0].number)
         newest = max((play.number for play, _, _ in felt if play.is_elsewhere), default=0)
-        driven = [
-            (play, contact, sensation)
+        targets = [
+            Target(
+                contact.key,
+                sensation.level_db_sl,
+                allow_weaker=sensation.allow_weaker,
+                pulse=sensation.pulse,
+                band=play.band,
+                priority=play.priority,
+                content=play.name,
+            )
             for play, contact, sensation in felt
             if not play.is_elsewhere or play.number == newest
         ]
+        clicking = {target.key for target in targets if target.is_short}
+        self._waiting = {key: self._waiting[key] for key in self._waiting if key in clicking}
         return HapticIntent(
-            tuple(
-                Target(
-                    contact.key,
-                    sensation.level_db_sl,
-                    allow_weaker=sensation.allow_weaker,
-                    pulse=sensation.pulse,
-                    band=play.band,
-                    priority=play.priority,
-                    content=play.name,
-                )
-                for play, contact, sensation in driven
-                if not self._waits(contact.key, sensation.pulse, now, ends)
-            ),
+            tuple(target for target in targets if not self._waits(target, now, ends)),
             "no effect plays for the contacts on the plate",
             until=min(ends, default=None),
         )
@@ -130,19 +131,39 @@ class EffectPlayer:
         ]
         self._start(finger, name, contact, now, level=level, priority=REQUESTED_PRIORITY)
 
-    def _waits(self, key: ContactKey, pulse: Pulse | None, now: float, ends: list[float]) -> bool:
-        """Whether a pulse must wait at a time [s] for its turn after one of another finger."""
-        if pulse is None or pulse.duration >= SHAPED_FROM or pulse.started_at is not None:
+    def _waits(self, target: Target, now: float, ends: list[float]) -> bool:
+        """Whether a short pulse must wait at a time [s] for its turn after those of others."""
+        key, pulse = target.key, target.pulse
+        if pulse is None or not target.is_short or pulse.started_at is not None:
             return False
         if math.isinf(pulse.due_at):
-            pulse.due_at = pulse.requested_at
+            self._line_up(key, pulse)
+        if self._waiting.get(key) is not pulse:
+            return math.isinf(pulse.due_at)
+        if self._last_click is not None and self._last_click[0] != key:
+            # It may have started later than it was due.
+            pulse.due_at = max(pulse.due_at, self._last_click[1].start + CLICKS_APART)
+        if now < pulse.due_at:
+            ends.append(pulse.due_at)
+            return True
+        del self._waiting[key]
+        self._last_click = key, pulse
+        return False
+
+    def _line_up(self, key: ContactKey, pulse: Pulse) -> None:
+        """Give a short pulse its turn: that of the one of its finger that waits, or the last."""
+        before = self._waiting.get(key)
+        if before is None:
+            others = [each.due_at for each in self._waiting.values()]
             if self._last_click is not None and self._last_click[0] != key:
-                pulse.due_at = max(pulse.due_at, self._last_click[1].start + CLICKS_APART)
-            self._last_click = key, pulse
-        if now >= pulse.due_at:
-            return False
-        ends.append(pulse.due_at)
-        return True
+                others.append(self._last_click[1].start)
+            due_at = max([pulse.requested_at, *(each + CLICKS_APART for each in others)])
+            if due_at > pulse.requested_at + _MAX_WAIT:
+                return
+        else:
+            due_at, before.due_at = before.due_at, -math.inf
+        pulse.due_at = due_at
+        self._waiting[key] = pulse
 
     def _update_regions(self, contacts: Sequence[Contact], now: float) -> None:
         """Start and end effects as fingers enter and leave regions."""

@@ -1,6 +1,7 @@
 """Effects at a finger, regions, and priorities among several fingers."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -243,7 +244,7 @@ def test_every_finger_in_a_region_feels_its_own() -> None:
 
 
 def test_clicks_of_two_fingers_are_60_ms_apart() -> None:
-    """The second waits, plays for its whole duration, and is never left out."""
+    """The second and the third wait, and play for their whole duration."""
     pads = (Region("left", LEFT, on_press="click"), Region("right", RIGHT, on_press="click"))
     player = EffectPlayer(SurfaceLayout(pads, {"click": Click(duration=0.04)}, elsewhere=None))
     fingers = [finger(1, 0.05), finger(2, 0.15), finger(3, 0.16)]
@@ -254,6 +255,44 @@ def test_clicks_of_two_fingers_are_60_ms_apart() -> None:
     assert wanted(player, fingers, 1.0999).keys() == {2}
     assert wanted(player, fingers, 1.1201).keys() == {3}
     assert wanted(player, fingers, 1.1601).keys() == set()
+
+
+def test_clicks_requested_faster_than_they_play_wait_for_two_turns_at_most() -> None:
+    """Two fingers by turns, 50 a second each for 2 s: one click every 60 ms, each soon felt."""
+    player = EffectPlayer(SurfaceLayout(effects={"click": Click(duration=0.04)}, elsewhere=None))
+    fingers = [finger(1, 0.05), finger(2, 0.15)]
+    starts: list[tuple[float, int]] = []
+    for step in range(400):
+        now = 0.005 * step
+        if step % 2 == 0:
+            player.play("click", fingers[step // 2 % 2], now, level_db_sl=None)
+        for target in player.intent(fingers, now).targets:
+            assert target.pulse is not None
+            if target.pulse.started_at is None:
+                target.pulse.started_at = now
+                starts.append((now, target.key.id))
+                assert now - target.pulse.requested_at <= 0.125
+    assert [id for _, id in starts] == [1 + number % 2 for number in range(len(starts))]
+    pauses = [after - before for (before, _), (after, _) in pairwise(starts)]
+    assert all(0.06 - 1e-9 <= pause <= 0.07 for pause in pauses)
+    assert len(starts) >= 28  # 2 s by 70 ms
+
+
+def test_a_waiting_click_is_replaced_in_its_place() -> None:
+    """A at 0 ms, B at 10 and again at 15: B once, at 60; A waits again, but lifts: C is next."""
+    player = EffectPlayer(SurfaceLayout(effects={"click": Click(duration=0.04)}, elsewhere=None))
+    fingers = [finger(1, 0.05), finger(2, 0.15), finger(3, 0.16)]
+    for one, now in zip(fingers[:2], (0.0, 0.010), strict=True):
+        player.play("click", one, now, level_db_sl=None)
+        assert wanted(player, fingers, now).keys() == {1}
+    player.play("click", fingers[1], 0.015, level_db_sl=None)
+    assert wanted(player, fingers, 0.015).keys() == {1}
+    assert wanted(player, fingers, 0.0601).keys() == {2}
+    player.play("click", fingers[0], 0.070, level_db_sl=None)
+    assert wanted(player, fingers, 0.070).keys() == {2}
+    player.play("click", fingers[2], 0.080, level_db_sl=None)
+    assert wanted(player, fingers[1:], 0.080).keys() == {2}
+    assert wanted(player, fingers[1:], 0.1201).keys() == {3}
 
 
 def test_player_ignores_plays_without_sensation() -> None:

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import logging
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 
 from controller.api.schema import headline
@@ -147,7 +147,7 @@ class Daemon:
             holds_lease=self._api.holds_lease,
             is_subscribed=self._publisher.hub.is_subscribed,
             is_busy=lambda: self._controller.is_preparing,
-            stop_all=lambda: asyncio.ensure_future(self._controller.group.stop()),
+            stop_all=self._stop_all,
             clock=clock.now,
         )
         self._gateway: asyncio.Task[None] | None = None
@@ -255,6 +255,13 @@ class Daemon:
                 if isinstance(found, Exception) and not isinstance(found, OSError):
                     _logger.error("closing failed", exc_info=found)
             self._publisher.hub.close()
+
+    def _stop_all(self) -> Awaitable[object]:
+        """Stop all amplifiers where a client's stop has failed on its way, and latch that."""
+        try:
+            return asyncio.ensure_future(self._controller.group.stop())
+        finally:
+            self._supervisor.latch_stop("stopped, though the request failed on its way")
 
     def _connected(self, amplifiers: Mapping[str, Amplifier]) -> None:
         """Follow amplifiers whose lines have been opened."""

@@ -199,6 +199,10 @@ class Supervisor:
         self._step(DaemonEvent(Trigger.STOP, cause, remedy))
         return asyncio.shield(stopping)
 
+    def latch_stop(self, cause: str) -> None:
+        """Latch a stop that was requested of the amplifiers already; raises nothing."""
+        call_guarded(partial(self._step, DaemonEvent(Trigger.STOP, cause, ACKNOWLEDGE)))
+
     async def handle(self, event: DaemonEvent) -> None:
         """Apply an event and carry out its actions; raises the error of an action.
 

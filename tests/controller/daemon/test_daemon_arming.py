@@ -17,6 +17,7 @@ from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogThread
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
+from controller.daemon.states import StateMachine
 from daemon_bench import (
     ENABLED,
     PATIENCE,
@@ -104,6 +105,35 @@ async def test_daemon_disarms_when_arming_client_left(
             await until_state(era, READY)
         assert (await era.status()).armed_by is None
         assert bench.far.summary().state == "SWITCH_ON_DISABLED"
+
+
+@pytest.mark.parametrize("latches", [True, False])
+async def test_stop_that_fails_on_its_way_stops_all_and_ends_the_lease(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, latches: bool
+) -> None:
+    """By a bug in its method, and one in the state machine as well: the amplifier stops anyhow."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        await era.arm("me", lease_s=60)
+        supervisor, after = bench.daemon._supervisor, list[StateMachine]()
+        stop_all = bench.daemon._server._stop_all
+
+        def fail(*_: object) -> None:
+            raise ZeroDivisionError("a bug")
+
+        def note() -> None:
+            stop_all()
+            after.append(supervisor.machine)
+
+        monkeypatch.setattr(bench.daemon._server, "_stop_all", note)
+        with monkeypatch.context() as broken:
+            broken.setattr(supervisor, "stop", fail)
+            if not latches:
+                broken.setattr(supervisor, "_step", fail)
+            assert await error_code(era.stop()) is ErrorCode.INTERNAL
+            await until(lambda: bench.far.summary().state == "QUICK_STOP_ACTIVE")
+        (machine,) = after
+        assert (machine.state.value == "QUICK_STOP_ACTIVE") is latches
+        assert (machine.lease is None) is latches
 
 
 async def test_reload_ends_after_unexpected_error(

@@ -227,6 +227,7 @@ class Decider:
             for _, target in one.content.targets:
                 if target.pulse is not None and target.pulse.started_at is None:
                     target.pulse.started_at = played.sent_at
+                    self._intent_due = min(self._intent_due or math.inf, target.pulse.end)
             playing[number] = replace(
                 one,
                 drive=tones_by_era(played.layers, self._rig, number),

@@ -14,6 +14,9 @@ from model.table.effect_level import SHAPED_FROM
 
 _MIN_WAIT = 0.001  # s
 
+# A pulse that has not started this long [s] after it was due has lost its touch.
+_MAX_DELAY = 0.1
+
 NO_CONTACTS = "no contact on the plate"
 
 
@@ -21,10 +24,10 @@ NO_CONTACTS = "no contact on the plate"
 class Pulse:
     """A vibration of limited duration [s], requested at a time [s]; a later one is another.
 
-    Its duration counts from started_at [s], when the amplifiers have been sent its commit; until
-    then, and if they never are, from when it is due: requested_at, or due_at [s] where it waits its
-    turn. is_raised: whether the drive is raised so that the level is felt over the duration, onset
-    included; else the level is the steady one.
+    Its duration counts from started_at [s], when the amplifiers have been sent its commit. Without
+    that it ends 0.1 s after it is due, or after its duration where that is more; it is due at
+    requested_at, or at due_at [s] where it waits its turn. is_raised: whether the drive is raised
+    so that the level is felt over the duration, onset included; else the level is the steady one.
     """
 
     duration: float
@@ -43,6 +46,8 @@ class Pulse:
     @property
     def end(self) -> float:
         """When [s] it ends, as far as known."""
+        if self.started_at is None:
+            return self.start + max(self.duration, _MAX_DELAY)
         return self.start + self.duration
 
 

@@ -33,21 +33,26 @@ RIGHT = Rectangle(0.1001, 0.0, 0.1, 0.2)
 def wanted(
     player: EffectPlayer, contacts: Sequence[Contact], now: float
 ) -> dict[int, float | None]:
-    """Intended levels by the id of the finger."""
+    """Intended levels by the id of the finger; their pulses start at once."""
     intent = player.intent(contacts, now)
+    for target in intent.targets:
+        if target.pulse is not None and target.pulse.started_at is None:
+            target.pulse.started_at = now
     return {target.key.id: target.level_db_sl for target in intent.targets}
 
 
 def test_click_ends_after_its_duration() -> None:
-    """A click lasts for 40 ms; the intent expires then."""
+    """A click lasts for 40 ms from its start; the intent expires then, or after 0.1 s without."""
     player = EffectPlayer(SurfaceLayout(effects={"click": Click(level=18.0)}, elsewhere="click"))
     here = [finger(1)]
     intent = player.intent(here, 10.0)
     assert [target.level_db_sl for target in intent.targets] == [18.0]
-    assert intent.until == pytest.approx(10.04)
-    assert wanted(player, here, 10.039) == {1: 18.0}
-    assert wanted(player, here, 10.04) == {}
-    assert player.intent(here, 10.05).until is None
+    assert intent.until == pytest.approx(10.1)
+    assert wanted(player, here, 10.05) == {1: 18.0}
+    assert player.intent(here, 10.06).until == pytest.approx(10.09)
+    assert wanted(player, here, 10.089) == {1: 18.0}
+    assert wanted(player, here, 10.0901) == {}
+    assert player.intent(here, 10.1).until is None
 
 
 def test_buzz_lasts_while_the_finger_stays() -> None:
@@ -179,8 +184,11 @@ def test_detents_click_once_per_detent() -> None:
     clicks = []
     for index, way in enumerate((1, 4, 5.3, 5.6, 5.2, 5.6, 14, 15.6, 30.6, 26, 24, 20)):
         now = 0.1 * index
-        if isinstance(course.feel(finger(1, x=0.9, y=0.05 + 1e-3 * way), now), Sensation):
+        felt = course.feel(finger(1, x=0.9, y=0.05 + 1e-3 * way), now)
+        if isinstance(felt, Sensation):
             clicks.append(way)
+            assert felt.pulse is not None
+            felt.pulse.started_at = now
             assert course.feel(finger(1, y=0.05 + 1e-3 * way), now + 0.031) == NoSensation()
     assert clicks == [5.6, 15.6, 30.6, 24]
 
@@ -224,10 +232,12 @@ def test_intent_expires_at_the_first_end() -> None:
     player = EffectPlayer(SurfaceLayout((slider,), effects, elsewhere="click"))
     player.intent([finger(1, 0.05)], 0.0)
     fingers = [finger(1, 0.056), finger(2, 0.15)]
-    assert player.intent(fingers, 1.0).until == pytest.approx(1.03)
+    assert wanted(player, fingers, 1.0) == {1: 20.0}
+    assert player.intent(fingers, 1.001).until == pytest.approx(1.03)
     assert player.intent(fingers, 1.03).until == pytest.approx(1.06)
-    assert player.intent(fingers, 1.0601).until == pytest.approx(1.1)
-    assert player.intent(fingers, 1.1001).until is None
+    assert wanted(player, fingers, 1.0601) == {2: 20.0}
+    assert player.intent(fingers, 1.07).until == pytest.approx(1.1001)
+    assert player.intent(fingers, 1.1002).until is None
 
 
 def test_every_finger_in_a_region_feels_its_own() -> None:
@@ -254,7 +264,7 @@ def test_clicks_of_two_fingers_are_60_ms_apart() -> None:
     assert wanted(player, fingers, 1.0601).keys() == {2}
     assert wanted(player, fingers, 1.0999).keys() == {2}
     assert wanted(player, fingers, 1.1201).keys() == {3}
-    assert wanted(player, fingers, 1.1601).keys() == set()
+    assert wanted(player, fingers, 1.1602).keys() == set()
 
 
 def test_clicks_requested_faster_than_they_play_wait_for_two_turns_at_most() -> None:

@@ -254,6 +254,39 @@ async def test_a_click_plays_beside_what_lasts() -> None:
 
 
 @in_virtual_time
+async def test_a_click_is_played_though_the_answer_takes_longer_than_it_lasts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """40 ms, for all of them, though the answer for it and two fingers beside it takes 60."""
+    loop = asyncio.get_running_loop()
+
+    def slowly(executor: Any, work: Callable[[], Any]) -> "asyncio.Future[Any]":
+        future = loop.create_future()
+        loop.call_later(0.06, lambda: future.set_result(work()))
+        return future
+
+    monkeypatch.setattr(type(loop), "run_in_executor", lambda self, *args: slowly(*args))
+    layout = SurfaceLayout(
+        LAYOUT.regions, {**LAYOUT.effects, "any": Click(level=14.0)}, elsewhere=None
+    )
+    async with fingers_on(table(), layout) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(0.5)
+        count, begin = len(fingers.committed), loop.time()
+        fingers.at[3] = ABOVE
+        await fingers.hold(0.3)
+        (start, is_driven), (end, is_still_driven) = (
+            (at, any(command.level for command in one.commands))
+            for at, _, layers in fingers.committed[count:]
+            for one in layers
+            if one.layer == 2
+        )
+        assert (is_driven, is_still_driven) == (True, False)
+        assert 0.06 <= start - begin <= 0.08
+        assert 0.04 <= end - start <= 0.05
+
+
+@in_virtual_time
 async def test_what_is_not_served_says_why() -> None:
     """Of six fingers the four newest have the four layers; the plate cannot serve all of these."""
     async with fingers_on(table(), LAYOUT, layers=4) as fingers:

@@ -58,7 +58,9 @@ class PatternEvent(Message):
     )
     predicted_contrast_db: float | None
     predicted_level_db_sl: float | None
-    latency_ms: float = Field(description="from the touch to the last byte of the command")
+    latency_ms: float | None = Field(
+        description="from the touch to the last byte of the command; null if none was needed"
+    )
 
 
 class SilenceEvent(Message):

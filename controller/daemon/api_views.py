@@ -81,7 +81,7 @@ class PlateView:
             robust_contrast_db=_finite(applied.pattern.robust_contrast_db),
             predicted_contrast_db=_finite(applied.pattern.contrast_db),
             predicted_level_db_sl=_finite(applied.pattern.level_db_sl),
-            latency_ms=1e3 * applied.latency,
+            latency_ms=None if applied.latency is None else 1e3 * applied.latency,
         )
 
     def silence_event(self) -> SilenceEvent | None:

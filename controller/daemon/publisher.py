@@ -168,7 +168,8 @@ class EventPublisher:
 
     def _pattern_applied(self, applied: Applied) -> None:
         self.view.applied, self.view.silenced = applied, None
-        self.latencies.add(applied.latency)
+        if applied.latency is not None:
+            self.latencies.add(applied.latency)
         self.hub.publish("pattern", self.view.pattern_event)
 
     def _silenced(self, silenced: Silenced) -> None:

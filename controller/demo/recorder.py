@@ -253,7 +253,7 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
         },
         mode=pattern.drive_mode,
         shaped_onset=bool(first.applied.pattern.onset),
-        latency_ms=1000 * first.applied.latency,
+        latency_ms=None if first.applied.latency is None else 1000 * first.applied.latency,
         played_s=main_part.duration,
         steady=main_part.duration >= STEADY_DURATION,
         predicted_felt_contrast_db=pattern.felt_contrast_db,

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.content import Content, Selection
+from controller.loop.content import Content, Selection, not_served
 from controller.loop.intent import IntentSource
 from controller.loop.plate_set import FADE_RAMP, PlateSet, SetBuilder
 from controller.loop.routing import Drive, tones_by_era
@@ -49,8 +49,8 @@ class Decision:
     from_rest: whether nothing has played for 0.4 s, so that the plate is at rest;
     triggered_at [s]: when the change arrived.
     sets: of the layers that change, by number, all from one moment on; started: those that play a
-    content; silence: ramp [s] along which all layers fall silent instead. Neither if all channels
-    are silent already. refusal: why a ledger refused the contents, which makes it silence.
+    content; silence: ramp [s] along which all layers fall silent instead. Neither if nothing is to
+    be sent. refusal: why a ledger refused a content, which is left out.
     """
 
     contacts: tuple[Contact, ...]
@@ -179,11 +179,6 @@ class Decider:
         return not self._tracker.contacts and not self._is_silent
 
     @property
-    def is_end_pending(self) -> bool:
-        """Whether a layer may play that no finger is to feel any more."""
-        return self.is_silence_pending or not self._may_play <= {*self._layer_of.values()}
-
-    @property
     def playing(self) -> Mapping[int, PlayedContent]:
         """The contents that play, by layer."""
         return self._playing
@@ -251,8 +246,14 @@ class Decider:
         return decision
 
     def refused(self, decision: Decision, error: CommandRefused) -> Decision:
-        """Return silence in place of the last decision, which a ledger has refused."""
+        """Return the last decision without its newest content, since a ledger has refused it.
+
+        Silence where no other content is left.
+        """
         self._retry_at = error.until
+        newest = max(decision.started, key=self._requested_at, default=None)
+        if newest is not None and len(self._playing) > 1:
+            return self._without(newest, decision, str(error))
         self._playing, self._is_silent = {}, True
         self._decided = replace(
             decision,
@@ -260,6 +261,24 @@ class Decider:
             started=frozenset(),
             silence=FADE_RAMP,
             refusal=str(error),
+        )
+        return self._decided
+
+    def _requested_at(self, number: int) -> float:
+        """Return when [s] what plays in a layer was requested, by its pulse or its contact."""
+        contact, target = self._playing[number].content.targets[0]
+        return contact.since if target.pulse is None else target.pulse.requested_at
+
+    def _without(self, number: int, decision: Decision, reason: str) -> Decision:
+        """Return the last decision with a layer that ends instead of what it starts there."""
+        left_out = self._playing[number].content
+        self._playing = {n: one for n, one in self._playing.items() if n != number}
+        self._decided = replace(
+            decision,
+            selection=_held_back(decision.selection, [left_out], reason),
+            sets={**decision.sets, number: self._builder.build_end(number, has_endings=False)},
+            started=decision.started - {number},
+            refusal=reason,
         )
         return self._decided
 
@@ -292,7 +311,10 @@ class Decider:
         self._playing = playing
 
     def ended(self, now: float) -> Decision | None:
-        """Return the end of all playback that has come by itself at a time [s], once; else None."""
+        """Return the ends of contents that have come by themselves at a time [s], once; else None.
+
+        With the selection of those that play on; silence if there are none.
+        """
         over = {
             number: replace(one, drive={})
             for number, one in self._playing.items()
@@ -301,9 +323,16 @@ class Decider:
         if not over or self._decided is None:
             return None
         self._playing = {**self._playing, **over}
-        if any(each.drive for each in self._playing.values()):
-            return None
-        return replace(self._decided, sets={}, started=frozenset(), refusal=ENDED, triggered_at=now)
+        over_contents = [one.content for one in over.values()]
+        self._decided = replace(
+            self._decided,
+            selection=_held_back(self._decided.selection, over_contents, ENDED),
+            sets={},
+            started=frozenset(),
+            refusal=ENDED,
+            triggered_at=now,
+        )
+        return self._decided
 
     def decide(self, now: float) -> Decision | None:
         """Decide at a time [s]; None if nothing changes."""
@@ -443,6 +472,16 @@ def _shortest(played: Mapping[str, Sequence[LayerSet]], number: int) -> float:
         if one.layer == number and one.valid_for and is_vibrating(one)
     ]
     return min(times, default=math.inf)
+
+
+def _held_back(selection: Selection, contents: Sequence[Content], reason: str) -> Selection:
+    """Return a selection without some of its contents, whose targets feel nothing for a reason."""
+    skipped = [not_served(contact, reason) for each in contents for contact, _ in each.targets]
+    return replace(
+        selection,
+        contents=tuple(each for each in selection.contents if each not in contents),
+        not_served=(*selection.not_served, *skipped),
+    )
 
 
 def _is_due(moment: float | None, now: float) -> bool:

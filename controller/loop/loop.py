@@ -303,8 +303,8 @@ class Controller:
 
     @property
     def _is_heartbeat_due(self) -> bool:
-        """Whether to feed the watchdogs now; what is to end has priority."""
-        if self.group_state is not GroupState.ARMED or self._decider.is_end_pending:
+        """Whether to feed the watchdogs now; pending silence has priority."""
+        if self.group_state is not GroupState.ARMED or self._decider.is_silence_pending:
             return False
         return clock.now() >= min(self._heartbeat_due, self._group.lost_from)
 
@@ -352,8 +352,7 @@ class Controller:
                 await self._renew(now)
             ended = self._decider.ended(now)
             if ended is not None:
-                silenced = silenced_by(ended, sent_at=None, now=now)
-                self._report(lambda each: each.silenced(silenced))
+                self._report_playing(ended, sent_at=None)
         elif decision.started and self._group.degraded:
             await self._end(self._decider.only_ends(decision))
         else:
@@ -387,15 +386,23 @@ class Controller:
             else:
                 await self._execute(self._decider.refused(decision, error))
             return
-        if sent_at is not None and decision.selection.contents and decision.refusal is None:
-            applied = applied_by(
-                decision, self._decider.playing, sent_at=sent_at, timing=self._timing
-            )
-            self._report(lambda each: each.pattern_applied(applied))
-            return
         refusal = decision.refusal
         if refusal is not None:
             self._report(lambda each: each.refused(refusal))
+        self._report_playing(decision, sent_at=sent_at)
+
+    def _report_playing(self, decision: Decision, *, sent_at: float | None) -> None:
+        """Report what plays after a decision, or silence; sent_at [s]: None if nothing was sent."""
+        if decision.selection.contents and decision.silence is None:
+            applied = applied_by(
+                decision,
+                self._decider.playing,
+                sent_at=sent_at,
+                now=clock.now(),
+                timing=self._timing,
+            )
+            self._report(lambda each: each.pattern_applied(applied))
+            return
         silenced = silenced_by(decision, sent_at=sent_at, now=clock.now())
         self._report(lambda each: each.silenced(silenced))
 

@@ -19,7 +19,8 @@ class Applied:
 
     contacts: all, in order of arrival; targets: a prediction for each; quiet: quiet contacts;
     contents: as they are played, by layer, the newest one last; latency [s]: from the touch frame
-    to the last byte of the command on the wire; time [s] of that byte; from_rest: whether the plate
+    to the last byte of the command on the wire, None if none was needed; time [s] of that byte, or
+    of the report; from_rest: whether the plate
     was at rest; settled_after [s]: when the last fade or envelope has ended; lasts: whether all
     play until their contacts change.
     """
@@ -28,7 +29,7 @@ class Applied:
     targets: tuple[Prediction, ...]
     quiet: tuple[Contact, ...]
     contents: Mapping[int, PlayedContent]
-    latency: float
+    latency: float | None
     time: float
     from_rest: bool = True
     settled_after: float = 0.0
@@ -89,23 +90,26 @@ def applied_by(
     decision: Decision,
     playing: Mapping[int, PlayedContent],
     *,
-    sent_at: float,
+    sent_at: float | None,
+    now: float,
     timing: Timing | None,
 ) -> Applied:
-    """Report what plays after a decision, by layer; sent_at [s]: of its last byte."""
-    order = sorted(playing, key=decision.started.__contains__)
+    """Report what plays after a decision, by layer; sent_at [s]: as of `silenced_by`."""
+    selected = decision.selection.contents
+    order = sorted(
+        (number for number, one in playing.items() if one.content in selected),
+        key=decision.started.__contains__,
+    )
     return Applied(
         contacts=decision.contacts,
         targets=decision.selection.predictions,
         quiet=decision.selection.quiet,
         contents={number: playing[number] for number in order},
-        latency=sent_at - decision.triggered_at,
-        time=sent_at,
+        latency=None if sent_at is None else sent_at - decision.triggered_at,
+        time=now if sent_at is None else sent_at,
         from_rest=decision.from_rest,
-        settled_after=max(each.settled_after for each in decision.sets.values()),
-        lasts=all(
-            target.pulse is None for one in playing.values() for _, target in one.content.targets
-        ),
+        settled_after=max((each.settled_after for each in decision.sets.values()), default=0.0),
+        lasts=all(target.pulse is None for each in selected for _, target in each.targets),
         timing=timing,
     )
 

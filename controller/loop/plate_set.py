@@ -139,8 +139,8 @@ class SetBuilder:
     def build_end(self, number: int, *, has_endings: bool) -> PlateSet:
         """Build the set that ends a layer along its endings, or along a ramp."""
         ramp = min(FADE_RAMP, self._ramp_max)
-        if has_endings:
-            layers = {name: Layer(number, ramp=ramp) for name in self._rig.amplifiers}
-        else:
-            layers = route({}, self._rig, ramp=ramp, number=number)
-        return PlateSet(layers, ramp)
+        plain = PlateSet(route({}, self._rig, ramp=ramp, number=number), ramp)
+        if not has_endings:
+            return plain
+        layers = {name: Layer(number, ramp=ramp) for name in self._rig.amplifiers}
+        return PlateSet(layers, ramp, plain)

@@ -342,6 +342,9 @@ def _alone(
             if tone.amplitude > 0
         ]
         change = min(0.0, float(decibels(min(left, default=1.0))))
+        if change < 0 and answer.felt_db_sl + change < 0:
+            reason = "the contents of other fingers use the whole stroke; lift a finger"
+            return Selection(targets, quiet, (), reason, (not_served(contact, reason),))
     content = Content(targets, answer.question, pattern.scaled(change) if change else pattern, ())
     promised = pattern.robust_felt_contrast_db
     predicted = Prediction(

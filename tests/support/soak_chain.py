@@ -447,7 +447,7 @@ class _Run:
     def _applied(self, applied: Applied) -> None:
         self.counts["patterns"] += 1
         drive = dict(sorted(applied.drive.items()))
-        self.note("pattern", f"{applied.latency:.9f}", drive)
+        self.note("pattern", f"{applied.latency or 0.0:.9f}", drive)
 
     async def _end(self) -> None:
         """Close all, and check for silence and for tasks left."""

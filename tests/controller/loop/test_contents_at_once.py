@@ -1,7 +1,7 @@
 """Several fingers, each with a content of its own, on the plate in virtual time."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -16,13 +16,16 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.effects.shapes import Rectangle
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.decision import PlayedContent
+from controller.loop.decision import ENDED, Decider, PlayedContent
 from controller.loop.envelopes import RAMPS_ONLY
 from controller.loop.intent import Target
 from controller.loop.joint_answer import query_jointly
+from controller.loop.plate_set import PlateSet
 from controller.loop.selection import unshaped
 from controller.sources.contacts import Contact, ContactKey
-from drivers.errors import LinkDegraded
+from drivers.contents import Layer
+from drivers.errors import CommandRefused
+from drivers.host.joint_sets import Played
 from model.arrays import Complex64Array
 from model.table.build import build_table
 from model.table.pattern import Pattern
@@ -164,36 +167,74 @@ async def test_a_lifted_finger_falls_silent_while_an_amplifier_is_degraded(
 
 
 @in_virtual_time
-async def test_no_watchdog_is_fed_until_the_end_of_a_lifted_finger_is_confirmed(
+async def test_a_refused_content_is_left_out_and_the_other_plays_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One reply is missed for 50 ms: its end is repeated meanwhile, heartbeats wait."""
-    async with fingers_on(table(), LAYOUT, breaks="heartbeat") as fingers:
+    """Two contents are refused together: the newer finger is told why, the other is not silent."""
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT}
+        await fingers.hold(0.5)
+        apply, count = fingers.controller.group.apply, len(fingers.committed)
+
+        async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
+            playing = [any(tone.level for tone in each.tones) for each in layers["main"]]
+            if sum(playing) > 1:
+                raise CommandRefused("too much power")
+            return await apply(layers)
+
+        monkeypatch.setattr(fingers.controller.group, "apply", refuse)
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.3)
+        felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
+        assert felt == {1: None, 2: "too much power"}
+        assert [_id(one) for one in fingers.applied[-1].contents.values()] == [1]
+        assert all(layers for _, _, layers in fingers.committed[count:])  # no Silence
+
+
+@in_virtual_time
+async def test_a_ramp_replaces_an_ending_that_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One finger lifts as the other moves: that one is not silenced for the ending of the first."""
+    async with fingers_on(table(), LAYOUT) as fingers:
         fingers.at = {1: LEFT, 2: RIGHT}
         await fingers.hold(0.6)
-        group, fed, tried = fingers.controller.group, 0, 0
-        beat = group.beat
+        apply, count = fingers.controller.group.apply, len(fingers.committed)
 
-        async def miss(layers: object) -> None:
-            nonlocal tried
-            tried += 1
-            await asyncio.sleep(0.010)
-            raise LinkDegraded("no reply")
+        async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
+            if any(not each.tones and not each.renew for each in layers["main"]):
+                raise CommandRefused("an ending is too loud")
+            return await apply(layers)
 
-        async def feed() -> None:
-            nonlocal fed
-            fed += 1
-            await beat()
-
-        monkeypatch.setattr(group, "beat", feed)
-        with monkeypatch.context() as patched:
-            patched.setattr(group, "apply", miss)
-            del fingers.at[1]
-            await fingers.hold(0.05)
-            assert fed == 0
-            assert tried >= 4
+        monkeypatch.setattr(fingers.controller.group, "apply", refuse)
+        del fingers.at[1]
+        fingers.at[2] = (RIGHT[0] + 0.01, RIGHT[1])
         await fingers.hold(0.3)
-        assert fed > 0
+        (_, _, sent), *_ = fingers.committed[count:]
+        assert sorted(any(c.level for c in one.commands) for one in sent) == [False, True]
+        assert [each.held_back for each in fingers.applied[-1].targets] == [None]
+
+
+@in_virtual_time
+async def test_the_end_of_one_layer_by_itself_is_said_while_the_other_plays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One is not renewed, and ends after 2 s; the other goes on, and nothing was sent for that."""
+    renewal = Decider.renewal
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(0.5)
+        (other,) = (n for n, one in fingers.applied[-1].contents.items() if _id(one) == 2)
+
+        def one_only(decider: Decider, now: float) -> dict[int, PlateSet]:
+            return {n: each for n, each in renewal(decider, now).items() if n == other}
+
+        monkeypatch.setattr(Decider, "renewal", one_only)
+        await fingers.hold(2.5)
+        assert len(fingers.applied) == 2
+        applied = fingers.applied[-1]
+        assert [*applied.contents] == [other]
+        assert applied.latency is None
+        felt = {each.contact.key.id: each.held_back for each in applied.targets}
+        assert felt == {1: ENDED, 2: None}
 
 
 @pytest.mark.parametrize("what", ["stop", "lift"])

@@ -278,3 +278,14 @@ def test_selector_queries_a_failing_table_once(table: Table) -> None:
     assert len(table.asked) == 1
     table.error = None
     assert selector.select((at(1, 0.2),), intent, CAPABILITIES).pattern is not None
+
+
+def test_a_pulse_is_held_back_where_others_use_the_whole_stroke(table: Table) -> None:
+    """Beside 1 µm of 1 µm nothing is left of its stroke: it is said, not played at level zero."""
+    pulse = Target(ContactKey("a", 2), 12.0, pulse=Pulse(0.03, requested_at=0.0))
+    intent = HapticIntent((Target(ContactKey("a", 1), 12.0), pulse))
+    full = replace(CAPABILITIES, max_amplitudes={"SW": 1e-6}, layers=2)
+    selection = Selector(table).select((at(1, 0.1), at(2, 0.2)), intent, full)
+    assert [each.targets[0][0].key.id for each in selection.contents] == [1]
+    (held,) = selection.not_served
+    assert held.held_back == "the contents of other fingers use the whole stroke; lift a finger"

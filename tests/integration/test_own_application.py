@@ -223,3 +223,53 @@ async def test_stop_of_a_page_needs_nothing_that_old_browsers_lack(tmp_path: Pat
         await tab.evaluate("window.fetch = () => { throw new Error('none'); }; undefined")
         await tab.click("#stop")
         await asyncio.to_thread(wait_for, lambda: daemon.methods.count("stop") == 3)
+
+
+async def test_page_that_loses_its_user_lifts_and_disarms(tmp_path: Path) -> None:
+    """Lifted once hidden, disarmed once left or closed, and by its button without a WebSocket."""
+    async with shown(tmp_path) as (tab, network, ended, origin):
+        socket = ended.enter_context(real_daemon(tmp_path))
+        era = ended.enter_context(Client.connect(socket))
+        wait_for_state(era, "READY_TO_SWITCH_ON")
+        era.subscribe("state")
+        options = ("--allow-origin", origin)
+        gateway = ended.enter_context(gateway_process(tmp_path, socket, *options))
+        network.target = gateway.port
+        opened = (
+            "(async () => {"
+            f"  const {{ Connection }} = await import('http://127.0.0.1:{network.port}/connection.js');"
+            "  await new Promise((opened) => {"
+            f"    window.own = new Connection('{TOKEN}', ['state'], {{ opened }}); }});"
+            "  await own.arm('own');"
+            "})()"
+        )
+
+        async def until_disarmed() -> None:
+            """By a call; a lease that runs out has another cause."""
+            causes = (told.data["cause"] for told in era.events(timeout=PATIENCE))
+            assert await asyncio.to_thread(any, (each.startswith("disarmed by") for each in causes))
+            await asyncio.to_thread(wait_for_state, era, "READY_TO_SWITCH_ON")
+
+        for end in ("own.socket.close(); own.disarm()", "own.close()"):
+            await tab.show(url(origin))
+            await tab.until(SAID, lambda text: text.startswith("ready: "))
+            await tab.evaluate(opened)
+            assert era.status().armed_by is not None
+            await tab.evaluate(end)
+            await until_disarmed()
+        await tab.until("own.socket.readyState === WebSocket.CLOSED")
+        await tab.click("#arm")
+        await tab.until(SAID, lambda text: text.startswith("on: "))
+        x, y = await tab.evaluate(
+            "(({x, y}) => [x + 50, y + 50])"
+            "(document.querySelector('#plate').getBoundingClientRect())"
+        )
+        await tab.touch("touchStart", [(x, y)])
+        await asyncio.to_thread(wait_for, lambda: len(era.status().contacts) == 1)
+        await tab.evaluate(
+            "Object.defineProperty(document, 'hidden', { value: true });"
+            "document.dispatchEvent(new Event('visibilitychange'))"
+        )
+        await asyncio.to_thread(wait_for, lambda: not era.status().contacts)
+        await tab.call("Page.navigate", url="about:blank")
+        await until_disarmed()

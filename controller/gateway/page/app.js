@@ -38,7 +38,7 @@ const fieldView = new FieldView(at("field"), at("scale"), (low, high) => {
   at("scale-low").textContent = `${low}`;
   at("scale-high").textContent = `${high} m/s²`;
 });
-new Fingers(at("plate"), overlay, (touches) => connection?.touch(touches));
+const fingers = new Fingers(at("plate"), overlay, (touches) => connection?.touch(touches));
 window.eraHaptics = { get frames() { return fieldView.frames; } };  // for measuring the frame rate
 
 function showError(error) {
@@ -75,7 +75,7 @@ function showButtons() {
   const isArmed = state === "OPERATION_ENABLED";
   const isConnected = state !== null && connection?.isOpen;
   at("arm").disabled = !isConnected || isArmed || !DISARMED.includes(state);
-  at("disarm").disabled = !isConnected || !isArmed;
+  at("disarm").disabled = isConnected ? !isArmed : !connection?.lease;
   at("clear").disabled = !isConnected || !LATCHED.includes(state);
   at("effects").disabled = !isConnected || !isArmed;
 }
@@ -268,16 +268,14 @@ function connect(token) {
     opened,
     closed,
     failed,
+    lifted: () => fingers.clear(),
     event: ({ topic, data }) => HANDLERS[topic]?.(data),
     field: (buffer) => fieldView.show(decodeField(buffer)),
   });
 }
 
-// A closed page cannot stop anything: disarm.
-window.addEventListener("pagehide", () => connection?.lease && connection.post("disarm").catch(() => {}));
-
 at("arm").addEventListener("click", () => attempt(() => connection.arm(`dashboard (${ownName})`)));
-at("disarm").addEventListener("click", () => attempt(() => connection.disarm()));
+at("disarm").addEventListener("click", () => attempt(() => connection.disarm()).then(showButtons));
 at("clear").addEventListener("click", () => attempt(() => connection.call("clear")));
 at("stop").addEventListener("click", stop);
 at("motion").addEventListener("change", ({ target }) => fieldView.setMotion(target.checked));

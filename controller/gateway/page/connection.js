@@ -22,10 +22,13 @@ export class RpcError extends Error {
   }
 }
 
+const noResponse = () => new RpcError({ code: 0, message: "the gateway does not respond" });
+
 export class Connection {
   // topics: to subscribe to. handlers, all optional: opened(hello, name) once the daemon has responded,
   // closed(), failed(why) after each loss or failed attempt to connect, event({ topic, data, lost }),
-  // disarmed() when the daemon refuses to renew the lease, field(ArrayBuffer). name: of this page, in
+  // disarmed() when the daemon refuses to renew the lease, lifted() when all fingers were lifted because
+  // the page lost the focus or is hidden: forget them; field(ArrayBuffer). name: of this page, in
   // the daemon's log. why: "daemon" if the daemon does not respond, "refused" because of the token,
   // "full" if the gateway responds but accepts no WebSocket, "unreachable". gateway: its URL.
   constructor(token, topics, handlers, gateway = import.meta.url) {
@@ -41,9 +44,16 @@ export class Connection {
     this.lease = null;  // while armed by `arm`; it outlives a short loss
     this.touches = [];
     this.connect();
-    setInterval(() => this.check(), CHECK_MS);
-    setInterval(() => this.renew(), (1000 * LEASE_S) / 3);
-    setInterval(() => this.touches.length && this.touch(this.touches), REPEAT_MS);
+    this.timers = [
+      setInterval(() => this.check(), CHECK_MS),
+      setInterval(() => this.renew(), (1000 * LEASE_S) / 3),
+      setInterval(() => this.touches.length && this.touch(this.touches), REPEAT_MS),
+    ];
+    this.listening = new AbortController();
+    const { signal } = this.listening;
+    window.addEventListener("blur", () => this.lift(), { signal });
+    document.addEventListener("visibilitychange", () => document.hidden && this.lift(), { signal });
+    window.addEventListener("pagehide", () => this.leave(), { signal });
   }
 
   get isOpen() {
@@ -72,10 +82,7 @@ export class Connection {
   }
 
   closed(code) {
-    for (const { reject } of this.pending.values()) {
-      reject(new RpcError({ code: 0, message: "the gateway does not respond" }));
-    }
-    this.pending.clear();
+    this.rejectPending();
     this.handlers.closed?.();
     if (code === NO_DAEMON) {
       this.wasEverAccepted = true;
@@ -84,7 +91,13 @@ export class Connection {
     else this.diagnose();
     this.wasOpen = false;
     this.silentChecks = 0;
-    setTimeout(() => this.connect(), RETRY_MS[Math.min(this.attempts++, RETRY_MS.length - 1)]);
+    const delay = RETRY_MS[Math.min(this.attempts++, RETRY_MS.length - 1)];
+    this.reconnecting = setTimeout(() => this.connect(), delay);
+  }
+
+  rejectPending() {
+    for (const { reject } of this.pending.values()) reject(noResponse());
+    this.pending.clear();
   }
 
   received(data) {
@@ -152,10 +165,38 @@ export class Connection {
     });
   }
 
-  // Ramp to silence and switch the high voltage off.
+  // Ramp to silence and switch the high voltage off; over HTTP while there is no WebSocket.
   disarm() {
     this.lease = null;
-    return this.call("disarm");
+    return this.isOpen ? this.call("disarm") : this.callOverHttp("disarm");
+  }
+
+  // Lift all fingers of this page, whose user may not see it any more.
+  lift() {
+    if (!this.touches.length) return;
+    this.touch([]);
+    this.handlers.lifted?.();
+  }
+
+  // A page that is left cannot stop anything: lift, and disarm if it armed; once, over HTTP, which outlives
+  // the page, as a second one may arrive when others have armed.
+  leave() {
+    this.lift();
+    if (!this.lease) return;
+    this.lease = null;
+    this.post("disarm").catch(() => {});
+  }
+
+  // Lift all fingers, disarm if it armed, and end the connection for good.
+  close() {
+    this.leave();
+    this.handlers = {};
+    this.listening.abort();
+    for (const timer of this.timers) clearInterval(timer);
+    clearTimeout(this.reconnecting);
+    this.socket.onmessage = this.socket.onclose = null;
+    this.socket.close();
+    this.rejectPending();
   }
 
   // Report all fingers that are down, [{ id, x_m, y_m }, ...], the newest last; repeated until the next
@@ -176,7 +217,7 @@ export class Connection {
 
   // Call a method without parameters over HTTP; a promise of its result.
   async callOverHttp(method) {
-    const response = await this.post(method);
+    const response = await this.post(method).catch(() => { throw noResponse(); });
     const result = await response.json();
     const { error, code, data } = result;
     if (!response.ok) throw new RpcError({ message: error, code, data });

@@ -18,8 +18,6 @@ export class Fingers {
     plate.addEventListener("contextmenu", (event) => event.preventDefault());
     plate.addEventListener("keydown", (event) => this.key(event));
     plate.addEventListener("blur", () => this.removeCursor());
-    window.addEventListener("blur", () => this.liftAll());
-    document.addEventListener("visibilitychange", () => document.hidden && this.liftAll());
   }
 
   press(event, plate) {
@@ -50,10 +48,9 @@ export class Fingers {
     if (this.positions.delete(id)) this.report();
   }
 
-  liftAll() {
-    if (!this.positions.size) return;
+  // The connection has lifted all.
+  clear() {
     this.positions.clear();
-    this.report();
   }
 
   key(event) {

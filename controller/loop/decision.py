@@ -134,8 +134,9 @@ class Decider:
     def replace_answers(self, table: LocalizationTable, timing: Timing | None) -> None:
         """Answer by another table of this plate from now on; what plays stays until it changes."""
         self._table, self._timing = table, timing
-        self._selector.replace(table, None if timing is None else timing.levels)
-        self._builder.replace(timing)
+        self._builder = self._builder.with_timing(timing)
+        levels = None if timing is None else timing.levels
+        self._selector.replace(table, levels, self._builder.shape)
 
     def prepare(self) -> None:
         """Precompute what the first touch would have to wait for; tens of milliseconds.

@@ -56,9 +56,9 @@ class SetBuilder:
         self._ramp_max = ramp_max
         self._timing = timing
 
-    def replace(self, timing: Timing | None) -> None:
-        """Shape by another timing from now on."""
-        self._timing = timing
+    def with_timing(self, timing: Timing | None) -> "SetBuilder":
+        """Return a builder that shapes by another timing."""
+        return SetBuilder(self._rig, support=self._support, ramp_max=self._ramp_max, timing=timing)
 
     def shape(
         self,

@@ -77,9 +77,12 @@ class Selector:
         self._current = _NOTHING
         self._requested: tuple[Selection, Targets] = (_NOTHING, ())
 
-    def replace(self, table: LocalizationTable, levels: EffectLevels | None) -> None:
-        """Answer by another table of this plate; the selection stays until its contacts change."""
-        self._table, self._levels = table, levels
+    def replace(self, table: LocalizationTable, levels: EffectLevels | None, shape: Shape) -> None:
+        """Answer by another table of this plate; the selection stays until its contacts change.
+
+        What the thread computes goes on by the former one, envelopes included.
+        """
+        self._table, self._levels, self._shape = table, levels, shape
 
     @property
     def is_choosing(self) -> bool:
@@ -149,12 +152,13 @@ class Selector:
         """
         if self._thread.is_busy and self._is_requested(lasting, short, contacts):
             return
-        table, levels, before = self._table, self._levels, self._lasting
+        table, levels, shape = self._table, self._levels, self._shape
+        before = self._lasting
 
         def chosen() -> _Chosen:
             found = None
             if lasting is not None:
-                found = self._lasting_of(table, levels, lasting, contacts, capabilities, before)
+                found = _lasting_of(table, levels, shape, lasting, contacts, capabilities, before)
             new = {
                 contact.key: _alone(
                     table,
@@ -186,28 +190,6 @@ class Selector:
         if lasting is not None and not _fits(requested, lasting, contacts):
             return False
         return _intents(short) <= _intents(pulses)
-
-    def _lasting_of(
-        self,
-        table: LocalizationTable,
-        levels: EffectLevels | None,
-        lasting: Targets,
-        contacts: Sequence[Contact],
-        capabilities: PlaybackCapabilities,
-        before: Selection,
-    ) -> Selection:
-        """Choose for all targets that last; any failure is their reason for silence."""
-        if len(lasting) == 1:
-            return _alone(table, levels, *lasting[0], contacts, capabilities, before)
-        keys = {contact.key for contact, _ in lasting}
-        quiet = tuple(each for each in contacts if each.key not in keys)
-        felt = {content.targets[0][0].key: content for content in before.contents}
-        try:
-            return query_jointly(
-                table, lasting, quiet, capabilities, before=felt, shape=self._shape
-            )
-        except Exception as error:
-            return _failed(lasting, quiet, error)
 
     def _together(
         self,
@@ -310,6 +292,27 @@ def _left_by(
         for name, tone in content.pattern.excitation.items():
             left[name] = max(left[name] - tone.amplitude, 1e-12)
     return replace(capabilities, max_amplitudes=left)
+
+
+def _lasting_of(
+    table: LocalizationTable,
+    levels: EffectLevels | None,
+    shape: Shape,
+    lasting: Targets,
+    contacts: Sequence[Contact],
+    capabilities: PlaybackCapabilities,
+    before: Selection,
+) -> Selection:
+    """Choose for all targets that last; any failure is their reason for silence."""
+    if len(lasting) == 1:
+        return _alone(table, levels, *lasting[0], contacts, capabilities, before)
+    keys = {contact.key for contact, _ in lasting}
+    quiet = tuple(each for each in contacts if each.key not in keys)
+    felt = {content.targets[0][0].key: content for content in before.contents}
+    try:
+        return query_jointly(table, lasting, quiet, capabilities, before=felt, shape=shape)
+    except Exception as error:
+        return _failed(lasting, quiet, error)
 
 
 def _alone(

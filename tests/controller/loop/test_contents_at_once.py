@@ -53,6 +53,19 @@ def table() -> LocalizationTable:
     return build_table(smooth_rig(), frequencies=np.linspace(40.0, 320.0, 29))
 
 
+def answering_after(seconds: float, monkeypatch: pytest.MonkeyPatch) -> asyncio.AbstractEventLoop:
+    """Let every answer of the thread take a time [s]; returns the running loop."""
+    loop = asyncio.get_running_loop()
+
+    def slowly(executor: Any, work: Callable[[], Any]) -> "asyncio.Future[Any]":
+        future = loop.create_future()
+        loop.call_later(seconds, lambda: future.set_result(work()))
+        return future
+
+    monkeypatch.setattr(type(loop), "run_in_executor", lambda self, *args: slowly(*args))
+    return loop
+
+
 @in_virtual_time
 async def test_two_fingers_each_feel_their_own_within_1_db_of_the_promise() -> None:
     """Measured at the fingertips over the wire, against the answer for the plate as modelled."""
@@ -243,14 +256,7 @@ async def test_stop_and_lift_do_not_wait_for_an_answer(
     what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """While one is computed for 0.2 s: silent as soon as without, and what it says is dropped."""
-    loop = asyncio.get_running_loop()
-
-    def slowly(executor: Any, work: Callable[[], Any]) -> "asyncio.Future[Any]":
-        future = loop.create_future()
-        loop.call_later(0.2, lambda: future.set_result(work()))
-        return future
-
-    monkeypatch.setattr(type(loop), "run_in_executor", lambda self, *args: slowly(*args))
+    loop = answering_after(0.2, monkeypatch)
     async with fingers_on(table(), LAYOUT) as fingers:
         fingers.at = {1: LEFT}
         await fingers.hold(0.3)
@@ -299,14 +305,7 @@ async def test_a_click_is_played_though_the_answer_takes_longer_than_it_lasts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """40 ms, for all of them, though the answer for it and two fingers beside it takes 60."""
-    loop = asyncio.get_running_loop()
-
-    def slowly(executor: Any, work: Callable[[], Any]) -> "asyncio.Future[Any]":
-        future = loop.create_future()
-        loop.call_later(0.06, lambda: future.set_result(work()))
-        return future
-
-    monkeypatch.setattr(type(loop), "run_in_executor", lambda self, *args: slowly(*args))
+    loop = answering_after(0.06, monkeypatch)
     layout = SurfaceLayout(
         LAYOUT.regions, {**LAYOUT.effects, "any": Click(level=14.0)}, elsewhere=None
     )
@@ -325,6 +324,42 @@ async def test_a_click_is_played_though_the_answer_takes_longer_than_it_lasts(
         assert (is_driven, is_still_driven) == (True, False)
         assert 0.06 <= start - begin <= 0.08
         assert 0.04 <= end - start <= 0.05
+
+
+@in_virtual_time
+async def test_an_answer_is_shaped_by_the_timing_it_began_with(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Others are put in place meanwhile, without a timing: what was begun has its onset."""
+    answering_after(0.03, monkeypatch)
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(0.01)
+        fingers.controller.replace_answers(table(), None)
+        await fingers.hold(0.3)
+        (applied,) = fingers.applied
+        assert all(one.pattern.onset for one in applied.contents.values())
+
+
+@in_virtual_time
+async def test_an_answer_that_takes_more_than_a_second_is_a_fault(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Silent, with the reason, until it has come."""
+    answering_after(2.0, monkeypatch)
+    async with fingers_on(table(), LAYOUT, breaks="touch") as fingers:
+        fingers.at = {1: LEFT}
+        await fingers.hold(0.3)
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.95)
+        before = len(fingers.silenced)
+        await fingers.hold(0.1)
+        (silenced,) = fingers.silenced[before:]
+        assert silenced.reason == (
+            "TimeoutError: answer must take less than 1 s, is still computed"
+        )
+        await fingers.hold(1.2)
+        assert [each.held_back for each in fingers.applied[-1].targets] == [None, None]
 
 
 @in_virtual_time

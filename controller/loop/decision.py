@@ -350,6 +350,8 @@ class Decider:
             draft = Decision(contacts, selection, from_rest, triggered_at)
             if is_new and selection.contents:
                 decision = self._with_sets(draft, now)
+                if decision is None and _why_not(selection) != _why_not(self._selected):
+                    decision = draft  # said without sending
         except Exception as error:
             has_failed = True
             selection = Selection((), contacts, (), failure_text(error))
@@ -363,7 +365,7 @@ class Decider:
             decision = None if is_awaited else self._ended(draft, now, has_failed=has_failed)
         if is_new:
             self._selected, self._retry_at = selection, None
-        if decision is not None and (decision.sets or decision.silence is not None):
+        if decision is not None and (decision.sets or selection.contents or decision.silence):
             self._decided = decision
         return decision
 
@@ -483,6 +485,12 @@ def _held_back(selection: Selection, contents: Sequence[Content], reason: str) -
         contents=tuple(each for each in selection.contents if each not in contents),
         not_served=(*selection.not_served, *skipped),
     )
+
+
+def _why_not(selection: Selection | None) -> dict[ContactKey, str | None]:
+    """Return why targets feel nothing of their own, by contact."""
+    held_back = () if selection is None else selection.not_served
+    return {each.contact.key: each.held_back for each in held_back}
 
 
 def _is_due(moment: float | None, now: float) -> bool:

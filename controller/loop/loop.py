@@ -209,10 +209,11 @@ class Controller:
 
     async def arm(self) -> None:
         """Switch the high voltage on, so that touches are felt; `run` must run or start at once."""
-        decider = self._decider
+        decider, was_armed = self._decider, self._group.is_armed
         await self._group.arm()
         decider.forget()
-        decider.confirm_silence()
+        if not was_armed:  # else what plays goes on
+            decider.confirm_silence()
         self._heartbeat_due = clock.now()
         self._schedule_expiry()  # fingers may have rested since before
         self._wake.set()

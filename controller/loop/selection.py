@@ -132,9 +132,13 @@ class Selector:
             then = {each.key for each in (*(contact for contact, _ in targets), *quiet)}
             is_for_all = {each.key for each in contacts} <= then
             # Levels and places may have changed since: else a finger that moves would get nothing.
-            if is_for_all and {each.key for each, _ in lasting} <= {
-                each.key for each, _ in targets
-            }:
+            # What plays may do again, since a finger that came has lifted meanwhile.
+            is_kept = _fits(self._lasting, lasting, contacts)
+            if (
+                not is_kept
+                and is_for_all
+                and {each.key for each, _ in lasting} <= {each.key for each, _ in targets}
+            ):
                 self._lasting = chosen.lasting
 
     def _choose(

@@ -27,6 +27,7 @@ from drivers.contents import Layer
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from model.arrays import Complex64Array
+from model.errors import InputError
 from model.table.build import build_table
 from model.table.pattern import Pattern
 from model.table.table import LocalizationTable
@@ -248,6 +249,63 @@ async def test_the_end_of_one_layer_by_itself_is_said_while_the_other_plays(
         assert applied.latency is None
         felt = {each.contact.key.id: each.held_back for each in applied.targets}
         assert felt == {1: ENDED, 2: None}
+
+
+@in_virtual_time
+async def test_an_answer_for_a_finger_that_has_lifted_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A finger comes and lifts while the answer for two is computed: the other's set stays."""
+    answering_after(0.2, monkeypatch)
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT}
+        await fingers.hold(0.3)
+        count = len(fingers.committed)
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.05)
+        del fingers.at[2]
+        await fingers.hold(0.5)
+        assert len(fingers.committed) == count
+        assert len(fingers.applied) == 1
+
+
+@in_virtual_time
+async def test_arming_again_forgets_no_layer_that_plays() -> None:
+    """A finger that lifts just then falls silent, as the other plays on."""
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(0.6)
+        layers = {_id(one): number for number, one in fingers.applied[-1].contents.items()}
+        count = len(fingers.committed)
+        await fingers.controller.arm()
+        del fingers.at[2]
+        await fingers.hold(0.1)
+        sets = {one.layer: one for _, _, sent in fingers.committed[count:] for one in sent}
+        assert not any(command.level for command in sets[layers[2]].commands)
+        assert any(command.level for command in sets[layers[1]].commands)
+
+
+@in_virtual_time
+async def test_a_click_that_cannot_be_played_is_said_though_no_layer_changes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A resting finger slides 4 mm into the region of a click, which the table refuses."""
+    regions = (LAYOUT.regions[0], replace(LAYOUT.regions[1], on_press="click"))
+    layout = SurfaceLayout(regions, {**LAYOUT.effects, "click": Click(level=14.0)}, elsewhere=None)
+    async with fingers_on(table(), layout) as fingers:
+        fingers.at = {1: LEFT, 2: (0.158, 0.049)}
+        await fingers.hold(0.5)
+        count = len(fingers.committed)
+
+        def refuse(*_: Any, **__: Any) -> None:
+            raise InputError("nothing is felt there")
+
+        monkeypatch.setattr("controller.loop.selection.query_table", refuse)
+        fingers.at[2] = (0.162, 0.049)
+        await fingers.hold(0.02)
+        assert len(fingers.committed) == count
+        felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
+        assert felt == {1: None, 2: "nothing is felt there"}
 
 
 @pytest.mark.parametrize("what", ["stop", "lift"])

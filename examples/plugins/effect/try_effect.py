@@ -19,6 +19,9 @@ course = effect.start(finger, 0.0, level_db_sl=effect.level_db_sl)
 now: float | None = 0.0
 while now is not None and now < 2.0:
     felt = course.feel(finger, now)
+    if isinstance(felt, Sensation) and felt.pulse is not None and felt.pulse.started_at is None:
+        felt.pulse.started_at = now  # as by the amplifiers: it ends a duration later
+        felt = course.feel(finger, now)
     if felt is None:
         print(f"{now:5.2f} s  over")
         break

@@ -272,11 +272,11 @@ class Decider:
 
     def _without(self, number: int, decision: Decision, reason: str) -> Decision:
         """Return the last decision with a layer that ends instead of what it starts there."""
-        left_out = self._playing[number].content
+        content = self._playing[number].content
         self._playing = {n: one for n, one in self._playing.items() if n != number}
         self._decided = replace(
             decision,
-            selection=_held_back(decision.selection, [left_out], reason),
+            selection=_held_back(decision.selection, [content], reason),
             sets={**decision.sets, number: self._builder.build_end(number, has_endings=False)},
             started=decision.started - {number},
             refusal=reason,

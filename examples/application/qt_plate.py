@@ -12,8 +12,13 @@ from collections.abc import Callable
 from typing import Any
 
 from PySide6.QtCore import QObject, QTimer, QUrl, Signal
-from PySide6.QtGui import QMouseEvent
-from PySide6.QtNetwork import QAbstractSocket, QNetworkRequest
+from PySide6.QtGui import QHideEvent, QMouseEvent
+from PySide6.QtNetwork import (
+    QAbstractSocket,
+    QNetworkAccessManager,
+    QNetworkReply,
+    QNetworkRequest,
+)
 from PySide6.QtWebSockets import QWebSocket, QWebSocketHandshakeOptions
 from PySide6.QtWidgets import QApplication, QLabel, QPushButton, QVBoxLayout, QWidget
 
@@ -36,15 +41,20 @@ class Plate(QObject):
 
     def __init__(self, url: str, token: str, topics: list[str]) -> None:
         super().__init__()
-        address = QUrl(url).resolved(QUrl("api/v1/ws"))
+        self._address = QUrl(url).resolved(QUrl("api/v1/"))
+        self._token = f"Bearer {token}".encode()
+        address = self._address.resolved(QUrl("ws"))
         address.setScheme({"http": "ws", "https": "wss"}[address.scheme()])
         self._request = QNetworkRequest(address)
-        self._request.setRawHeader(b"Authorization", f"Bearer {token}".encode())
+        self._request.setRawHeader(b"Authorization", self._token)
+        self._network = QNetworkAccessManager(self)
         self._options = QWebSocketHandshakeOptions()
         self._options.setSubprotocols(["era-haptics.v1"])
         self._topics = topics
         self._ids = itertools.count(1)
-        self._pending: dict[int, Callable[[Any], None]] = {}
+        self._pending: dict[
+            int, tuple[Callable[[Any], None], object]
+        ] = {}  # with the lease renewed
         self._lease: str | None = None
         self._touches: list[dict[str, Any]] = []
         self._is_open = False
@@ -67,7 +77,7 @@ class Plate(QObject):
             self.refused.emit("not connected")
             return
         number = next(self._ids)
-        self._pending[number] = done
+        self._pending[number] = done, params.get("lease")
         self._send(method, params, id=number)
 
     def arm(self, owner: str) -> None:
@@ -77,18 +87,43 @@ class Plate(QObject):
     def disarm(self) -> None:
         """Ramp to silence and switch the high voltage off."""
         self._lease = None
-        self.call("disarm")
+        self._call_anyhow("disarm")
 
     def stop(self) -> None:
         """Stop all amplifiers; `refused` names those that are not confirmed silent."""
         self._lease = None
-        self.call("stop")
+        self._call_anyhow("stop")
+
+    def leave(self) -> None:
+        """Lift all fingers, and disarm if it armed or arms: who does not see it cannot stop."""
+        self.touch([])
+        is_arming = self._armed in (done for done, _ in self._pending.values())
+        if is_arming or self._lease is not None:
+            self.disarm()
+            self._socket.flush()  # the application may end now
 
     def touch(self, places: list[tuple[float, float]]) -> None:
         """Report all fingers, at x, y [m], the newest last; repeated until the next call."""
         self._touches = [{"id": id, "x_m": x, "y_m": y} for id, (x, y) in enumerate(places)]
         if self._is_open:
             self._send("touch", {"source": "qt", "touches": self._touches})
+
+    def _call_anyhow(self, method: str) -> None:
+        """Call a method without parameters, over HTTP while there is no WebSocket."""
+        if self._is_open:
+            self.call(method)
+            return
+        request = QNetworkRequest(self._address.resolved(QUrl(method)))
+        request.setRawHeader(b"Authorization", self._token)
+        request.setHeader(QNetworkRequest.KnownHeaders.ContentTypeHeader, "application/json")
+        request.setTransferTimeout(1000 * MAX_SILENT)
+        reply = self._network.post(request, b"{}")
+        reply.finished.connect(lambda: self._replied(reply))
+
+    def _replied(self, reply: QNetworkReply) -> None:
+        if reply.error() is not QNetworkReply.NetworkError.NoError:
+            self.refused.emit(reply.errorString())
+        reply.deleteLater()
 
     def _connect(self) -> None:
         self._silent = 0
@@ -107,14 +142,15 @@ class Plate(QObject):
             self._is_open = True
             self.opened.emit(message["result"])
             self.call("subscribe", topics=self._topics)
-        elif (done := self._pending.pop(message["id"], None)) is not None:
+        elif message["id"] in self._pending:
+            done, lease = self._pending.pop(message["id"])
             if "error" in message:
-                self._fail(message["error"])
+                self._fail(message["error"], lease)
             else:
                 done(message["result"])
 
-    def _fail(self, error: dict[str, Any]) -> None:
-        if error["code"] == NO_LEASE:
+    def _fail(self, error: dict[str, Any], lease: object) -> None:
+        if error["code"] == NO_LEASE and lease == self._lease:
             self._lease = None
         self.refused.emit(error["message"])
 
@@ -169,6 +205,10 @@ class Window(QWidget):
         plate.failed.connect(lambda why: self.state.setText(f"no connection: {why}"))
         plate.refused.connect(self.felt.setText)
         plate.event.connect(self._show)
+
+    def hideEvent(self, event: QHideEvent) -> None:  # noqa: N802 (Qt's name)
+        """Leave the plate; a window that is closed is hidden too."""
+        self.plate.leave()
 
     def _show(self, topic: str, data: dict[str, Any]) -> None:
         if topic == "state":

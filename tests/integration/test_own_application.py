@@ -259,7 +259,7 @@ async def test_page_that_loses_its_user_lifts_and_disarms(tmp_path: Path) -> Non
             await until_disarmed()
         await tab.until("own.socket.readyState === WebSocket.CLOSED")
         await tab.click("#arm")
-        await tab.until(SAID, lambda text: text.startswith("on: "))
+        await asyncio.to_thread(wait_for_state, era, "OPERATION_ENABLED")
         x, y = await tab.evaluate(
             "(({x, y}) => [x + 50, y + 50])"
             "(document.querySelector('#plate').getBoundingClientRect())"

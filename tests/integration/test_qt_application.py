@@ -59,6 +59,11 @@ def test_application_plays_and_comes_back_after_every_loss(tmp_path: Path) -> No
             until_said("ready: ")
             QTest.mouseClick(window.arm, left)
             until_said("on: armed by 'my application'")
+            until(lambda: era.status().state == "OPERATION_ENABLED")
+            refused: list[str] = []
+            window.plate.refused.connect(refused.append)
+            QTest.mouseClick(window.arm, left)  # the lease is kept
+            until(lambda: any(each.startswith("armed by") for each in refused))
             QTest.mousePress(window.surface, left, pos=at)
             until(lambda: window.felt.text().startswith("played by "))
             rig = era.hello("test").rig
@@ -81,3 +86,49 @@ def test_application_plays_and_comes_back_after_every_loss(tmp_path: Path) -> No
             QTest.mouseClick(window.stop, left)
             until_said("stopped: ")
             assert era.status().state == "QUICK_STOP_ACTIVE"
+
+
+@pytest.mark.usefixtures("_qt")
+def test_application_without_its_user_or_connection_lifts_and_disarms(tmp_path: Path) -> None:
+    """A hidden window, a closed one, and Disarm without a WebSocket; no lease runs out."""
+    from PySide6.QtCore import QPoint, Qt
+    from PySide6.QtTest import QTest
+    from PySide6.QtWidgets import QApplication
+    from qt_plate import Plate, Window
+
+    application = QApplication.instance() or QApplication([])
+
+    def until(condition: Callable[[], object]) -> None:
+        def processed() -> object:
+            application.processEvents()
+            return condition()
+
+        wait_for(processed)
+
+    with (
+        real_daemon(tmp_path) as socket,
+        gateway_process(tmp_path, socket) as gateway,
+        Client.connect(socket) as era,
+    ):
+        era.subscribe("state")
+        window = Window(Plate(gateway.url, TOKEN, ["state", "pattern", "silence"]))
+        left = Qt.MouseButton.LeftButton
+
+        def disarm() -> None:
+            window.plate._socket.abort()
+            QTest.mouseClick(window.disarm, left)
+
+        for leave in (window.hide, disarm, window.close):
+            window.show()
+            until(lambda: window.state.text().startswith("ready: "))
+            QTest.mouseClick(window.arm, left)
+            until(lambda: era.status().armed_by is not None)
+            until(lambda: window.state.text().startswith("on: "))
+            if leave is not disarm:
+                QTest.mousePress(window.surface, left, pos=QPoint(100, 150))
+                until(lambda: len(era.status().contacts) == 1)
+            leave()
+            until(lambda: era.status().armed_by is None and not era.status().contacts)
+            causes = [each.data["cause"] for each in era.events(timeout=0.1)]
+            assert "the arming lease was not renewed" not in causes
+            QTest.mouseRelease(window.surface, left, pos=QPoint(100, 150))

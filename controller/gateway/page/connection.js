@@ -42,6 +42,7 @@ export class Connection {
     this.wasEverAccepted = false;
     this.wasOpen = false;  // since the last attempt to connect
     this.lease = null;  // while armed by `arm`; it outlives a short loss
+    this.isArming = false;
     this.touches = [];
     this.connect();
     this.timers = [
@@ -151,8 +152,13 @@ export class Connection {
 
   // Switch the high voltage on, and renew the lease until `disarm` or `stop`, or until it is refused.
   async arm(owner) {
-    const { lease } = await this.call("arm", { owner, lease_s: LEASE_S });
-    this.lease = lease;
+    this.isArming = true;
+    try {
+      const { lease } = await this.call("arm", { owner, lease_s: LEASE_S });
+      this.lease = lease;
+    } finally {
+      this.isArming = false;
+    }
   }
 
   renew() {
@@ -178,11 +184,11 @@ export class Connection {
     this.handlers.lifted?.();
   }
 
-  // A page that is left cannot stop anything: lift, and disarm if it armed; once, over HTTP, which outlives
-  // the page, as a second one may arrive when others have armed.
+  // A page that is left cannot stop anything: lift, and disarm if it armed or is arming; once, over HTTP,
+  // which outlives the page: a second one might arrive when others have armed.
   leave() {
     this.lift();
-    if (!this.lease) return;
+    if (!this.lease && !this.isArming) return;
     this.lease = null;
     this.post("disarm").catch(() => {});
   }

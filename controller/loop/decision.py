@@ -175,6 +175,11 @@ class Decider:
         return min((moment for moment in moments if moment is not None), default=None)
 
     @property
+    def is_choosing(self) -> bool:
+        """Whether contents are being chosen, which are decided when they arrive."""
+        return self._selector.is_choosing
+
+    @property
     def is_silence_pending(self) -> bool:
         """Whether the last contact has lifted and silence has not been commanded yet."""
         return not self._tracker.contacts and not self._is_silent
@@ -345,8 +350,9 @@ class Decider:
         from_rest = now - self._played_until >= _RING_DOWN
         decision, has_failed = None, False
         try:
-            selection = self._select(contacts, now)
+            selection = self._select(contacts, now, triggered_at)
             is_new = selection != self._selected or _is_due(self._retry_at, now)
+            triggered_at = min(triggered_at, self._selector.triggered_at)
             draft = Decision(contacts, selection, from_rest, triggered_at)
             if is_new and selection.contents:
                 decision = self._with_sets(draft, now)
@@ -359,7 +365,7 @@ class Decider:
             draft = Decision(contacts, selection, from_rest, triggered_at)
             if is_new:
                 _logger.exception("loop: decision failed, silencing all channels")
-        self._triggered_at = triggered_at if self._selector.is_choosing else None
+        self._triggered_at = None
         if is_new and not selection.contents:
             is_awaited = selection.is_pending and not self._may_play
             decision = None if is_awaited else self._ended(draft, now, has_failed=has_failed)
@@ -369,12 +375,14 @@ class Decider:
             self._decided = decision
         return decision
 
-    def _select(self, contacts: tuple[Contact, ...], now: float) -> Selection:
+    def _select(self, contacts: tuple[Contact, ...], now: float, triggered_at: float) -> Selection:
         """Query the intent, and the table for it."""
         self._intent_due = None
         intent = self._intent_source.intent(contacts, now)
         self._intent_due = intent.due(now)
-        return self._selector.select(contacts, intent, self._capabilities)
+        return self._selector.select(
+            contacts, intent, self._capabilities, triggered_at=triggered_at
+        )
 
     def _with_sets(self, draft: Decision, now: float) -> Decision | None:
         """Return a draft with the sets of all layers that change; None if none does."""

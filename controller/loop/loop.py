@@ -128,6 +128,8 @@ class Controller:
     @property
     def is_preparing(self) -> bool:
         """Whether a change of contacts is on its way to the amplifiers."""
+        if self._decider_if_open is not None and self._decider_if_open.is_choosing:
+            return True
         return self._changed_at is not None and self._group.last_sent_at < self._changed_at
 
     @property

@@ -44,11 +44,12 @@ def unshaped(question: Question, pattern: Pattern, is_continued: bool) -> Patter
 class _Chosen:
     """What lasts, chosen together, and each short pulse that began with it.
 
-    lasting: None where what lasts was kept.
+    lasting: None where what lasts was kept; triggered_at [s]: when the change arrived.
     """
 
     lasting: Selection | None
     short: Mapping[ContactKey, Selection]
+    triggered_at: float
 
 
 class Selector:
@@ -75,6 +76,8 @@ class Selector:
         self._lasting = _NOTHING
         self._short: Mapping[ContactKey, Selection] = {}
         self._current = _NOTHING
+        self.triggered_at = math.inf
+        """When [s] the change arrived whose answer of the thread the last selection has."""
         self._requested: tuple[Selection, Targets] = (_NOTHING, ())
 
     def replace(self, table: LocalizationTable, levels: EffectLevels | None, shape: Shape) -> None:
@@ -94,16 +97,20 @@ class Selector:
         contacts: Sequence[Contact],
         intent: HapticIntent,
         capabilities: PlaybackCapabilities,
+        *,
+        triggered_at: float = math.inf,
     ) -> Selection:
         """Return the selection for contacts in their order of arrival; the same object if kept.
 
-        While the thread computes, what played and is still to be felt stays.
+        While the thread computes, what played and is still to be felt stays. triggered_at [s]: when
+        their change arrived.
         """
         by_key = {target.key: target for target in intent.targets}
         targets = tuple((each, by_key[each.key]) for each in contacts if each.key in by_key)
         served, skipped = _within_layers(targets, capabilities)
         lasting = tuple(each for each in served if not each[1].is_short)
         short = tuple(each for each in served if each[1].is_short)
+        self.triggered_at = math.inf
         self._adopt(lasting, contacts)
         self._lasting = _remaining(self._lasting, lasting)
         pulses = self._short
@@ -115,7 +122,14 @@ class Selector:
         new = tuple(each for each in short if each[0].key not in self._short)
         is_kept = not lasting or _fits(self._lasting, lasting, contacts)
         if new or not is_kept:
-            self._choose(None if is_kept else lasting, new, tuple(contacts), capabilities, pulses)
+            self._choose(
+                None if is_kept else lasting,
+                new,
+                tuple(contacts),
+                capabilities,
+                pulses,
+                triggered_at,
+            )
         found = self._together(contacts, targets, skipped, intent.reason)
         if found != self._current:
             self._current = found
@@ -127,6 +141,8 @@ class Selector:
         if chosen is None:
             return
         self._short = {**self._short, **chosen.short}
+        if chosen.short:
+            self.triggered_at = chosen.triggered_at
         if chosen.lasting is not None:
             targets, quiet = chosen.lasting.targets, chosen.lasting.quiet
             then = {each.key for each in (*(contact for contact, _ in targets), *quiet)}
@@ -139,7 +155,7 @@ class Selector:
                 and is_for_all
                 and {each.key for each, _ in lasting} <= {each.key for each, _ in targets}
             ):
-                self._lasting = chosen.lasting
+                self._lasting, self.triggered_at = chosen.lasting, chosen.triggered_at
 
     def _choose(
         self,
@@ -148,6 +164,7 @@ class Selector:
         contacts: tuple[Contact, ...],
         capabilities: PlaybackCapabilities,
         pulses: Mapping[ContactKey, Selection],
+        triggered_at: float,
     ) -> None:
         """Choose for what lasts, None where it is kept, and for new short pulses.
 
@@ -176,7 +193,7 @@ class Selector:
                 )
                 for contact, target in short
             }
-            return _Chosen(found, new)
+            return _Chosen(found, new, triggered_at)
 
         if self._thread.is_busy or (lasting is not None and len(lasting) > 1):
             self._requested = Selection(lasting or (), contacts), short

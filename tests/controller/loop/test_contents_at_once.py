@@ -252,6 +252,27 @@ async def test_the_end_of_one_layer_by_itself_is_said_while_the_other_plays(
 
 
 @in_virtual_time
+async def test_latency_counts_from_the_change_that_an_answer_is_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A slide of 1.5 s, answers of 0.2 s, too late for a touch: one that runs, then its own."""
+    answering_after(0.2, monkeypatch)
+    async with fingers_on(table(), LAYOUT, breaks="touch") as fingers:
+        fingers.at = {1: (0.03, 0.06), 2: RIGHT}
+        await fingers.hold(0.5)
+        count = len(fingers.applied)
+
+        def slide(since: float) -> None:
+            fingers.at[1] = (0.03 + 0.07 * since, 0.06)
+
+        await fingers.hold(1.5, slide)
+        latencies = [each.latency or 0.0 for each in fingers.applied[count:]]
+        assert len(latencies) >= 3
+        assert min(latencies) >= 0.2
+        assert max(latencies) <= 0.45
+
+
+@in_virtual_time
 async def test_an_answer_for_a_finger_that_has_lifted_changes_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -16,7 +16,6 @@ from PySide6.QtGui import QHideEvent, QMouseEvent
 from PySide6.QtNetwork import (
     QAbstractSocket,
     QNetworkAccessManager,
-    QNetworkReply,
     QNetworkRequest,
 )
 from PySide6.QtWebSockets import QWebSocket, QWebSocketHandshakeOptions
@@ -42,11 +41,10 @@ class Plate(QObject):
     def __init__(self, url: str, token: str, topics: list[str]) -> None:
         super().__init__()
         self._address = QUrl(url).resolved(QUrl("api/v1/"))
-        self._token = f"Bearer {token}".encode()
         address = self._address.resolved(QUrl("ws"))
         address.setScheme({"http": "ws", "https": "wss"}[address.scheme()])
         self._request = QNetworkRequest(address)
-        self._request.setRawHeader(b"Authorization", self._token)
+        self._request.setRawHeader(b"Authorization", f"Bearer {token}".encode())
         self._network = QNetworkAccessManager(self)
         self._options = QWebSocketHandshakeOptions()
         self._options.setSubprotocols(["era-haptics.v1"])
@@ -113,17 +111,13 @@ class Plate(QObject):
         if self._is_open:
             self.call(method)
             return
-        request = QNetworkRequest(self._address.resolved(QUrl(method)))
-        request.setRawHeader(b"Authorization", self._token)
+        request = QNetworkRequest(self._request)  # with the token
+        request.setUrl(self._address.resolved(QUrl(method)))
         request.setHeader(QNetworkRequest.KnownHeaders.ContentTypeHeader, "application/json")
         request.setTransferTimeout(1000 * MAX_SILENT)
         reply = self._network.post(request, b"{}")
-        reply.finished.connect(lambda: self._replied(reply))
-
-    def _replied(self, reply: QNetworkReply) -> None:
-        if reply.error() is not QNetworkReply.NetworkError.NoError:
-            self.refused.emit(reply.errorString())
-        reply.deleteLater()
+        reply.errorOccurred.connect(lambda _: self.refused.emit(reply.errorString()))
+        reply.finished.connect(reply.deleteLater)
 
     def _connect(self) -> None:
         self._silent = 0

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from controller.sources.contacts import Contact, ContactKey
 from model.finger.perception import STRONG_DB_SL
-from model.table.effect_level import SHAPED_FROM
+from model.table.question import SHAPED_FROM
 
 _MIN_WAIT = 0.001  # s
 

@@ -404,7 +404,8 @@ class Controller:
                 now=clock.now(),
                 timing=self._timing,
             )
-            self._report(lambda each: each.pattern_applied(applied))
+            if applied.contents:  # else forgotten meanwhile, and decided anew
+                self._report(lambda each: each.pattern_applied(applied))
             return
         silenced = silenced_by(decision, sent_at=sent_at, now=clock.now())
         self._report(lambda each: each.silenced(silenced))

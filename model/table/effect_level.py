@@ -16,7 +16,7 @@ from model.finger.perception import decibels, detection_threshold
 from model.structure.attachments import Fingertip, fingertip_loads
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, ONSET_RAMP, Pattern
 from model.table.pulse_gains import PulseGains, PulseResponses, pulse_gains
-from model.table.question import Question
+from model.table.question import SHAPED_FROM, Question
 from model.table.table import LocalizationTable
 from model.transients.loaded_ramps import (
     ramped_accelerations,
@@ -27,9 +27,6 @@ from model.transients.loaded_ramps import (
 from model.transients.onset import ringing_time
 from model.transients.shaping import RISE
 from model.vibration.excitation import Excitation, base_amplitudes
-
-SHAPED_FROM = 0.2
-"""Shortest duration [s] with a shaped onset, which settles in half of it."""
 
 MIN_CONTRAST_DB = 6.0
 """Contrast over an effect down to which its drive is raised: quiet fingers feel half of it."""

@@ -21,6 +21,9 @@ Point: TypeAlias = tuple[float, float]
 MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 200.0
 """Below the smallest amplitude of a channel, and above what a plate survives."""
 
+SHAPED_FROM = 0.2
+"""Shortest duration [s] of an effect with a shaped onset, which settles in half of it."""
+
 
 @dataclass(frozen=True)
 class Question:

@@ -106,6 +106,25 @@ async def test_amplifiers_stage_before_any_commits() -> None:
         assert bench.reports.applied[-1].drive.keys() == {"SW"}
 
 
+@in_virtual_time
+async def test_a_touch_while_arming_ends_is_felt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its set may be on the wire when the amplifiers are armed and what played is forgotten."""
+    async with running() as bench:
+        await bench.controller.disarm()
+        arm = bench.controller.group.arm
+
+        async def armed_late() -> None:
+            await arm()
+            bench.touch(FINGER)
+            await asyncio.sleep(0)
+
+        monkeypatch.setattr(bench.controller.group, "arm", armed_late)
+        await bench.controller.arm()
+        await bench.hold(FINGER, seconds=0.1)
+        assert bench.states() == {ENABLED}
+        assert bench.reports.applied[-1].contents
+
+
 @pytest.mark.parametrize("kind", ["Set", "Commit", "Ping"])
 @in_virtual_time
 async def test_unexpected_exception_stops_all(kind: str) -> None:
@@ -277,7 +296,7 @@ async def test_no_clear_is_sent_between_a_stop_and_its_frame() -> None:
     for step in range(20):
         async with running() as bench:
             bench.touch(FINGER)
-            await asyncio.sleep(0.05)  # so that silence takes the ramp of the stop
+            await asyncio.sleep(0)  # so that silence takes the ramp of the stop
             bench.far_end.delay = 0.003
             first = asyncio.create_task(bench.controller.stop())
             await asyncio.sleep(0.011)  # its clear waits behind a status of the first stop

@@ -217,13 +217,13 @@ class Decider:
         self._may_play = frozenset()
 
     def confirm(self, decision: Decision, played: Played, *, now: float) -> None:
-        """Note what the amplifiers play for the last decision, unless it was forgotten meanwhile.
+        """Note what the amplifiers play for the last decision.
 
         Pulses start when the last commit was sent.
         """
         self._may_play = self._may_play.difference(decision.sets).union(decision.started)
         playing = dict(self._playing)
-        for number in decision.started & playing.keys():
+        for number in decision.started:
             one = playing[number]
             for _, target in one.content.targets:
                 if target.pulse is not None and target.pulse.started_at is None:
@@ -244,7 +244,7 @@ class Decider:
         sets = {number: each.plain or each for number, each in decision.sets.items()}
         decision = self._decided = replace(decision, sets=sets)
         playing = dict(self._playing)
-        for number in decision.started & playing.keys():
+        for number in decision.started:
             one = playing[number]
             pattern = replace(one.pattern, onset=None, ending=None)
             playing[number] = replace(one, set=sets[number], pattern=pattern)
@@ -257,8 +257,7 @@ class Decider:
         Silence where no other content is left.
         """
         self._retry_at = error.until
-        started = decision.started & self._playing.keys()
-        newest = max(started, key=self._requested_at, default=None)
+        newest = max(decision.started, key=self._requested_at, default=None)
         if newest is not None and len(self._playing) > 1:
             return self._without(newest, decision, str(error))
         self._playing, self._is_silent = {}, True
@@ -303,7 +302,7 @@ class Decider:
     def confirm_renewal(self, numbers: Iterable[int], played: Played, *, now: float) -> None:
         """Note that the amplifiers have accepted a renewal of layers."""
         playing = dict(self._playing)
-        for number in playing.keys() & numbers:  # unless forgotten meanwhile
+        for number in numbers:
             validity = self._validity(played, number, playing[number].content, now)
             playing[number] = replace(playing[number], validity=validity)
         self._playing = playing
@@ -312,7 +311,7 @@ class Decider:
         """Note that a ledger has refused a renewal until a time [s], None: the playback ends."""
         due = math.inf if until is None else until
         playing = dict(self._playing)
-        for number in playing.keys() & numbers:  # unless forgotten meanwhile
+        for number in numbers:
             validity = replace(playing[number].validity, renewal_due=due)
             playing[number] = replace(playing[number], validity=validity)
         self._playing = playing

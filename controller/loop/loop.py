@@ -98,6 +98,7 @@ class Controller:
         self._wake = asyncio.Event()
         self._changed_at: float | None = None  # s; until all changes are decided
         self._heartbeat_due = 0.0
+        self._is_armed_anew = False  # until the next turn, which sends again what is to play
         self._expiry: asyncio.TimerHandle | None = None
 
     @property
@@ -211,11 +212,11 @@ class Controller:
 
     async def arm(self) -> None:
         """Switch the high voltage on, so that touches are felt; `run` must run or start at once."""
-        decider, was_armed = self._decider, self._group.is_armed
+        was_armed = self._group.is_armed
         await self._group.arm()
-        decider.forget()
+        self._is_armed_anew = True
         if not was_armed:  # else what plays goes on
-            decider.confirm_silence()
+            self._decider.confirm_silence()
         self._heartbeat_due = clock.now()
         self._schedule_expiry()  # fingers may have rested since before
         self._wake.set()
@@ -268,6 +269,9 @@ class Controller:
         """Run the loop once: decide, send what changed, then the heartbeat if it is due."""
         self._wake.clear()
         now = clock.now()
+        if self._is_armed_anew:  # not amid a turn, whose set may be on the wire
+            self._is_armed_anew = False
+            self._decider.forget()
         expired = self._decider.expire(now)
         decision = self._decider.decide(now)
         try:
@@ -404,8 +408,7 @@ class Controller:
                 now=clock.now(),
                 timing=self._timing,
             )
-            if applied.contents:  # else forgotten meanwhile, and decided anew
-                self._report(lambda each: each.pattern_applied(applied))
+            self._report(lambda each: each.pattern_applied(applied))
             return
         silenced = silenced_by(decision, sent_at=sent_at, now=clock.now())
         self._report(lambda each: each.silenced(silenced))

@@ -114,6 +114,19 @@ async def shown(tmp_path: Path) -> AsyncIterator[tuple[Page, Network, ExitStack,
             yield tab, network, ended, ended.enter_context(pages(page, network))
 
 
+@asynccontextmanager
+async def shown_scripted(tmp_path: Path) -> AsyncIterator[tuple[Page, Network, ScriptedDaemon]]:
+    """A tab with the page, ready over the network on a scripted daemon."""
+    async with shown(tmp_path) as (tab, network, ended, origin):
+        daemon = ended.enter_context(ScriptedDaemon(tmp_path))
+        options = ("--allow-origin", origin)
+        gateway = ended.enter_context(gateway_process(tmp_path, daemon.socket, *options))
+        network.target = gateway.port
+        await tab.show(url(origin))
+        await tab.until(SAID, lambda text: text.startswith("ready: "))
+        yield tab, network, daemon
+
+
 def url(origin: str) -> str:
     """The page's address; it takes no gateway from a link."""
     return f"{origin}/plate.html?gateway=http://127.0.0.1:1/#{TOKEN}"
@@ -185,13 +198,7 @@ def test_program_holds_fingers_and_prints_what_plays(tmp_path: Path) -> None:
 
 async def test_page_leaves_a_silent_network_and_repeats_no_arm(tmp_path: Path) -> None:
     """A pending arm is given up with the connection; the page subscribes anew."""
-    async with shown(tmp_path) as (tab, network, ended, origin):
-        daemon = ended.enter_context(ScriptedDaemon(tmp_path))
-        options = ("--allow-origin", origin)
-        gateway = ended.enter_context(gateway_process(tmp_path, daemon.socket, *options))
-        network.target = gateway.port
-        await tab.show(url(origin))
-        await tab.until(SAID, lambda text: text.startswith("ready: "))
+    async with shown_scripted(tmp_path) as (tab, network, daemon):
         with daemon.holding():
             await tab.click("#arm")
             await asyncio.to_thread(wait_for, lambda: "arm" in daemon.methods)
@@ -210,13 +217,7 @@ async def test_page_leaves_a_silent_network_and_repeats_no_arm(tmp_path: Path) -
 
 async def test_stop_of_a_page_needs_nothing_that_old_browsers_lack(tmp_path: Path) -> None:
     """Without AbortSignal.timeout it goes both ways; where HTTP throws, over the WebSocket."""
-    async with shown(tmp_path) as (tab, network, ended, origin):
-        daemon = ended.enter_context(ScriptedDaemon(tmp_path))
-        options = ("--allow-origin", origin)
-        gateway = ended.enter_context(gateway_process(tmp_path, daemon.socket, *options))
-        network.target = gateway.port
-        await tab.show(url(origin))
-        await tab.until(SAID, lambda text: text.startswith("ready: "))
+    async with shown_scripted(tmp_path) as (tab, _, daemon):
         await tab.evaluate("delete AbortSignal.timeout")
         await tab.click("#stop")
         await asyncio.to_thread(wait_for, lambda: daemon.methods.count("stop") == 2)

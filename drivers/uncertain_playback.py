@@ -13,8 +13,7 @@ from typing import NamedTuple, TypeAlias
 from drivers.playback import Playback
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES
-from drivers.transition import Transition
-from drivers.voices import Voice
+from drivers.voices import Transition, Voice
 
 Interval: TypeAlias = tuple[float, float]
 _LAYERS = QUANTITIES["layer_count"].maximum

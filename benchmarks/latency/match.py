@@ -16,8 +16,8 @@ from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.routing import phasor_of, route
 from controller.loop.selection import MOVE_TOLERANCE, Selector
 from controller.sources.contacts import Contact, ContactKey
+from drivers.codec.serial_line.frame import unpack_words
 from drivers.contents import Layer, Tone
-from drivers.protocol.serial_payload import unpack_words
 from drivers.protocol.sets import Assembly, unpack_layers
 from drivers.protocol.table import MAX_WORDS, QUANTITIES, read_request
 from model.rig.rig import Rig

@@ -20,9 +20,8 @@ import serial
 from pythonosc.osc_packet import OscPacket
 
 from benchmarks.wires.bench import arm_values, make_sets
-from drivers.codec.serial_line.frame import Frame, encode_frame
+from drivers.codec.serial_line.frame import Frame, encode_frame, pack_words
 from drivers.host.serial_wire import SerialWire
-from drivers.protocol.serial_payload import pack_words
 from drivers.protocol.table import MESSAGES, VERSION
 from drivers.urls import Place
 from drivers.wires.serial_line import SerialAddress

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from drivers.codec.can_bus.canopen import CANOPEN, cob_id
 from drivers.codec.can_bus.segments import REPLY, REQUEST, frames_of
-from drivers.protocol.serial_payload import HELLO
-from drivers.protocol.table import EVENT, FAULTS, MAX_WORDS, MESSAGES, NAK, STATES
+from drivers.protocol.table import EVENT, FAULTS, HELLO, MAX_WORDS, MESSAGES, NAK, STATES
 
 _HOST, _AMPLIFIER = "Host", "Amplifier"
 _TYPES = {"Hello": HELLO, **{name: each.number for name, each in MESSAGES.items()}}

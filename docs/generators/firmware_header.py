@@ -10,7 +10,6 @@ import textwrap
 from collections.abc import Iterator, Mapping
 
 from drivers.protocol.records import Bits, Number, Real, Record
-from drivers.protocol.serial_payload import HELLO
 from drivers.protocol.table import (
     COMMAND,
     ENVELOPE,
@@ -18,6 +17,7 @@ from drivers.protocol.table import (
     EVENT_RECORD,
     FAULTS,
     FEATURES,
+    HELLO,
     KNOT,
     LAYER,
     MAX_WORDS,

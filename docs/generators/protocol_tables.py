@@ -13,7 +13,6 @@ from amplifier_dbc import dbc_text
 from amplifier_eds import eds_text
 from drivers.codec.can_bus.canopen import CANOPEN
 from drivers.protocol.records import Bits, Number, Numbers, Real, Record, Rest, Rows, Text
-from drivers.protocol.serial_payload import HELLO
 from drivers.protocol.table import (
     COMMAND,
     ENVELOPE,
@@ -21,6 +20,7 @@ from drivers.protocol.table import (
     EVENT_RECORD,
     FAULTS,
     FEATURES,
+    HELLO,
     IDENTITY,
     KNOT,
     LAYER,

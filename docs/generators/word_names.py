@@ -2,8 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 
-from drivers.protocol.quantity import WireQuantity
-from drivers.protocol.records import Bits, Number, Numbers, Record, Rows
+from drivers.protocol.records import Bits, Number, Numbers, Record, Rows, WireQuantity
 
 
 def word_names(record: Record, counts: Mapping[str, int]) -> list[str]:

@@ -24,8 +24,8 @@ from drivers.host.dialogue import Staged
 from drivers.host.sensors import Reading, Sensor, measure_tones, read_sensors
 from drivers.host.stop import Stopped
 from drivers.host.timing import HEARTBEAT
+from drivers.protocol.sets import token_after
 from drivers.protocol.table import ENABLED
-from drivers.protocol.tokens import token_after
 from registry.limits import GuardLimits
 
 _RAMP = 0.02  # s; long enough that neither start nor end of a vibration clicks

@@ -18,8 +18,7 @@ from drivers.codec.can_bus.segments import (
 from drivers.conformance.client import Answer, Client, Heard, When, altered, expect_reply, read_as
 from drivers.conformance.findings import expect_equal
 from drivers.protocol.records import Values
-from drivers.protocol.serial_payload import HELLO
-from drivers.protocol.table import IDENTITY, NAK
+from drivers.protocol.table import HELLO, IDENTITY, NAK
 from drivers.statistics import WireCounters
 
 NMT: Mapping[str, int] = CANOPEN["nmt"]

@@ -12,7 +12,7 @@ from drivers.conformance.client import When
 from drivers.conformance.findings import Late, expect, expect_equal, expect_one_of, expect_within
 from drivers.playback import playback_of
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, LayerSet
+from drivers.protocol.sets import Command, LayerSet, token_after
 from drivers.protocol.table import (
     FAULTS,
     MESSAGES,
@@ -21,7 +21,6 @@ from drivers.protocol.table import (
     STATES,
     STATUS_FLAGS,
 )
-from drivers.protocol.tokens import token_after
 from drivers.uncertain_playback import UncertainPlayback
 
 SLACK = 0.002  # s; of times in milliseconds

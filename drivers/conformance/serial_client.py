@@ -6,7 +6,16 @@ from collections.abc import Iterator, Sequence
 from cobs import cobs
 
 from drivers import clock
-from drivers.codec.serial_line.frame import NEUTRAL, REPLY, Frame, FrameReader, encode_frame
+from drivers.codec.serial_line.frame import (
+    NEUTRAL,
+    REPLY,
+    Frame,
+    FrameReader,
+    encode_frame,
+    pack_words,
+    unpack_identity,
+    unpack_words,
+)
 from drivers.conformance.client import (
     Answer,
     Client,
@@ -18,8 +27,7 @@ from drivers.conformance.client import (
 )
 from drivers.conformance.findings import expect_equal
 from drivers.protocol.records import Values
-from drivers.protocol.serial_payload import HELLO, pack_words, unpack_identity, unpack_words
-from drivers.protocol.table import EVENT, MAX_WORDS, NAK, VERSION
+from drivers.protocol.table import EVENT, HELLO, MAX_WORDS, NAK, VERSION
 
 _SEQUENCES = 1 << 16
 _SEQUENCE_AT, _CRC_SIZE = 3, 4

@@ -6,8 +6,8 @@ from drivers.conformance.check import driving
 from drivers.conformance.material import layer
 from drivers.conformance.rows import Rows, play, send, stage
 from drivers.conformance.subject import Subject
+from drivers.protocol.sets import token_after
 from drivers.protocol.table import QUANTITIES
-from drivers.protocol.tokens import token_after
 
 _STATES, _SESSIONS = "protocol.md#states", "protocol.md#sessions-and-the-watchdog"
 _WRONG = "WRONG_STATE"

@@ -23,14 +23,13 @@ from drivers.host.line import Line
 from drivers.host.stop import Stop, Stopped
 from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT, STOP_RAMP
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
+from drivers.protocol.sets import Command, LayerSet, is_newer_token, pack_layers, parts
 from drivers.protocol.table import (
     ENABLED,
     FAULTS,
     QUANTITIES,
     STATES,
 )
-from drivers.protocol.tokens import is_newer_token
 from registry.limits import GuardLimits
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms

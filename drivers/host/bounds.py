@@ -13,8 +13,7 @@ from itertools import pairwise
 from drivers.playback import Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
-from drivers.transition import Transition, amplitude_of, amplitudes_of, steepest
-from drivers.voices import Voice
+from drivers.voices import Transition, Voice, amplitude_of, amplitudes_of, steepest
 
 _RAMP, _STEP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["envelope_step"], QUANTITIES["level"]
 _FREQUENCY, _VALID_FOR = QUANTITIES["frequency"], QUANTITIES["valid_for"]

@@ -20,9 +20,10 @@ from drivers.codec.can_bus.segments import (
 )
 from drivers.host.wire import Arrival, OtherHost, Reply, Several, read_event, read_reply
 from drivers.protocol.records import Values
-from drivers.protocol.serial_payload import BROADCAST, HELLO
 from drivers.protocol.table import (
+    BROADCAST,
     BY_NUMBER,
+    HELLO,
     MAX_WORDS,
     MESSAGES,
     VERSION,

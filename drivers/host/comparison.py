@@ -9,10 +9,8 @@ from drivers.errors import LinkError
 from drivers.host.feeding import Feeding
 from drivers.host.ledger import Ledger
 from drivers.protocol.records import Values, bits_of
-from drivers.protocol.serial_payload import speaks
-from drivers.protocol.sets import LayerSet
+from drivers.protocol.sets import LayerSet, is_newer_token
 from drivers.protocol.table import LATCHED, QUANTITIES, STATUS_FLAGS, VERSION, has_feature
-from drivers.protocol.tokens import is_newer_token
 
 _POSITIVE = ("frequency_step", "level_step", "phase_step")
 _FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")
@@ -23,7 +21,7 @@ def check_identity(identity: Values, name: str, serial_number: str | None) -> No
 
     serial_number: the expected one, None for any.
     """
-    if not speaks(identity, VERSION):
+    if not identity["versions"] >> VERSION & 1:  # bit n: version n
         spoken = map(str, bits_of(identity["versions"]))
         raise LinkError(
             f"amplifier {name} speaks protocol {', '.join(spoken) or 'none'}, needs {VERSION}; "

@@ -13,9 +13,8 @@ from drivers.host.line import Line
 from drivers.host.timing import FAST, SET_WORDS, STOP_RAMP, TAKEN_WORDS
 from drivers.host.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet
+from drivers.protocol.sets import LayerSet, is_newer_token
 from drivers.protocol.table import ENABLED, FAULTS, MESSAGES, QUANTITIES
-from drivers.protocol.tokens import is_newer_token
 from drivers.statistics import LinkStatistics
 
 _SAME_MOMENT = 0.01  # s; statuses that are closer show a contradiction once

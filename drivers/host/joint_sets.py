@@ -18,9 +18,8 @@ from drivers.host.jobs import JointStart, Priority
 from drivers.host.line import Line
 from drivers.host.members import Members
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet
+from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import ENABLED, STATES
-from drivers.protocol.tokens import token_after
 
 
 @dataclass(frozen=True)

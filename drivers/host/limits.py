@@ -12,8 +12,7 @@ from operator import index
 
 from drivers.contents import Layer, Shape, Tone
 from drivers.errors import CommandError, CommandRefused
-from drivers.protocol.quantity import WireQuantity
-from drivers.protocol.records import Values
+from drivers.protocol.records import Values, WireQuantity
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
 from registry.limits import GuardLimits

@@ -29,8 +29,7 @@ from drivers.host.wire import (
     reply_words,
 )
 from drivers.protocol.records import TEXT_MAX, Refusal, Values
-from drivers.protocol.serial_payload import BROADCAST, TEXTS
-from drivers.protocol.table import MESSAGES, REACTION
+from drivers.protocol.table import BROADCAST, MESSAGES, REACTION, TEXTS
 from drivers.statistics import WireCounters
 
 _BOX = 256  # registers of a message

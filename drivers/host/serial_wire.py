@@ -7,6 +7,9 @@ from drivers.codec.serial_line.frame import (
     FrameReader,
     encode_frame,
     frame_length,
+    pack_words,
+    unpack_identity,
+    unpack_words,
 )
 from drivers.host.wire import (
     NETWORK_DELAY,
@@ -18,15 +21,10 @@ from drivers.host.wire import (
     read_reply,
 )
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.serial_payload import (
-    BROADCAST,
-    HELLO,
-    pack_words,
-    unpack_identity,
-    unpack_words,
-)
 from drivers.protocol.table import (
+    BROADCAST,
     EVENT,
+    HELLO,
     MESSAGES,
     NAK,
     VERSION,

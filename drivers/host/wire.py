@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Protocol, TypeAlias
 
-from drivers.protocol.quantity import WireQuantity
 from drivers.protocol.records import (
     TEXT_MAX,
     Number,
@@ -21,6 +20,7 @@ from drivers.protocol.records import (
     Rows,
     Text,
     Values,
+    WireQuantity,
 )
 from drivers.protocol.table import (
     BY_NUMBER,

@@ -1,26 +1,86 @@
-"""Messages as rows of 16-bit words: fields, records, and the conversion between both ends.
+"""Messages as rows of 16-bit words: numbers, fields, records, and the conversion between both ends.
 
-A record is compiled once from its fields. Values are the integers of the wire (see
-`WireQuantity.to_wire`); only type f32 is a float, and a text a str. Requests are read strictly, by
-the amplifier: `Refusal` for a word that is missing, too many or out of range. Replies may grow, so
-what follows their fields is ignored.
+Values are the integers of the wire (see `WireQuantity.to_wire`); only type f32 is a float, and a
+text a str. Requests are read strictly, by the amplifier: `Refusal` for a word that is missing, too
+many or out of range. Replies may grow, so what follows their fields is ignored.
 """
 
+import math
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
-from drivers.errors import FrameError
-from drivers.protocol.quantity import WireQuantity
+from drivers.errors import CommandError, FrameError
 
 WORD = 0x10000
 _CODES = {"channel": "BAD_CHANNEL", "token": "BAD_TOKEN"}
 """Of Naks, by quantity; others are BAD_VALUE."""
 TEXT_MAX = 32  # bytes
 _REAL_MAX = (2 - 2**-23) * 2.0**127  # of IEEE 754 binary32
+_TOLERANCE = 1e-3  # of a step; sums of floats may exceed a range by rounding
 
 Values = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class WireQuantity:
+    """A kind of number on the wire: an integer of `per_unit` steps per unit, within a range.
+
+    wire: u16, u32 or i16; minimum, maximum: as integers; wraps: an angle, modulo 360.
+    """
+
+    name: str
+    wire: str
+    per_unit: int
+    unit: str
+    minimum: int
+    maximum: int
+    wraps: bool = False
+
+    @cached_property
+    def step(self) -> float:
+        """Resolution on the wire, in the unit."""
+        return 1 / self.per_unit
+
+    @property
+    def low(self) -> float:
+        """Smallest value, in the unit."""
+        return self.minimum / self.per_unit
+
+    @property
+    def high(self) -> float:
+        """Largest value, in the unit."""
+        return self.maximum / self.per_unit
+
+    def to_wire(self, value: float) -> int:
+        """Encode a value [unit] as an integer, rounded to the nearest step.
+
+        Raises CommandError for NaN, infinities and values out of range; nothing is clipped.
+        """
+        scaled = value * self.per_unit
+        if self.minimum <= scaled <= self.maximum:
+            return round(scaled)
+        if not math.isfinite(value):
+            raise CommandError(f"{self.name} must be a finite number, got {value}")
+        if self.wraps:
+            span = self.maximum - self.minimum + 1
+            return (round(scaled) - self.minimum) % span + self.minimum
+        if not self.minimum - _TOLERANCE <= scaled <= self.maximum + _TOLERANCE:
+            unit = f" {self.unit}" if self.unit else ""
+            raise CommandError(
+                f"{self.name} must be {self.low:g} to {self.high:g}{unit}, got {value:g}{unit}"
+            )
+        return round(scaled)
+
+    def from_wire(self, integer: int) -> float:
+        """Decode an integer to a value [unit]."""
+        return integer / self.per_unit
+
+    def quantise(self, value: float) -> float:
+        """Return the value [unit] that arrives when this one is sent."""
+        return self.to_wire(value) / self.per_unit
 
 
 def bits_of(word: int) -> list[int]:
@@ -126,7 +186,7 @@ class Numbers:
         low, high = self.quantity.minimum, self.quantity.maximum
         for number in numbers:
             if not low <= number <= high:
-                raise ValueError(_out_of_range(self.name, low, high, number))
+                raise ValueError(_out_of_range(self.name, self.quantity, number))
         words.extend(numbers)
 
     def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
@@ -138,7 +198,7 @@ class Numbers:
         low, high = self.quantity.minimum, self.quantity.maximum
         for number in numbers:
             if not low <= number <= high:
-                raise Refusal(_out_of_range(self.name, low, high, number))
+                raise Refusal(_out_of_range(self.name, self.quantity, number))
         values[self.name] = numbers
         return end
 
@@ -189,85 +249,38 @@ class Rest:
 Field = Number | Bits | Real | Text | Numbers | Rows | Rest
 
 
-@dataclass(frozen=True, slots=True)
-class _Word:
-    """The word of a field, or the two of an u32: name, least, greatest and bits of each part."""
-
-    parts: tuple[tuple[str, int, int, int], ...]
-    quantity: WireQuantity | None
-    is_long: bool
-
-    @classmethod
-    def of(cls, field: Number | Bits) -> "_Word":
-        """Lay out a field."""
-        if isinstance(field, Bits):
-            parts = tuple((name, 0, (1 << bits) - 1, bits) for name, bits in field.parts)
-            return cls(parts, None, False)
-        each = field.quantity
-        is_long = each.wire == "u32"
-        part = (field.name, each.minimum, each.maximum, 32 if is_long else 16)
-        return cls((part,), each, is_long)
-
-
-class _Run:
-    """Numbers and shared words that follow each other, in one loop: the codec's hot path."""
-
-    def __init__(self, fields: Iterable[Number | Bits]) -> None:
-        self._words = tuple(map(_Word.of, fields))
-
-    def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
-        """Append the words; ValueError for a value out of range, KeyError for no number."""
-        for each in self._words:
-            word = 0
-            for name, low, high, bits in each.parts:
-                value = values.get(name, 0) if each.quantity is None else values[name]
-                if not low <= value <= high:
-                    raise ValueError(_out_of_range(name, low, high, value))
-                word = word << bits | value % (1 << bits)
-            if each.is_long:
-                words.append(word >> 16)
-            words.append(word % WORD)
-
-    def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
-        """Read the words; raises Refusal for one out of range."""
-        for each in self._words:
-            word = words[at]
-            if each.quantity is None:
-                for name, _, high, bits in reversed(each.parts):
-                    values[name] = word & high
-                    word >>= bits
-                if word:
-                    raise Refusal(f"unused bits beside {name} must be 0")
-            else:
-                name, low, high, _ = each.parts[0]
-                if each.is_long:
-                    at += 1
-                    word = word * WORD + words[at]
-                elif low < 0 and word >= WORD // 2:
-                    word -= WORD
-                if not low <= word <= high:
-                    code = _CODES.get(each.quantity.name, "BAD_VALUE")
-                    raise Refusal(_out_of_range(name, low, high, word), code)
-                values[name] = word
-            at += 1
-        return at
-
-
 class Record:
     """Fields that follow each other in words."""
 
-    append: Callable[[Mapping[str, Any], list[int]], None]
-    """Append the words of values; ValueError for one out of range, KeyError for none."""
-
     def __init__(self, *fields: Field) -> None:
         self.fields = fields
-        self.names = tuple(name for field in fields for name in _names(field))
-        self._codecs = tuple(_codecs(fields))
-        self.append = self._codecs[0].pack if len(self._codecs) == 1 else self._append_all
+        self.names: list[str] = []
+        for field in fields:
+            self.names += dict(field.parts) if isinstance(field, Bits) else [field.name]
 
-    def _append_all(self, values: Mapping[str, Any], words: list[int]) -> None:
-        for codec in self._codecs:
-            codec.pack(values, words)
+    def append(self, values: Mapping[str, Any], words: list[int]) -> None:
+        """Append the words of values; ValueError for one out of range, KeyError for no number.
+
+        Numbers and shared words, nearly all, without a call: every set has dozens of them.
+        """
+        for field in self.fields:
+            if isinstance(field, Number):
+                quantity, value = field.quantity, values[field.name]
+                if not quantity.minimum <= value <= quantity.maximum:
+                    raise ValueError(_out_of_range(field.name, quantity, value))
+                if quantity.wire == "u32":
+                    words.append(value >> 16)
+                words.append(value % WORD)
+            elif isinstance(field, Bits):
+                word = 0
+                for name, bits in field.parts:
+                    value = values.get(name, 0)
+                    if not 0 <= value < 1 << bits:
+                        raise ValueError(f"{name} must be below {1 << bits}, got {value}")
+                    word = word << bits | value
+                words.append(word)
+            else:
+                field.pack(values, words)
 
     def pack(self, values: Mapping[str, Any]) -> list[int]:
         """Return the words of values."""
@@ -279,8 +292,29 @@ class Record:
         """Read the values from an index on, and the index behind them; raises Refusal."""
         values: Values = {}
         try:
-            for codec in self._codecs:
-                at = codec.unpack(words, at, values)
+            for field in self.fields:
+                if isinstance(field, Number):
+                    quantity, word = field.quantity, words[at]
+                    if quantity.wire == "u32":
+                        at += 1
+                        word = word * WORD + words[at]
+                    elif quantity.minimum < 0 and word >= WORD // 2:
+                        word -= WORD
+                    if not quantity.minimum <= word <= quantity.maximum:
+                        code = _CODES.get(quantity.name, "BAD_VALUE")
+                        raise Refusal(_out_of_range(field.name, quantity, word), code)
+                    values[field.name] = word
+                    at += 1
+                elif isinstance(field, Bits):
+                    word = words[at]
+                    for name, bits in reversed(field.parts):
+                        values[name] = word & (1 << bits) - 1
+                        word >>= bits
+                    if word:
+                        raise Refusal(f"unused bits beside {field.parts[0][0]} must be 0")
+                    at += 1
+                else:
+                    at = field.unpack(words, at, values)
         except IndexError:
             raise Refusal("message is too short", "BAD_LENGTH") from None
         return values, at
@@ -293,27 +327,5 @@ class Record:
         return values
 
 
-def _names(field: Field) -> Iterator[str]:
-    if isinstance(field, Bits):
-        yield from (name for name, _ in field.parts)
-    else:
-        yield field.name
-
-
-def _codecs(fields: Iterable[Field]) -> Iterator[_Run | Real | Text | Numbers | Rows | Rest]:
-    """Yield what packs and unpacks fields: of words that follow each other together."""
-    run: list[Number | Bits] = []
-    for field in fields:
-        if isinstance(field, Number | Bits):
-            run.append(field)
-            continue
-        if run:
-            yield _Run(run)
-            run = []
-        yield field
-    if run:
-        yield _Run(run)
-
-
-def _out_of_range(name: str, low: int, high: int, value: int) -> str:
-    return f"{name} must be {low} to {high}, got {value}"
+def _out_of_range(name: str, quantity: WireQuantity, value: int) -> str:
+    return f"{name} must be {quantity.minimum} to {quantity.maximum}, got {value}"

@@ -1,4 +1,4 @@
-"""Sets: what layers are to play, as a stream of words that is cut into parts, and back.
+"""Sets: what layers are to play, as a stream of words that is cut into parts, and their tokens.
 
 All numbers are integers of the wire. A stream has the layers that a set changes one after the
 other; a part is the values of one Set message. The far end collects parts in an `Assembly`.
@@ -8,10 +8,31 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import COMMAND, ENVELOPE, KNOT, LAYER, MAX_WORDS, MESSAGES, STAGED_LIFE
+from drivers.protocol.table import (
+    COMMAND,
+    ENVELOPE,
+    KNOT,
+    LAYER,
+    MAX_WORDS,
+    MESSAGES,
+    QUANTITIES,
+    STAGED_LIFE,
+)
 
+_SPAN = 1 << 16
+_LAST_TOKEN = QUANTITIES["token"].maximum
 PART_WORDS = MAX_WORDS - len(MESSAGES["Set"].request.fields) + 1
 MAX_PARTS = 127
+
+
+def token_after(number: int) -> int:
+    """Return the token or latch after this one, 0 before the first: 1..65535, then 1 again."""
+    return number % _LAST_TOKEN + 1
+
+
+def is_newer_token(number: int, than: int) -> bool:
+    """Whether one follows another by less than half of 2^16 (RFC 1982); any follows 0, none."""
+    return than == 0 or 0 < (number - than) % _SPAN < _SPAN // 2
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from drivers.protocol.quantity import WireQuantity
 from drivers.protocol.records import (
     Bits,
     Number,
@@ -21,9 +20,14 @@ from drivers.protocol.records import (
     Rows,
     Text,
     Values,
+    WireQuantity,
 )
 
 VERSION: Final = 3
+HELLO: Final = 1
+"""Number of the message that every version has."""
+BROADCAST: Final = 0
+"""The address of all amplifiers on a line."""
 MAX_WORDS: Final = 120
 """Of a message: what one frame of the serial line and one write of Modbus carry."""
 STAGED_LIFE: Final = 1.0
@@ -205,6 +209,8 @@ IDENTITY = Record(
     *_numbers("versions:flags"), *map(Text, ("vendor", "product", "serial_number", "firmware"))
 )
 """Of CAN objects and Modbus registers; on a serial line Hello keeps the bytes of version 2."""
+TEXTS = [field for field in IDENTITY.fields if isinstance(field, Text)]
+"""Of an identity, in their order."""
 
 
 def sensor_reading(tones: int) -> Record:

@@ -15,7 +15,7 @@ from typing import Protocol
 
 from drivers.playback import Voice, playback_of
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import LayerSet
+from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import (
     FAULTS,
     FEATURES,
@@ -25,7 +25,6 @@ from drivers.protocol.table import (
     STATES,
     STATUS_FLAGS,
 )
-from drivers.protocol.tokens import token_after
 from sim.amplifier.capabilities import capabilities
 from sim.amplifier.readings import (
     HIGH_VOLTAGE,

@@ -8,9 +8,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import Assembly, Command, Envelope, LayerSet, unpack_layers
+from drivers.protocol.sets import (
+    Assembly,
+    Command,
+    Envelope,
+    LayerSet,
+    is_newer_token,
+    unpack_layers,
+)
 from drivers.protocol.table import STAGED_LIFE
-from drivers.protocol.tokens import is_newer_token
 
 
 class SetIntake:

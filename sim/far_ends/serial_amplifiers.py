@@ -5,19 +5,23 @@ On a shared line amplifiers have one address each, and send no events.
 
 from collections.abc import Mapping
 
-from drivers.codec.serial_line.frame import NEUTRAL, REPLY, Frame, FrameReader, encode_frame
-from drivers.protocol.records import Refusal, Values
-from drivers.protocol.serial_payload import (
-    BROADCAST,
-    HELLO,
+from drivers.codec.serial_line.frame import (
+    NEUTRAL,
+    REPLY,
+    Frame,
+    FrameReader,
+    encode_frame,
     pack_identity,
     pack_words,
     unpack_words,
 )
+from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import (
+    BROADCAST,
     BY_NUMBER,
     EVENT,
     EVENT_RECORD,
+    HELLO,
     NAK,
     VERSION,
     nak_of,

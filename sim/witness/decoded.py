@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from drivers.protocol.records import Record, Refusal, Values
-from drivers.protocol.serial_payload import HELLO as HELLO_NUMBER
 from drivers.protocol.table import (
     BY_NUMBER,
     EVENT,
@@ -20,6 +19,7 @@ from drivers.protocol.table import (
     STATES,
     read_request,
 )
+from drivers.protocol.table import HELLO as HELLO_NUMBER
 from sim.witness.capture import Direction
 
 HELLO = "Hello"

@@ -9,8 +9,8 @@ import math
 from collections.abc import Mapping, Sequence
 
 from drivers.protocol.records import Values
+from drivers.protocol.sets import is_newer_token
 from drivers.protocol.table import LATCHED, QUANTITIES, REACTION, STAGED_LIFE
-from drivers.protocol.tokens import is_newer_token
 from drivers.uncertain_playback import Interval
 from sim.witness.decoded import (
     CHANGING,

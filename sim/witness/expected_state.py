@@ -3,8 +3,8 @@
 import math
 
 from drivers.protocol.records import Values
+from drivers.protocol.sets import is_newer_token
 from drivers.protocol.table import FAULTS, LATCHED, QUANTITIES, STATES, STATUS_FLAGS
-from drivers.protocol.tokens import is_newer_token
 from drivers.uncertain_playback import Interval
 from sim.witness.decoded import ENABLED, Sent
 from sim.witness.expected_outputs import ExpectedOutputs

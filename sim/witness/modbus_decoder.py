@@ -4,8 +4,8 @@ import struct
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
+from drivers.codec.serial_line.frame import unpack_identity
 from drivers.protocol.records import Refusal
-from drivers.protocol.serial_payload import unpack_identity
 from drivers.protocol.table import BY_NUMBER, MAX_WORDS, REFUSALS
 from sim.witness.capture import Direction
 from sim.witness.decoded import (

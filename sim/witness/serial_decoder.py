@@ -1,10 +1,9 @@
 """Messages of a serial line."""
 
-from drivers.codec.serial_line.frame import NEUTRAL, FrameReader
+from drivers.codec.serial_line.frame import NEUTRAL, FrameReader, unpack_identity, unpack_words
 from drivers.protocol.records import Refusal
-from drivers.protocol.serial_payload import HELLO as HELLO_NUMBER
-from drivers.protocol.serial_payload import unpack_identity, unpack_words
 from drivers.protocol.table import EVENT, REFUSALS, VERSION
+from drivers.protocol.table import HELLO as HELLO_NUMBER
 from sim.witness.capture import Direction
 from sim.witness.decoded import (
     DecodedFrame,

@@ -6,9 +6,8 @@ from copy import deepcopy
 from dataclasses import replace
 from typing import TypeAlias
 
-from drivers.protocol.sets import Command, LayerSet
+from drivers.protocol.sets import Command, LayerSet, is_newer_token
 from drivers.protocol.table import QUANTITIES
-from drivers.protocol.tokens import is_newer_token
 from sim.witness.amplifier_session import AmplifierSession
 
 _STEP = 0.6  # of a step of the wire; tolerance of rounding

@@ -13,7 +13,7 @@ from benchmarks.latency.report import cases, flooded_lines, report
 from benchmarks.latency.run import Case, Disturbed, Failed, Found, attempt
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import LatencySummary
-from drivers.protocol.serial_payload import pack_words
+from drivers.codec.serial_line.frame import pack_words
 from drivers.protocol.sets import Command as ToneOnWire
 from drivers.protocol.sets import LayerSet, pack_layers, parts
 from drivers.protocol.table import MESSAGES

@@ -7,9 +7,14 @@ from typing import NamedTuple
 from drivers.codec.can_bus.adapter_text import SLCAN, TextReader
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import REPLY, REQUEST, pack_frames, segments, unpack_frames
-from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
+from drivers.codec.serial_line.frame import (
+    Frame,
+    FrameReader,
+    encode_frame,
+    pack_words,
+    unpack_words,
+)
 from drivers.protocol.records import Record, Values
-from drivers.protocol.serial_payload import pack_words, unpack_words
 from drivers.protocol.table import BY_NUMBER, EVENT, EVENT_RECORD, NAK, NAK_RECORD, VERSION
 from moved_firmware import CAN, SERIAL, TCP, MovedFirmware
 from sim.amplifier.contract import Amplifier

@@ -4,8 +4,7 @@ import random
 from collections.abc import Iterator
 
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers
-from drivers.protocol.tokens import token_after
+from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, token_after
 
 NONSENSE = [*range(2, 14), *range(19, 40)]  # others depend on what is there besides
 FREQUENCIES = (2000, 2600, 2605, 5000)  # 0.05 Hz

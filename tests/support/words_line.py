@@ -15,8 +15,7 @@ from drivers.host.line import Line
 from drivers.host.modbus_wire import ModbusWire
 from drivers.host.serial_wire import SerialWire
 from drivers.host.wire import NETWORK_DELAY, Wire
-from drivers.protocol.serial_payload import HELLO
-from drivers.protocol.table import BY_NUMBER
+from drivers.protocol.table import BY_NUMBER, HELLO
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers

@@ -1,20 +1,24 @@
-"""Frames on a serial line: bytes in, checked frames out.
+"""Frames on a serial line and their payloads: bytes in, checked frames out.
 
     0x00  COBS( type u8 · version u8 · address u8 · sequence u16 · payload · CRC-32 u32 )  0x00
 
 Every integer is little-endian. Bit 7 of the type is set in replies. The CRC is that of zlib and
 Ethernet, over everything before it. COBS leaves no zero inside a frame, so a reader resynchronizes
 at the next zero. The leading zero ends preceding noise; empty frames are ignored.
+
+Payloads are words, but those of Hello and its reply keep their bytes in every version of the
+protocol: versions u16 · vendor · product · serial number · firmware, each a length u8 and UTF-8.
 """
 
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from cobs import cobs
 
-from drivers.protocol.table import MAX_WORDS
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.table import MAX_WORDS, TEXTS
 
 REPLY = 0x80
 NEUTRAL = 0
@@ -108,3 +112,36 @@ class FrameReader:
             return None
         kind, version, address, sequence = _HEADER.unpack_from(body)
         return Frame(kind, address, sequence, body[_HEADER.size :], version)
+
+
+def pack_words(words: Sequence[int]) -> bytes:
+    """Return the payload of words."""
+    return struct.pack(f"<{len(words)}H", *words)
+
+
+def unpack_words(payload: bytes) -> tuple[int, ...]:
+    """Return the words of a payload; Refusal for half a word."""
+    if len(payload) % 2:
+        raise Refusal("payload must have an even number of bytes", "BAD_LENGTH")
+    return struct.unpack(f"<{len(payload) // 2}H", payload)
+
+
+def pack_identity(identity: Values) -> bytes:
+    """Return the payload of the reply; texts are cut at 32 bytes."""
+    texts = [field.encoded(identity) for field in TEXTS]
+    return int(identity["versions"]).to_bytes(2, "little") + b"".join(
+        bytes([len(text)]) + text for text in texts
+    )
+
+
+def unpack_identity(payload: bytes) -> Values:
+    """Read the payload; what follows is ignored. Raises Refusal."""
+    identity: Values = {"versions": int.from_bytes(payload[:2], "little")}
+    at = 2
+    for field in TEXTS:
+        if at >= len(payload):
+            raise Refusal(f"{field.name} must not be missing", "BAD_LENGTH")
+        end = at + 1 + payload[at]
+        field.read(payload[at + 1 : end], payload[at], identity)
+        at = end
+    return identity

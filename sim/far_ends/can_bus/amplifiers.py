@@ -18,11 +18,11 @@ from drivers.codec.can_bus.segments import (
     unpack_frames,
 )
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.serial_payload import HELLO
 from drivers.protocol.table import (
     BY_NUMBER,
     EVENT,
     EVENT_RECORD,
+    HELLO,
     IDENTITY,
     NAK,
     QUANTITIES,

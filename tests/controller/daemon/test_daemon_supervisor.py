@@ -20,9 +20,8 @@ from drivers.errors import CommandRefused, LinkError
 from drivers.host.line import GRACE
 from drivers.host.timing import HEARTBEAT
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
+from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_after
 from drivers.protocol.table import FAULTS, STATES
-from drivers.protocol.tokens import token_after
 from newest_contact import BuzzNewestContact
 from virtual_loop import in_virtual_time
 

@@ -10,7 +10,7 @@ import pytest
 from driven_bases import motion_of as sampled
 from drivers.playback import Playback, Voice
 from drivers.protocol.sets import Command, Envelope, LayerSet
-from drivers.transition import Transition
+from drivers.voices import Transition
 from sim.plant.voiced_base import delayed, motion_of
 
 STROKE = 1e-4

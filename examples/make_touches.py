@@ -1,12 +1,15 @@
-"""Makes touches.tuio: a stream of touches as a TUIO 1.1 tracker sends them, one to three fingers.
+"""Makes recordings of touches as a TUIO 1.1 tracker sends them; schedules stand for people.
 
-The schedule below stands for people at the plate; places are drawn once with a fixed seed, fingers
-at least 6 cm apart. Run it again after changing the schedule:
+In touches.tuio one to three fingers come and go at places drawn once with a fixed seed, at least
+6 cm apart. In the others each person stays in an upright strip of the plate: two_people.tuio; and
+three_people.tuio, where one slides and one leaves before the others. Run it again after a change:
 
     python examples/make_touches.py
 """
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,11 +17,10 @@ from controller.sources.capture import RecordedDatagram, write_capture
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 
-LENGTH, WIDTH = 0.3048, 0.2286
-MARGIN = 0.015
-APART = 0.06
-FINGERS_PER_GROUP = (1, 2, 3, 2, 3, 1, 3, 2, 3, 2)
-AT_ONCE = (3, 7, 9)  # groups whose fingers all come down at one moment
+PLATE = np.array([0.3048, 0.2286])  # metres
+MARGIN, APART = 0.015, 0.06  # metres
+FINGERS_PER_GROUP = (1, 2, 3, 2, 3, 1, 3, 2)
+AT_ONCE = (3, 7)  # groups whose fingers all come down at one moment
 HOLD = 0.55  # seconds from one finger to the next, and after the last one
 PAUSE = 0.15  # seconds with no finger down
 REST = 0.75  # the same before those that come at one moment: the plate has stopped ringing
@@ -26,47 +28,63 @@ FRAME = 1 / 60  # seconds between the frames of a tracker
 SETTLING = 0.08  # seconds over which a fingertip rolls into its place
 ROLL = 0.0015  # metres that it rolls
 
+# Times [s] from down to up, and where the finger is at each, in shares of the plate
+FingerPath: TypeAlias = tuple[Sequence[float], Sequence[Sequence[float]]]
+TWO_PEOPLE: list[FingerPath] = [
+    ((0.3, 1.6), [(0.20, 0.35)] * 2),
+    ((0.7, 1.6), [(0.80, 0.60)] * 2),
+    ((2.0, 3.3), [(0.65, 0.25)] * 2),
+    ((2.4, 3.3), [(0.35, 0.80)] * 2),
+]
+THREE_PEOPLE: list[FingerPath] = [
+    ((0.3, 1.9, 2.3, 4.3), [(0.15, 0.30), (0.15, 0.30), (0.15, 0.65), (0.15, 0.65)]),
+    ((0.7, 4.3), [(0.50, 0.70)] * 2),
+    ((1.1, 3.2), [(0.85, 0.40)] * 2),
+]
+
 
 def draw_places(count: int, rng: np.random.Generator) -> np.ndarray:
     """Places [m] (count, 2), each at least APART from the others."""
     while True:
-        places = rng.uniform([MARGIN, MARGIN], [LENGTH - MARGIN, WIDTH - MARGIN], (count, 2))
+        places = rng.uniform(MARGIN, PLATE - MARGIN, (count, 2))
         gaps = np.linalg.norm(places[:, None] - places[None], axis=-1)
         if count == 1 or gaps[np.triu_indices(count, 1)].min() > APART:
             return places
 
 
-def schedule(rng: np.random.Generator) -> tuple[list[tuple[float, float, np.ndarray]], float]:
-    """Every touch as (down [s], up [s], place [m]) and when the last one is up."""
-    touches = []
-    start = 0.3
+def one_person(rng: np.random.Generator) -> list[FingerPath]:
+    """Groups of fingers, one group after another."""
+    paths: list[FingerPath] = []
+    up = 0.15
     for group, count in enumerate(FINGERS_PER_GROUP):
+        start = up + (REST if group in AT_ONCE else PAUSE)
         apart = 0.0 if group in AT_ONCE else HOLD
-        start += REST - PAUSE if group in AT_ONCE else 0.0
         up = start + (count - 1) * apart + HOLD
-        places = draw_places(count, rng)
-        touches += [(start + n * apart, up, place) for n, place in enumerate(places)]
-        start = up + PAUSE
-    return touches, start
+        for number, place in enumerate(draw_places(count, rng) / PLATE):
+            paths.append(((start + number * apart, up), [place, place]))
+    return paths
 
 
-def main() -> None:
-    """Write the capture beside this file."""
-    rng = np.random.default_rng(2024)
-    touches, end = schedule(rng)
-    rolls = rng.normal(scale=ROLL, size=(len(touches), 2))
+def record(name: str, paths: Sequence[FingerPath], rng: np.random.Generator) -> None:
+    """Write the recording of some fingers beside this file, until shortly after the last lift."""
+    rolls = rng.normal(scale=ROLL, size=(len(paths), 2)) / PLATE
     datagrams = []
+    end = max(times[-1] for times, _ in paths) + PAUSE
     for number, time in enumerate(np.arange(0.0, end, FRAME), start=1):
         alive = []
-        for id, ((down, up, place), roll) in enumerate(zip(touches, rolls, strict=True), start=1):
-            if down <= time < up:
-                x, y = place + roll * max(0.0, 1 - (time - down) / SETTLING)
-                alive.append(Touch(id, float(x / LENGTH), float(1 - y / WIDTH)))
+        for id, ((times, places), roll) in enumerate(zip(paths, rolls, strict=True), start=1):
+            if times[0] <= time < times[-1]:
+                place = [np.interp(time, times, along) for along in zip(*places, strict=True)]
+                x, y = place + roll * max(0.0, 1 - (time - times[0]) / SETTLING)
+                alive.append(Touch(id, float(x), float(1 - y)))
         frame = TouchFrame("demo", float(time), tuple(alive))
         datagrams.append(RecordedDatagram(float(time), tuio_datagram(frame, number)))
-    write_capture(Path(__file__).with_name("touches.tuio"), datagrams)
-    print(f"{len(touches)} touches in {end:.1f} s")
+    write_capture(Path(__file__).with_name(f"{name}.tuio"), datagrams)
+    print(f"{name}: {len(paths)} touches in {end:.1f} s")
 
 
 if __name__ == "__main__":
-    main()
+    rng = np.random.default_rng(2024)
+    record("touches", one_person(rng), rng)
+    record("two_people", TWO_PEOPLE, rng)
+    record("three_people", THREE_PEOPLE, rng)

@@ -50,11 +50,18 @@ def test_wheel_holds_the_sources_and_their_data(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     made = {name for name in names if ".dist-info/" in name}
-    lent = {"model/data/paper_plate.yaml", "controller/data/touches.tuio"} | {
-        f"sim/soft_amp/{path.relative_to(ROOT).as_posix()}"
-        for folder in ("core", "wire", "ports/sound")
-        for path in (ROOT / "firmware" / folder).iterdir()
+    recordings = {
+        f"controller/data/{name}.tuio" for name in ("touches", "two_people", "three_people")
     }
+    lent = (
+        recordings
+        | {"model/data/paper_plate.yaml"}
+        | {
+            f"sim/soft_amp/{path.relative_to(ROOT).as_posix()}"
+            for folder in ("core", "wire", "ports/sound")
+            for path in (ROOT / "firmware" / folder).iterdir()
+        }
+    )
     sources = {
         path.relative_to(ROOT).as_posix()
         for package in PACKAGES

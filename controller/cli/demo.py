@@ -49,7 +49,9 @@ def demo(
         Path | None,
         typer.Option(metavar="FILE", help="TUIO capture."),
     ] = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the picture.")] = Path("out"),
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the pictures.")] = Path(
+        "out"
+    ),
     exact: ExactOption = False,
     seed: SeedOption = None,
     as_json: Annotated[
@@ -64,19 +66,15 @@ def demo(
 ) -> None:
     """Play recorded touches on a simulated plate; measure contrast.
 
-    The plate deviates from the table's within the rig's uncertainty, the same for the same --seed;
-    recorded places are shares of its size.
+    First one person, of whose fingers one feels it; then two, or on eight ERAs and more three, who
+    each feel a vibration of their own. The plate deviates from the table's within the rig's
+    uncertainty, the same for the same --seed; recorded places are shares of its size.
     """
     import asyncio
     import time
 
-    from controller.demo.run import (
-        WIRES,
-        example_touches_path,
-        run_demo,
-        run_live,
-        write_picture,
-    )
+    from controller.demo.run import WIRES, run_demo, run_live, write_pictures
+    from controller.demo.scene import Scene, example_scenes
     from controller.sources.capture import read_capture
     from model.rig.file import example_rig_path, load_rig
     from model.table.table_cache import cached_table
@@ -86,7 +84,7 @@ def demo(
     if dashboard and (touches is not None or as_json):
         raise InputError("--dashboard takes its touches from the page; omit --touches and --json")
     drawn = seed_of_plate(exact=exact, seed=seed)
-    recorded = read_capture(touches or example_touches_path())
+    recorded = None if touches is None else Scene(read_capture(touches))
     own_rig, rig_file = rig_file, (rig_file or example_rig_path()).absolute()
     rig = load_rig(rig_file)
     started = time.perf_counter()
@@ -108,12 +106,12 @@ def demo(
             rig_file,
             table,
             wire=wire,
-            touches=recorded,
+            scenes=example_scenes(rig) if recorded is None else [recorded],
             on_row=lambda row: None if as_json else print(_line(row), flush=True),
             seed=drawn,
         )
     )
-    files = write_picture(table, rows, out)
+    files = write_pictures(table, rows, out)
     if as_json:
         print(
             json.dumps(
@@ -149,15 +147,19 @@ _HEADING = (
 )
 
 
+_MAX_NAMES = 4  # of ERAs in a row
+
+
 def _line(row: "TouchRow") -> str:
     x, y = (100 * value for value in row.targets_m[0])
-    start = f"{row.time_s:5.1f}  {x:5.1f},{y:5.1f}  {len(row.quiet):6d}  "
+    others = len(row.fingers) - 1 if row.fingers else len(row.quiet)
+    start = f"{row.time_s:5.1f}  {x:5.1f},{y:5.1f}  {others:6d}  "
     if row.reason is not None:
         return f"{start}silent: {row.reason}"
     by_frequency: dict[float, list[str]] = {}
     for era, tone in row.drive.items():
         by_frequency.setdefault(tone["frequency_hz"], []).append(era)
-    eras = ", ".join(f"{' '.join(some)} {hertz:g} Hz" for hertz, some in by_frequency.items())
+    eras = ", ".join(f"{_named(some)} {hertz:g} Hz" for hertz, some in by_frequency.items())
     pairs = (
         (row.robust_felt_contrast_db, row.measured_felt_contrast_db),
         (row.predicted_transient_contrast_db, row.measured_transient_contrast_db),
@@ -167,7 +169,14 @@ def _line(row: "TouchRow") -> str:
     note = "" if row.steady else "  still ringing"
     if row.measured_level_db_sl is None:
         note = f"  not measured: it played for {row.played_s:.2f} s"
+    for finger in row.fingers:
+        if finger.at_m == row.targets_m[0]:
+            note += f"  {finger.verdict}, of {counted(len(row.contents), 'content')}"
     return f"{start}{eras:22s} {figures} {_number(row.latency_ms):>7s}{note}"
+
+
+def _named(eras: list[str]) -> str:
+    return " ".join(eras) if len(eras) <= _MAX_NAMES else counted(len(eras), "ERA")
 
 
 def _number(value: float | None) -> str:

@@ -2,12 +2,13 @@
 
 import asyncio
 import math
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from controller.demo.far_end import SimulatedPlate
 from controller.demo.touch_row import (
+    FingerRow,
     FingerVibration,
     Position,
     TouchRow,
@@ -15,6 +16,8 @@ from controller.demo.touch_row import (
     peak_contrast_db,
     steady_contrast_db,
 )
+from controller.loop.content import HELD_BACK, Prediction
+from controller.loop.decision import PlayedContent
 from controller.loop.observer import Applied, Observer, Silenced
 from controller.sources.contacts import Change, Contact, ContactKey
 from drivers import clock
@@ -35,11 +38,14 @@ STEADY_DURATION = 0.4
 
 _NOT_THE_TARGET = "another finger came down at the same moment and was the target"
 
+SLIDE_PAUSE = 0.25
+"""Shortest rest [s] after which a finger that moves begins another slide."""
+
 MIN_MOVEMENT = 0.001
 """Movement [m] below which a finger's sensor stays in place, so that its window is not broken."""
 
 
-@dataclass
+@dataclass(eq=False)
 class _Touch:
     """A touch and the patterns that were played for it."""
 
@@ -50,15 +56,16 @@ class _Touch:
     reason: str | None = None
 
 
-@dataclass
+@dataclass(eq=False)
 class _Playing:
-    """A pattern from its commit to the next command [s], with its measurements.
+    """What plays from its commit to the next command [s], with its measurements.
 
-    steady, onset: vibration by finger over its end and its first 100 ms.
+    touches: those that feel a content; steady, onset: vibration by finger over its end and its
+    first 100 ms.
     """
 
     applied: Applied
-    touch: _Touch
+    touches: Sequence[_Touch]
     until: float = math.inf
     steady: asyncio.Task[dict[str, FingerVibration]] | None = None
     onset: asyncio.Task[dict[str, FingerVibration]] | None = None
@@ -85,7 +92,8 @@ class TouchRecorder:
         self._start = clock.now()
         self._touches: dict[ContactKey, _Touch] = {}
         self._playing: _Playing | None = None
-        self._changed_at = -math.inf  # when a finger landed or lifted last
+        self._changed_at = -math.inf  # when a finger landed, lifted or began to slide last
+        self._moved_at = -math.inf
         self._sensors: dict[str, Position] = {}
         self._loads: dict[str, float] = {}
         self._tasks: set[asyncio.Task[Any]] = set()
@@ -119,7 +127,7 @@ class TouchRecorder:
         """Note that the plate is armed no longer; rows of touches that this spoils say so."""
         self._fault = cause.partition("; ")[0]  # without its remedy
         since = -math.inf if self._playing is None else self._playing.applied.time
-        self._end_pattern(clock.now())
+        self._end_pattern(clock.now(), is_measured=False)  # silent since a time that is not known
         for touch in self._touches.values():
             if touch.contact.since > since:
                 touch.reason = self._fault
@@ -139,7 +147,7 @@ class TouchRecorder:
         if change.down or change.up:
             self._changed_at = clock.now()
         for contact in change.down:
-            others = {_id(other): (other.x, other.y) for other in contacts if other != contact}
+            others = {_id(other): _place(other) for other in contacts if other != contact}
             self._touches[contact.key] = _Touch(contact, others, reason=self._fault)
         if contacts:
             self._lifted.clear()
@@ -148,18 +156,25 @@ class TouchRecorder:
         for contact in change.up:
             touch = self._touches.pop(contact.key)
             touch.until = clock.now()
-            if self._playing is None or touch is not self._playing.touch:
+            if self._playing is None or touch not in self._playing.touches:
                 self._run(self._add_row(touch))
 
     def _pattern_applied(self, applied: Applied) -> None:
         self._end_pattern(applied.time)
         for each in self._touches.values():
             each.reason = each.reason or _NOT_THE_TARGET
-        touch = self._touches.get(_target(applied).key)
-        if touch is None:  # lifted meanwhile
+        touches = []
+        for felt in applied.targets:
+            touch = self._touches.get(felt.contact.key)
+            if touch is not None and felt.verdict == HELD_BACK:
+                touch.reason = felt.held_back
+            elif touch is not None:  # not lifted meanwhile
+                touches.append(touch)
+        if not touches:
             return
-        self._playing = _Playing(applied, touch)
-        touch.patterns.append(self._playing)
+        self._playing = _Playing(applied, touches)
+        for touch in touches:
+            touch.patterns.append(self._playing)
         if applied.from_rest and applied.quiet:
             self._playing.onset = self._run(self._measure_onset(self._playing))
 
@@ -169,20 +184,21 @@ class TouchRecorder:
             if touch := self._touches.get(contact.key):
                 touch.reason = silenced.reason
 
-    def _end_pattern(self, now: float) -> None:
+    def _end_pattern(self, now: float, *, is_measured: bool = True) -> None:
         """Close the playing pattern and measure its end."""
         ended, self._playing = self._playing, None
         if ended is None:
             return
         ended.until = now
         settled = ended.applied.time + ended.applied.pattern.ramp
-        # Its end is reported with the reply to what ended it: a finger that lifted is the end.
+        # Its end is reported with the reply to what ended it: the change of a finger is the end.
         end = self._changed_at if now - RESPONSE < self._changed_at < now else now
         since, until = max(settled, end - STEADY_WINDOW) + MARGIN, end - MARGIN
-        if since < until:
+        if is_measured and since < until:
             ended.steady = self._run(self._plate.vibration(since, until))
-        if ended.touch.until < math.inf:
-            self._run(self._add_row(ended.touch))
+        for touch in ended.touches:
+            if touch.until < math.inf:
+                self._run(self._add_row(touch))
 
     async def _measure_onset(self, playing: _Playing) -> dict[str, FingerVibration]:
         """Vibration over the first 100 ms of a pattern; empty if it ended earlier."""
@@ -196,10 +212,15 @@ class TouchRecorder:
         """Make the plate's sensors follow the fingers."""
         sensors = {}
         for contact in contacts:
-            position = (contact.x, contact.y)
+            position = _place(contact)
             before = self._sensors.get(_id(contact), (math.inf, math.inf))
             is_at_rest = math.dist(before, position) < MIN_MOVEMENT
             sensors[_id(contact)] = before if is_at_rest else position
+        before_now = self._sensors.items()
+        if any(sensors.get(id, position) != position for id, position in before_now):
+            if clock.now() - self._moved_at > SLIDE_PAUSE:
+                self._changed_at = clock.now()
+            self._moved_at = clock.now()
         loads = {_id(contact): contact.load for contact in contacts}
         if sensors != self._sensors or loads != self._loads:
             self._sensors, self._loads = sensors, loads
@@ -212,7 +233,7 @@ class TouchRecorder:
             target_id=_id(contact),
             time_s=contact.since - self._start,
             until_s=touch.until - self._start,
-            targets_m=[(contact.x, contact.y)],
+            targets_m=[_place(contact)],
             quiet=touch.quiet,
             reason=touch.reason or "no vibration was confirmed before it lifted",
         )
@@ -238,26 +259,45 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
     """The row with the longest pattern of a touch; latency and onset are of its first one."""
     main_part = max(touch.patterns, key=lambda playing: playing.duration)
     first, applied = touch.patterns[0], main_part.applied
-    predicted, pattern = applied.targets[0], applied.pattern
+    key = touch.contact.key
+    predicted = next(felt for felt in applied.targets if felt.contact.key == key)
+    played = _content_of(predicted, applied)
+    pattern = played.pattern
     vibration = await main_part.steady if main_part.steady else {}
-    target, quiet = _fingers(vibration, applied)
-    onset_target, onset_quiet = _fingers(await first.onset if first.onset else {}, first.applied)
-    return replace(
+    row = replace(
         row,
         reason=None,
-        targets_m=[(predicted.contact.x, predicted.contact.y)],
-        quiet={_id(other): (other.x, other.y) for other in applied.quiet},
+        targets_m=[_place(predicted.contact)],
+        quiet={_id(other): _place(other) for other in applied.quiet},
         drive={
             era: {"frequency_hz": each.frequency, "level": each.level, "phase_deg": each.phase}
-            for era, each in applied.drive.items()
+            for era, each in played.drive.items()
         },
         mode=pattern.drive_mode,
-        shaped_onset=bool(first.applied.pattern.onset),
+        shaped_onset=bool(_content_of(predicted, first.applied).pattern.onset),
         latency_ms=None if first.applied.latency is None else 1000 * first.applied.latency,
         played_s=main_part.duration,
         steady=main_part.duration >= STEADY_DURATION,
         predicted_felt_contrast_db=pattern.felt_contrast_db,
-        robust_felt_contrast_db=pattern.robust_felt_contrast_db,
+        robust_felt_contrast_db=predicted.promised_contrast_db,
+        predicted_level_db_sl=predicted.level_db_sl,
+        pattern=pattern,
+        levels_db_sl={id: finger.level_db_sl for id, finger in vibration.items()},
+    )
+    if len(applied.contents) > 1:
+        own = _finger_row(predicted, vibration)
+        return replace(
+            row,
+            measured_felt_contrast_db=own.measured_contrast_db,
+            measured_level_db_sl=own.measured_level_db_sl,
+            fingers=[_finger_row(each, vibration) for each in applied.targets],
+            contents=[each.pattern for each in applied.contents.values()],
+        )
+    target, quiet = _fingers(vibration, predicted, applied.quiet)
+    onset_vibration = await first.onset if first.onset else {}
+    onset_target, onset_quiet = _fingers(onset_vibration, predicted, first.applied.quiet)
+    return replace(
+        row,
         measured_felt_contrast_db=felt_contrast_db(target, quiet) if target else None,
         predicted_contrast_db=predicted.contrast_db,
         robust_contrast_db=pattern.robust_contrast_db,
@@ -266,27 +306,51 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
         measured_transient_contrast_db=(
             peak_contrast_db(onset_target, onset_quiet) if onset_target and onset_quiet else None
         ),
-        predicted_level_db_sl=predicted.level_db_sl,
         measured_level_db_sl=target.level_db_sl if target else None,
-        pattern=pattern,
-        levels_db_sl={id: finger.level_db_sl for id, finger in vibration.items()},
+    )
+
+
+def _content_of(felt: Prediction, applied: Applied) -> PlayedContent:
+    """What plays for a finger, its own or the one that it shares."""
+    return next(
+        played
+        for played in applied.contents.values()
+        if any(contact.key == felt.contact.key for contact, _ in played.content.targets)
+    )
+
+
+def _finger_row(felt: Prediction, vibration: Mapping[str, FingerVibration]) -> FingerRow:
+    """What a finger feels among several contents."""
+    level = contrast = None
+    measured = vibration.get(_id(felt.contact))
+    if measured is not None and felt.frequency is not None:
+        own, others = measured.parted(felt.frequency)
+        if math.isfinite(own.level_db_sl):
+            level = own.level_db_sl
+            contrast = level - others.loudest_db_sl
+    return FingerRow(
+        at_m=_place(felt.contact),
+        frequency_hz=felt.frequency,
+        verdict=felt.verdict,
+        promised_contrast_db=felt.promised_contrast_db,
+        measured_contrast_db=contrast if contrast != math.inf else None,
+        measured_level_db_sl=level,
     )
 
 
 def _fingers(
-    vibration: Mapping[str, FingerVibration], applied: Applied
+    vibration: Mapping[str, FingerVibration], felt: Prediction, others: Sequence[Contact]
 ) -> tuple[FingerVibration | None, list[FingerVibration]]:
     """Vibration of the target and of the quiet fingers; no target unless all were measured."""
-    target = vibration.get(_id(_target(applied)))
-    quiet = [vibration[_id(each)] for each in applied.quiet if _id(each) in vibration]
-    if target is None or not len(target.frequencies) or len(quiet) < len(applied.quiet):
+    target = vibration.get(_id(felt.contact))
+    quiet = [vibration[_id(each)] for each in others if _id(each) in vibration]
+    if target is None or not len(target.frequencies) or len(quiet) < len(others):
         return None, []
     return target, quiet
 
 
-def _target(applied: Applied) -> Contact:
-    """The finger that feels a pattern: without a layout one at a time does."""
-    return applied.targets[0].contact
+def _place(contact: Contact) -> Position:
+    return contact.x, contact.y
 
 
 def _id(contact: Contact) -> str:

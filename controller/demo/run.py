@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from controller.api.async_client import AsyncClient
 from controller.api.jsonrpc import RpcError
@@ -18,12 +19,14 @@ from controller.daemon.log import LogThread, start_log
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from controller.daemon.states import DaemonState
+from controller.demo.contents_picture import contents_figure
 from controller.demo.far_end import SIM_OPTIONS, WATCHDOG, SimulatedPlate, simulated_plate
 from controller.demo.picture import choose_rows, touches_figure
 from controller.demo.recorder import TouchRecorder
+from controller.demo.scene import Scene
 from controller.demo.touch_row import TouchRow
 from controller.gateway.installed import require_gateway
-from controller.sources.capture import RecordedDatagram, replay_capture
+from controller.sources.capture import replay_capture
 from drivers import clock
 from drivers.errors import LinkError
 from model.figures import save_figure
@@ -40,17 +43,11 @@ DECAY = 0.1
 RECOVERY = 30.0
 """Time [s] within which the daemon must be armed, also anew after a fault."""
 
+_LAYOUT_FILE = "layout.yaml"
 _HOST = "127.0.0.1"
 _ARMED = DaemonState.OPERATION_ENABLED
 _TIMEOUT = 60.0  # s; of a request to the daemon, on a machine that is busy
 _PAUSE = 0.05  # s; between attempts to arm
-
-
-def example_touches_path() -> Path:
-    """The recorded touches of the demonstration: installed with this package, or in a checkout."""
-    package = Path(__file__).parents[1]
-    installed = package / "data" / "touches.tuio"
-    return installed if installed.exists() else package.parent / "examples" / "touches.tuio"
 
 
 async def run_demo(
@@ -58,20 +55,23 @@ async def run_demo(
     table: LocalizationTable,
     *,
     wire: str,
-    touches: Sequence[RecordedDatagram],
+    scenes: Sequence[Scene],
     on_row: Callable[[TouchRow], None],
     seed: int | None = 0,
 ) -> list[TouchRow]:
-    """Play recorded touches to a daemon, over a wire, onto a simulated plate.
+    """Play scenes one after another to a daemon, over a wire, onto a simulated plate.
 
-    rig_file: an absolute path; wire: one of WIRES; touches: of a TUIO capture; on_row: called with
-    each row when complete; seed: of the plate within the rig's uncertainty, None for the rig's own.
-    Return all rows in order of time. Raises LinkError if the far end is lost.
+    rig_file: an absolute path; wire: one of WIRES; on_row: called with each row when complete;
+    seed: of the plate within the rig's uncertainty, None for the rig's own. The daemon reloads its
+    layout between scenes. Return all rows in order of time. Raises LinkError if the far end is
+    lost.
     """
     port = _free_port()
     url = f"tuio:{_HOST}:{port}?timeout={CONTACT_TIMEOUT:g}"
     more = {"socket": "era.sock", "touch": [{"name": "recorded", "url": url}]}
-    async with _on_simulated_plate(rig_file, more, wire=wire, seed=seed) as (config, lock, plate):
+    async with _on_simulated_plate(
+        rig_file, more, layout=scenes[0].layout, wire=wire, seed=seed
+    ) as (config, lock, plate):
         recorder = TouchRecorder(plate, on_row=on_row)
         daemon = Daemon(
             config,
@@ -84,7 +84,7 @@ async def run_demo(
         )
         serving = asyncio.create_task(daemon.run(lock))
         arming = asyncio.create_task(_keep_armed(daemon, config.socket, recorder))
-        playing = asyncio.create_task(_play(touches, port, recorder))
+        playing = asyncio.create_task(_play(scenes, port, recorder, daemon, config))
         tasks = (serving, arming, playing, recorder.failure)
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -118,7 +118,9 @@ async def run_live(
     require_gateway()
     log = start_log(None, level="warning")
     try:
-        async with _on_simulated_plate(rig_file, {}, wire=wire, seed=seed) as (config, lock, _):
+        async with _on_simulated_plate(
+            rig_file, {}, layout=Scene(()).layout, wire=wire, seed=seed
+        ) as (config, lock, _):
             daemon = Daemon(
                 config,
                 table,
@@ -134,16 +136,24 @@ async def run_live(
 
 @contextlib.asynccontextmanager
 async def _on_simulated_plate(
-    rig_file: Path, more: Mapping[str, object], *, wire: str, seed: int | None
+    rig_file: Path,
+    more: Mapping[str, object],
+    *,
+    layout: Mapping[str, Any],
+    wire: str,
+    seed: int | None,
 ) -> AsyncIterator[tuple[DaemonConfig, SocketLock, SimulatedPlate]]:
     """Configuration and socket of a daemon of a rig, and the plate that it drives.
 
-    more: keys of the daemon's file besides the rig.
+    more: keys of the daemon's file besides the rig; layout: the content of `_LAYOUT_FILE`.
     """
     async with contextlib.AsyncExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="era-")))
         file = folder / "daemon.yaml"
-        file.write_text(json.dumps({"rig": str(rig_file), **more}), encoding="utf-8")
+        file.write_text(
+            json.dumps({"rig": str(rig_file), "layout": _LAYOUT_FILE, **more}), encoding="utf-8"
+        )
+        _write_layout(folder, layout)
         config = load_daemon_config(file)
         lock = SocketLock(config.socket)
         stack.callback(lock.release)
@@ -194,22 +204,42 @@ async def _armed(era: AsyncClient) -> str:
         await asyncio.sleep(_PAUSE)
 
 
-async def _play(touches: Sequence[RecordedDatagram], port: int, recorder: TouchRecorder) -> None:
-    """Play the touches; wait until the last one is lifted, or counts as such, and has its row."""
+async def _play(
+    scenes: Sequence[Scene],
+    port: int,
+    recorder: TouchRecorder,
+    daemon: Daemon,
+    config: DaemonConfig,
+) -> None:
+    """Play the scenes; wait until all touches are lifted, or count as such, and have their rows."""
     await recorder.start()
-    await replay_capture(touches, _HOST, port)
-    await asyncio.sleep(DECAY)  # the last datagrams arrive
-    await recorder.all_lifted()
+    for scene in scenes:
+        if scene.layout != scenes[0].layout:
+            _write_layout(config.source.parent, scene.layout)
+            await daemon.reload()
+        await replay_capture(scene.touches, _HOST, port)
+        await asyncio.sleep(DECAY)  # the last datagrams arrive
+        await recorder.all_lifted()
     await asyncio.sleep(DECAY)
     await recorder.finish()
 
 
-def write_picture(table: LocalizationTable, rows: list[TouchRow], folder: Path) -> list[Path]:
-    """Draw some of the touches into a folder; return no file if nothing was played."""
-    chosen = choose_rows(rows)
-    if not chosen:
-        return []
+def _write_layout(folder: Path, layout: Mapping[str, Any]) -> None:
+    (folder / _LAYOUT_FILE).write_text(json.dumps(layout), encoding="utf-8")
+
+
+def write_pictures(table: LocalizationTable, rows: list[TouchRow], folder: Path) -> list[Path]:
+    """Draw some of the touches into a folder, and several contents; return what was written."""
+    figures = {}
+    if chosen := choose_rows([row for row in rows if not row.fingers]):
+        figures["touches"] = touches_figure(table, chosen)
+    several = [row for row in rows if row.measured_level_db_sl is not None and row.fingers]
+    if several:
+        figures["contents"] = contents_figure(
+            table, max(several, key=lambda row: len(row.contents))
+        )
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "touches.png"
-    save_figure(touches_figure(table, chosen), path)
-    return [path]
+    paths = [folder / f"{name}.png" for name in figures]
+    for path, figure in zip(paths, figures.values(), strict=True):
+        save_figure(figure, path)
+    return paths

@@ -1,7 +1,7 @@
 """One row of the demonstration: a touch, what was predicted for it and what was measured."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -17,6 +17,9 @@ from model.table.pattern import Pattern
 from model.vibration.excitation import peak_acceleration
 
 Position: TypeAlias = tuple[float, float]
+
+SAME_FREQUENCY = 1.0
+"""Difference [Hz] within which a tone is that of a content, as its amplifier has rounded it."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,31 @@ class FingerVibration:
         """Sensation level at the loudest point of the tip; -inf without vibration."""
         return float(sensation_level(self.frequencies, self.amplitudes, self.threshold).max())
 
+    def parted(self, frequency: float) -> tuple["FingerVibration", "FingerVibration"]:
+        """Return the part of a content's frequency [Hz], and that of all others."""
+        is_own = np.abs(self.frequencies - frequency) < SAME_FREQUENCY
+        own, others = (
+            replace(self, frequencies=self.frequencies[some], amplitudes=self.amplitudes[some])
+            for some in (is_own, ~is_own)
+        )
+        return own, others
+
+
+@dataclass(frozen=True, kw_only=True)
+class FingerRow:
+    """A finger among several contents: its frequency and verdict, what was promised and measured.
+
+    Contrasts are those of its own level above that of the power of all others' contents here.
+    Measured ones are None where nothing of its own, or nothing else, was measured.
+    """
+
+    at_m: Position
+    frequency_hz: float | None
+    verdict: str
+    promised_contrast_db: float | None
+    measured_contrast_db: float | None
+    measured_level_db_sl: float | None
+
 
 @dataclass(frozen=True, kw_only=True)
 class TouchRow:
@@ -55,7 +83,9 @@ class TouchRow:
     plate, robust ones are the promise, what nine of ten plates within the rig's uncertainty give;
     felt ones are in levels, the others in accelerations; transient ones are over the first 100 ms
     of the touch's first pattern. drive: as the amplifiers achieved it, by ERA; latency_ms: from
-    touch frame to last byte on the wire; reason: why nothing played, if so.
+    touch frame to last byte on the wire; reason: why nothing played, if so. fingers: of several
+    contents, each; contrasts are then to the contents of others at this finger; contents: their
+    patterns, in the order of layers.
     """
 
     target_id: str
@@ -82,6 +112,8 @@ class TouchRow:
     measured_level_db_sl: float | None = None
     pattern: Pattern | None = None
     levels_db_sl: Mapping[str, float] = field(default_factory=dict)
+    fingers: Sequence[FingerRow] = ()
+    contents: Sequence[Pattern] = ()
 
     @property
     def keeps_promise(self) -> bool | None:
@@ -94,12 +126,14 @@ class TouchRow:
     def as_json(self) -> dict[str, Any]:
         """Return the row in the format of `era demo --json`."""
         row = {each.name: getattr(self, each.name) for each in fields(self)}
-        return {key: row[key] for key in row if key not in _OWN} | {
-            "quiet_m": list(self.quiet.values())
-        }
+        row = {key: row[key] for key in row if key not in _OWN}
+        row["quiet_m"] = list(self.quiet.values())
+        if self.fingers:
+            row["fingers"] = [asdict(each) for each in self.fingers]
+        return row
 
 
-_OWN = ("target_id", "quiet", "pattern", "levels_db_sl")
+_OWN = ("target_id", "quiet", "pattern", "levels_db_sl", "fingers", "contents")
 
 
 def felt_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float | None:

@@ -15,12 +15,15 @@ import pytest
 
 import controller.demo.far_end
 import controller.demo.run
+import controller.demo.scene
 from controller.cli.main import run
 from controller.demo.recorder import TouchRecorder
-from controller.sources.capture import RecordedDatagram, write_capture
+from controller.demo.scene import Scene, layout_of_people
+from controller.sources.capture import RecordedDatagram, read_capture, write_capture
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 from daemon_bench import until
+from model.rig.file import example_rig_path, load_rig
 from patient_daemon import wait_long
 
 ERA = Path(sys.executable).with_name("era")
@@ -117,17 +120,33 @@ def demo(environment, tmp_path, monkeypatch, capsys):
         pytest.param("modbus", marks=pytest.mark.long),
     ],
 )
-def test_demo_contacts_feel_the_prediction(wire, capture, demo):
+def test_demo_contacts_feel_the_prediction(wire, capture, demo, monkeypatch):
     """Each touch has its row; level within 3 dB of the promise, contrast at least the promised.
 
-    Of the first plate that is drawn, on which these touches keep it.
+    Of the first plate that is drawn, on which these touches keep it. Then the same as two people,
+    by a layout that the daemon has reloaded: both that are down together have a content each.
     """
-    status, out, said = demo("--wire", wire, "--touches", capture)
+    plate = load_rig(example_rig_path()).plate
+    layout = layout_of_people(plate, {"left": None, "right": None})
+    recorded = read_capture(capture)
+    scenes = [Scene(recorded), Scene(recorded, layout)]
+    monkeypatch.setattr(controller.demo.scene, "example_scenes", lambda rig: scenes)
+    status, out, said = demo("--wire", wire)
     assert status == 0, said
     result = json.loads(out)
     assert result["wire"] == wire
-    rows = result["touches"]
-    assert len(rows) == len(SCHEDULE)
+    rows, people = result["touches"][: len(SCHEDULE)], result["touches"][len(SCHEDULE) :]
+    assert len(people) == len(SCHEDULE)
+    assert not any("fingers" in row for row in (*rows, people[2]))
+    one, other = people[1]["fingers"]
+    assert [one["at_m"]] == people[0]["targets_m"]
+    assert [other["at_m"]] == people[1]["targets_m"]
+    assert abs(one["frequency_hz"] - other["frequency_hz"]) >= 30
+    for finger in (one, other):
+        assert finger["verdict"] in ("own", "mixed")
+        promised, measured = finger["promised_contrast_db"], finger["measured_contrast_db"]
+        assert 6 < promised < measured + 3 < promised + 23  # nine of ten plates keep it
+        assert finger["measured_level_db_sl"] == pytest.approx(20, abs=3)
     for row, (_, _, _, x, y) in zip(rows, SCHEDULE, strict=True):
         assert row["targets_m"] == [[pytest.approx(x * 0.3048), pytest.approx((1 - y) * 0.2286)]]
         assert row["mode"] == "phased"
@@ -149,8 +168,10 @@ def test_demo_contacts_feel_the_prediction(wire, capture, demo):
         promised, measured = beside[f"robust_{what}"], beside[f"measured_{what}"]
         assert 3 < promised < beside[f"predicted_{what}"]
         assert promised <= measured < promised + 20
-    (picture,) = map(Path, result["files"])
-    assert picture.read_bytes().startswith(b"\x89PNG")
+    pictures = [*map(Path, result["files"])]
+    assert [each.name for each in pictures] == ["touches.png", "contents.png"]
+    for picture in pictures:
+        assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.real_time

@@ -9,6 +9,7 @@ import pytest
 
 import model
 from controller.demo.run import run_demo
+from controller.demo.scene import Scene, example_scenes
 from controller.effects.layout_file import load_layout
 from controller.sources.capture import RecordedDatagram, read_capture, write_capture
 from controller.sources.touch import Touch, TouchFrame
@@ -51,7 +52,13 @@ def test_finger_feels_what_many_eras_promise(name: str, capture: Path) -> None:
     assert [counts[amplifier] for amplifier in rig.amplifiers] == CHANNELS[name]
     table = build_table(rig, frequencies=np.array([120.0, 160.0, 200.0]), drive_mode="phased")
     rows = run_virtual_on_sockets(
-        run_demo(file, table, wire="sim", touches=read_capture(capture), on_row=lambda row: None)
+        run_demo(
+            file,
+            table,
+            wire="sim",
+            scenes=[Scene(read_capture(capture))],
+            on_row=lambda row: None,
+        )
     )
     row = rows[-1]
     assert row.drive.keys() == {era.name for era in rig.eras}
@@ -62,6 +69,37 @@ def test_finger_feels_what_many_eras_promise(name: str, capture: Path) -> None:
     assert row.robust_felt_contrast_db is not None
     assert row.measured_felt_contrast_db >= row.robust_felt_contrast_db > 6
     assert row.measured_level_db_sl == pytest.approx(row.predicted_level_db_sl, abs=3)
+
+
+def test_three_people_each_feel_their_own_content_while_one_slides_and_one_leaves() -> None:
+    """In its band; every finger at least the contrast promised, on the first plate that is drawn.
+
+    The one that leaves had both others beside it, these have each other at the end, where one has
+    slid by a third of the plate.
+    """
+    file = EXAMPLES / "car_display.yaml"
+    rig = load_rig(file)
+    table = build_table(rig, frequencies=np.arange(60.0, 281.0, 10.0), drive_mode="phased")
+    scene = example_scenes(rig)[-1]
+    rows = run_virtual_on_sockets(
+        run_demo(file, table, wire="sim", scenes=[scene], on_row=lambda row: None)
+    )
+    slid, stayed, left = rows
+    assert [len(row.fingers) for row in rows] == [2, 2, 3]
+    assert slid.targets_m == [pytest.approx((0.15 * 0.53, 0.65 * 0.30), abs=0.008)]
+    bands = [(60, 110), (130, 180), (220, 280)]
+    for fingers in (stayed.fingers, left.fingers):
+        for finger, (low, high) in zip(fingers, bands, strict=False):
+            assert finger.frequency_hz is not None
+            assert low <= finger.frequency_hz <= high
+            assert finger.verdict in ("own", "mixed")
+            assert finger.measured_contrast_db is not None
+            assert finger.promised_contrast_db is not None
+            assert finger.measured_contrast_db >= finger.promised_contrast_db > 6
+            assert finger.measured_level_db_sl == pytest.approx(20.0, abs=3)
+    for row in rows:
+        assert row.steady
+        assert row.as_json()["fingers"]
 
 
 def test_table_answers_twenty_fingers() -> None:

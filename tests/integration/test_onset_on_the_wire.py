@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from controller.demo.run import run_demo
+from controller.demo.scene import Scene
 from controller.sources import contacts
 from controller.sources.capture import RecordedDatagram
 from controller.sources.touch import Touch, TouchFrame
@@ -45,7 +46,7 @@ def test_onset_contrast_matches_prediction(touches, monkeypatch):
             rig_file,
             table,
             wire="serial",
-            touches=touches,
+            scenes=[Scene(touches)],
             on_row=lambda row: None,
             seed=None,
         )

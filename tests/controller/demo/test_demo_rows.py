@@ -7,6 +7,7 @@ import pytest
 
 from controller.demo.picture import choose_rows
 from controller.demo.touch_row import (
+    FingerRow,
     FingerVibration,
     TouchRow,
     felt_contrast_db,
@@ -21,6 +22,18 @@ KEYS = (
     *("time_s", "until_s", "targets_m", "quiet_m", "reason", "drive", "mode", "latency_ms"),
     *("played_s", "shaped_onset", "steady"),
 )
+FINGER = FingerRow(
+    at_m=(0.1, 0.1),
+    frequency_hz=90.0,
+    verdict="own",
+    promised_contrast_db=12.0,
+    measured_contrast_db=14.0,
+    measured_level_db_sl=20.0,
+)
+FINGER_KEYS = {
+    *("at_m", "frequency_hz", "verdict"),
+    *("promised_contrast_db", "measured_contrast_db", "measured_level_db_sl"),
+}
 
 
 def vibration(amplitudes, frequencies=(100.0, 250.0)):
@@ -67,6 +80,18 @@ def test_felt_contrast_relates_levels_not_accelerations():
     )
 
 
+def test_contents_are_told_apart_by_their_frequencies():
+    """By hand: 10 times threshold of its own, 0.3 and 0.4 of others: 26 dB above their power."""
+    thresholds = detection_threshold(np.array([90.0, 170.0, 260.0]))
+    felt = vibration(np.diag(thresholds) @ [[10.0], [0.3], [0.4]], (90.0, 170.02, 260.0))
+    own, foreign = felt.parted(90.0)
+    assert own.level_db_sl == pytest.approx(20.0)
+    assert felt_contrast_db(own, [foreign]) == pytest.approx(20 + 6.02, abs=0.01)
+    nothing, all_others = felt.parted(500.0)
+    assert nothing.level_db_sl == -np.inf
+    assert all_others.level_db_sl == pytest.approx(felt.level_db_sl)
+
+
 def test_promise_is_kept_by_at_least_the_robust_contrast():
     """Only steady touches with a promise and a measurement count."""
     promised = replace(row(1.0, contrast=12.0, others=1), steady=True, robust_felt_contrast_db=12.0)
@@ -101,6 +126,10 @@ def test_json_has_the_documented_keys_of_every_touch():
     figures = {f"{what}_{of}" for what in ("predicted", "measured") for of in FIGURES}
     assert silent.as_json().keys() == {*figures, *ROBUST, *KEYS}
     assert silent.as_json()["quiet_m"] == [(0.1, 0.0)]
+    shared = replace(silent, fingers=[FINGER])
+    assert shared.as_json().keys() - silent.as_json().keys() == {"fingers"}
+    (finger,) = shared.as_json()["fingers"]
+    assert finger.keys() == FINGER_KEYS
 
 
 def test_picture_shows_highest_contrasts_of_each_number_of_fingers():

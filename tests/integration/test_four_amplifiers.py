@@ -5,31 +5,22 @@ which every ERA plays, stands for the search.
 """
 
 import asyncio
-import contextlib
 import math
-from collections.abc import AsyncIterator, Mapping
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from contextlib import AbstractAsyncContextManager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import model
-from controller.loop.loop import Controller
-from controller.sources.touch import Touch, TouchFrame
-from drivers.errors import DriverError
+from chain import Chain
 from drivers.host.group import GroupState
-from drivers.opening import Lines
 from long_form import in_turn
-from memory_machine import live_in_memory
 from model.fem.mesh import Mesh
 from model.rig.file import load_rig
-from model.rig.rig import Rig
 from model.vibration.excitation import Tone
-from newest_contact import BuzzNewestContact
-from sim.bench.amplifier_device import AmplifierDevice
-from sim.bench.bench import Bench
-from sim.far_ends.wires import Wire, open_wires
+from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
 from witnessed_chain import OneTable
@@ -62,75 +53,34 @@ ALL = OWN + FED + 0.010 + 0.015  # s; and its reaction, and the stop of the othe
 LEVEL = 0.2
 
 
-@dataclass
-class FourAmplifiers:
-    """An armed controller and what its amplifiers play."""
-
-    rig: Rig
-    bench: Bench
-    devices: Mapping[str, AmplifierDevice]
-    controller: Controller
-
-    async def hold(self, seconds: float) -> None:
-        """Rest one finger on the plate for a time [s]."""
-        loop = asyncio.get_running_loop()
-        end = loop.time() + seconds
-        while loop.time() < end:
-            self.controller.deliver(TouchFrame("test", loop.time(), (Touch(1, 0.3, 0.4),)))
-            await asyncio.sleep(1 / 60)
-
-    def levels(self) -> dict[str, tuple[float, ...]]:
-        """Level of each channel now, by amplifier."""
-        now = asyncio.get_running_loop().time()
-        self.bench.advance(now)
-        return {name: each.summary(now).levels for name, each in self.bench.amplifiers.items()}
-
-    def starts(self) -> dict[str, set[float]]:
-        """When each amplifier began to play what it plays now [s]."""
-        self.levels()
-        return {
-            name: {
-                voice.transition.start
-                for voices in each.outputs
-                for voice in voices
-                if voice.transition.last
-            }
-            for name, each in self.bench.amplifiers.items()
-        }
-
-
-@asynccontextmanager
-async def four_amplifiers(wires: Mapping[str, Wire]) -> AsyncIterator[FourAmplifiers]:
+def four_amplifiers(wires: Mapping[str, Wire]) -> AbstractAsyncContextManager[Chain]:
     """The example's sixteen ERAs on a coarse mesh, armed."""
-    loop = asyncio.get_running_loop()
-    live_in_memory()
     rig = load_rig(Path(model.__file__).parents[1] / "examples" / "table.yaml")
     rig = replace(rig, mesh=Mesh(8, 8, rig.plate.length, rig.plate.width))
-    bench = Bench(rig, now=loop.time())
-    devices = {
-        name: AmplifierDevice(bench, name, address=number)
-        for number, name in enumerate(rig.amplifiers, 1)
-    }
     table = OneTable(rig.plate)
     table.alone = {
         era.name: Tone(110.0, LEVEL * era.stroke, math.radians(10 * number))
         for number, era in enumerate(rig.eras)
     }
-    async with open_wires(wires, [*devices.values()]) as urls:
-        controller = Controller(
-            rig, table, lines=Lines, intent_source=BuzzNewestContact(), urls=urls
-        )
-        await controller.open()
-        running = asyncio.create_task(controller.run())
-        await controller.arm()
-        yield FourAmplifiers(rig, bench, devices, controller)
-        running.cancel()
-        with contextlib.suppress(asyncio.CancelledError, DriverError):
-            await running
-        with contextlib.suppress(DriverError):
-            await controller.close()
-        for device in devices.values():
-            device.close()
+    # On one bus four heartbeats go one after the other, of 20 ms each over RTU.
+    return Chain.armed(wires, rig, table, judged={"times_s": {"heartbeat": 0.05 + 5 * 0.02}})
+
+
+def touch(four: Chain) -> None:
+    """Put a finger on the panel."""
+    four.is_felt = False
+    four.at = {1: (0.3, 0.3)}
+
+
+def starts(four: Chain) -> list[float]:
+    """When each channel began to play what it plays now [s]."""
+    return [
+        voice.transition.start
+        for each in four.far.bench.amplifiers.values()
+        for voices in each.outputs
+        for voice in voices
+        if voice.transition.last
+    ]
 
 
 @pytest.mark.parametrize("arranged", ARRANGED)
@@ -138,13 +88,13 @@ async def four_amplifiers(wires: Mapping[str, Wire]) -> AsyncIterator[FourAmplif
 async def test_sixteen_channels_of_four_amplifiers_start_together(arranged: str) -> None:
     """Every channel plays its level; on one bus from one moment, on four lines within a ms."""
     async with four_amplifiers(ARRANGED[arranged]) as four:
+        touch(four)
         await four.hold(0.3)
         levels = four.levels()
         assert {name: len(each) for name, each in levels.items()} == dict.fromkeys(NAMES, 4)
         for each in levels.values():
             assert each == pytest.approx((LEVEL,) * 4, abs=1e-4)
-        starts = [start for each in four.starts().values() for start in each]
-        skew = max(starts) - min(starts)
+        skew = max(starts(four)) - min(starts(four))
         assert skew <= (1e-9 if arranged.startswith("one bus") else MAX_SKEW)
 
 
@@ -159,15 +109,17 @@ async def test_loss_of_one_of_four_silences_all(arranged: str, lost: str) -> Non
     Until then the others play on: a set is not renewed, and an amplifier may only be late.
     """
     async with four_amplifiers(ARRANGED[arranged]) as four:
+        touch(four)
         await four.hold(0.3)
         assert all(level > 0 for each in four.levels().values() for level in each)
-        four.devices[lost].inject_fault(FaultWindow("hang"))
+        four.disturb()
+        four.far.devices[lost].inject_fault(FaultWindow("hang"))
         holding = asyncio.create_task(four.hold(0.6))
         await asyncio.sleep(OWN)
         assert not any(four.levels()[lost])
         await asyncio.sleep(ALL - OWN)
         assert not any(level for each in four.levels().values() for level in each)
         assert four.controller.group_state is GroupState.LOST
-        four.devices[lost].recover()
+        four.far.devices[lost].recover()
         await holding
         assert not any(level for each in four.levels().values() for level in each)

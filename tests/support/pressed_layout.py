@@ -1,34 +1,27 @@
 """Fingers on a surface layout in virtual time: real bytes on a wire, a plate in time, what is felt.
 
-Backends, codecs, far ends and amplifiers are the project's own, with the durations of the wire;
-the level is measured at the finger's points of the plate, from the moment its amplifier starts.
+The level is measured at the finger's points of the plate, from the moment its amplifier starts.
 """
 
-import asyncio
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
+from chain import Chain, Position
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.loop.envelopes import RAMPS_ONLY
-from controller.loop.loop import Controller
-from controller.loop.observer import Applied, Observer
-from controller.sources.touch import Touch, TouchFrame
-from drivers.opening import Lines
+from controller.loop.observer import Applied
+from drivers import clock
 from drivers.protocol.records import Values
-from memory_machine import live_in_memory
 from model.arrays import FloatArray
 from model.finger.perception import detection_threshold
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
-from sim.bench.amplifier_device import AmplifierDevice
-from sim.bench.bench import Bench
-from sim.far_ends.wires import Wire, open_wires
-from sim.faults.fault_window import Faults
+from sim.far_ends.wires import Wire
 from virtual_loop import run_virtual
 
 WIRES = {
@@ -39,9 +32,6 @@ WIRES = {
 }
 """Wires at their default speeds."""
 
-Position = tuple[float, float]
-
-_REPORT = 0.010  # s; between two frames of the panel
 _LEAST_PAUSE, _PAUSE_STEP = 0.1, 0.0137  # s; between presses, at another phase of heartbeats
 
 
@@ -105,94 +95,72 @@ class Pressed:
     async def _run(
         self, ways: Sequence[Callable[[float], Position]], held: float
     ) -> list[list[Felt]]:
-        loop = asyncio.get_running_loop()
-        live_in_memory()
-        self._bench = Bench(self.rig, now=loop.time())
-        device = AmplifierDevice(
-            self._bench, "main", address=1, faults=Faults(begin=loop.time(), seed=1)
-        )
-        self._watch(device)
+        source, timing = EffectPlayer(self.layout), Timing(self.table)
         felt = []
-        async with open_wires({"main": WIRES[self.wire]}, [device]) as urls:
-            self._controller = Controller(
-                self.rig,
-                self.table,
-                lines=Lines,
-                urls=urls,
-                intent_source=EffectPlayer(self.layout),
-                timing=Timing(self.table),
-                observer=Observer(pattern_applied=lambda applied: self._reports.append(applied)),
-            )
-            self._starts: list[float] = []
-            self._reports: list[Applied] = []
-            await self._controller.open()
-            await self._controller.arm()
-            running = asyncio.create_task(self._controller.run())
-            await self._hold(0.5, None, 0)
+        async with _Starts.armed(
+            WIRES[self.wire], self.rig, self.table, intent_source=source, timing=timing
+        ) as chain:
+            chain.must_be_felt = False
+            chain.at = dict(enumerate(self.resting))
+            await chain.hold(0.5)
             for number, way in enumerate(ways, start=1):
-                self._starts, self._reports, self._felts = [], [], []
-                self._touched, self._at = loop.time(), way(0.0)
-                await self._hold(held, way, number)
-                self._harvest(number)
-                felt.append(self._felts)
-                await self._hold(_LEAST_PAUSE + _PAUSE_STEP * number, None, number)
-            running.cancel()
-            await asyncio.gather(running, return_exceptions=True)
-            await self._controller.close()
-            device.close()
+                felt.append(await chain.press(100 + number, way, held))
+                await chain.hold(_LEAST_PAUSE + _PAUSE_STEP * number)
         return felt
 
-    def _watch(self, device: AmplifierDevice) -> None:
+
+@dataclass
+class _Starts(Chain):
+    """A chain of which every start of a vibration is known."""
+
+    starts: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
         """Note when a tone starts."""
-        obey, bench = device.handle, self._bench
+        obey, amplifier = self.far.device.handle, self.far.amplifier
 
         def handle(name: str, values: Values, now: float) -> Values:
             reply = obey(name, values, now)
-            outputs = bench.amplifiers["main"].outputs
-            origins = {tone.origin for each in outputs for tone in each if tone.transition.last}
-            self._starts += sorted(origins - {*self._starts})
+            tones = [tone for each in amplifier.outputs for tone in each]
+            origins = {tone.origin for tone in tones if tone.transition.last}
+            self.starts += sorted(origins - {*self.starts})
             return reply
 
-        device.handle = handle  # type: ignore[method-assign]
+        self.far.device.handle = handle  # type: ignore[method-assign]
 
-    async def _hold(
-        self, seconds: float, way: Callable[[float], Position] | None, number: int
-    ) -> None:
-        """Report the fingers for a time [s]."""
-        loop = asyncio.get_running_loop()
-        begin = loop.time()
-        while (since := loop.time() - begin) < seconds - 1e-9:
-            fingers = dict(enumerate(self.resting))
-            if way is not None:
-                fingers[100 + number] = way(since)
-                if way(since) != self._at:  # records end where a finger moves
-                    self._harvest(number)
-                    self._at = way(since)
-            self._bench.place_fingers(
-                {str(id): position for id, position in fingers.items()}, now=loop.time()
-            )
-            touches = tuple(
-                Touch(id, x / self.rig.plate.length, 1 - y / self.rig.plate.width)
-                for id, (x, y) in fingers.items()
-            )
-            self._controller.deliver(TouchFrame("panel", loop.time(), touches))
-            await asyncio.sleep(_REPORT)
+    async def press(self, id: int, way: Callable[[float], Position], held: float) -> list[Felt]:
+        """Press once; records end where the finger moves."""
+        self.starts.clear()
+        self.applied.clear()
+        felt, touched = list[Felt](), clock.now()
 
-    def _harvest(self, number: int) -> None:
-        """Note what the pressing finger has felt at its last position."""
-        now = asyncio.get_running_loop().time()
-        self._bench.advance(now)
-        for start in self._starts:
-            applied = min(self._reports, key=lambda each: abs(each.time - start))
-            record = self._bench.fingers.felt(start, now)[str(100 + number)]
-            self._felts.append(
+        def move(since: float) -> None:
+            if self.at.get(id) not in (None, way(since)):
+                felt.extend(self._harvest(str(id), touched))
+            self.at[id] = way(since)
+
+        await self.hold(held, move)
+        felt += self._harvest(str(id), touched)
+        del self.at[id]
+        return felt
+
+    def _harvest(self, finger: str, touched: float) -> list[Felt]:
+        """What the finger has felt at its last position."""
+        now, bench, felt = clock.now(), self.far.bench, list[Felt]()
+        bench.advance(now)
+        for start in self.starts:
+            applied = min(self.applied, key=lambda each: abs(each.time - start))
+            record = bench.fingers.felt(start, now)[finger]
+            felt.append(
                 Felt(
-                    start - self._touched,
+                    start - touched,
                     applied,
                     record.accelerations[record.times > start],
                     record.weights,
-                    self._bench.sample_rate,
-                    self.rig.threshold,
+                    bench.sample_rate,
+                    bench.rig.threshold,
                 )
             )
-        self._starts, self._reports = [], []
+        self.starts.clear()
+        self.applied.clear()
+        return felt

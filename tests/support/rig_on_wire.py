@@ -11,8 +11,9 @@ from sim.amplifier.contract import Amplifier
 from sim.amplifier.summary import AmplifierSummary
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
-from sim.far_ends.wires import Wire, open_wire
+from sim.far_ends.wires import Wire, open_wires
 from sim.faults.fault_window import Faults
+from sim.plant.imperfections import Imperfections
 
 
 @dataclass(frozen=True)
@@ -52,14 +53,24 @@ class FarSide:
 
 
 @asynccontextmanager
-async def far_side(wire: Wire, rig: Rig, *, seed: int = 0) -> AsyncIterator[FarSide]:
-    """The amplifiers of a rig behind a wire, without faults until a test injects them."""
-    bench = Bench(rig, now=clock.now())
+async def far_side(
+    wire: Wire | Mapping[str, Wire],
+    rig: Rig,
+    *,
+    seed: int = 0,
+    imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
+) -> AsyncIterator[FarSide]:
+    """The amplifiers of a rig behind a wire, without faults until a test injects them.
+
+    wire: of all of them, or of each by name.
+    """
+    bench = Bench(rig, now=clock.now(), imperfections=imperfections)
     devices = [
         AmplifierDevice(bench, name, address=number, faults=Faults(begin=clock.now(), seed=seed))
         for number, name in enumerate(bench.amplifiers, start=1)
     ]
-    async with open_wire(wire, devices) as urls:
+    wires = dict.fromkeys(bench.amplifiers, wire) if isinstance(wire, Wire) else wire
+    async with open_wires(wires, devices) as urls:
         try:
             yield FarSide(urls, {device.name: device for device in devices}, bench)
         finally:

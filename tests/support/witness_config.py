@@ -9,7 +9,11 @@ from sim.witness.witness import Witness
 
 
 def witness_config(
-    urls: Mapping[str, str], *, channels: int = 4, times_s: Mapping[str, float], **limits: Any
+    urls: Mapping[str, str],
+    *,
+    channels: int = 4,
+    times_s: Mapping[str, float] | None = None,
+    **limits: Any,
 ) -> dict[str, Any]:
     """A configuration with wires named by their location; limits: of all channels."""
     endpoints = {name: parse_endpoint(url) for name, url in urls.items()}
@@ -24,7 +28,7 @@ def witness_config(
             }
             for name, endpoint in endpoints.items()
         },
-        "times_s": times_s,
+        "times_s": times_s or {},
     }
 
 

@@ -20,10 +20,10 @@ from long_form import in_turn
 from model.fem.mesh import Mesh
 from model.rig.file import load_rig
 from model.vibration.excitation import Tone
+from set_table import SetTable
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
-from witnessed_chain import OneTable
 
 NAMES = ("a", "b", "c", "d")
 BUSES = {
@@ -57,11 +57,11 @@ def four_amplifiers(wires: Mapping[str, Wire]) -> AbstractAsyncContextManager[Ch
     """The example's sixteen ERAs on a coarse mesh, armed."""
     rig = load_rig(Path(model.__file__).parents[1] / "examples" / "table.yaml")
     rig = replace(rig, mesh=Mesh(8, 8, rig.plate.length, rig.plate.width))
-    table = OneTable(rig.plate)
-    table.alone = {
+    tones = {
         era.name: Tone(110.0, LEVEL * era.stroke, math.radians(10 * number))
         for number, era in enumerate(rig.eras)
     }
+    table = SetTable(tones, rig.plate)
     # On one bus four heartbeats go one after the other, of 20 ms each over RTU.
     return Chain.armed(wires, rig, table, judged={"times_s": {"heartbeat": 0.05 + 5 * 0.02}})
 

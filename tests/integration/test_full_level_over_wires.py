@@ -13,9 +13,9 @@ from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from newest_contact import BuzzNewestContact
 from rig_on_wire import far_side
+from set_table import SetTable
 from virtual_loop import in_virtual_time
 from wires import WIRES
-from witnessed_chain import OneTable
 
 
 @pytest.mark.parametrize("of_rig", [False, True])
@@ -31,7 +31,11 @@ async def test_motion_and_output_are_not_taken_for_each_other(
     rig = rigs[of_rig]
     async with far_side(WIRES[wire], rigs[of_amplifier]) as far:
         controller = Controller(
-            rig, OneTable(rig.plate), lines=Lines, intent_source=BuzzNewestContact(), urls=far.urls
+            rig,
+            SetTable({}, rig.plate),
+            lines=Lines,
+            intent_source=BuzzNewestContact(),
+            urls=far.urls,
         )
         player = TonePlayer(rig, Lines, far.urls)
         if of_amplifier is of_rig:

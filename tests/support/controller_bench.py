@@ -4,10 +4,8 @@ import asyncio
 import math
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
-
-import numpy as np
 
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer, Silenced
@@ -22,16 +20,11 @@ from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, unpack_layers
 from drivers.protocol.table import NO_CHANNEL, QUANTITIES
-from model.arrays import FloatArray
-from model.fem.mesh import Mesh
-from model.rig.rig import Channel, Rig
-from model.structure.attachments import Era
-from model.structure.plate import Material, Plate
-from model.table.pattern import Pattern
-from model.table.question import Question
-from model.vibration.excitation import Excitation, Tone
+from model.rig.rig import Rig
+from model.vibration.excitation import Tone
 from newest_contact import BuzzNewestContact
 from registry.limits import GuardLimits
+from set_table import SetTable, make_rig
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
@@ -249,45 +242,6 @@ class BenchLines(Lines):
             far_end.close()
 
 
-class Table:
-    """A table whose answer is set by the test, or an exception to raise."""
-
-    def __init__(self, excitation: Excitation | Exception, plate: Plate) -> None:
-        self.excitation = excitation
-        self.plate = plate
-        self.prepared: list[str] = []
-        self.asked: list[Question] = []
-
-    @property
-    def frequencies(self) -> FloatArray:
-        """Those of the tests' tones [Hz]."""
-        return np.array([110.0, 250.0])
-
-    def prepare(self, drive_mode: str) -> None:
-        """Remember it."""
-        self.prepared.append(drive_mode)
-
-    def query(self, question: Question, over_effect: object = None) -> Pattern:
-        """The same for every target."""
-        self.asked.append(question)
-        if isinstance(self.excitation, Exception):
-            raise self.excitation
-        return Pattern(
-            self.excitation,
-            0.015,
-            20.0,
-            12.0 if question.quiet else None,
-            None,
-            question.drive_mode or "",
-        )
-
-    def amplitudes(
-        self, excitation: Excitation, points: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """1 m/s² everywhere."""
-        return np.array([110.0]), np.ones((1, len(points)))
-
-
 @dataclass
 class Reports:
     """What the control loop reported to its observer."""
@@ -309,21 +263,6 @@ class Reports:
         )
 
 
-def _rig(*amplifiers: str) -> Rig:
-    """A rig with two ERAs, both on the first amplifier or one on each."""
-    return Rig(
-        plate=Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33)),
-        mesh=Mesh(4, 4, 0.3, 0.2),
-        eras=(
-            Era("SW", 0.0, 0.0, 17_000.0, 1.0, 0.0, 100e-6),
-            Era("NE", 0.3, 0.2, 17_000.0, 1.0, 0.0, 100e-6),
-        ),
-        wiring={"SW": Channel(amplifiers[0], 0), "NE": Channel(amplifiers[-1], 1)},
-        amplifiers=dict.fromkeys(amplifiers, "fake://"),
-        limits=GuardLimits(40.0, 500.0, 1.0),
-    )
-
-
 @dataclass
 class Bench:
     """A controller with its far ends, its table, its reports and its running loop."""
@@ -331,7 +270,7 @@ class Bench:
     controller: Controller
     rig: Rig
     far_ends: list[Any]
-    table: Table
+    table: SetTable
     reports: Reports
     loop: asyncio.Task[None] | None = None
 
@@ -384,9 +323,9 @@ def make_bench(
     names = amplifiers or ("main",)
     far_ends = far_ends or [FarEnd(channels) for _ in names]
     reports = Reports()
-    rig = _rig(*names)
-    rig = replace(rig, limits=replace(rig.limits, rate=rate, on_time=on_time))
-    table = Table({"SW": Tone(110.0, 20e-6, math.pi / 2)}, rig.plate)
+    limits = GuardLimits(40.0, 500.0, 1.0, rate=rate, on_time=on_time)
+    rig = make_rig(names, limits, eras=2)
+    table = SetTable({"SW": Tone(110.0, 20e-6, math.pi / 2)}, rig.plate)
     by_name = dict(zip(names, far_ends, strict=True))
     controller = Controller(
         rig,

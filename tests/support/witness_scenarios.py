@@ -2,10 +2,11 @@
 
 import hand_written as hand
 from model.vibration.excitation import Tone
-from witnessed_chain import ALONE, STROKE, Chain
+from set_table import STROKE
+from witnessed_chain import ALONE, Scene
 
 
-async def day(chain: Chain) -> None:
+async def day(chain: Scene) -> None:
     """Touches, a neighbour, a lift, a stop amid a touch, clearing, arming, disarming."""
     await chain.operate("arm", rest=0.12)
     await chain.touch(1, rest=0.1)
@@ -24,7 +25,7 @@ async def day(chain: Chain) -> None:
     await chain.touch()
 
 
-async def hasty(chain: Chain) -> None:
+async def hasty(chain: Scene) -> None:
     """Other fingers touch every 4 ms, within the ramp of a pattern; then all is opened again."""
     await chain.operate("arm", rest=0.12)
     for _ in range(5):
@@ -38,7 +39,7 @@ async def hasty(chain: Chain) -> None:
     await chain.touch(rest=0.05)
 
 
-async def hung(chain: Chain) -> None:
+async def hung(chain: Scene) -> None:
     """The control loop stalls during a touch; a client polls the status, clears and rearms."""
     await chain.operate("arm")
     await chain.touch(1, rest=0.1)
@@ -54,7 +55,7 @@ async def hung(chain: Chain) -> None:
     await chain.touch(rest=0.06)
 
 
-async def source_dies(chain: Chain) -> None:
+async def source_dies(chain: Scene) -> None:
     """A finger beside the plate is none; the source of touches dies with a finger down."""
     await chain.operate("arm", rest=0.05)
     chain.touch_beside()
@@ -64,7 +65,7 @@ async def source_dies(chain: Chain) -> None:
     await chain.rest(0.1)
 
 
-async def slow(chain: Chain) -> None:
+async def slow(chain: Scene) -> None:
     """The last finger is lifted, then an amplifier is stopped, each before a late reply."""
     await chain.operate("arm", rest=0.02)
     chain.delay = 0.025
@@ -77,19 +78,19 @@ async def slow(chain: Chain) -> None:
     await chain.rest(0.05)
 
 
-async def too_much(chain: Chain) -> None:
+async def too_much(chain: Scene) -> None:
     """The table asks for more than full level on one ERA, 620 Hz, or is damaged: NaN."""
     await chain.operate("arm")
     for tone in ((150.0, 0.7, 0.0), (620.0, 0.4, 0.0), (150.0, 0.4, float("nan"))):
         frequency, level, phase = tone
-        chain.table.alone = {**ALONE, "NE": Tone(frequency, level * STROKE, phase)}
+        chain.table.excitation = {**ALONE, "NE": Tone(frequency, level * STROKE, phase)}
         await chain.touch(1, answerable=False)
         chain.witness.expect(None)
         await chain.rest(0.1)
         await chain.touch(rest=0.05)
 
 
-async def arc(chain: Chain) -> None:
+async def arc(chain: Scene) -> None:
     """An amplifier trips amid a touch, is asked for its faults, cleared and identified again."""
     await chain.operate("arm")
     await chain.touch(1, rest=0.06)
@@ -105,7 +106,7 @@ async def arc(chain: Chain) -> None:
     await chain.amplifier.request("GetFaults", {})
 
 
-async def stranger(chain: Chain) -> None:
+async def stranger(chain: Scene) -> None:
     """Another program sends a silent set while disarmed, later a heartbeat of its own session."""
     await chain.rest(0.1)
     chain.inject(hand.frame(hand.SET, hand.part(7, hand.layer(0), now=True), sequence=999))

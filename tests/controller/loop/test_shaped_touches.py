@@ -220,7 +220,7 @@ async def test_open_prepares_table_and_envelopes(link: FarEnd, shapes: Shapes) -
     bench = make_bench(far_ends=[link], timing=shapes)
     await bench.controller.open()
     assert bench.table.prepared == ["phased"]
-    assert shapes.prepared == [110.0, 250.0]
+    assert shapes.prepared == [90.0, 110.0, 150.0, 250.0]
     await bench.controller.close()
 
 

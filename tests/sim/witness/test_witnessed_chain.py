@@ -6,17 +6,16 @@ virtual time. The faults, each with the rule that must be reported: tests/faults
 
 import inspect
 import re
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
 from ruamel.yaml import YAML
 
 import witness_scenarios
-from witnessed_chain import WITNESSED, Chain, play
+from witnessed_chain import WITNESSED, Scenario, play
 
 ROOT = Path(__file__).parents[3]
-SCENARIOS: dict[str, Callable[[Chain], Awaitable[None]]]
+SCENARIOS: dict[str, Scenario]
 SCENARIOS = dict(inspect.getmembers(witness_scenarios, inspect.iscoroutinefunction))
 # Over RTU an answer begins within 10 ms, and nothing may be sent before it: 25 ms are a fault, and
 # the stop that follows a fault is still under way when the operator clears.
@@ -39,11 +38,11 @@ def _played() -> list[tuple[str, str, int]]:
 @pytest.mark.parametrize(("scenario", "wire", "amplifiers"), _played())
 def test_witness_finds_nothing_in_the_chain(scenario: str, wire: str, amplifiers: int) -> None:
     """Every scenario passes clean; amplifiers share a wire of a kind that can be shared."""
-    outcome = play(wire, SCENARIOS[scenario], amplifiers=("a", "b")[:amplifiers])
-    broken = sorted({one.invariant for one in outcome.found})
-    assert not broken, f"broken {', '.join(broken)}: {outcome.found[0]}"
-    assert outcome.errors == []
-    assert outcome.frames > 5
+    chain, found = play(wire, SCENARIOS[scenario], amplifiers=("a", "b")[:amplifiers])
+    broken = sorted({one.invariant for one in found})
+    assert not broken, f"broken {', '.join(broken)}: {found[0]}"
+    assert chain.errors == []
+    assert chain.witness.frames > 5
 
 
 def test_a_fault_is_planted_for_every_rule() -> None:

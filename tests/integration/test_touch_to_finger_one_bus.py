@@ -12,7 +12,7 @@ import pytest
 from can_mailboxes import MailboxBus
 from drivers.codec.can_bus.canopen import CanFrame
 from felt_assertions import CHECKS, Truth, contrasts
-from felt_chain import Chain, Played
+from felt_chain import Played, play_stream
 from model.finger.grid import Grid
 from model.rig.file import load_rig
 from model.table.build import build_table
@@ -73,13 +73,12 @@ def played(
 
     results = {}
     for name, changes in CHANGES.items():
-        rig_file = write_rig(folder / "rig.yaml", *changes)
-        rig = load_rig(rig_file)
-        chain = Chain(rig, truths[name].table, rig, TWO if changes else ONE, rig_file)
+        rig = load_rig(write_rig(folder / "rig.yaml", *changes))
         with pytest.MonkeyPatch.context() as patch:
             if changes:
                 patch.setattr(wires, "CanBus", restless)
-            results[name] = chain.play(STREAM)
+            lines = TWO if changes else ONE
+            results[name] = play_stream(STREAM, lines, rig, truths[name].table)
     return results
 
 

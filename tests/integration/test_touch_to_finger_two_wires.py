@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from felt_assertions import CHECKS, Truth
-from felt_chain import Chain, Played
+from felt_chain import Played, play_stream
 from model.finger.grid import Grid
 from model.rig.file import load_rig
 from model.table.build import build_table
@@ -41,9 +41,8 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
 @pytest.fixture(scope="module")
 def played(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Played:
     """What came of the stream."""
-    rig_file = write_rig(tmp_path_factory.mktemp("chain") / "rig.yaml", *TWO_AMPLIFIERS)
-    rig = load_rig(rig_file)
-    return Chain(rig, truth.table, rig, WIRES, rig_file, drive_mode="switched").play(STREAM)
+    rig = load_rig(write_rig(tmp_path_factory.mktemp("chain") / "rig.yaml", *TWO_AMPLIFIERS))
+    return play_stream(STREAM, WIRES, rig, truth.table, drive_mode="switched")
 
 
 def test_amplifiers_take_turns(played: Played, truth: Truth) -> None:

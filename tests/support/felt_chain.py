@@ -1,171 +1,137 @@
-"""The whole chain in virtual time: touch frames, control loop, wire, far end, fingertips.
+"""The chain with a touch stream: what fingertips felt and sensors read in each of its situations.
 
-Everything between the touch frames and the plate is the project's own, with the durations of the
-wires; only the lines are memory. Each wire has a witness.
+Fingers are at every place of the stream, so that what they felt can be read for any window
+afterwards; those that do not touch have no weight.
 """
 
 import asyncio
-import json
+import math
 import random
-from collections.abc import AsyncIterator, Mapping
-from contextlib import asynccontextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
-import pytest
+import numpy as np
 
-import sim.shared_rig
-from controller.api.client_protocol import Notification
+from chain import Chain
 from controller.daemon.api_views import PlateView
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
-from controller.loop.loop import Controller
-from controller.loop.observer import Applied, Observer
+from controller.loop.observer import Applied
 from drivers import clock
-from drivers.opening import Lines
-from heard import SENSORS, Heard, hear
-from memory_machine import live_in_memory
+from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
-from sim.bench.amplifier_device import AmplifierDevice
-from sim.bench.bench import Bench
-from sim.control.context import SimulationContext
-from sim.control.operations import carry_out
-from sim.far_ends.wires import Wire, open_wires
+from sim.amplifier.summary import AmplifierSummary
+from sim.far_ends.wires import Wire
+from sim.plant.accelerometer import Accelerometer
+from sim.plant.felt import Felt
 from sim.plant.imperfections import draw_imperfections
-from sim.witness.violation import Violation
-from sim.witness.witness import Witness
-from touch_stream import Stream
+from sim.sensors.accelerometers import Accelerometers
+from sim.sensors.recording import Recording
+from touch_stream import Place, Situation, Stream
 from virtual_loop import run_virtual
-from witness_config import witness_config
 
 LEVEL_DB_SL = 30.0
 LEVEL_LIMIT = 1.0  # of the example's rig, written by hand
 SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcand": 500_000}
 """Default speeds of the wires that have one [bit/s]."""
+SENSORS: Mapping[str, Place] = {
+    "P1": (0.03, 0.05),
+    "P2": (0.20, 0.11),
+    "P3": (0.29, 0.20),
+    "P4": (0.08, 0.19),
+    "P5": (0.15, 0.04),
+    "P6": (0.26, 0.09),
+}
+STEADY = 0.3  # s; the end of each situation, when its transients have decayed
+ONSET = 0.1  # s; over which an onset is judged
 
 _POLL = 0.005  # s
 
 
 @dataclass(frozen=True)
-class Played:
-    """Results of a stream.
+class Heard:
+    """A situation as it was on the plate, from start to end [s].
 
-    polls: times [s] of the far end, and the levels of all channels then; violations, frames: of the
-    witness, which no wire within a process has.
+    patterns: as a daemon would report them, the first after a delay [s]; steady,
+    onset: what fingertips felt in the end and in the first 100 ms, by place; phasors (f, s) [m/s²]:
+    at the sensors in the end, at the frequencies that were played; fading: what sensors read where
+    nobody touched.
     """
+
+    situation: Situation
+    begin: float
+    end: float
+    patterns: tuple[Mapping[str, Any], ...] = ()
+    delay: float = 0.0
+    steady: Mapping[str, Felt] = field(default_factory=dict)
+    onset: Mapping[str, Felt] = field(default_factory=dict)
+    phasors: ComplexArray | None = None
+    fading: Recording | None = None
+
+
+@dataclass(frozen=True)
+class Played:
+    """Results of a stream; polls: times [s], and the levels of all channels then."""
 
     heard: list[Heard]
     polls: list[tuple[float, list[float]]]
-    violations: list[Violation]
-    frames: int
-    state: Mapping[str, Any]
+    summaries: Sequence[AmplifierSummary]
+
+
+def play_stream(
+    stream: Stream,
+    wires: Mapping[str, str],
+    rig: Rig,
+    table: LocalizationTable,
+    *,
+    plate: Rig | None = None,
+    drive_mode: str | None = None,
+) -> Played:
+    """Play a stream from arming to closing; wires: kinds by amplifier.
+
+    rig, table: of the controller; plate: its rig, which the controller does not know.
+    """
+
+    async def run() -> Played:
+        async with Streamed.armed(
+            {name: Wire(kind, speed=SPEEDS.get(kind)) for name, kind in wires.items()},
+            rig,
+            table,
+            plate=plate,
+            imperfections=draw_imperfections(plate or rig),
+            intent_source=EffectPlayer(SurfaceLayout(effects=default_effects(LEVEL_DB_SL))),
+            timing=Timing(table),
+            drive_mode=drive_mode,
+            judged={"level": LEVEL_LIMIT},
+        ) as chain:
+            times = await chain.send(stream)
+            heard = [
+                chain.hear(situation, begin, end)
+                for situation, begin, end in zip(stream.situations, times, times[1:], strict=False)
+            ]
+        return Played(heard, chain.polls, [chain.far.summary(name) for name in chain.far.devices])
+
+    return run_virtual(run(), rng=random.Random(1))
 
 
 @dataclass
-class Chain:
-    """A chain to play one stream.
+class Streamed(Chain):
+    """A chain with sensors, to which a stream is sent."""
 
-    rig, table: of the controller; truth: the rig of the plate; wires: kinds by amplifier, None for
-    sim:// of the rig's file.
-    """
+    polls: list[tuple[float, list[float]]] = field(default_factory=list)
 
-    rig: Rig
-    table: LocalizationTable
-    truth: Rig
-    wires: Mapping[str, str] | None
-    rig_file: Path
-    drive_mode: str | None = None
-    witness: Witness | None = field(default=None, init=False)
-    _early: list[tuple[str, str, bytes]] = field(default_factory=list, init=False)
+    def __post_init__(self) -> None:
+        """Place the sensors."""
+        self._sensors = Accelerometers(self.far.bench)
+        self._sensors.place([Accelerometer(name, *at) for name, at in SENSORS.items()])
 
-    def play(self, stream: Stream) -> Played:
-        """Play a stream from arming to closing."""
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sim.shared_rig, "control_socket", self._keep_context)
-            return run_virtual(self._play(stream), rng=random.Random(1), seen=self._seen)
-
-    async def ask(self, op: str, **request: Any) -> dict[str, Any]:
-        """Execute a request of the plate's control."""
-        line = json.dumps({"op": op, **request}).encode()
-        reply = await carry_out(self._context, line, now=clock.now())
-        assert "error" not in reply, reply
-        return dict(reply)
-
-    async def _play(self, stream: Stream) -> Played:
-        live_in_memory()
-        async with self._far_end() as urls:
-            controller = Controller(
-                self.rig,
-                self.table,
-                lines=Lines,
-                urls=urls,
-                intent_source=EffectPlayer(SurfaceLayout(effects=default_effects(LEVEL_DB_SL))),
-                timing=Timing(self.table),
-                observer=Observer(pattern_applied=self._applied),
-                drive_mode=self.drive_mode,
-            )
-            self._events: list[Notification] = []
-            self._polls: list[tuple[float, list[float]]] = []
-            await controller.open()
-            sensors = {name: {"at_m": list(at)} for name, at in SENSORS.items()}
-            await self.ask("sensors", sensors=sensors)
-            await self._touch(stream, {})
-            self._operate("arm")
-            await controller.arm()
-            tasks = [asyncio.create_task(work) for work in (controller.run(), self._poll())]
-            times = await self._send(stream, controller)
-            heard = [
-                await hear(self, situation, begin, end, events=self._events)
-                for situation, begin, end in zip(stream.situations, times, times[1:], strict=False)
-            ]
-            self._operate("disarm")
-            await controller.close()
-            state = await self.ask("state")
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-        witness = self.witness
-        found = [] if witness is None else witness.finish(clock.now())
-        return Played(heard, self._polls, found, 0 if witness is None else witness.frames, state)
-
-    @asynccontextmanager
-    async def _far_end(self) -> AsyncIterator[Mapping[str, str]]:
-        """Open the amplifiers of the true rig on their wires."""
-        if self.wires is None:
-            yield {"main": f"sim://{quote(str(self.rig_file))}?control=control"}
-            return
-        bench = Bench(
-            self.truth,
-            now=clock.now(),
-            imperfections=draw_imperfections(self.truth),
-        )
-        devices = {
-            name: AmplifierDevice(bench, name, address=number)
-            for number, name in enumerate(bench.amplifiers, start=1)
-        }
-        wires = {name: Wire(kind, speed=SPEEDS.get(kind)) for name, kind in self.wires.items()}
-        async with open_wires(wires, [*devices.values()]) as urls:
-            config = witness_config(urls, times_s={}, level=LEVEL_LIMIT)
-            self.witness = Witness(config)
-            for link in config["wires"]:
-                self.witness.opened(link, clock.now())
-            self._context = SimulationContext(bench, devices, urls)
-            yield urls
-            for device in devices.values():
-                device.close()
-
-    @asynccontextmanager
-    async def _keep_context(self, context: SimulationContext, path: Path) -> AsyncIterator[None]:
-        """Keep the plate of sim:// at hand instead of serving its control at a path."""
-        self._context = context
-        yield
-
-    async def _send(self, stream: Stream, controller: Controller) -> list[float]:
-        """Deliver the stream at its pace; return the times of its changes [s]."""
+    async def send(self, stream: Stream) -> list[float]:
+        """Deliver a stream at its pace; return the times of its changes [s]."""
+        polling = asyncio.create_task(self._poll())
+        self._touch(stream, {})
         start = clock.now()
         due = list(stream.changes)
         times = []
@@ -173,36 +139,63 @@ class Chain:
             await asyncio.sleep(max(0.0, start + frame.time - clock.now()))
             while due and due[0][0] <= frame.time + 1e-6:
                 times.append(clock.now())
-                await self._touch(stream, due.pop(0)[1])
-            controller.deliver(replace(frame, time=clock.now()))
+                self._touch(stream, due.pop(0)[1])
+            self.controller.deliver(replace(frame, time=clock.now()))
+        polling.cancel()
         return times
 
-    async def _touch(self, stream: Stream, fingers: Mapping[int, str]) -> None:
-        """Rest fingers on places; at the others they only feel."""
-        await self.ask(
-            "fingers",
-            fingers={name: list(at) for name, at in stream.places.items()},
-            observers=[name for name in stream.places if name not in fingers.values()],
+    def hear(self, situation: Situation, begin: float, end: float) -> Heard:
+        """Read what was felt in a situation between two times [s]."""
+        bench = self.far.bench
+        bench.advance(clock.now())
+        heard = Heard(situation, begin, end)
+        if situation.target is None:
+            return replace(heard, fading=self._sensors.read(begin, end))
+        applied = [each for each in self.applied if begin <= each.time < end]
+        steady = bench.felt(end - STEADY, end)
+        heard = replace(
+            heard,
+            patterns=tuple(map(_pattern, applied)),
+            delay=applied[0].time - begin if applied else math.inf,
+            steady=steady,
+            phasors=_phasors(
+                self._sensors.read(end - STEADY, end),
+                np.array(next(iter(steady.values())).frequencies),
+            ),
         )
-        if self.witness is not None:
-            self.witness.contacts(clock.now(), tuple(fingers))
+        if not situation.from_rest:
+            return heard
+        first = self._sensors.read(begin, begin + 2 * ONSET)
+        motion = np.abs(first.samples).max(axis=1)
+        onset = float(first.times[np.argmax(motion > 1e-3 * motion.max())])
+        return replace(heard, onset=bench.felt(onset, onset + ONSET))
+
+    def _touch(self, stream: Stream, fingers: Mapping[int, str]) -> None:
+        """Rest fingers on places; at the others they only feel."""
+        observers = stream.places.keys() - {*fingers.values()}
+        self.far.bench.place_fingers(stream.places, now=clock.now(), observers=observers)
+        self.witness.contacts(clock.now(), tuple(fingers))
 
     async def _poll(self) -> None:
         while True:
-            state = await self.ask("state")
-            levels = [v for each in state["amplifiers"].values() for v in each["levels"]]
-            self._polls.append((state["time_s"], levels))
+            levels = [level for each in self.levels().values() for level in each]
+            self.polls.append((clock.now(), levels))
             await asyncio.sleep(_POLL)
 
-    def _operate(self, command: Any) -> None:
-        if self.witness is not None:
-            self.witness.operator_command(clock.now(), command)
 
-    def _applied(self, applied: Applied) -> None:
-        event = PlateView(effect_of=lambda key: None, applied=applied).pattern_event()
-        assert event is not None
-        self._events.append(Notification("pattern", applied.time, 0, event.model_dump()))
+def _pattern(applied: Applied) -> Mapping[str, Any]:
+    event = PlateView(effect_of=lambda key: None, applied=applied).pattern_event()
+    assert event is not None
+    return event.model_dump()
 
-    def _seen(self, link: str, toward: str, data: bytes) -> None:
-        if self.witness is not None:
-            self.witness.record_bytes(link, toward, clock.now(), data)  # type: ignore[arg-type]
+
+def _phasors(signals: Recording, frequencies: FloatArray) -> ComplexArray:
+    """Complex amplitudes (f, s) of Im[a exp(i omega t)], t from the first sample on.
+
+    Least squares under a Hann window, which keeps out what still rings at other frequencies.
+    """
+    weights = np.sqrt(np.hanning(len(signals.times)))[:, None]
+    angles = 2 * np.pi * np.outer(signals.times - signals.times[0], frequencies)
+    basis = np.hstack([np.sin(angles), np.cos(angles)])
+    found = np.linalg.lstsq(weights * basis, weights * signals.samples, rcond=None)[0]
+    return np.asarray(found[: len(frequencies)] + 1j * found[len(frequencies) :])

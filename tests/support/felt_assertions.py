@@ -262,6 +262,11 @@ def all_is_off_in_the_end(played: Played, truth: Truth) -> None:
         assert not any(amplifier.levels), amplifier
 
 
+def witness_reports_nothing(played: Played, truth: Truth) -> None:
+    """No rule of the protocol is broken."""
+    assert not played.violations, played.violations[0]
+
+
 CHECKS: Mapping[str, Callable[[Played, Truth], None]] = {
     check.__name__: check
     for check in (
@@ -274,6 +279,7 @@ CHECKS: Mapping[str, Callable[[Played, Truth], None]] = {
         plate_decays,
         levels_stay_within_limits,
         all_is_off_in_the_end,
+        witness_reports_nothing,
     )
 }
 

@@ -30,6 +30,7 @@ from sim.plant.felt import Felt
 from sim.plant.imperfections import draw_imperfections
 from sim.sensors.accelerometers import Accelerometers
 from sim.sensors.recording import Recording
+from sim.witness.violation import Violation
 from touch_stream import Place, Situation, Stream
 from virtual_loop import run_virtual
 
@@ -74,11 +75,15 @@ class Heard:
 
 @dataclass(frozen=True)
 class Played:
-    """Results of a stream; polls: times [s], and the levels of all channels then."""
+    """Results of a stream; polls: times [s], and the levels of all channels then.
+
+    violations: what the witness found.
+    """
 
     heard: list[Heard]
     polls: list[tuple[float, list[float]]]
     summaries: Sequence[AmplifierSummary]
+    violations: Sequence[Violation]
 
 
 def play_stream(
@@ -96,7 +101,7 @@ def play_stream(
     """
 
     async def run() -> Played:
-        async with Streamed.armed(
+        async with Streamed.on(
             {name: Wire(kind, speed=SPEEDS.get(kind)) for name, kind in wires.items()},
             rig,
             table,
@@ -107,12 +112,16 @@ def play_stream(
             drive_mode=drive_mode,
             judged={"level": LEVEL_LIMIT},
         ) as chain:
+            await chain.open()
+            await chain.operate("arm")
             times = await chain.send(stream)
             heard = [
                 chain.hear(situation, begin, end)
                 for situation, begin, end in zip(stream.situations, times, times[1:], strict=False)
             ]
-        return Played(heard, chain.polls, [chain.far.summary(name) for name in chain.far.devices])
+            await chain.close()
+            summaries = [chain.far.summary(name) for name in chain.far.devices]
+            return Played(heard, chain.polls, summaries, chain.witness.finish(clock.now()))
 
     return run_virtual(run(), rng=random.Random(1))
 

@@ -28,20 +28,18 @@ from model.rig.rig import Channel, Rig
 from model.table.table import LocalizationTable
 from newest_contact import BuzzNewestContact
 from paper_plate import make_paper_rig
+from rig_on_wire import far_side
 from sim.bench.amplifier_device import AmplifierDevice
-from sim.bench.bench import Bench
-from sim.far_ends.wires import Wire, open_wires
-from sim.faults.fault_window import Faults
+from sim.far_ends.wires import Wire
 from sim.witness.witness import OperatorCommand
 from small_table import small_table
-from soak_checks import RELEASE, Checks
+from soak_checks import Checks
 from soak_contacts import SourceContacts
 from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence
 from soak_witness import SoakWitness
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual
 
-Handle = Callable[[str, Values, float], Values]
-
+_RELEASE = 0.020  # s; from the last finger up to zero
 _ON_THE_WIRE = 0.002  # s; through driver, adapter and back
 # Bytes of a silent set for four channels and what may precede it on the line, there and back.
 _BYTES = 200
@@ -146,7 +144,6 @@ class _Run:
         loop.set_exception_handler(self._unhandled)
         self.machine = live_in_memory()
         self.rig = make_soak_rig(self.plan.amplifiers)
-        self.bench = Bench(self.rig, now=loop.time())
         self.contacts = SourceContacts()
         self.arm_requests = 0
         self.is_ending = False
@@ -157,46 +154,39 @@ class _Run:
         self.running: asyncio.Task[None] | None = None
         self.controller: Controller | None = None
         self.tasks: list[asyncio.Task[Any]] = []
-        self.checks = Checks(
-            self.bench,
-            self.plan,
-            begin=loop.time(),
-            release=self._release(),
-            contacts=self.contacts,
-            arming=lambda: self.arm_requests > 0,
-        )
-        self.checks.violations = self.violations
-        devices = self._devices()
-        lines = self.plan.lines
+        lines, names = self.plan.lines, [*self.rig.amplifiers]
         wires = {
             name: Wire(
                 lines[number % len(lines)].kind,
                 speed=lines[number % len(lines)].speed,
-                shared=len(lines) < len(devices),
+                shared=len(lines) < len(names),
                 unpluggable=True,
                 line=str(number % len(lines)),
             )
-            for number, name in enumerate(devices)
+            for number, name in enumerate(names)
         }
-        async with open_wires(wires, [*devices.values()]) as urls:
-            self.urls = urls
+        async with far_side(wires, self.rig, seed=self.plan.seed) as far:
+            self.far = far
             self.witness = SoakWitness(
                 loop,
-                urls,
+                far.urls,
                 self.contacts,
                 channels=1 + max(channel.number for channel in self.rig.wiring.values()),
                 release=self._release(),
                 heartbeat=self._release(_BYTES_BETWEEN_FEEDS),
             )
-            self.checks.sense = self.witness.sense
+            self.checks = Checks(
+                far.bench, begin=loop.time(), contacts=self.contacts, sense=self.witness.sense
+            )
+            self.checks.violations = self.violations
+            for name, device in far.devices.items():
+                self._listen(name, device)
             self.serving = asyncio.create_task(self._serve())
-            await self._play(devices)
+            await self._play()
             await self._end()
             self.checks.check()
             self.violations += self.witness.found()
             self.counts["frames seen by the witness"] = self.witness.frames
-            for device in devices.values():
-                device.close()
         self.checks.close()
         await asyncio.sleep(2.0)  # until all bytes in flight have arrived
         left = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
@@ -210,34 +200,26 @@ class _Run:
         preceding: bytes that may be on the line before.
         """
         on_wire = [preceding * 10 / line.speed if line.speed else 0.0 for line in self.plan.lines]
-        return RELEASE + max(on_wire) + _ON_THE_WIRE
+        return _RELEASE + max(on_wire) + _ON_THE_WIRE
 
-    def _devices(self) -> dict[str, AmplifierDevice]:
-        devices = {}
-        for number, name in enumerate(self.bench.amplifiers, start=1):
-            faults = Faults(begin=self.loop.time(), seed=self.plan.seed)
-            device = AmplifierDevice(self.bench, name, address=number, faults=faults)
-            device.handle = self._handling(name, device.handle)  # type: ignore[method-assign]
-            device.listeners.append(
-                lambda event, at, name=name: self.note(  # type: ignore[misc]
-                    "amplifier", name, event["state"], event["fault"]
-                )
-            )
-            devices[name] = device
-        return devices
+    def _listen(self, name: str, device: AmplifierDevice) -> None:
+        """Note what an amplifier is asked, and what becomes of it."""
+        obey = device.handle
 
-    def _handling(self, name: str, handle: Handle) -> Handle:
-        def handling(request: str, values: Values, now: float) -> Values:
+        def handle(request: str, values: Values, now: float) -> Values:
             self.counts["requests"] += 1
-            reply = handle(request, values, now)  # a refusal changes nothing
+            reply = obey(request, values, now)  # a refusal changes nothing
             self.checks.exchanged(name, request)
             return reply
 
-        return handling
+        device.handle = handle  # type: ignore[method-assign]
+        device.listeners.append(
+            lambda event, at: self.note("amplifier", name, event["state"], event["fault"])
+        )
 
-    async def _play(self, devices: dict[str, AmplifierDevice]) -> None:
+    async def _play(self) -> None:
         """Run the actions."""
-        by_number = [*devices.values()]
+        by_number = [*self.far.devices.values()]
         for action in self.plan.actions:
             await self._until(action.at)
             match action:
@@ -281,7 +263,6 @@ class _Run:
                     sequence.source, now + stamp, tuple(Touch(*touch) for touch in touches)
                 )
                 self.controller.deliver(frame)
-            self.checks.lifted()
             self.counts["touches that must be felt"] += must_be_felt
 
     def _must_be_felt(self) -> bool:
@@ -423,7 +404,7 @@ class _Run:
             _table(),
             lines=Lines,
             intent_source=BuzzNewestContact(),
-            urls=self.urls,
+            urls=self.far.urls,
             connected=self._connected,
             observer=Observer(
                 pattern_applied=self._applied,
@@ -464,9 +445,8 @@ class _Run:
             if error is not None:
                 self.checks.violate(f"{task.get_coro()} ended with {error!r}")
         await asyncio.sleep(_QUIET_END)
-        for name, amplifier in self.bench.amplifiers.items():
-            self.bench.advance(self.loop.time())
-            if any(amplifier.summary(self.loop.time()).levels):
+        for name in self.far.devices:
+            if any(self.far.summary(name).levels):
                 self.checks.violate(f"{name} plays after everything was closed")
         if len(self.loop._scheduled) > _TIMERS_MAX:
             self.checks.violate(f"{len(self.loop._scheduled)} timers wait")

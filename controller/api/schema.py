@@ -166,6 +166,9 @@ class ContactStatus(Message):
         None, description="predicted, target over loudest quiet finger; null for a single finger"
     )
     effect: str | None = Field(None, description="what it is to feel: an effect, if any")
+    feels: str | None = Field(
+        None, description="the effect that it feels: its own, or that of another finger"
+    )
     verdict: Literal["own", "mixed", "shared", "held back"] | None = Field(
         None,
         description="what a target feels: its own, mixed with the contents of others (promised "
@@ -174,8 +177,8 @@ class ContactStatus(Message):
     frequency_hz: float | None = Field(None, description="of what it feels; null for several")
     foreign_level_db_sl: float | None = Field(
         None,
-        description="of the contents of others at a target, which nine of ten plates do not "
-        "exceed; null where it is the only content",
+        description="of the contents of others there, which nine of ten plates do not exceed; "
+        "null where there are none",
     )
     held_back: str | None = Field(
         None, description="why a target does not feel its own; null if it does"

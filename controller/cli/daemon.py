@@ -339,6 +339,10 @@ def show_status(status: "StatusResult") -> str:
         promised = contact.robust_felt_contrast_db
         contrast = "" if promised is None else f", at least {promised:.1f} dB over the others"
         effect = "" if contact.effect is None else f", effect {contact.effect}"
+        if contact.feels not in (None, contact.effect):
+            effect += f", feels {contact.feels}"
+        others = contact.foreign_level_db_sl
+        effect += "" if others is None else f", others at most {others:.1f} dB SL"
         verdict = "" if contact.verdict in (None, "own") else f", {contact.verdict}"
         held_back = verdict if contact.held_back is None else f"{verdict}: {contact.held_back}"
         load = "" if contact.load == 1 else f", load {contact.load:.1f}"

@@ -54,7 +54,7 @@ class PlateView:
     def contact_statuses(self) -> list[ContactStatus]:
         """All contacts with their roles."""
         return [
-            contact_status(contact, self.applied, effect=self.effect_of(contact.key))
+            contact_status(contact, self.applied or self.silenced, self.effect_of(contact.key))
             for contact in self.contacts
         ]
 
@@ -69,7 +69,7 @@ class PlateView:
             return None
         return PatternEvent(
             contacts=[
-                contact_status(contact, applied, effect=self.effect_of(contact.key))
+                contact_status(contact, applied, self.effect_of(contact.key))
                 for contact in applied.contacts
             ],
             drive=self.drive(),
@@ -90,7 +90,10 @@ class PlateView:
         if silenced is None:
             return None
         return SilenceEvent(
-            contacts=[contact_status(contact, None) for contact in silenced.contacts],
+            contacts=[
+                contact_status(contact, silenced, self.effect_of(contact.key))
+                for contact in silenced.contacts
+            ],
             reason=silenced.reason,
             latency_ms=None if silenced.latency is None else 1e3 * silenced.latency,
         )
@@ -109,9 +112,9 @@ def played_tones(drive: Drive) -> dict[str, PlayedTone]:
 
 
 def contact_status(
-    contact: Contact, applied: Applied | None, *, effect: str | None = None
+    contact: Contact, report: Applied | Silenced | None, effect: str | None
 ) -> ContactStatus:
-    """Describe a contact with its predicted level under a pattern, and its effect."""
+    """Describe a contact with what it is predicted to feel, and the effect that it was to feel."""
     status: dict[str, object] = {
         "source": contact.key.source,
         "id": contact.key.id,
@@ -120,11 +123,13 @@ def contact_status(
         "effect": effect,
         "load": contact.load,
     }
-    if applied is not None:
-        for felt in applied.targets:
-            if felt.contact.key == contact.key:
+    if report is not None:
+        for felt in report.targets:
+            # A report may be older than a finger of the same number.
+            if (felt.contact.key, felt.contact.since) == (contact.key, contact.since):
                 status |= {
                     "role": "target",
+                    "feels": felt.content,
                     "level_db_sl": _finite(felt.level_db_sl),
                     "robust_felt_contrast_db": _finite(felt.promised_contrast_db),
                     "contrast_db": _finite(felt.contrast_db),
@@ -133,11 +138,15 @@ def contact_status(
                     "foreign_level_db_sl": _finite(felt.foreign_level_db_sl),
                     "held_back": felt.held_back,
                 }
-        if any(quiet.key == contact.key for quiet in applied.quiet):
-            # Of several quiet contacts only the level of the loudest is known.
-            is_known = len(applied.quiet) == len(applied.contents) == 1
-            level = applied.pattern.quiet_level_db_sl if is_known else None
-            status |= {"role": "quiet", "level_db_sl": _finite(level)}
+    if isinstance(report, Applied) and any(each.key == contact.key for each in report.quiet):
+        # Of several quiet contacts only the level of the loudest is known.
+        is_known = len(report.quiet) == len(report.contents) == 1
+        level = report.pattern.quiet_level_db_sl if is_known else None
+        status |= {
+            "role": "quiet",
+            "level_db_sl": _finite(level),
+            "foreign_level_db_sl": _finite(report.quiet_levels.get(contact.key)),
+        }
     return ContactStatus.model_validate(status)
 
 

@@ -180,8 +180,8 @@ class TouchRecorder:
 
     def _silenced(self, silenced: Silenced) -> None:
         self._end_pattern(silenced.time)
-        for contact in silenced.targets:
-            if touch := self._touches.get(contact.key):
+        for each in silenced.targets:
+            if touch := self._touches.get(each.contact.key):
                 touch.reason = silenced.reason
 
     def _end_pattern(self, now: float, *, is_measured: bool = True) -> None:

@@ -54,6 +54,9 @@ class RegionSection(TunedSection):
     on_release: Identifier | None = None
     level: Level | None = None
     priority: Annotated[int, Field(ge=0, le=100)] = 0
+    own: bool = False
+    may_share: bool = False
+    protected: bool = False
 
 
 class LayoutSection(Section):
@@ -160,6 +163,10 @@ def _check_region(
         validation.add(
             (*path, key), f"has no effect to apply to; add an effect or remove the {key}"
         )
+    if region.own and region.may_share:
+        validation.add(
+            (*path, "may_share"), "must not be true beside own: its content is shared; remove one"
+        )
     for key, is_for_motion in (("on_press", False), ("on_move", True), ("on_release", False)):
         name = getattr(region, key)
         _check_use(validation, (*path, key), name, effects, is_for_motion=is_for_motion)
@@ -228,4 +235,7 @@ def _region(name: str, section: RegionSection) -> Region:
         has_level=section.level is not None,
         priority=section.priority,
         band=section.tuned_band,
+        is_own=section.own,
+        may_share=section.may_share,
+        is_protected=section.protected,
     )

@@ -38,6 +38,7 @@ class _Play:
     number: int
     priority: int
     band: Band | None
+    region: Region | None
     is_elsewhere: bool
 
 
@@ -89,6 +90,8 @@ class EffectPlayer:
                 band=play.band,
                 priority=play.priority,
                 content=play.name,
+                is_own=play.region is not None and play.region.is_own,
+                may_share=play.region is not None and play.region.may_share,
             )
             for play, contact, sensation in felt
             if not play.is_elsewhere or play.number == newest
@@ -99,6 +102,11 @@ class EffectPlayer:
             tuple(target for target in targets if not self._waits(target, now, ends)),
             "no effect plays for the contacts on the plate",
             until=min(ends, default=None),
+            protected=frozenset(
+                key
+                for key, finger in self._fingers.items()
+                if finger.region is not None and finger.region.is_protected
+            ),
         )
 
     def replace(self, layout: SurfaceLayout) -> None:
@@ -249,7 +257,7 @@ class EffectPlayer:
         if not isinstance(run, EffectRun):
             raise WrongResultError(effect, run, EffectRun)
         band = self.layout.band_of(name, region)
-        finger.plays.append(_Play(name, run, self._number, priority, band, is_elsewhere))
+        finger.plays.append(_Play(name, run, self._number, priority, band, region, is_elsewhere))
 
     def _current_sensation(
         self, contact: Contact, now: float, ends: list[float]

@@ -1,9 +1,10 @@
 """What layers play: one content each, for its own finger and those that share it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from controller.loop.intent import Target
-from controller.sources.contacts import Contact
+from controller.sources.contacts import Contact, ContactKey
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.request import OWN_CONTRAST_DB
@@ -20,8 +21,9 @@ class Prediction:
     does. level_db_sl: over the duration of the effect, onset included, or the steady one where it
     has none; contrast_db: of the steady vibration to the loudest quiet point, in peak acceleration;
     promised_contrast_db: of levels, to the loudest quiet finger or to the contents of others here,
-    on nine of ten plates; foreign_level_db_sl: of others' contents here. None where there is
-    nothing to compare with. frequency [Hz]: None where several or none play.
+    on nine of ten plates; foreign_level_db_sl: of others' contents here, which nine of ten plates
+    do not exceed. None where there is nothing to compare with. frequency [Hz]: None where several
+    or none play; content: name of what it feels.
     """
 
     contact: Contact
@@ -32,6 +34,7 @@ class Prediction:
     promised_contrast_db: float | None = None
     foreign_level_db_sl: float | None = None
     frequency: float | None = None
+    content: str | None = None
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,9 @@ class Selection:
 
     targets, quiet: contacts as they were when the contents were chosen, targets with their
     intents; not_served: targets that feel nothing, with the reason; is_pending: whether the
-    contents of some targets are still being chosen.
+    contents of some targets are still being chosen. quiet_levels [dB SL]: what quiet contacts feel
+    of the contents, which nine of ten plates do not exceed; protected: contacts that must not
+    notice those of others.
     """
 
     targets: tuple[tuple[Contact, Target], ...]
@@ -69,6 +74,8 @@ class Selection:
     reason: str | None = None
     not_served: tuple[Prediction, ...] = ()
     is_pending: bool = False
+    quiet_levels: Mapping[ContactKey, float] = field(default_factory=dict)
+    protected: frozenset[ContactKey] = frozenset()
 
     @property
     def predictions(self) -> tuple[Prediction, ...]:
@@ -87,9 +94,9 @@ class Selection:
         return self.contents[-1].question if self.contents else None
 
 
-def not_served(contact: Contact, reason: str, **others: float | None) -> Prediction:
-    """Return the prediction for a target that feels nothing of its own; others: of its fields."""
-    return Prediction(contact, None, verdict=HELD_BACK, held_back=reason, **others)
+def not_served(contact: Contact, reason: str) -> Prediction:
+    """Return the prediction for a target that feels nothing of its own."""
+    return Prediction(contact, None, verdict=HELD_BACK, held_back=reason)
 
 
 def verdict_of(promised_contrast_db: float | None) -> str:

@@ -60,6 +60,8 @@ class Target:
     None without an end of its own. band: lowest and highest frequency [Hz]; equal ones stand for
     the nearest of the table. priority: lower ones give way first. content: a name; fingers of one
     name may share one vibration where the plate cannot give each its own. None: of this one alone.
+    is_own: whether it feels its own content or none; may_share: whether it may also feel that of
+    any finger that may share.
     """
 
     key: ContactKey
@@ -69,6 +71,8 @@ class Target:
     band: tuple[float, float] | None = None
     priority: int = 0
     content: str | None = None
+    is_own: bool = False
+    may_share: bool = False
 
     @property
     def is_short(self) -> bool:
@@ -81,12 +85,14 @@ class HapticIntent:
     """Targets and their levels at one moment.
 
     targets: each contact once; those that are not on the plate are ignored. reason: why there are
-    none. until: when [s] the intent may change though no contact has; None for never.
+    none. until: when [s] the intent may change though no contact has; None for never. protected:
+    contacts that must not notice the contents of others.
     """
 
     targets: tuple[Target, ...]
     reason: str = "no target"
     until: float | None = None
+    protected: frozenset[ContactKey] = frozenset()
 
     def due(self, now: float) -> float | None:
         """Return when [s] to query again, at least a millisecond from now."""

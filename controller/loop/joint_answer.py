@@ -6,7 +6,7 @@ one promises 3 dB more to the worst finger, or serves more of them.
 
 import cmath
 import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ from model.arrays import Complex64Array
 from model.finger.perception import FELT_DB_SL, decibels
 from model.table import request
 from model.table.answer import answer
-from model.table.pattern import ONSET_RAMP, Pattern
+from model.table.pattern import IMPERCEPTIBLE_DB_SL, ONSET_RAMP, Pattern
 from model.table.question import Question
 from model.table.request import OWN_CONTRAST_DB, Answer, Finger, Layer, Request
 from model.table.table import LocalizationTable
@@ -42,13 +42,15 @@ def query_jointly(
     *,
     before: Mapping[ContactKey, Content],
     shape: Shape,
+    protected: frozenset[ContactKey] = frozenset(),
 ) -> Selection:
     """Answer the requests of several targets with a content for each; takes some 20 ms.
 
-    before: what fingers feel now. Raises InputError for fingers that are too close.
+    before: what fingers feel now; protected: those that must not notice others' contents. Raises
+    InputError for fingers that are too close.
     """
-    requests = _requests(table, targets, capabilities)
-    fingers = [Finger((each.x, each.y), each.load) for each in quiet]
+    requests = _requests(table, targets, capabilities, protected)
+    fingers = [Finger((each.x, each.y), each.load, _bound(each, protected)) for each in quiet]
     found = _answer(table, requests, fingers, _kept(requests, targets, before))
     places = [each.at for each in requests]
     fields = table.unit_fields(np.array(places), contacts=places)
@@ -73,28 +75,47 @@ def query_jointly(
             contents.append(
                 _content(served, targets, quiet, pattern, then, factor=factor, shape=shape)
             )
-    return Selection(tuple(targets), tuple(quiet), tuple(contents), None, tuple(skipped))
+    change = float(decibels(factor))
+    return Selection(
+        tuple(targets),
+        tuple(quiet),
+        tuple(contents),
+        None if contents else skipped[0].held_back,
+        tuple(skipped),
+        quiet_levels={
+            contact.key: felt.level_db_sl + change
+            for contact, felt in zip(quiet, found.quiet, strict=True)
+        },
+        protected=protected,
+    )
 
 
 def _requests(
     table: LocalizationTable,
     targets: Sequence[tuple[Contact, Target]],
     capabilities: PlaybackCapabilities,
+    protected: frozenset[ContactKey],
 ) -> list[Request]:
-    """One request per finger; those of the name that most have may share."""
-    names = Counter(target.content for _, target in targets if target.content is not None)
-    shared = [name for name, count in names.most_common(1) if count > 1]
+    """One request per finger."""
     return [
         Request(
             (contact.x, contact.y),
             playable_band(target.band, table.frequencies, capabilities.frequencies),
             FELT_DB_SL if target.level_db_sl is None else target.level_db_sl,
             target.priority,
-            may_share=target.content in shared,
+            may_share=target.may_share,
             load=contact.load,
+            content=None if target.is_own else target.content,
+            min_contrast_db=OWN_CONTRAST_DB if target.is_own else -math.inf,
+            max_foreign_db_sl=_bound(contact, protected),
         )
         for contact, target in targets
     ]
+
+
+def _bound(contact: Contact, protected: frozenset[ContactKey]) -> float:
+    """The level [dB SL] of others' contents that a finger may feel."""
+    return IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf
 
 
 def _kept(
@@ -202,6 +223,7 @@ def _content(
             promised_contrast_db=layer.promised_contrast_db,
             foreign_level_db_sl=_changed(layer.foreign_level_db_sl, change),
             frequency=frequency,
+            content=served[0][1].content,
         )
         for contact, _, layer in served
     )
@@ -221,10 +243,15 @@ def _held_back(contact: Contact, layer: Layer) -> Prediction:
     """What is said of a finger whose content is held back, and by how much."""
     had = layer.promised_contrast_db
     figure = "" if had is None or not math.isfinite(had) else f", only {had:.1f} dB"
-    return not_served(
-        contact,
-        f"too many contents for this plate: beside the others it would not have had "
-        f"{request.MIN_CONTRAST_DB:g} dB of contrast{figure}; lift a finger, or move it away",
+    reason = (
+        "a protected finger would notice it; lower its level, or lift that finger"
+        if layer.is_disturbing
+        else "too many contents for this plate: beside the others it would not have had "
+        f"{max(request.MIN_CONTRAST_DB, layer.request.min_contrast_db):g} dB of contrast{figure}; "
+        "lift a finger, or move it away"
+    )
+    return replace(
+        not_served(contact, reason),
         promised_contrast_db=had,
         foreign_level_db_sl=layer.foreign_level_db_sl,
     )

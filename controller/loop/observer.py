@@ -4,10 +4,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from controller.loop.content import Prediction
+from controller.loop.content import Prediction, not_served
 from controller.loop.decision import Decision, PlayedContent
 from controller.loop.routing import Drive
-from controller.sources.contacts import Change, Contact
+from controller.sources.contacts import Change, Contact, ContactKey
 from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.timing import Timing
@@ -17,7 +17,8 @@ from model.table.timing import Timing
 class Applied:
     """The contents that amplifiers play since their last confirmed set.
 
-    contacts: all, in order of arrival; targets: a prediction for each; quiet: quiet contacts;
+    contacts: all, in order of arrival; targets: a prediction for each; quiet: quiet contacts, and
+    what they feel at most (`Selection.quiet_levels`);
     contents: as they are played, by layer, the newest one last; latency [s]: from the touch frame
     to the last byte of the command on the wire, None if none was needed; time [s] of that byte, or
     of the report; from_rest: whether the plate
@@ -28,6 +29,7 @@ class Applied:
     contacts: tuple[Contact, ...]
     targets: tuple[Prediction, ...]
     quiet: tuple[Contact, ...]
+    quiet_levels: Mapping[ContactKey, float]
     contents: Mapping[int, PlayedContent]
     latency: float | None
     time: float
@@ -75,12 +77,12 @@ class Applied:
 class Silenced:
     """All channels are silent, for a reason; latency and time [s].
 
-    targets: contacts for which a pattern was requested. latency: up to the last byte of the
-    command, None if none was needed.
+    targets: of contacts that were to feel something, with the reason for each. latency: up to the
+    last byte of the command, None if none was needed.
     """
 
     contacts: tuple[Contact, ...]
-    targets: tuple[Contact, ...]
+    targets: tuple[Prediction, ...]
     reason: str
     latency: float | None
     time: float
@@ -104,6 +106,7 @@ def applied_by(
         contacts=decision.contacts,
         targets=decision.selection.predictions,
         quiet=decision.selection.quiet,
+        quiet_levels=decision.selection.quiet_levels,
         contents={number: playing[number] for number in order},
         latency=None if sent_at is None else sent_at - decision.triggered_at,
         time=now if sent_at is None else sent_at,
@@ -116,10 +119,16 @@ def applied_by(
 
 def silenced_by(decision: Decision, *, sent_at: float | None, now: float) -> Silenced:
     """Report a decision for silence; sent_at [s]: of its last byte, None if nothing was sent."""
+    selection = decision.selection
+    reason = decision.refusal or selection.reason or ""
+    known = {each.contact.key: each for each in selection.not_served}
     return Silenced(
         contacts=decision.contacts,
-        targets=tuple(contact for contact, _ in decision.selection.targets),
-        reason=decision.refusal or decision.selection.reason or "",
+        targets=tuple(
+            known.get(contact.key) or not_served(contact, reason)
+            for contact, _ in selection.targets
+        ),
+        reason=reason,
         latency=None if sent_at is None else sent_at - decision.triggered_at,
         time=now,
     )

@@ -3,7 +3,7 @@
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from controller.loop.answer_thread import AnswerThread
@@ -17,7 +17,7 @@ from model.drive_modes import UNRESTRICTED
 from model.errors import InputError
 from model.finger.perception import decibels
 from model.table.effect_level import EffectLevels
-from model.table.pattern import Pattern
+from model.table.pattern import IMPERCEPTIBLE_DB_SL, Pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from registry.plugins import failure_text
@@ -28,6 +28,8 @@ MOVE_TOLERANCE = 0.008
 
 # A step of a ramp or texture may be this far [dB] below its level before its frequency changes.
 _STEP_SHORT_OF = 1.0
+
+_QUIETER = "lower its level, or lift that finger"
 
 _logger = logging.getLogger(__name__)
 
@@ -79,6 +81,7 @@ class Selector:
         self.triggered_at = math.inf
         """When [s] the change arrived whose answer of the thread the last selection has."""
         self._requested: tuple[Selection, Targets] = (_NOTHING, ())
+        self._protected: frozenset[ContactKey] = frozenset()
 
     def replace(self, table: LocalizationTable, levels: EffectLevels | None, shape: Shape) -> None:
         """Answer by another table of this plate; the selection stays until its contacts change.
@@ -111,6 +114,7 @@ class Selector:
         lasting = tuple(each for each in served if not each[1].is_short)
         short = tuple(each for each in served if each[1].is_short)
         self.triggered_at = math.inf
+        self._protected = intent.protected
         self._adopt(lasting, contacts)
         self._lasting = _remaining(self._lasting, lasting)
         pulses = self._short
@@ -120,7 +124,7 @@ class Selector:
             if contact.key in pulses and pulses[contact.key].targets[0][1] == target
         }
         new = tuple(each for each in short if each[0].key not in self._short)
-        is_kept = not lasting or _fits(self._lasting, lasting, contacts)
+        is_kept = not lasting or self._fits(self._lasting, lasting, contacts)
         if new or not is_kept:
             self._choose(
                 None if is_kept else lasting,
@@ -149,10 +153,11 @@ class Selector:
             is_for_all = {each.key for each in contacts} <= then
             # Levels and places may have changed since: else a finger that moves would get nothing.
             # What plays may do again, since a finger that came has lifted meanwhile.
-            is_kept = _fits(self._lasting, lasting, contacts)
+            is_kept = self._fits(self._lasting, lasting, contacts)
             if (
                 not is_kept
                 and is_for_all
+                and self._protected <= chosen.lasting.protected
                 and {each.key for each, _ in lasting} <= {each.key for each, _ in targets}
             ):
                 self._lasting, self.triggered_at = chosen.lasting, chosen.triggered_at
@@ -174,12 +179,14 @@ class Selector:
         if self._thread.is_busy and self._is_requested(lasting, short, contacts):
             return
         table, levels, shape = self._table, self._levels, self._shape
-        before = self._lasting
+        before, protected = self._lasting, self._protected
 
         def chosen() -> _Chosen:
             found = None
             if lasting is not None:
-                found = _lasting_of(table, levels, shape, lasting, contacts, capabilities, before)
+                found = _lasting_of(
+                    table, levels, shape, lasting, contacts, capabilities, before, protected
+                )
             new = {
                 contact.key: _alone(
                     table,
@@ -189,14 +196,16 @@ class Selector:
                     contacts,
                     capabilities,
                     pulses.get(contact.key),
-                    beside=(found or before).contents,
+                    protected,
+                    beside=found or before,
                 )
                 for contact, target in short
             }
             return _Chosen(found, new, triggered_at)
 
-        if self._thread.is_busy or (lasting is not None and len(lasting) > 1):
-            self._requested = Selection(lasting or (), contacts), short
+        takes_long = lasting is not None and (len(lasting) > 1 or bool(protected))
+        if self._thread.is_busy or takes_long:
+            self._requested = Selection(lasting or (), contacts, protected=protected), short
             self._thread.compute(chosen)
             return
         found = chosen()
@@ -208,7 +217,7 @@ class Selector:
     ) -> bool:
         """Whether the thread computes this already."""
         requested, pulses = self._requested
-        if lasting is not None and not _fits(requested, lasting, contacts):
+        if lasting is not None and not self._fits(requested, lasting, contacts):
             return False
         return _intents(short) <= _intents(pulses)
 
@@ -228,6 +237,7 @@ class Selector:
         if len(parts) == 1 and {each.key for each, _ in parts[0].targets} == keys:
             return parts[0]
         reasons = [part.reason for part in parts if part.reason is not None]
+        levels = [part.quiet_levels for part in parts]
         return Selection(
             targets,
             quiet,
@@ -235,25 +245,35 @@ class Selector:
             reasons[0] if reasons else None,
             (*(each for part in parts for each in part.not_served), *skipped),
             is_pending=self._thread.is_busy,
+            quiet_levels={
+                each.key: _sum_db(level[each.key] for level in levels if each.key in level)
+                for each in quiet
+            },
         )
+
+    def _fits(self, chosen: Selection, lasting: Targets, contacts: Sequence[Contact]) -> bool:
+        """Whether what was chosen also serves these targets among these contacts."""
+        if _intents(lasting) != _intents(chosen.targets):
+            return False
+        then = {each.key: each for each in (*(c for c, _ in chosen.targets), *chosen.quiet)}
+        now = {each.key: each for each in contacts}
+        same = now.keys() <= then.keys() if _is_whole(chosen) else now.keys() == then.keys()
+        return same and all(
+            math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
+            and contact.load == then[key].load
+            and (key in self._protected) == (key in chosen.protected)
+            for key, contact in now.items()
+        )
+
+
+def _sum_db(levels: Iterable[float]) -> float:
+    """Return the level of powers that add up [dB]."""
+    power = sum(10 ** (level / 10) for level in levels)
+    return 10 * math.log10(power) if power else -math.inf
 
 
 def _intents(targets: Targets) -> set[Target]:
     return {target for _, target in targets}
-
-
-def _fits(chosen: Selection, lasting: Targets, contacts: Sequence[Contact]) -> bool:
-    """Whether what was chosen also serves these targets among these contacts."""
-    if _intents(lasting) != _intents(chosen.targets):
-        return False
-    then = {each.key: each for each in (*(c for c, _ in chosen.targets), *chosen.quiet)}
-    now = {each.key: each for each in contacts}
-    same = now.keys() <= then.keys() if _is_whole(chosen) else now.keys() == then.keys()
-    return same and all(
-        math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
-        and contact.load == then[key].load
-        for key, contact in now.items()
-    )
 
 
 def _is_whole(chosen: Selection) -> bool:
@@ -323,15 +343,18 @@ def _lasting_of(
     contacts: Sequence[Contact],
     capabilities: PlaybackCapabilities,
     before: Selection,
+    protected: frozenset[ContactKey],
 ) -> Selection:
     """Choose for all targets that last; any failure is their reason for silence."""
-    if len(lasting) == 1:
-        return _alone(table, levels, *lasting[0], contacts, capabilities, before)
     keys = {contact.key for contact, _ in lasting}
+    if len(lasting) == 1 and protected <= keys:
+        return _alone(table, levels, *lasting[0], contacts, capabilities, before, protected)
     quiet = tuple(each for each in contacts if each.key not in keys)
     felt = {content.targets[0][0].key: content for content in before.contents}
     try:
-        return query_jointly(table, lasting, quiet, capabilities, before=felt, shape=shape)
+        return query_jointly(
+            table, lasting, quiet, capabilities, before=felt, shape=shape, protected=protected
+        )
     except Exception as error:
         return _failed(lasting, quiet, error)
 
@@ -344,21 +367,22 @@ def _alone(
     contacts: Sequence[Contact],
     capabilities: PlaybackCapabilities,
     before: Selection | None,
+    protected: frozenset[ContactKey],
     *,
-    beside: Sequence[Content] = (),
+    beside: Selection = _NOTHING,
 ) -> Selection:
     """Choose for one target, all others quiet; any failure is its reason for silence.
 
-    before: what was chosen for it; beside: contents that leave less of the stroke.
+    before: what was chosen for it; beside: what leaves less of the stroke, and may be felt there.
     """
     targets = ((contact, target),)
     quiet = tuple(each for each in contacts if each.key != contact.key)
     try:
-        capabilities = _left_by(beside, capabilities)
+        capabilities = _left_by(beside.contents, capabilities)
         answer = _query(table, levels, contact, target, quiet, capabilities, before)
     except Exception as error:
         return _failed(targets, quiet, error)
-    pattern, change = answer.pattern, 0.0
+    pattern, change, reason = answer.pattern, 0.0, None
     if target.is_short:
         left = [
             capabilities.max_amplitudes[name] / tone.amplitude
@@ -368,18 +392,33 @@ def _alone(
         change = min(0.0, float(decibels(min(left, default=1.0))))
         if change < 0 and answer.felt_db_sl + change < 0:
             reason = "the contents of other fingers use the whole stroke; lift a finger"
-            return Selection(targets, quiet, (), reason, (not_served(contact, reason),))
+    felt, promised = answer.felt_db_sl + change, answer.promised_contrast_db
+    leak = -math.inf if promised is None else felt - promised
+    if protected - {contact.key} and leak > IMPERCEPTIBLE_DB_SL:
+        reason = f"a protected finger would notice it, up to {leak:.1f} dB SL; {_QUIETER}"
+    if reason is not None:
+        return Selection(targets, quiet, (), reason, (not_served(contact, reason),))
     content = Content(targets, answer.question, pattern.scaled(change) if change else pattern, ())
-    promised = pattern.robust_felt_contrast_db
+    others = beside.quiet_levels.get(contact.key)
+    if others is not None:
+        promised = min(math.inf if promised is None else promised, felt - others)
     predicted = Prediction(
         contact,
-        answer.felt_db_sl + change,
+        felt,
         pattern.contrast_db,
         verdict_of(promised),
         promised_contrast_db=promised,
+        foreign_level_db_sl=others,
         frequency=content.frequency,
+        content=target.content,
     )
-    return Selection(targets, quiet, (replace(content, predictions=(predicted,)),))
+    return Selection(
+        targets,
+        quiet,
+        (replace(content, predictions=(predicted,)),),
+        quiet_levels={each.key: leak for each in quiet},
+        protected=protected,
+    )
 
 
 def _query(

@@ -32,15 +32,17 @@ _SHORT_OF = 0.1  # dB; a level closer to the wanted one is reached
 class TableAnswer:
     """The question that was finally answered, its pattern, and the level felt of it [dB SL].
 
-    held_back_db: by how much it is weaker so that quiet fingers feel half of it at most.
-
     felt_db_sl: over the duration of a pulse whose level is felt, onset included, or the steady one
     in a band, both on the plate as modelled; else the steady level of nine of ten plates.
+    promised_contrast_db: to the loudest quiet finger, on nine of ten plates, over the duration of
+    such a pulse, else of the steady vibration; None without one. held_back_db: by how much it is
+    weaker so that quiet fingers feel half of it at most.
     """
 
     question: Question
     pattern: Pattern
     felt_db_sl: float
+    promised_contrast_db: float | None
     held_back_db: float = 0.0
 
 
@@ -71,7 +73,7 @@ def query_table(
     if target.level_db_sl is None:
         rated = _over_effect(levels, question, duration)
         pattern = strongest(table.query(question, rated), capabilities.max_amplitudes)
-        felt = pattern.level_db_sl
+        felt, promised = pattern.level_db_sl, pattern.robust_felt_contrast_db
         if duration is not None and levels is not None:
             # Along the ramp of its duration, but no stronger: the neighbours feel it as long.
             raised = levels.raised(
@@ -82,7 +84,8 @@ def query_table(
                 limits=DriveLimits({n: tone.amplitude for n, tone in pattern.excitation.items()}),
             )
             pattern, felt = raised.pattern, raised.level_db_sl
-        return TableAnswer(question, pattern, felt)
+            promised = raised.promised_contrast_db
+        return TableAnswer(question, pattern, felt, promised)
     if duration is None and target.allow_weaker:
         return _as_neighbours_allow(table, question, capabilities)
     is_fixed = target.band is not None
@@ -93,9 +96,9 @@ def query_table(
             # Alike wherever the finger is: the margin for other plates differs from place to place.
             excess = max(pattern.level_db_sl - question.level_db_sl, 0.0)
             pattern = pattern.scaled(-excess)
-            return TableAnswer(question, pattern, pattern.level_db_sl)
+            return _steady(question, pattern, pattern.level_db_sl)
         robust = pattern.robust_level_db_sl
-        return TableAnswer(question, pattern, pattern.level_db_sl if robust is None else robust)
+        return _steady(question, pattern, pattern.level_db_sl if robust is None else robust)
     return _over_duration(table, question, duration, capabilities, levels)
 
 
@@ -156,7 +159,8 @@ def _over_duration(
         found = levels.raised(
             pattern, question, level_db_sl=level, duration=duration, limits=limits
         )
-        return TableAnswer(question, found.pattern, found.level_db_sl, found.held_back_db)
+        promised = found.promised_contrast_db
+        return TableAnswer(question, found.pattern, found.level_db_sl, promised, found.held_back_db)
 
     rated = _over_effect(levels, question, duration)
     question, pattern = _query(table, question, allow_weaker=True, over_effect=rated)
@@ -213,7 +217,12 @@ def _as_neighbours_allow(
         level = question.level_db_sl
         question = replace(question, level_db_sl=min(level, FELT_DB_SL))
         pattern = strongest(table.query(question), capabilities.max_amplitudes, max_db_sl=level)
-    return TableAnswer(question, pattern, pattern.level_db_sl)
+    return _steady(question, pattern, pattern.level_db_sl)
+
+
+def _steady(question: Question, pattern: Pattern, felt_db_sl: float) -> TableAnswer:
+    """Return an answer whose level and contrast are those of the steady vibration."""
+    return TableAnswer(question, pattern, felt_db_sl, pattern.robust_felt_contrast_db)
 
 
 def strongest(

@@ -3,7 +3,8 @@
 A promise below the least contrast at the worst finger is not served as requested. In this order,
 and each only where the requests allow it: the nearest two fingers that may share feel one content;
 the finger of the lowest priority that need not be protected gives up content and protection; the
-content of the lowest priority is held back. Where nothing reaches it, the best tried is served.
+content of the lowest priority is held back. Where nothing reaches it, the best tried is served,
+but for bounds that requests state themselves: these hold, if by silence.
 """
 
 import math
@@ -66,12 +67,13 @@ class _Plan:
     """Which fingers, by index, feel which content and which are quiet.
 
     contents: the fingers of each, its own first; quiet: those that are protected; held: contents
-    given up, with the contrast that they would have had; applied: what was changed, in words.
+    given up, with the contrast that they would have had, and whether they would disturb a finger;
+    applied: what was changed, in words.
     """
 
     contents: tuple[tuple[int, ...], ...]
     quiet: tuple[int, ...]
-    held: tuple[tuple[int, float], ...] = ()
+    held: tuple[tuple[int, float, bool], ...] = ()
     applied: tuple[str, ...] = ()
 
 
@@ -102,15 +104,18 @@ class _Answering:
         quiet = range(count, count + len(self.fingers))
         plan = _Plan(tuple((number,) for number in range(count)), tuple(quiet))
         tried = [(plan, self._measure(plan))]
-        while _worst_of(tried[-1]) < min_contrast_db and len(tried[-1][0].contents) > 1:
+        while self._is_out_of_bounds(*tried[-1]) or (
+            _worst_of(tried[-1]) < min_contrast_db and len(tried[-1][0].contents) > 1
+        ):
             plan = self._with_less(*tried[-1])
             tried.append((plan, self._measure(plan)))
         below: tuple[str, ...] = ()
         if _worst_of(tried[-1]) < min_contrast_db:
-            tried.append(best_by(tried, _worst_of))
+            within = [each for each in tried if not self._is_out_of_bounds(*each)]
+            tried.append(best_by(within, _worst_of))
             below = (f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served",)
         plan, found = tried[-1]
-        for number, contrast in plan.held:
+        for number, contrast, is_disturbing in plan.held:
             heard_there = found.quiet.get(number)
             found.layers[number] = Layer(
                 self.requests[number],
@@ -118,6 +123,7 @@ class _Answering:
                 "held back",
                 promised_contrast_db=contrast,
                 foreign_level_db_sl=None if heard_there is None else heard_there.level_db_sl,
+                is_disturbing=is_disturbing,
             )
         return Answer(
             tuple(found.layers[number] for number in range(count)),
@@ -127,6 +133,25 @@ class _Answering:
             plan.applied + below + found.applied,
         )
 
+    def _is_out_of_bounds(self, plan: _Plan, found: _Measured) -> bool:
+        """Whether a finger has less contrast, or more of others' contents, than it allows."""
+        if len(plan.contents) > 1:
+            for finger, layer in found.layers.items():
+                contrast = layer.promised_contrast_db
+                if contrast is not None and contrast < self.requests[finger].min_contrast_db:
+                    return True
+        return bool(self._disturbed(found))
+
+    def _disturbed(self, found: _Measured) -> list[int]:
+        """Fingers that would feel more of others' contents than they allow."""
+        felt = {finger: layer.foreign_level_db_sl for finger, layer in found.layers.items()}
+        felt |= {finger: each.level_db_sl for finger, each in found.quiet.items()}
+        return [
+            finger
+            for finger, level in felt.items()
+            if level is not None and not level <= self._every[finger].max_foreign_db_sl
+        ]
+
     def _with_less(self, plan: _Plan, found: _Measured) -> _Plan:
         """The plan after the next step of the rule."""
         requests, contents = self.requests, plan.contents
@@ -134,7 +159,7 @@ class _Answering:
             (one, other)
             for number, one in enumerate(contents)
             for other in contents[:number]
-            if all(requests[finger].may_share for finger in (*one, *other))
+            if all(requests[a].may_feel_one_with(requests[b]) for a in one for b in other)
         ]
         if pairs:
             near = [
@@ -151,8 +176,10 @@ class _Answering:
                 applied=(*plan.applied, f"{_at(requests[other[0]])} shares the content of "
                          f"{_at(requests[one[0]])}"),
             )  # fmt: skip
-        least = min(requests[each[0]].priority for each in contents)
-        lowest = [each for each in contents if requests[each[0]].priority == least]
+        disturbed = self._disturbed(found)[:1]
+        others = [each for each in contents if not {*disturbed}.intersection(each)]
+        least = min(requests[each[0]].priority for each in others)
+        lowest = [each for each in others if requests[each[0]].priority == least]
         open_ = [
             each for each in lowest if not any(requests[finger].is_protected for finger in each)
         ]
@@ -162,7 +189,10 @@ class _Answering:
         return _Plan(
             tuple(each for each in contents if each != given_up),
             plan.quiet if open_ else (*plan.quiet, *given_up),
-            (*plan.held, *((finger, -math.inf if c is None else c) for finger, c in figures)),
+            (
+                *plan.held,
+                *((n, -math.inf if c is None else c, bool(disturbed)) for n, c in figures),
+            ),
             (*plan.applied, f"content of {_at(requests[given_up[0]])} {verb}"),
         )
 
@@ -227,6 +257,9 @@ class _Answering:
 
     def _measure(self, plan: _Plan) -> _Measured:
         """What fingers feel of a plan's contents."""
+        if not plan.contents:
+            nothing = {n: QuietFinger(self._every[n].at, *_NOTHING) for n in plan.quiet}
+            return _Measured({}, nothing, None, 1.0)
         table, contents = self.table, self._contents(plan)
         found = choose_tones(table, contents)
         if found is None:
@@ -268,6 +301,10 @@ class _Answering:
         worst = None if math.isnan(found.worst) else float(decibels(found.worst))
         applied = () if found.is_apart else (f"frequencies are nearer than {self.apart_hz:g} Hz",)
         return _Measured(layers, quiet, worst, found.stroke_factor, applied)
+
+
+_NOTHING = math.inf, math.inf, -math.inf
+"""Contrasts and level at a quiet finger of no content."""
 
 
 def _worst_of(tried: tuple[_Plan, _Measured]) -> float:

@@ -33,8 +33,11 @@ class Request:
 
     band_hz: lowest and highest frequency of the content; level_db_sl: its level; priority: lower
     ones give way first; may_share: whether the content may be that of the nearest finger that may
-    share, too; is_protected: whether the finger keeps the others' contents away where its own is
-    given up; load: of the finger relative to the rig's fingertip.
+    share, too; content: a name, fingers of one name may share; is_protected: whether the finger
+    keeps the others' contents away where its own is given up; load: of the finger relative to the
+    rig's fingertip; min_contrast_db: promised contrast to the contents of others below which
+    contents give way; max_foreign_db_sl: level of others' contents at the finger that nine of ten
+    plates do not exceed, else these are held back.
     """
 
     at: Point
@@ -44,6 +47,9 @@ class Request:
     may_share: bool = False
     is_protected: bool = True
     load: float = 1.0
+    content: str | None = None
+    min_contrast_db: float = -math.inf
+    max_foreign_db_sl: float = math.inf
 
     def __post_init__(self) -> None:
         """Check everything that does not depend on the table."""
@@ -64,19 +70,40 @@ class Request:
             )
         if isinstance(self.priority, bool) or not isinstance(self.priority, int):
             raise InputError(f"priority must be a whole number, got {self.priority!r}")
+        if not (self.content is None or isinstance(self.content, str)):
+            raise InputError(f"content must be a name, got {shown(self.content)}")
+        _check_bound(self.min_contrast_db, what="min_contrast_db", unit="dB")
+        _check_bound(self.max_foreign_db_sl, what="max_foreign_db_sl", unit="dB SL")
+
+    def may_feel_one_with(self, other: "Request") -> bool:
+        """Whether both fingers may feel one content."""
+        is_same = self.content is not None and self.content == other.content
+        return is_same or (self.may_share and other.may_share)
 
 
 @dataclass(frozen=True)
 class Finger:
-    """A finger at a place [m] that is to feel nothing; load: relative to the rig's fingertip."""
+    """A finger at a place [m] that is to feel nothing.
+
+    load: relative to the rig's fingertip; max_foreign_db_sl: as of `Request`.
+    """
 
     at: Point
     load: float = 1.0
+    max_foreign_db_sl: float = math.inf
 
     def __post_init__(self) -> None:
         """Check the types."""
         _check_pair(self.at, what="place of a finger", such_as="(0.08, 0.06), x and y in metres")
         expect_number(self.load, what="load", unit="times the rig's fingertip")
+        _check_bound(self.max_foreign_db_sl, what="max_foreign_db_sl", unit="dB SL")
+
+
+def _check_bound(given: float, *, what: str, unit: str) -> None:
+    """Raise InputError for anything but a number, which may be infinite."""
+    expect_number(given, what=what, unit=unit)
+    if math.isnan(given):
+        raise InputError(f"{what} must be a number of {unit}, got {given}")
 
 
 def _check_pair(given: object, *, what: str, such_as: str) -> None:
@@ -97,7 +124,8 @@ class Layer:
     and of nine of ten plates, None where there is nothing to compare with; foreign_level_db_sl: of
     all other contents at this finger, which nine of ten plates do not exceed; verdict: `own`,
     `mixed` (below OWN_CONTRAST_DB), `shared` (the content of another finger) or `held back`, which
-    has the contrast that it would have had.
+    has the contrast that it would have had; is_disturbing: whether that is because of a finger's
+    max_foreign_db_sl.
     """
 
     request: Request
@@ -109,6 +137,7 @@ class Layer:
     median_felt_contrast_db: float | None = None
     promised_contrast_db: float | None = None
     foreign_level_db_sl: float | None = None
+    is_disturbing: bool = False
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 
@@ -13,10 +14,20 @@ from controller.effects.player import EffectPlayer
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, unpack_layers
 from model.finger.perception import detection_threshold
+from model.table.build import build_table
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from paper_table import smooth_rig
 from sim.far_ends.wires import Wire
+
+LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)
+"""Places on the paper's plate, 11 to 23 cm apart."""
+
+
+@cache
+def table() -> LocalizationTable:
+    """The paper's plate at 29 frequencies."""
+    return build_table(smooth_rig(), frequencies=np.linspace(40.0, 320.0, 29))
 
 
 @dataclass

@@ -9,6 +9,7 @@ from controller.demo import run
 from controller.demo.far_end import SimulatedPlate
 from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import TouchRow
+from controller.loop.content import not_served
 from controller.loop.observer import Silenced
 from controller.plate_control import PlateControl
 from controller.sources.contacts import Change, Contact, ContactKey
@@ -38,7 +39,9 @@ async def test_rows_after_a_fault_name_it_until_the_plate_is_armed_again(tmp_pat
     observer = recorder.observer
     near, down, later, last = (contact(number) for number in range(4))
     observer.contacts_changed((near,), Change(down=(near,)))
-    observer.silenced(Silenced((near,), (near,), "too close to an edge", None, clock.now()))
+    reason = "too close to an edge"
+    silenced = Silenced((near,), (not_served(near, reason),), reason, None, clock.now())
+    observer.silenced(silenced)
     observer.contacts_changed((), Change(up=(near,)))
     observer.contacts_changed((down,), Change(down=(down,)))
     recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")

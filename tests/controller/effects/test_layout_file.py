@@ -50,6 +50,26 @@ def test_load_layout_reads_the_example() -> None:
     assert layout.region_at(0.30, 0.01) is None
 
 
+def test_a_region_says_how_its_fingers_are_to_be_served(tmp_path: Path) -> None:
+    """Each key alone; what is a finger's own is not shared."""
+    shape = "rectangle: {start: [0, 0], end: [0.1, 0.1]}"
+    path = tmp_path / "layout.yaml"
+    path.write_text(
+        f"regions: {{a: {{{shape}, own: true, protected: true}}, b: {{{shape}, may_share: true}}}}",
+        encoding="utf-8",
+    )
+    a, b = load_layout(path, None).regions
+    assert (a.is_own, a.may_share, a.is_protected) == (True, False, True)
+    assert (b.is_own, b.may_share, b.is_protected) == (False, True, False)
+    assert {key: a.as_json()[key] for key in ("own", "may_share", "protected")} == {
+        "own": True,
+        "may_share": False,
+        "protected": True,
+    }
+    both = f"regions: {{a: {{{shape}, own: true, may_share: true}}}}"
+    assert "regions.a.may_share" in refused(path, both)
+
+
 def test_region_at_returns_the_later_region_where_two_overlap(tmp_path: Path) -> None:
     """Regions lie on top of each other in the order of the file."""
     path = tmp_path / "layout.yaml"

@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -28,14 +27,9 @@ from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from model.arrays import Complex64Array
 from model.errors import InputError
-from model.table.build import build_table
 from model.table.pattern import Pattern
-from model.table.table import LocalizationTable
-from paper_table import smooth_rig
-from several_fingers import fingers_on
+from several_fingers import ABOVE, LEFT, RIGHT, fingers_on, table
 from virtual_loop import in_virtual_time
-
-LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)
 
 LAYOUT = SurfaceLayout(
     (
@@ -46,12 +40,6 @@ LAYOUT = SurfaceLayout(
     {"low": Buzz(level=14.0), "high": Buzz(level=14.0), "any": Buzz(level=14.0)},
     elsewhere=None,
 )
-
-
-@cache
-def table() -> LocalizationTable:
-    """The paper's plate at 29 frequencies."""
-    return build_table(smooth_rig(), frequencies=np.linspace(40.0, 320.0, 29))
 
 
 def answering_after(seconds: float, monkeypatch: pytest.MonkeyPatch) -> asyncio.AbstractEventLoop:

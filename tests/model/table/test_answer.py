@@ -220,6 +220,47 @@ def test_fingers_that_may_share_feel_one_content():
     assert "shares" in found.applied[0]
 
 
+def test_fingers_whose_contents_have_one_name_share_and_no_others():
+    """Two pairs of names, of which the nearer pair shares: the third finger is between them."""
+    places = ((0.09, 0.07), (0.14, 0.08), (0.11, 0.12), (0.25, 0.18))
+    names = ("low", "high", "low", "high")
+    requests = [Request(at, content=name) for at, name in zip(places, names, strict=True)]
+    every = answer(smooth_table(), requests, min_contrast_db=-99)
+    found = answer(smooth_table(), requests, min_contrast_db=every.promised_worst_db + 0.1)
+    assert "shared" in {found.layers[0].verdict, found.layers[2].verdict}
+    assert found.layers[2].excitation == found.layers[0].excitation
+    assert found.layers[1].excitation != found.layers[3].excitation
+
+
+def test_what_is_to_be_own_is_own_or_makes_contents_give_way():
+    """With 12 dB or held back, whichever priority is lower; what 6 dB suffice for is mixed."""
+    table, places = smooth_table(), (NEAR, FAR, THIRD)
+    mixed = answer(table, [Request(at) for at in places])
+    assert {each.verdict for each in mixed.layers} >= {"mixed"}
+    for priority, verdict in ((1, "own"), (-1, "held back")):
+        requests = [
+            Request(at, min_contrast_db=12.0, priority=priority) if at == THIRD else Request(at)
+            for at in places
+        ]
+        found = answer(table, requests)
+        assert found.layers[2].verdict == verdict
+        assert "held back" in {each.verdict for each in found.layers}
+
+
+def test_a_finger_that_must_not_be_disturbed_is_not():
+    """Contents that leak more than it allows are held back, to the last; quieter ones are not."""
+    table = smooth_table()
+    played = answer(table, [Request(NEAR)], [Finger(QUIET)])
+    leak = played.quiet[0].level_db_sl
+    for bound, verdict in ((leak + 0.1, "own"), (leak - 0.1, "held back")):
+        found = answer(table, [Request(NEAR)], [Finger(QUIET, max_foreign_db_sl=bound)])
+        assert found.layers[0].verdict == verdict
+        assert found.quiet[0].level_db_sl <= bound
+    requests = [Request(NEAR, priority=-1, max_foreign_db_sl=-30.0), Request(FAR)]
+    found = answer(table, requests)
+    assert [each.verdict for each in found.layers] == ["own", "held back"]
+
+
 def test_the_lowest_priority_is_held_back():
     """With the contrast that it would have had, and the level of the others there."""
     requests = [Request(at, priority=int(at != FAR)) for at in (NEAR, FAR, THIRD, FOURTH)]
@@ -278,7 +319,15 @@ def test_answer_refuses_what_contradicts_itself(requests, fingers, named):
 
 
 @pytest.mark.parametrize(
-    "given", [{"band_hz": (90, 60)}, {"level_db_sl": np.nan}, {"priority": 1.5}, {"priority": True}]
+    "given",
+    [
+        {"band_hz": (90, 60)},
+        {"level_db_sl": np.nan},
+        {"priority": 1.5},
+        {"priority": True},
+        {"content": 3},
+        {"max_foreign_db_sl": np.nan},
+    ],
 )
 def test_a_request_refuses_what_no_content_has(given):
     """A band that ends before it begins, no level, and a priority without order."""

@@ -258,19 +258,6 @@ def test_daemon_continues_when_gateways_are_killed_under_load(
     assert len(sources) == 1  # the watch's own
 
 
-def test_fingers_of_a_killed_gateway_are_lifted(daemon: Path, tmp_path: Path) -> None:
-    """After the contact timeout."""
-    with Client.connect(daemon, name="test") as era:
-        with gateway_process(tmp_path, daemon) as gateway, RawWebSocket(gateway) as ws:
-            wait_for_daemon(gateway)
-            point = {"id": 1, "x_m": 0.2, "y_m": 0.1}
-            while not era.status().contacts:
-                ws.call("touch", {"source": "me", "touches": [point]})
-                ws.response()
-            gateway.process.kill()
-        wait_for(lambda: not era.status().contacts)
-
-
 def test_stop_over_http_is_latched_until_clear(
     watched: Watch, daemon: Path, tmp_path: Path
 ) -> None:

@@ -12,18 +12,13 @@ import pytest
 import serial
 
 from controller.api.jsonrpc import ErrorCode
-from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
-from controller.daemon.log import LogThread
-from controller.daemon.service_manager import ServiceManager
-from controller.daemon.socket_lock import SocketLock
 from controller.daemon.states import StateMachine
 from daemon_bench import (
     ENABLED,
     PATIENCE,
     READY,
     daemon_at,
-    daemon_table,
     error_code,
     far_end,
     next_event,
@@ -31,10 +26,8 @@ from daemon_bench import (
     running_daemon,
     until,
     until_state,
-    write_daemon,
 )
 from drivers.errors import LinkError
-from sim.faults.fault_window import FaultWindow
 
 
 def delay_arming(
@@ -203,25 +196,6 @@ async def test_shutdown_while_a_port_is_opened_leaves_none_open(
         assert len(opened) == 1
         with serial.Serial(opened[0].port, exclusive=True):
             pass
-
-
-async def test_shutdown_ends_wait_for_amplifier_at_start(tmp_path: Path) -> None:
-    """An amplifier that does not reply does not delay it."""
-    async with far_end(tmp_path) as far:
-        far.device.inject_fault(FaultWindow("hang"))
-        config = load_daemon_config(write_daemon(tmp_path, {"main": far.url}))
-        lock, log = SocketLock(config.socket), LogThread(tmp_path / "log")
-        daemon = Daemon(config, daemon_table(), log=log, manager=ServiceManager({}), dashboard=None)
-        running = asyncio.create_task(daemon.run(lock))
-        try:
-            await asyncio.sleep(0.1)
-            begin = asyncio.get_running_loop().time()
-            daemon.shut_down("end of the test")
-            await asyncio.wait_for(running, PATIENCE)
-            assert asyncio.get_running_loop().time() - begin < 1.0
-        finally:
-            log.close()
-            lock.release()
 
 
 async def test_log_event_escapes_bytes_that_are_not_text(tmp_path: Path) -> None:

@@ -37,21 +37,6 @@ async def test_touches_of_clients_become_frames_of_sources() -> None:
     assert frames == [TouchFrame("api:7:me", 12.5, placed, origin="api:7")]
 
 
-async def test_newest_touches_of_each_source_are_delivered() -> None:
-    """One frame of each source per iteration of the event loop, however many came."""
-    frames: list[TouchFrame] = []
-    touches = ApiTouches(PLATE, frames.append)
-    for number in range(1000):
-        touches.add("client", params("me", (0.0004 * number, 0.0)), client_name="1", now=number)
-        touches.add("client", params("you", (0.1, 0.0)), client_name="1", now=number)
-    await asyncio.sleep(0)
-    assert [(frame.source, frame.time) for frame in frames] == [
-        ("api:1:me", 999),
-        ("api:1:you", 999),
-    ]
-    assert frames[0].touches[0].x == pytest.approx(0.999)
-
-
 async def test_touches_before_a_lift_are_delivered() -> None:
     """Frames with a finger that the next one does not have come before it, in their order."""
     frames: list[TouchFrame] = []

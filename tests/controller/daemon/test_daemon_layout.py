@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from controller.api.jsonrpc import ErrorCode
-from daemon_bench import error_code, holding, next_event, ready_daemon, until
+from daemon_bench import error_code, holding, ready_daemon, until
 
 LAYOUT = """\
 effects:
@@ -73,41 +73,3 @@ async def test_daemon_plays_effects_by_region_and_by_name(
             assert decided  # not with the next heartbeat
             assert await level_of("alert") == pytest.approx(12, abs=0.5)
             assert (await era.status()).silence_reason is None
-
-
-async def test_daemon_publishes_layouts_and_rejects_invalid_ones(tmp_path: Path) -> None:
-    """Subscribers get the current one, then each replacement, as hello does from then on."""
-    path = tmp_path / "layout.yaml"
-    path.write_text(LAYOUT, encoding="utf-8")
-    async with ready_daemon(tmp_path, "layout: layout.yaml\n") as (bench, era):
-        await era.subscribe("layout")
-
-        async def published() -> dict[str, object]:
-            return dict((await next_event(era, "layout")).data["layout"])
-
-        assert await published() == (await era.hello("test")).layout
-        path.write_text(LAYOUT.replace("level: 14", "level: loud"), encoding="utf-8")
-        await bench.daemon.reload()
-        path.write_text(LAYOUT.replace("pad:", "field:"), encoding="utf-8")
-        await bench.daemon.reload()
-        layout = await published()
-        assert [region["name"] for region in layout["regions"]] == ["field", "quiet"]
-        assert (await era.hello("test")).layout == layout
-
-
-@pytest.mark.usefixtures("resting")
-async def test_status_says_what_the_plate_cannot_serve(tmp_path: Path) -> None:
-    """The few frequencies of this table keep one of two contents away; the thread is a real one."""
-    two = LAYOUT.replace("0.15]}}\nelsewhere", "0.15]}, on_press: alert}\nelsewhere")
-    (tmp_path / "layout.yaml").write_text(two, encoding="utf-8")
-    async with ready_daemon(tmp_path, "layout: layout.yaml\n") as (bench, era):
-        view = bench.daemon._publisher.view
-        await era.arm("me", lease_s=60)
-        await era.touch([ON_PAD, ON_QUIET])
-        await until(lambda: view.applied is not None and len(view.applied.targets) == 2)
-        first, second = (await era.status()).contacts
-        assert (first.effect, first.role, first.verdict) == ("hum", "target", "mixed")
-        assert (first.held_back, first.level_db_sl) == (None, pytest.approx(14, abs=0.5))
-        assert (second.effect, second.role, second.verdict) == ("alert", "target", "held back")
-        assert second.level_db_sl is None
-        assert (second.held_back or "").startswith("too many contents for this plate")

@@ -19,7 +19,6 @@ from controller.daemon.log import JsonFormatter, LogThread, RateLimitFilter
 from controller.daemon.message_recorder import MessageRecord, MessageRecorder
 from controller.daemon.service_manager import ServiceManager
 from controller_bench import BenchLines, FarEnd
-from drivers.errors import LinkTimeout
 from registry.limits import GuardLimits
 from virtual_loop import in_virtual_time
 
@@ -242,24 +241,6 @@ def test_latency_percentiles_are_values_that_occurred() -> None:
     counts = dict(summary.histogram)
     assert (counts[1.0], counts[5.0], counts[50.0], counts[100.0]) == (1, 1, 30, 950)
     assert sum(counts.values()) == summary.count == 1000
-
-
-@in_virtual_time
-async def test_messages_are_recorded_by_amplifier() -> None:
-    """Requests and replies by name, with their values; what has no reply, too."""
-    far_end, recorder = FarEnd(), MessageRecorder()
-    host = await BenchLines({"main": far_end}).amplifier("", LIMITS, name="main")
-    recorder.follow({"main": host})
-    await host.open()
-    far_end.is_mute = True
-    with pytest.raises(LinkTimeout):
-        await host.read_status()
-    found = [(each.direction, each.message) for each in recorder.records()]
-    assert found[:5] == [
-        *(("open", ""), ("out", "Hello"), ("in", "Reply"), ("out", "GetCaps"), ("in", "Reply")),
-    ]
-    assert found[-2:] == [("out", "GetStatus"), ("none", "no reply")]
-    assert {each.link for each in recorder.records()} == {"main"}
 
 
 @in_virtual_time

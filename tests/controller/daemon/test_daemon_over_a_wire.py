@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import logging
 import re
 from pathlib import Path
 
@@ -68,39 +67,6 @@ async def test_daemon_plays_touches_only_while_armed(tmp_path: Path) -> None:
         assert (await era.status()).drive == {}
 
 
-async def test_daemon_disarms_when_lease_not_renewed(tmp_path: Path) -> None:
-    """Armed for 1.4 s by a lease of 1 s that is renewed once; then disarmed."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        lease = await era.arm("me", lease_s=1)
-        await asyncio.sleep(0.7)
-        await era.renew(lease.lease)
-        await asyncio.sleep(0.7)
-        assert (await era.status()).state == ENABLED
-        await until_state(era, READY)
-        assert bench.far.summary().state == "SWITCH_ON_DISABLED"
-        assert await error_code(era.renew(lease.lease)) is ErrorCode.LEASE
-
-
-async def test_any_client_stops_daemon_armed_by_another(tmp_path: Path) -> None:
-    """A second lease is refused, a stop is not; the stop is latched until cleared."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        await era.arm("me", lease_s=30)
-        async with await bench.client("other") as other, holding(era, far=bench.far):
-            assert await error_code(other.arm("you")) is ErrorCode.LEASE
-            await other.stop()
-            await until(lambda: not any(bench.far.summary().levels))
-            status = await other.status()
-        assert (status.state, status.armed_by) == ("QUICK_STOP_ACTIVE", None)
-        assert "other" in status.cause
-        assert bench.far.summary().state == "QUICK_STOP_ACTIVE"
-        assert await error_code(era.arm("me")) is ErrorCode.WRONG_STATE
-        await era.clear()
-        await until_state(era, READY)
-        await era.arm("me")
-        await era.disarm()
-        await until_state(era, READY)
-
-
 async def test_daemon_stays_disarmed_and_latched_after_link_loss_while_armed(
     tmp_path: Path,
 ) -> None:
@@ -136,49 +102,6 @@ async def test_daemon_stays_disarmed_and_latched_after_link_loss_while_armed(
         await era.clear()
         await until_state(era, READY)
         await era.arm("me")
-
-
-async def test_link_loss_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """One error with cause and remedy and one line for equal retries, neither in topic `log`."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        await era.subscribe("link", "log")
-        with caplog.at_level(logging.INFO, "controller"):
-            bench.far.device.inject_fault(FaultWindow("hang"))
-            events = [await next_event(era, "link", "log") for _ in range(3)]
-            lost, *retried = caplog.records
-            logging.getLogger("controller").info("something else")
-            last = await next_event(era, "log")
-    assert [each.data.get("event") for each in events] == ["lost", "retry", "retry"]
-    assert last.data["message"] == "something else"
-    assert (lost.levelname, lost.getMessage()) == ("ERROR", f"{READY} -> COMM_LOST")
-    assert "amplifier main" in vars(lost)["cause"]
-    assert vars(lost)["remedy"]
-    (retry,) = [record.getMessage() for record in retried]
-    assert events[1].data["message"] in retry
-
-
-async def test_status_hides_last_reply_of_lost_amplifier(tmp_path: Path) -> None:
-    """While it is lost and while it is being reopened; a loss while disarmed latches nothing."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        (known,) = (await era.status()).amplifiers
-        assert (known.lost, known.levels, known.high_voltage) == (False, [0.0] * 4, False)
-        bench.far.device.inject_fault(FaultWindow("hang"))
-        await until_state(era, "COMM_LOST")
-        begun = lost_for = (await era.status()).lost_for_s or 0.0
-        while lost_for < begun + 1.0:  # two attempts to reopen it
-            status = await era.status()
-            (lost,) = status.amplifiers
-            assert lost.lost
-            unknown = (lost.state, lost.fault, lost.temperature_c, lost.high_voltage)
-            assert (unknown, lost.levels) == ((None,) * 4, [])
-            assert status.lost_for_s is not None
-            assert (lost.reply_age_s or 0.0) >= status.lost_for_s
-            lost_for = status.lost_for_s
-            await asyncio.sleep(0.01)
-        bench.far.device.recover()
-        await until_state(era, READY)
-        status = await era.status()
-        assert (status.lost_for_s, status.amplifiers[0].lost) == (None, False)
 
 
 async def test_status_tells_lost_amplifier_from_one_closed_with_it(tmp_path: Path) -> None:
@@ -286,19 +209,3 @@ async def test_daemon_refuses_amplifier_with_another_serial_number(tmp_path: Pat
     async with running_daemon(tmp_path, more) as bench, await bench.client() as era:
         await until_state(era, "COMM_LOST")
         assert re.search(r"A1.*SIM-main", (await era.status()).cause)
-
-
-async def test_daemon_describes_rig_and_amplifiers(tmp_path: Path) -> None:
-    """Amplifiers and latency at a rate; hello has the whole rig and a summary of the table."""
-    async with ready_daemon(tmp_path) as (_, era):
-        await era.subscribe("amplifiers", "latency", rate_hz=50)
-        (amplifier,) = (await next_event(era, "amplifiers")).data["amplifiers"]
-        assert amplifier["serial_number"] == "SIM-main"
-        assert amplifier["state"] == "SWITCH_ON_DISABLED"
-        assert (await next_event(era, "latency")).data["latency_ms"]["count"] == 0
-        hello = await era.hello("again")
-        assert hello.rig.simulated
-        channels = {place.name: place.channel for place in hello.rig.eras}
-        assert channels == {"SW": 0, "SE": 1, "NE": 2, "NW": 3}
-        assert hello.rig_text == (tmp_path / "rig.yaml").read_text("utf-8")
-        assert (hello.table.cells_x, hello.table.cells_y) == (4, 3)

@@ -8,8 +8,7 @@ import pytest
 
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from daemon_bench import PLACE, READY, holding, ready_daemon, until, until_state
-from sim.faults.fault_window import FaultWindow
+from daemon_bench import ready_daemon
 from tuio_panel import free_port
 
 
@@ -46,18 +45,3 @@ async def test_daemon_combines_contacts_of_panels_and_clients(tmp_path: Path) ->
             ("right", 7): pytest.approx((0.2286, 0.05715)),
             ("api", 1): pytest.approx((0.15, 0.1)),
         }
-
-
-async def test_daemon_follows_contacts_while_link_lost(tmp_path: Path) -> None:
-    """A finger that rests is shown; one that lifts during the loss neither then nor after it."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        async with holding(era, PLACE):
-            await until(lambda: bench.daemon._publisher.view.contacts)
-            bench.far.device.inject_fault(FaultWindow("hang"))
-            await until_state(era, "COMM_LOST")
-            assert len((await era.status()).contacts) == 1
-        await era.touch([])
-        assert (await era.status()).contacts == []
-        bench.far.device.recover()
-        await until_state(era, READY)
-        assert (await era.status()).contacts == []

@@ -362,14 +362,3 @@ def test_websocket_message_in_two_fragments_is_one(gateway: GatewayProcess) -> N
         ws.send(text[:at], first=0x01)
         ws.send(text[at:], first=0x80)
         assert json.loads(ws.next()[1]) == {"jsonrpc": "2.0", "id": "ü", "result": {}}
-
-
-def test_stop_and_disarm_are_served_to_a_host_that_connects_too_often(
-    gateway: GatewayProcess, daemon: ScriptedDaemon
-) -> None:
-    """Others are refused; reading metrics needs none. The last test, for it is such a host."""
-    wait_for(lambda: call(gateway, "status")[0] == 429)
-    daemon.calls.clear()
-    assert [call(gateway, method)[0] for method in ("stop", "disarm")] == [200, 200]
-    assert daemon.methods == ["stop", "disarm"]
-    assert b"\nera_up 1.0\n" in http(gateway, "/metrics", method="GET", body=b"", token=()).body

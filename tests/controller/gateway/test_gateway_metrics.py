@@ -17,7 +17,6 @@ from controller.gateway.access import Access
 from controller.gateway.metrics import exposition
 from controller.gateway.settings import Settings
 from daemon_bench import ready_daemon
-from gateway_bench import ScriptedDaemon, gateway_process, http, wait_for_daemon
 
 
 def scraped(status: StatusResult | None) -> dict[tuple[str, str], float]:
@@ -52,22 +51,6 @@ async def test_metrics_follow_status(tmp_path: Path) -> None:
     assert read["era_touch_to_wire_seconds_bucket", "0.005"] == 5
     assert read["era_touch_to_wire_seconds_bucket", "+Inf"] == 9
     assert read["era_rejected_touches_total", "off_plate"] == 3
-
-
-def test_metrics_are_era_up_0_without_daemon() -> None:
-    """No other sample is given."""
-    assert scraped(None) == {("era_up", ""): 0}
-
-
-def test_metrics_need_no_token_on_the_loopback(daemon: ScriptedDaemon, tmp_path: Path) -> None:
-    """Prometheus reads them of an allowed Host; they say that the daemon responds."""
-    with gateway_process(tmp_path, daemon.socket) as gateway:
-        wait_for_daemon(gateway)
-        served = http(gateway, "/metrics", method="GET", body=b"", token=())
-        assert served.status == 200
-        assert b"\nera_up 1.0\n" in served.body
-        foreign = http(gateway, "/metrics", method="GET", body=b"", host=["evil.example"])
-        assert foreign.status == 421
 
 
 async def test_metrics_need_the_token_elsewhere(tmp_path: Path) -> None:

@@ -1,9 +1,6 @@
 """The control loop, in virtual time, with amplifiers that record their requests."""
 
 import asyncio
-import logging
-import math
-from itertools import count, pairwise
 
 import pytest
 
@@ -11,12 +8,10 @@ from controller.loop.intent import NO_CONTACTS
 from controller.loop.observer import Observer
 from controller.sources.touch import Touch, TouchFrame
 from controller_bench import FINGER, OTHER, Bench, armed, running
-from drivers.contents import Tone as Played
 from drivers.host.group import GroupState
 from drivers.host.timing import HEARTBEAT
 from drivers.protocol.records import Values
-from model.errors import InputError
-from model.vibration.excitation import Excitation, Tone
+from model.vibration.excitation import Tone
 from virtual_loop import in_virtual_time
 
 NEAR = (FINGER[0], FINGER[1] + 0.001, FINGER[2])  # of the same pattern
@@ -39,33 +34,6 @@ def assert_silenced_within_20_ms(bench: Bench, lifted: float) -> None:
 def first_silence(bench: Bench, since: float) -> float:
     """When the first silent set from a time on was sent [s]."""
     return next(each.time for each in bench.far_end.sets() if each.is_silent and each.time >= since)
-
-
-@in_virtual_time
-async def test_controller_plays_a_touch_within_one_turn() -> None:
-    """A touch is on the wire at once, and reported as confirmed, with figures worked out by hand.
-
-    20 of 100 µm is level 0.2; the ramp is that of the pattern; latency counts from the frame.
-    """
-    async with running() as bench:
-        bench.touch(FINGER, ago=0.003)
-        await asyncio.sleep(0.001)
-        played = bench.far_end.sets()[-1]
-        assert [(c.channel, c.frequency, c.phase) for c in played.commands] == [
-            (0, 110.0, 90.0),
-            (1, 40.0, 0.0),
-        ]
-        assert [c.level for c in played.commands] == pytest.approx([0.2, 0.0])
-        assert played.ramp == 0.015
-        (applied,) = bench.reports.applied
-        assert applied.latency == pytest.approx(0.003)
-        (felt,) = applied.targets
-        assert (felt.contact.x, felt.contact.y) == pytest.approx((0.15, 0.1))
-        assert (felt.level_db_sl, felt.contrast_db) == (20.0, None)
-        assert applied.quiet == ()
-        assert applied.pattern.level_db_sl == 20.0
-        assert applied.drive == {"SW": Played(0, 110.0, 0.2, 90.0)}
-        assert bench.reports.contacts == [1]
 
 
 @in_virtual_time
@@ -154,18 +122,6 @@ async def test_controller_keeps_phase_when_a_finger_moves() -> None:
         ]
 
 
-@in_virtual_time
-async def test_controller_restarts_phase_after_a_disarm() -> None:
-    """What plays is unknown then: the next pattern counts its phase from its commit."""
-    async with armed() as bench:
-        bench.touch(FINGER)
-        await bench.controller.step()
-        await bench.controller.disarm()
-        await bench.controller.arm()
-        await bench.controller.step()
-        assert [each.commands[0].keep_phase for each in bench.far_end.sets()] == [False, False]
-
-
 @pytest.mark.parametrize("kind", ["Set", "Commit", "GetStatus", "Ping"])
 @in_virtual_time
 async def test_controller_silences_a_lift_while_a_reply_is_awaited(kind: str) -> None:
@@ -197,63 +153,6 @@ async def test_controller_silences_a_lift_while_a_reply_is_awaited(kind: str) ->
         assert bench.controller.group_state is GroupState.ARMED
 
 
-@in_virtual_time
-async def test_controller_repeats_no_aborted_request() -> None:
-    """A heartbeat without a reply yields to silence, and to the pattern of a finger that comes.
-
-    The last finger lifts 25 ms after it, and another comes at once.
-    """
-    async with running() as bench:
-        await bench.hold(FINGER, seconds=0.1)
-        due = bench.far_end.times("Ping")[-1] + HEARTBEAT
-        bench.touch(FINGER)
-        await asyncio.sleep(due - 0.001 - now())
-        bench.far_end.is_mute = True
-        asked = len(bench.far_end.asked)
-        await asyncio.sleep(0.026)
-        bench.touch()
-        bench.touch(OTHER)
-        await asyncio.sleep(0.002)
-        bench.far_end.is_mute = False
-        await asyncio.sleep(0.030)
-        assert bench.far_end.names(asked)[:3] == ["GetStatus", "Set", "Commit"]
-        assert bench.controller.group_state is GroupState.ARMED
-        assert bench.reports.refused == []
-
-
-@in_virtual_time
-async def test_controller_commits_no_set_after_its_finger_lifted() -> None:
-    """The finger lifts while one of two amplifiers takes 5 ms to stage."""
-    async with running("a", "b") as bench:
-        bench.far_ends[0].delay = 0.005
-        bench.touch(FINGER)
-        await asyncio.sleep(0.003)
-        bench.touch()
-        await asyncio.sleep(0.010)
-        for far_end in bench.far_ends:
-            assert far_end.requests("Commit") == []
-            assert far_end.sets()[-1].is_silent
-        assert bench.controller.group_state is GroupState.ARMED
-        assert bench.reports.refused == []
-
-
-@in_virtual_time
-async def test_controller_silences_before_a_due_heartbeat() -> None:
-    """On several amplifiers at once."""
-    async with running("a", "b") as bench:
-        await asyncio.sleep(0.045)
-        for far_end in bench.far_ends:
-            far_end.delay = 0.004
-        bench.touch(FINGER)
-        await asyncio.sleep(0.002)
-        lifted = now()
-        bench.touch()
-        await asyncio.sleep(0.02)
-        assert_silenced_within_20_ms(bench, lifted)
-        for far_end in bench.far_ends:
-            assert lifted < far_end.times("Silence")[-1] < far_end.times("Ping")[-1]
-
-
 @pytest.mark.parametrize("later", range(3))
 @in_virtual_time
 async def test_lift_as_a_set_is_confirmed_precedes_a_due_heartbeat(later: int) -> None:
@@ -281,55 +180,6 @@ async def test_lift_as_a_set_is_confirmed_precedes_a_due_heartbeat(later: int) -
         for far_end, count in zip(bench.far_ends, before, strict=True):
             sent = far_end.names(count)
             assert sent.index("Silence") < sent.index("Ping")
-
-
-@in_virtual_time
-async def test_new_pattern_waits_until_all_amplifiers_reply(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The other amplifier, too, is sent nothing but heartbeats; then it is played at once."""
-    async with running("a", "b") as bench:
-        step, steps = bench.controller.step, count()
-
-        async def counted() -> None:
-            assert next(steps) < 1000, "the loop must not run without pause"
-            await step()
-
-        monkeypatch.setattr(bench.controller, "step", counted)
-        await bench.hold(FINGER, seconds=0.1)
-        silent, other = bench.far_ends
-
-        silent.is_mute = True
-        while not bench.controller.degraded:
-            bench.touch(FINGER)
-            await asyncio.sleep(0.005)
-        assert bench.controller.degraded == ("a",)
-        begin, applied = now(), len(bench.reports.applied)
-        bench.touch(OTHER)
-        await asyncio.sleep(0.02)
-        sent = {name for time, name, _ in other.asked if time > begin}
-        assert sent <= {"Ping", "GetStatus"}
-        silent.is_mute = False
-        await bench.hold(OTHER, seconds=0.1)
-        assert len(bench.reports.applied) == applied + 1
-
-
-@in_virtual_time
-async def test_controller_resends_cancelled_silence() -> None:
-    """A loop that replaces a cancelled one does not rely on its last command."""
-    async with armed() as bench:
-        bench.touch(FINGER)
-        await bench.controller.step()
-        bench.far_end.delay = 0.01
-        bench.touch()
-        first = asyncio.create_task(bench.controller.run())
-        await asyncio.sleep(0.001)
-        first.cancel()
-        await asyncio.gather(first, return_exceptions=True)
-        second = asyncio.create_task(bench.controller.run())
-        await asyncio.sleep(0.012)
-        assert bench.silences() == [False, True, True]
-    await second
 
 
 @pytest.mark.parametrize("ago", [5.0, 0.146])
@@ -364,33 +214,6 @@ async def test_controller_times_out_a_finger_from_before_arming() -> None:
 
 
 @in_virtual_time
-async def test_resting_finger_costs_heartbeats_only() -> None:
-    """A heartbeat every 50 ms with and without a finger, and no set twice."""
-    async with running() as bench:
-        await asyncio.sleep(0.5)
-        await bench.hold(FINGER, seconds=0.5)
-        assert bench.silences() == [True, False]
-        pauses = [after - before for before, after in pairwise(bench.far_end.times("Ping"))]
-        assert len(pauses) in (19, 20)  # within a second, by rounding
-        assert pauses == pytest.approx([0.05] * len(pauses), abs=1e-6)
-
-
-@in_virtual_time
-async def test_heartbeat_is_sent_only_after_the_loop_has_run() -> None:
-    """Only a turn of the loop sends it, once, after what the turn had to send."""
-    async with armed() as bench:
-        await asyncio.sleep(4 * HEARTBEAT)
-        assert bench.far_end.requests("Ping") == []
-        bench.touch(FINGER)
-        await bench.controller.step()
-        kinds = bench.far_end.names()
-        identified = ["GetCaps", "GetStatus"]  # as after each loss of supply
-        assert kinds == [*identified * 2, "Arm", "Set", "Commit", "GetStatus", "Ping"]
-        await asyncio.sleep(1.0)
-        assert len(bench.far_end.requests("Ping")) == 1
-
-
-@in_virtual_time
 async def test_heartbeat_stops_when_the_loop_hangs() -> None:
     """While the loop waits for one amplifier, the other gets no heartbeat."""
     async with running("a", "b") as bench:
@@ -415,69 +238,6 @@ async def test_arm_changes_nothing_while_armed() -> None:
         kinds = bench.far_end.names(begin)
         assert "Arm" not in kinds
         assert "Ping" in kinds
-        assert bench.controller.group_state is GroupState.ARMED
-
-
-@in_virtual_time
-async def test_controller_uses_the_latest_frame() -> None:
-    """Frames that arrive during a command are not sent one by one."""
-    async with running() as bench:
-        bench.far_end.delay = 0.02
-        bench.touch(FINGER)
-        for step in range(1, 10):
-            await asyncio.sleep(0.001)
-            bench.touch((1, 0.5 + 0.04 * step, 0.5))
-        await asyncio.sleep(0.1)
-        touched = [applied.targets[0].contact.x for applied in bench.reports.applied]
-        assert touched == pytest.approx([0.15, 0.258])
-
-
-@pytest.mark.parametrize(
-    ("answer", "reason", "logged"),
-    [
-        (InputError("no pattern reaches 20 dB SL there"), "no pattern reaches 20 dB SL there", 0),
-        (ZeroDivisionError("a bug"), "ZeroDivisionError: a bug", 1),
-        ({"SW": Tone(110.0, 1e-6), "XX": Tone(110.0, 1e-6)}, "XX", 1),
-    ],
-)
-@in_virtual_time
-async def test_controller_silences_when_the_table_fails(
-    caplog: pytest.LogCaptureFixture, answer: Excitation | Exception, reason: str, logged: int
-) -> None:
-    """The reason is reported, a bug logged once; the next silence is not sent, the next touch is.
-
-    A pattern that drives an ERA unknown to the rig is silence as a whole.
-    """
-    async with running() as bench:
-        await bench.hold(FINGER, seconds=0.1)
-        excitation, bench.table.excitation = bench.table.excitation, answer
-        await bench.hold(FINGER, OTHER, seconds=0.2)
-        assert bench.silences() == [True, False, True]
-        assert reason in bench.reports.silenced[-1].reason
-        bench.touch()
-        await asyncio.sleep(0.01)
-        assert bench.silences() == [True, False, True]
-        assert bench.reports.silenced[-1].latency is None
-        bench.table.excitation = excitation
-        bench.touch((3, 0.1, 0.1))
-        await asyncio.sleep(0.01)
-        assert not bench.far_end.sets()[-1].is_silent
-    assert len([r for r in caplog.records if r.levelno == logging.ERROR]) == logged
-
-
-@pytest.mark.parametrize("tone", [(110.0, 101e-6), (39.0, 10e-6), (110.0, math.nan)])
-@in_virtual_time
-async def test_controller_silences_when_the_guard_refuses(tone: tuple[float, float]) -> None:
-    """A pattern that the guard refuses becomes silence, and is reported with its channel."""
-    async with running() as bench:
-        await bench.hold(FINGER, seconds=0.1)
-        bench.table.excitation = {"SW": Tone(*tone)}
-        await bench.hold(FINGER, OTHER, seconds=0.1)
-        assert bench.silences() == [True, False, True]
-        (refusal,) = bench.reports.refused
-        assert refusal.startswith("main: ")
-        assert "channel 0" in refusal
-        assert bench.reports.silenced[-1].reason == refusal
         assert bench.controller.group_state is GroupState.ARMED
 
 

@@ -84,17 +84,6 @@ async def test_vibration_ends_by_itself_if_a_contact_of_a_dead_panel_stays(
 
 
 @in_virtual_time
-async def test_silence_has_no_end() -> None:
-    """Only vibrations end by themselves."""
-    async with running() as bench:
-        await bench.hold(FINGER, seconds=1.0)
-        bench.touch()
-        await asyncio.sleep(0.1)
-        silent = [each for each in bench.far_end.sets() if each.is_silent]
-        assert {each.valid_for for each in silent} == {0.0}
-
-
-@in_virtual_time
 async def test_renewal_keeps_to_a_rate_limit_of_one_set_a_second() -> None:
     """There is no gap although each second allows one set."""
     async with running(rate=1.0) as bench:

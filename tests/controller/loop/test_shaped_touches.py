@@ -9,7 +9,6 @@ from controller.loop.intent import HapticIntent, Target
 from controller.sources.contacts import Contact
 from controller_bench import ENABLED, FINGER, OTHER, FarEnd, Sent, make_bench, running
 from drivers.protocol.sets import Envelope
-from model.vibration.excitation import Tone
 from straight_shapes import Shapes
 from virtual_loop import in_virtual_time
 
@@ -75,40 +74,6 @@ async def test_touch_starts_along_its_onset(link: FarEnd, shapes: Shapes) -> Non
         assert applied.transient_contrast_db == 30.0
 
 
-@pytest.mark.parametrize(("knots", "carried"), [(32, 20), (20, 20), (5, 5), (1, 1)])
-@in_virtual_time
-async def test_onset_has_as_many_knots_as_are_carried(
-    shapes: Shapes, knots: int, carried: int
-) -> None:
-    """Of an amplifier with few knots it is the same line in longer steps: half after half."""
-    link = FarEnd(knots=knots)
-    async with running(far_ends=[link], timing=shapes) as bench:
-        bench.touch(FINGER, OTHER)
-        await asyncio.sleep(ONSET / 2)
-        assert len(levels_of(sets(link)[0].commands[0].onset)) == carried
-        assert level(link) == pytest.approx(FULL / 2, abs=2e-3)
-        await bench.hold(FINGER, OTHER, seconds=0.1)
-        assert level(link) == pytest.approx(FULL)
-        assert len(sets(link)) == 1
-
-
-@pytest.mark.parametrize(("baud", "knots"), [(921_600, 20), (115_200, 8), (38_400, 0)])
-@in_virtual_time
-async def test_onset_has_as_many_knots_as_the_wire_carries_in_10_ms(
-    shapes: Shapes, baud: int, knots: int
-) -> None:
-    """Two channels; by hand: 115 200 baud carry 54 words in 10 ms, of which 22 are heads.
-
-    A frame of 120 words has some 252 bytes, each of 10 bits. A knot has 4 words for both channels.
-    """
-    link = FarEnd(knots=32, baud=baud)
-    async with running(far_ends=[link], timing=shapes, watchdog=1.0) as bench:
-        assert bench.controller.capabilities.envelope_support.onset_knots == knots
-        bench.touch(FINGER, OTHER)
-        await asyncio.sleep(0.02)
-        assert bench.table.asked[-1].envelopes is (knots > 0)
-
-
 @in_virtual_time
 async def test_lifted_target_fades_along_its_ending(link: FarEnd, shapes: Shapes) -> None:
     """While another finger stays; reported as silence."""
@@ -133,19 +98,6 @@ async def test_last_lift_skips_the_ending(link: FarEnd, shapes: Shapes, held: fl
         await bench.hold(FINGER, seconds=held)
         bench.touch()
         await asyncio.sleep(0)
-        await asyncio.sleep(0.020)
-        assert link.levels == (0, 0)
-
-
-@in_virtual_time
-async def test_last_lift_interrupts_an_ending(link: FarEnd, shapes: Shapes) -> None:
-    """The target lifts, 5 ms later the other finger: silent 20 ms after that, not 35."""
-    async with running(far_ends=[link], timing=shapes) as bench:
-        await bench.hold(OTHER, FINGER, seconds=0.3)
-        bench.touch(OTHER)
-        await asyncio.sleep(0.005)
-        assert level(link) > 0.15
-        bench.touch()
         await asyncio.sleep(0.020)
         assert link.levels == (0, 0)
 
@@ -222,21 +174,6 @@ async def test_open_prepares_table_and_envelopes(link: FarEnd, shapes: Shapes) -
     assert bench.table.prepared == ["phased"]
     assert shapes.prepared == [90.0, 110.0, 150.0, 250.0]
     await bench.controller.close()
-
-
-@in_virtual_time
-async def test_amplifiers_start_onsets_together(shapes: Shapes) -> None:
-    """Each has the envelope of its ERA before any commits."""
-    links = [FarEnd(knots=32), FarEnd(knots=32)]
-    for link in links:
-        link.delay = 0.002
-    async with running("left", "right", far_ends=links, timing=shapes) as bench:
-        bench.table.excitation = {"SW": Tone(110.0, 2e-5), "NE": Tone(110.0, 4e-5)}
-        await asyncio.sleep(0.02)
-        bench.touch(FINGER)
-        await asyncio.sleep(0.002 + ONSET / 2)
-        for link, channel, full in ((links[0], 0, 0.2), (links[1], 1, 0.4)):
-            assert level(link, channel) == pytest.approx(full / 2, rel=0.1)
 
 
 @in_virtual_time

@@ -9,7 +9,6 @@ three_people.tuio, where one slides and one leaves before the others. Run it aga
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
@@ -29,14 +28,13 @@ SETTLING = 0.08  # seconds over which a fingertip rolls into its place
 ROLL = 0.0015  # metres that it rolls
 
 # Times [s] from down to up, and where the finger is at each, in shares of the plate
-FingerPath: TypeAlias = tuple[Sequence[float], Sequence[Sequence[float]]]
-TWO_PEOPLE: list[FingerPath] = [
+TWO_PEOPLE = [
     ((0.3, 1.6), [(0.20, 0.35)] * 2),
     ((0.7, 1.6), [(0.80, 0.60)] * 2),
     ((2.0, 3.3), [(0.65, 0.25)] * 2),
     ((2.4, 3.3), [(0.35, 0.80)] * 2),
 ]
-THREE_PEOPLE: list[FingerPath] = [
+THREE_PEOPLE = [
     ((0.3, 1.9, 2.3, 4.3), [(0.15, 0.30), (0.15, 0.30), (0.15, 0.65), (0.15, 0.65)]),
     ((0.7, 4.3), [(0.50, 0.70)] * 2),
     ((1.1, 3.2), [(0.85, 0.40)] * 2),
@@ -52,9 +50,9 @@ def draw_places(count: int, rng: np.random.Generator) -> np.ndarray:
             return places
 
 
-def one_person(rng: np.random.Generator) -> list[FingerPath]:
+def one_person(rng: np.random.Generator) -> list[tuple]:
     """Groups of fingers, one group after another."""
-    paths: list[FingerPath] = []
+    paths = []
     up = 0.15
     for group, count in enumerate(FINGERS_PER_GROUP):
         start = up + (REST if group in AT_ONCE else PAUSE)
@@ -65,7 +63,7 @@ def one_person(rng: np.random.Generator) -> list[FingerPath]:
     return paths
 
 
-def record(name: str, paths: Sequence[FingerPath], rng: np.random.Generator) -> None:
+def record(name: str, paths: Sequence[tuple], rng: np.random.Generator) -> None:
     """Write the recording of some fingers beside this file, until shortly after the last lift."""
     rolls = rng.normal(scale=ROLL, size=(len(paths), 2)) / PLATE
     datagrams = []

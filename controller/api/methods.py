@@ -21,7 +21,6 @@ from controller.api.schema import (
     DaemonStateName,
     EffectDescription,
     Empty,
-    GroupStateName,
     LatencySummary,
     LearningSummary,
     Message,
@@ -65,7 +64,6 @@ class StatusResult(Message):
     )
     cause: str = Field(description="why the daemon is in this state")
     remedy: str | None = Field(description="what to do about it; null if nothing")
-    amplifiers_state: GroupStateName
     assume_energised: bool = Field(description="whether lost amplifiers may still be playing")
     lost_for_s: float | None = Field(
         description="how long a link has been lost; null if all are up"

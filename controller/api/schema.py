@@ -51,9 +51,6 @@ def headline(state: DaemonStateName, cause: str) -> str:
     return cause if cause.startswith(word) else f"{word}: {cause}"
 
 
-GroupStateName: TypeAlias = Literal["closed", "disarmed", "armed", "lost"]
-"""State of all amplifiers together."""
-
 LearningStateName: TypeAlias = Literal[
     "off",
     "starting",

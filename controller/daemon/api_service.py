@@ -5,7 +5,6 @@ import itertools
 import logging
 import time
 from collections.abc import Awaitable, Mapping
-from typing import cast
 
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
@@ -27,12 +26,13 @@ from controller.api.methods import (
     TouchParams,
     UnsubscribeParams,
 )
-from controller.api.schema import Empty, GroupStateName, headline
+from controller.api.schema import Empty, headline
 from controller.api.server import Handler
 from controller.daemon.active_layout import ActiveLayout
 from controller.daemon.api_views import amplifier_silence, hello_result
 from controller.daemon.config import DaemonConfig
 from controller.daemon.lease import Lease, check_lease
+from controller.daemon.operation import LEASE_OVER
 from controller.daemon.publisher import EventPublisher
 from controller.daemon.states import (
     ENERGISED,
@@ -41,7 +41,7 @@ from controller.daemon.states import (
     StateMachine,
     Trigger,
 )
-from controller.daemon.supervisor import LEASE_OVER, Supervisor
+from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches
 from controller.learning.learning import Learning
 from controller.loop.loop import Controller
@@ -114,10 +114,9 @@ class ApiService:
             state=machine.state.value,
             cause=machine.cause,
             remedy=machine.remedy,
-            amplifiers_state=cast("GroupStateName", self._controller.group_state.name.lower()),
             assume_energised=self._supervisor.assume_energised(now),
-            lost_for_s=machine.lost_for(now),
-            watchdog_s=machine.watchdog,
+            lost_for_s=None if machine.lost is None else now - machine.lost.at,
+            watchdog_s=self._controller.watchdog,
             armed_by=lease.owner if lease else None,
             lease_left_s=lease.expires_at - now if lease else None,
             contacts=view.contact_statuses(),
@@ -231,7 +230,7 @@ class ApiService:
 
     def _play(self, client: Connection, params: PlayParams) -> Empty:
         machine = self._supervisor.machine
-        if machine.state is not _ENABLED or machine.is_degraded:
+        if machine.state is not _ENABLED or self._controller.degraded:
             raise _wrong_state(machine)
         self._layout.play_nearest(params, self._publisher.view.contacts, now=clock.now())
         self._controller.request_update()

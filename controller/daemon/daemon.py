@@ -33,7 +33,6 @@ from drivers import clock
 from drivers.errors import DriverError
 from drivers.garbage_collection import no_long_collections, without_collections
 from drivers.host.amplifier import WATCHDOG, Amplifier
-from drivers.host.group import GroupState
 from drivers.opening import Lines
 from drivers.threads import in_thread
 from model.errors import InputError
@@ -87,7 +86,6 @@ class Daemon:
             ),
             link_changed=lambda *change: self._publisher.link_changed(*change),
             alive=lambda: manager.alive(clock.now()),
-            watchdog=watchdog,
         )
         self._layout = ActiveLayout(config.effective_layout)
         self._publisher = EventPublisher(
@@ -95,7 +93,7 @@ class Daemon:
             amplifiers=lambda: amplifier_statuses(
                 self._controller.amplifiers,
                 config.urls,
-                are_open=self._controller.group_state in (GroupState.DISARMED, GroupState.ARMED),
+                are_open=self._controller.is_open,
                 missing=self._controller.missing,
             ),
             effect_of=self._layout.effect_of,

@@ -4,25 +4,23 @@ State names follow CiA 402.
 
 - Only ARM in READY_TO_SWITCH_ON leads to SWITCHED_ON, and only ARMED from there to
   OPERATION_ENABLED.
-- QUICK_STOP_ACTIVE and FAULT lead only to SWITCH_ON_DISABLED, after an acknowledgement (CLEAR) and
-  a read-back of all amplifiers without a fault and at level zero.
+- QUICK_STOP_ACTIVE and FAULT lead only to SWITCH_ON_DISABLED, by VERIFIED: whoever says that has
+  read back all amplifiers, without a fault and at level zero, after a CLEAR of the same epoch.
 - COMM_LOST ends with RECONNECTED, not before any lost amplifier's watchdog has certainly expired;
   it leads to FAULT if anything was latched or energised before.
 - An event without an entry in the table changes nothing.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum, StrEnum, auto
 from typing import NamedTuple
 
 from controller.daemon.lease import Lease
-from drivers.host.amplifier import WATCHDOG
 
 ACKNOWLEDGE = "find the cause, then clear (era clear) and arm again"
 """Remedy of every fault."""
-
-_WATCHDOG_MARGIN = 0.1  # s; for clock deviations and the last ramp
 
 
 class DaemonState(StrEnum):
@@ -54,8 +52,7 @@ class Trigger(Enum):
     FAULT = auto()  # reported by an amplifier or the control loop
     REACTION_DONE = auto()  # the fault reaction is complete
     LINK_LOST = auto()  # an amplifier cannot be reached
-    LINK_DEGRADED = auto()  # an amplifier does not reply, and may still play
-    LINK_RESTORED = auto()  # all reply again, and play what they should
+    LINK_CHANGED = auto()  # an amplifier does not reply but may still play, or all reply again
     RECONNECTED = auto()  # all amplifiers reply again and are disarmed, and the lost ones silent
     CLOSE = auto()  # the daemon shuts down
 
@@ -75,41 +72,41 @@ class Action(Enum):
 
 @dataclass(frozen=True)
 class DaemonEvent:
-    """An event with its cause and a remedy for the user."""
+    """An event with its cause and a remedy for the user.
+
+    energised_until [s]: when what was lost must be silent.
+    """
 
     trigger: Trigger
     cause: str = ""
     remedy: str | None = None
     lease: Lease | None = None
+    energised_until: float = -math.inf
+
+
+class Loss(NamedTuple):
+    """A loss of amplifiers: since when [s], and when they must be silent [s]."""
+
+    at: float
+    energised_until: float
 
 
 @dataclass(frozen=True)
 class StateMachine:
     """The operation of the plate: its state and everything that the next transition depends on.
 
-    is_latched: an acknowledgement is required before arming; acknowledged: epoch in which it was
-    given, and since which the amplifiers are being read back; lost_at [s]: when the link was lost;
-    is_degraded: whether an amplifier does not reply while armed, so that nothing new is played;
-    watchdog [s]: of armed amplifiers; lease: of who armed, in the states of ENERGISED alone. epoch:
-    rises with every change of state, and with a stop, fault or loss that changes none: what began
-    before must not go on.
+    is_latched: a clear is required before arming; lost: while amplifiers cannot be reached; lease:
+    of who armed, in the states of ENERGISED alone. epoch: rises with every change of state, and
+    with a stop, fault or loss that changes none: what began before must not go on.
     """
 
     state: DaemonState = DaemonState.NOT_READY
     cause: str = "the daemon is starting"
     remedy: str | None = None
     is_latched: bool = False
-    acknowledged: int | None = None
-    lost_at: float = 0.0
-    is_degraded: bool = False
-    watchdog: float = WATCHDOG
+    lost: Loss | None = None
     lease: Lease | None = None
     epoch: int = 0
-
-    @property
-    def is_acknowledged(self) -> bool:
-        """Whether an acknowledgement was given, and no stop, fault or loss came since."""
-        return self.acknowledged == self.epoch
 
     def lease_at(self, now: float) -> Lease | None:
         """The lease, unless it has expired at a time [s]."""
@@ -119,15 +116,6 @@ class StateMachine:
         """Whether amplifiers are armed for a client whose lease has expired at a time [s]."""
         is_armed = self.state is DaemonState.OPERATION_ENABLED and self.lease is not None
         return is_armed and self.lease_at(now) is None
-
-    def lost_for(self, now: float) -> float | None:
-        """Time since the link was lost [s]; None while it is up."""
-        return now - self.lost_at if self.state is DaemonState.COMM_LOST else None
-
-    def assume_energised(self, now: float) -> bool:
-        """Whether a lost amplifier may still be playing: its watchdog may not have expired yet."""
-        lost_for = self.lost_for(now)
-        return lost_for is not None and lost_for < self.watchdog + _WATCHDOG_MARGIN
 
 
 class Transition(NamedTuple):
@@ -152,10 +140,6 @@ _OPEN = (*_SILENT, *ENERGISED, *_LATCHING)
 
 def _is_latched(machine: StateMachine, now: float) -> bool:
     return machine.is_latched
-
-
-def _is_acknowledged(machine: StateMachine, now: float) -> bool:
-    return machine.is_acknowledged
 
 
 TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
@@ -204,9 +188,7 @@ TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
         for state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
     },
     **{
-        (state, Trigger.VERIFIED): (
-            Transition(DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,), _is_acknowledged),
-        )
+        (state, Trigger.VERIFIED): (Transition(DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,)),)
         for state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
     },
     **{
@@ -223,10 +205,9 @@ TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
     (DaemonState.COMM_LOST, Trigger.LINK_LOST): (
         Transition(DaemonState.COMM_LOST, (Action.RECONNECT,)),
     ),
-    **{
-        (DaemonState.OPERATION_ENABLED, trigger): (Transition(DaemonState.OPERATION_ENABLED),)
-        for trigger in (Trigger.LINK_DEGRADED, Trigger.LINK_RESTORED)
-    },
+    (DaemonState.OPERATION_ENABLED, Trigger.LINK_CHANGED): (
+        Transition(DaemonState.OPERATION_ENABLED),
+    ),
     (DaemonState.COMM_LOST, Trigger.RECONNECTED): (
         Transition(DaemonState.FAULT, when=_is_latched),
         Transition(DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,)),
@@ -255,14 +236,7 @@ def failed(machine: StateMachine, cause: str) -> StateMachine:
     epoch = machine.epoch + 1
     if machine.state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):
         return replace(machine, is_latched=True, epoch=epoch)
-    return StateMachine(
-        DaemonState.FAULT,
-        cause,
-        ACKNOWLEDGE,
-        is_latched=True,
-        watchdog=machine.watchdog,
-        epoch=epoch,
-    )
+    return StateMachine(DaemonState.FAULT, cause, ACKNOWLEDGE, is_latched=True, epoch=epoch)
 
 
 def _with_event(machine: StateMachine, event: DaemonEvent, now: float) -> StateMachine:
@@ -274,20 +248,12 @@ def _with_event(machine: StateMachine, event: DaemonEvent, now: float) -> StateM
             return replace(machine, lease=event.lease.renewed(now))
         case Trigger.ARMED if machine.lease is not None:  # arming may have taken longer than it
             return replace(machine, lease=machine.lease.renewed(now))
-        case Trigger.CLEAR:
-            return replace(machine, acknowledged=machine.epoch)
         case Trigger.STOP:
             return replace(machine, is_latched=True)
-        case Trigger.NOT_FOUND:
-            return replace(machine, lost_at=now)
-        case Trigger.LINK_LOST if machine.state is not DaemonState.COMM_LOST:
-            return replace(
-                machine,
-                lost_at=now,
-                is_latched=machine.is_latched or machine.state in ENERGISED,
-            )
-        case Trigger.LINK_DEGRADED | Trigger.LINK_RESTORED:
-            return replace(machine, is_degraded=event.trigger is Trigger.LINK_DEGRADED)
+        case Trigger.NOT_FOUND | Trigger.LINK_LOST if machine.lost is None:
+            is_latched = machine.is_latched or machine.state in ENERGISED
+            lost = Loss(now, event.energised_until)
+            return replace(machine, lost=lost, is_latched=is_latched)
         case _:
             return machine
 
@@ -298,7 +264,7 @@ def _enter(
     """Enter the next state of a transition with its cause and remedy."""
     if to is before.state:
         # A persisting fault may have a new cause.
-        has_cause = (Trigger.FAULT, Trigger.LINK_DEGRADED, Trigger.LINK_RESTORED)
+        has_cause = (Trigger.FAULT, Trigger.LINK_CHANGED)
         is_new_cause = event.trigger in has_cause and bool(event.cause)
         return replace(updated, cause=event.cause, remedy=event.remedy) if is_new_cause else updated
     is_latched = to in _LATCHING or (to is DaemonState.COMM_LOST and updated.is_latched)
@@ -314,7 +280,6 @@ def _enter(
         cause=cause,
         remedy=remedy,
         is_latched=is_latched,
-        acknowledged=None,
-        is_degraded=False,
+        lost=updated.lost if to is DaemonState.COMM_LOST else None,
         lease=updated.lease if to in ENERGISED else None,
     )

@@ -1,19 +1,20 @@
-"""Runs the daemon's state machine: applies events, carries out actions, restores lost links.
+"""Keeps the amplifiers of a plate connected, and armed only as its operation allows.
 
-Actions come before observers: these are called a moment later, each guarded (`DeferredCalls`). An
-unexpected exception in a transition or action ends in a stop of all amplifiers and in FAULT.
+It carries out the actions of the state machine, tells it of faults and losses, and opens lost
+amplifiers again.
 """
 
 import asyncio
 import contextlib
 import logging
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+import math
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Literal
 
-from controller.daemon.deferred_calls import DeferredCalls, call_guarded
-from controller.daemon.lease import Lease, check_lease
+from controller.daemon.deferred_calls import call_guarded
+from controller.daemon.operation import Operation, StateObserver
 from controller.daemon.read_back import (
     READ_BACK_INTERVAL,
     are_silent,
@@ -26,10 +27,7 @@ from controller.daemon.states import (
     Action,
     DaemonEvent,
     DaemonState,
-    StateMachine,
     Trigger,
-    failed,
-    step,
 )
 from controller.loop.loop import Controller
 from controller.loop.observer import Observer
@@ -42,43 +40,32 @@ from drivers.errors import (
     LinkError,
     Preempted,
 )
-from drivers.host.amplifier import WATCHDOG, Amplifier
+from drivers.host.amplifier import Amplifier
 from drivers.host.comparison import name_of
-from drivers.host.group import Group, GroupState
 from drivers.host.stop import Stopped
 from drivers.pauses import pauses
 from drivers.protocol.records import Values
 from drivers.protocol.table import FAULTS, NO_CHANNEL
 from model.errors import InputError
-from registry.plugins import failure_text
 
 STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
 _MAX_READ_BACKS = 15
 _RECHECK = 0.05  # s; of whether the watchdog of a lost amplifier has passed
+_WATCHDOG_MARGIN = 0.1  # s; of an amplifier that another host may have armed
 _SEARCHING = "check cables and supply; the daemon reconnects by itself and stays disarmed"
 
-_LOG_LEVELS = {
-    DaemonState.COMM_LOST: logging.ERROR,
-    DaemonState.FAULT_REACTION_ACTIVE: logging.ERROR,
-}
-
-LEASE_OVER = DaemonEvent(Trigger.LEASE_LOST, "the arming lease was not renewed", "arm again")
 LinkChange = Literal["degraded", "restored", "lost", "retry", "reopened"]
-StateObserver = Callable[[StateMachine, StateMachine], None]
-"""Receives the old and the new state machine."""
 
 _logger = logging.getLogger(__name__)
 _rate_limited_logger = logging.getLogger(f"{__name__}.background")
-_T = TypeVar("_T")
 
 
-class Supervisor:
-    """Keeps the amplifiers of a controller connected, and armed only as the state machine allows.
+class Supervisor(Operation):
+    """The operation of the plate by the amplifiers of a controller.
 
     The controller must be created with `observe(observer)` and `connected` of this supervisor.
-    state_changed are called a moment after every transition; link_changed receives the kind of
-    change, the lost amplifiers ("lost" only) and a message; alive is called after each cycle of the
-    control loop and periodically while there is none. watchdog [s]: of armed amplifiers.
+    link_changed receives the kind of change, the lost amplifiers ("lost" only) and a message; alive
+    is called after each cycle of the control loop, which runs in every state.
     """
 
     def __init__(
@@ -87,40 +74,40 @@ class Supervisor:
         state_changed: Sequence[StateObserver],
         link_changed: Callable[[LinkChange, Sequence[str], str], None],
         alive: Callable[[], None],
-        watchdog: float = WATCHDOG,
     ) -> None:
-        self.machine = StateMachine(watchdog=watchdog)
-        self._state_observers = (_log_transition, *state_changed)
+        super().__init__(state_changed)
         self._link_observer = link_changed
-        self._alive_observer = alive
+        self._alive = alive
         self.started = asyncio.Event()  # the amplifiers are open, or searched for
         self._closing = asyncio.Event()
-        self._reports = DeferredCalls()
         self._controller_if_running: Controller | None = None
-        self._control_loop: asyncio.Task[None] | None = None
-        self._tasks: set[asyncio.Task[Any]] = set()
         self._loss_lock = asyncio.Lock()  # held until the lost amplifiers are closed
-        self._clears = 0  # in progress
+        self._clears: list[int] = []  # epochs of those in progress
+        self._is_degraded = False  # as reported last
 
     def observe(self, observer: Observer) -> Observer:
-        """Wrap an observer so that the supervisor sees refusals and cycles first."""
+        """Wrap an observer so that the supervisor sees refusals, losses and cycles first."""
 
         def refused(reason: str) -> None:
-            is_armed = self.machine.state is DaemonState.OPERATION_ENABLED
-            if is_armed and self._controller.group_state is GroupState.DISARMED:
-                # The control loop has stopped the amplifiers by itself.
-                self.post(DaemonEvent(Trigger.FAULT, reason, ACKNOWLEDGE))
-            else:
+            if not self._check_own_stop(reason):
                 observer.refused(reason)
 
+        def link_lost(cause: str) -> None:
+            if not self._is_loss_handled:
+                self._spawn(self._in_background(self._handle_loss(LinkError(cause))))
+            observer.link_lost(cause)
+
         def cycle_completed() -> None:
-            self.tick()
-            self._check_own_stop()
+            self._check_own_stop(
+                "the control loop has stopped the amplifiers, because an exchange failed"
+            )
             self._check_degraded()
-            self._alive()
+            call_guarded(self._alive)
             observer.cycle_completed()
 
-        return replace(observer, refused=refused, cycle_completed=cycle_completed)
+        return replace(
+            observer, refused=refused, link_lost=link_lost, cycle_completed=cycle_completed
+        )
 
     def connected(self, amplifiers: Mapping[str, Amplifier]) -> None:
         """Listen to the events of amplifiers, by name, whose lines have been opened."""
@@ -135,40 +122,30 @@ class Supervisor:
         amplifiers that do not fit the configuration.
         """
         self._controller_if_running = controller
-        polling = asyncio.create_task(self._poll())
+        loop = asyncio.create_task(self._run_control_loop(), name="control loop")
         try:
             await self._open()
             self.started.set()
             while self.machine.state is not DaemonState.NOT_READY:
-                if self.machine.state is DaemonState.COMM_LOST:
+                self._changed.clear()
+                if self._must_reopen:
                     await self._restore_link()
                 else:
-                    await self._run_control_loop()
+                    await self._poll()
         finally:
-            polling.cancel()
-            await asyncio.gather(polling, *self._tasks, return_exceptions=True)
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+            loop.cancel()
+            await asyncio.gather(loop, return_exceptions=True)
             self._reports.flush()
 
     async def _run_control_loop(self) -> None:
-        """Run the control loop until it ends or a reconnection cancels it; handle its error."""
-        loop = self._control_loop = asyncio.create_task(self._controller.run(), name="control loop")
-        try:
-            await asyncio.wait({loop})
-        finally:
-            self._control_loop = None
-            loop.cancel()
-            await asyncio.wait({loop})
-        error = None if loop.cancelled() else loop.exception()
-        is_over = self.machine.state in (DaemonState.COMM_LOST, DaemonState.NOT_READY)
-        if error is None and self._controller.group_state is GroupState.CLOSED and not is_over:
-            error = LinkError("the amplifiers must be open, got closed ones; they are opened again")
-        if isinstance(error, LinkError):
-            await self._in_background(self._handle_loss(error))
-        elif isinstance(error, DriverError):
-            raise error
-        elif isinstance(error, Exception):  # unforeseen: a fault, which can be cleared
-            _logger.error("control loop failed, stopping all amplifiers", exc_info=error)
-            await self._fail(error)
+        """Run the control loop; an unforeseen exception is a fault, which can be cleared."""
+        while True:
+            try:
+                await self._controller.run()
+            except Exception as error:
+                _logger.exception("control loop failed, stopping all amplifiers")
+                await self._fail(error)
             await asyncio.sleep(_RECHECK)
 
     async def close(self, cause: str) -> None:
@@ -179,16 +156,13 @@ class Supervisor:
         self._reports.flush()
 
     def assume_energised(self, now: float) -> bool:
-        """Whether a lost amplifier may still be playing at a time [s]; over a network for longer.
+        """Whether a lost amplifier may still be playing at a time [s].
 
-        There a request without reply may arrive late, and feed its watchdog.
+        Over a network for longer: there a request without reply may arrive late, and feed its
+        watchdog.
         """
-        machine, controller = self.machine, self._controller_if_running
-        if machine.state is not DaemonState.COMM_LOST or controller is None:
-            return False
-        known = controller.amplifiers.values()
-        may_play = any(each.feeding.may_play_until > now for each in known)
-        return machine.assume_energised(now) or may_play
+        lost = self.machine.lost
+        return lost is not None and now < max(lost.energised_until, self._may_play_until)
 
     def stop(self, cause: str, remedy: str | None = None) -> Awaitable[Mapping[str, Stopped]]:
         """Quick-stop all amplifiers in any state; await the outcome of each, by name.
@@ -199,97 +173,27 @@ class Supervisor:
         self._step(DaemonEvent(Trigger.STOP, cause, remedy))
         return asyncio.shield(stopping)
 
-    def latch_stop(self, cause: str) -> None:
-        """Latch a stop that was requested of the amplifiers already; raises nothing."""
-        call_guarded(partial(self._step, DaemonEvent(Trigger.STOP, cause, ACKNOWLEDGE)))
-
-    async def handle(self, event: DaemonEvent) -> None:
-        """Apply an event and carry out its actions; raises the error of an action.
-
-        The actions are completed even if the caller is cancelled.
-        """
-        try:
-            await asyncio.shield(self._spawn(self._applied(event)))
-        except (DriverError, asyncio.CancelledError):
-            raise
-        except Exception as error:
-            await self._fail(error)
-            raise
-
-    def post(self, event: DaemonEvent) -> None:
-        """Apply an event at once and carry out its actions in a task."""
-        self._spawn(self._in_background(self._applied(event)))
-
-    def tick(self) -> None:
-        """End the lease if it has expired."""
-        if self.machine.is_lease_over(clock.now()):
-            self.post(LEASE_OVER)
-
-    def renew(self, token: str) -> Lease:
-        """Renew the lease of a token; raises RpcError if it has expired or is another's."""
-        now = clock.now()
-        lease = check_lease(self.machine.lease, token, now).renewed(now)
-        self.machine = replace(self.machine, lease=lease)
-        return lease
-
-    def withdraw(self, token: str, cause: str) -> None:
-        """Disarm, unless the lease of a token has ended."""
-        lease = self.machine.lease
-        if lease is not None and lease.token == token:
-            self.post(DaemonEvent(Trigger.LEASE_LOST, cause, "arm again"))
-
     @property
     def _controller(self) -> Controller:
         if self._controller_if_running is None:
             raise RuntimeError("supervisor is not running")
         return self._controller_if_running
 
-    def _spawn(self, work: Coroutine[Any, Any, _T]) -> "asyncio.Task[_T]":
-        """Run work in a task that `run` waits for."""
-        task = asyncio.ensure_future(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        return task
+    @property
+    def _may_play_until(self) -> float:
+        """When [s] the watchdog must have silenced each amplifier as identified last."""
+        known = self._controller.amplifiers.values()
+        return max((each.feeding.may_play_until for each in known), default=-math.inf)
 
-    def _step(self, event: DaemonEvent) -> tuple[Action, ...]:
-        """Apply one transition; return its actions."""
-        before = self.machine
-        try:
-            self.machine, actions = step(before, event, clock.now())
-        except Exception as error:
-            self.machine, actions = failed(before, failure_text(error)), (Action.STOP,)
-        self._report_transition(before)
-        return actions
-
-    def _report_transition(self, before: StateMachine) -> None:
-        """Notify the observers of a new state, deferred."""
-        if self.machine.state is not before.state:
-            for observer in self._state_observers:
-                call_guarded(partial(self._reports.add, partial(observer, before, self.machine)))
+    def _energised_until(self, now: float) -> float:
+        """When [s] amplifiers that are lost now must be silent; one never seen may be armed."""
+        if self._controller.amplifiers:
+            return self._may_play_until
+        return now + self._controller.watchdog + _WATCHDOG_MARGIN
 
     def _link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
         report = partial(self._link_observer, change, lost, message)
         call_guarded(partial(self._reports.add, report))
-
-    def _alive(self) -> None:
-        call_guarded(self._alive_observer)
-
-    def _applied(self, event: DaemonEvent) -> Coroutine[Any, Any, None]:
-        """Apply an event; await its actions."""
-        actions = self._step(event)
-        return self._carry_out(actions, self.machine.epoch)
-
-    async def _carry_out(self, actions: Sequence[Action], epoch: int) -> None:
-        for action in actions:
-            await self._do(action, epoch)
-
-    async def _fail(self, error: Exception) -> None:
-        """Stop all amplifiers after an unexpected exception, which is a fault."""
-        before, self.machine = self.machine, failed(self.machine, failure_text(error))
-        self._report_transition(before)
-        await asyncio.shield(self._spawn(self._stop()))
-        if self.machine.state is DaemonState.COMM_LOST and self._control_loop is not None:
-            self._control_loop.cancel()  # so that amplifiers are reopened
 
     async def _do(self, action: Action, epoch: int) -> None:
         match action:
@@ -307,7 +211,10 @@ class Supervisor:
                 await self.handle(DaemonEvent(Trigger.REACTION_DONE, cause, remedy))
             case Action.CLEAR:
                 await self._over_link(self._clear(epoch), epoch)
-            case Action.RECONNECT | Action.CLOSE:
+            case Action.RECONNECT:
+                await self._controller.release()
+                self._changed.set()
+            case Action.CLOSE:
                 await self._controller.close()
 
     async def _over_link(self, work: Awaitable[object], epoch: int) -> None:
@@ -341,11 +248,15 @@ class Supervisor:
     async def _stop(self) -> None:
         await self._stopped(self._controller.stop())
 
+    @property
+    def _is_loss_handled(self) -> bool:
+        """Whether amplifiers are lost or closed already."""
+        return self.machine.state in (DaemonState.COMM_LOST, DaemonState.NOT_READY)
+
     async def _check_links(self) -> None:
         """Handle the loss of an amplifier unless it is handled already."""
-        is_handled = self.machine.state in (DaemonState.COMM_LOST, DaemonState.NOT_READY)
         causes = self._controller.group.lost_by.values()
-        if causes and not is_handled:
+        if causes and not self._is_loss_handled:
             await self._handle_loss(LinkError(next(iter(causes))))
 
     async def _open(self) -> None:
@@ -384,11 +295,11 @@ class Supervisor:
             await self.handle(DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE))
 
     async def _clear(self, epoch: int) -> None:
-        self._clears += 1
+        self._clears.append(epoch)
         try:
             problem = await self._read_back(epoch, clears=True)
         finally:
-            self._clears -= 1
+            self._clears.remove(epoch)
         self._check_none_since(epoch)
         if problem is None:
             await self.handle(DaemonEvent(Trigger.VERIFIED, "acknowledged, and the cause is gone"))
@@ -433,10 +344,19 @@ class Supervisor:
             cause = f"amplifier {', '.join(lost)}: {text}" if lost else text
             await self.handle(DaemonEvent(Trigger.LINK_LOST, cause, _SEARCHING))
 
+    @property
+    def _must_reopen(self) -> bool:
+        """Whether amplifiers are lost, and all lines are closed."""
+        return self.machine.state is DaemonState.COMM_LOST and self._controller.is_released
+
+    async def _fail(self, error: Exception) -> None:
+        await super()._fail(error)
+        if self.machine.state is DaemonState.COMM_LOST:  # what should have closed them has failed
+            await self._do(Action.RECONNECT, self.machine.epoch)
+
     async def _restore_link(self) -> None:
         """Reopen the amplifiers, with growing pauses; leave COMM_LOST once they are all silent."""
         try:
-            await self._controller.close()  # a pending close would close it again
             for pause in pauses():
                 if self.machine.state is not DaemonState.COMM_LOST:
                     return
@@ -445,13 +365,15 @@ class Supervisor:
                 await self._pause(pause)
             while self.assume_energised(clock.now()) and not self._closing.is_set():
                 await self._pause(_RECHECK)
-            if self._controller.group_state is GroupState.DISARMED:  # none was lost again
+            if self._controller.is_open:  # none was lost again
                 await self.handle(DaemonEvent(Trigger.RECONNECTED))
         except DriverError as error:
             _rate_limited_logger.info("failed: %s", error)
         except Exception:
             _rate_limited_logger.exception("reconnection failed")
             await self._pause(STATUS_INTERVAL)
+        if self.machine.state is DaemonState.COMM_LOST:
+            await self._controller.release()
 
     async def _reopen(self) -> bool:
         """Open all amplifiers, disarmed; none that may be armed stays open."""
@@ -460,7 +382,7 @@ class Supervisor:
             await self._controller.disarm()  # a short loss may not have expired the watchdog
         except (DriverError, InputError) as error:
             self._link_changed("retry", (), str(error))
-            await self._controller.close()
+            await self._controller.release()
             return False
         self._link_changed("reopened", (), "all amplifiers reply again and are disarmed")
         return True
@@ -472,29 +394,31 @@ class Supervisor:
                 await self._closing.wait()
 
     async def _poll(self) -> None:
-        """Poll the status of disarmed amplifiers; the control loop polls armed ones.
+        """Read the status of disarmed amplifiers; the control loop reads that of armed ones.
 
-        A stop or fault reaction that has not silenced all of them is repeated. While there is no
-        control loop, these are the signs of life.
+        Then pause, or until the state changes. A stop or fault reaction that has not silenced all
+        of them is repeated.
         """
-        while True:
-            await asyncio.sleep(STATUS_INTERVAL)
-            if self._control_loop is None:
-                self._alive()
-            if self._controller.group_state is not GroupState.DISARMED:
-                continue
-            try:
-                await self._check_disarmed(self._controller.group)
-            except LinkError as error:
-                if not self._controller.group.is_degraded_only(error):
-                    await self._in_background(self._handle_loss(error))
-            except DriverError:
-                pass  # preempted by another request, which reports for itself
-            except Exception:
-                _rate_limited_logger.exception("status read failed")
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(STATUS_INTERVAL):
+                while self.machine.state is not DaemonState.NOT_READY and not self._must_reopen:
+                    await self._changed.wait()
+                    self._changed.clear()
+                return
+        if not self._controller.is_open or self._controller.group.is_armed:
+            return
+        try:
+            await self._check_disarmed()
+        except LinkError as error:
+            if not self._controller.group.is_degraded_only(error):
+                await self._in_background(self._handle_loss(error))
+        except DriverError:
+            pass  # preempted by another request, which reports for itself
+        except Exception:
+            _rate_limited_logger.exception("status read failed")
 
-    async def _check_disarmed(self, group: Group) -> None:
-        epoch = self.machine.epoch
+    async def _check_disarmed(self) -> None:
+        epoch, group = self.machine.epoch, self._controller.group
         statuses = await group.statuses()
         if epoch != self.machine.epoch:
             return  # they may have been read before
@@ -505,34 +429,43 @@ class Supervisor:
         elif (
             not are_silent(statuses, group.amplifiers)
             and state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
-            and not (self._clears and self.machine.is_acknowledged)  # it reads back for itself
+            and self.machine.epoch not in self._clears  # a clear reads back for itself
         ):
             _rate_limited_logger.error("stop repeated: %s", problem)
             await self._stop()
 
-    def _check_own_stop(self) -> None:
-        """Post a fault where amplifiers of an armed plate are armed no longer, without a reason."""
+    def _check_own_stop(self, cause: str) -> bool:
+        """Post a fault where the loop itself has stopped the amplifiers of an armed plate."""
         is_armed = self.machine.state is DaemonState.OPERATION_ENABLED
-        if is_armed and self._controller.group_state is not GroupState.ARMED:
-            cause = "the control loop has stopped the amplifiers, because an exchange failed"
+        group = self._controller.group
+        is_stopped = is_armed and self._controller.is_open and not group.is_armed
+        if is_stopped:
             self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
+        return is_stopped
 
     def _check_degraded(self) -> None:
         """Note that armed amplifiers have ceased to reply, or that all reply again."""
         degraded = self._controller.degraded
-        is_armed = self.machine.state is DaemonState.OPERATION_ENABLED
-        if not is_armed or bool(degraded) is self.machine.is_degraded:
-            return
-        if degraded:
+        if self.machine.state is not DaemonState.OPERATION_ENABLED:
+            self._is_degraded = False
+        elif bool(degraded) is self._is_degraded or self._controller.group.lost_by:
+            pass  # of one that is lost the next heartbeat says so
+        elif degraded:
             cause = f"amplifier {', '.join(degraded)} does not reply; nothing new is played"
-            self.post(DaemonEvent(Trigger.LINK_DEGRADED, cause, "check cables and supply"))
-            _rate_limited_logger.warning("link: degraded: %s", cause, extra={"topic": "link"})
-            self._link_changed("degraded", degraded, cause)
-        elif not self._controller.group.lost_by:  # the next heartbeat reports those
+            self._link_event("degraded", degraded, cause, "check cables and supply")
+        else:
             cause = "all amplifiers reply again and play what they should"
-            self.post(DaemonEvent(Trigger.LINK_RESTORED, cause, "era disarm, or era stop"))
-            _rate_limited_logger.info("link: restored: %s", cause, extra={"topic": "link"})
-            self._link_changed("restored", (), cause)
+            self._link_event("restored", (), cause, "era disarm, or era stop")
+
+    def _link_event(
+        self, change: LinkChange, degraded: Sequence[str], cause: str, remedy: str
+    ) -> None:
+        """Say that the link of armed amplifiers is degraded, or restored."""
+        self._is_degraded = bool(degraded)
+        self.post(DaemonEvent(Trigger.LINK_CHANGED, cause, remedy))
+        level = logging.WARNING if degraded else logging.INFO
+        _rate_limited_logger.log(level, "link: %s: %s", change, cause, extra={"topic": "link"})
+        self._link_changed(change, degraded, cause)
 
     def _amplifier_event(self, name: str, event: Values) -> None:
         """Post a fault that an amplifier reports unsolicited, ahead of the next heartbeat."""
@@ -541,23 +474,3 @@ class Supervisor:
         channel = "" if event["channel"] == NO_CHANNEL else f", channel {event['channel']}"
         cause = f"amplifier {name} reports {name_of(FAULTS, event['fault'])}{channel}"
         self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
-
-    async def _in_background(self, work: Awaitable[object]) -> None:
-        """Await work without a caller: its errors are already part of the state."""
-        try:
-            await work
-        except DriverError as error:
-            _rate_limited_logger.info("failed: %s", error)
-        except Exception as error:
-            _rate_limited_logger.exception("failed, stopping all amplifiers")
-            await self._fail(error)
-
-
-def _log_transition(before: StateMachine, after: StateMachine) -> None:
-    _logger.log(
-        _LOG_LEVELS.get(after.state, logging.INFO),
-        "%s -> %s",
-        before.state,
-        after.state,
-        extra={"topic": "state", "cause": after.cause, "remedy": after.remedy},
-    )

@@ -24,7 +24,7 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import WATCHDOG, Amplifier
-from drivers.host.group import Group, GroupState
+from drivers.host.group import Group
 from drivers.host.joint_sets import Played
 from drivers.host.stop import Stopped
 from drivers.host.timing import HEARTBEAT
@@ -98,6 +98,8 @@ class Controller:
         self._wake = asyncio.Event()
         self._changed_at: float | None = None  # s; until all changes are decided
         self._heartbeat_due = 0.0
+        self._sending = asyncio.Lock()  # held while a turn sends
+        self._is_closed = False
         self._is_armed_anew = False  # until the next turn, which sends again what is to play
         self._expiry: asyncio.TimerHandle | None = None
 
@@ -112,9 +114,19 @@ class Controller:
         return self._group
 
     @property
-    def group_state(self) -> GroupState:
-        """State of all amplifiers together."""
-        return self._group.state
+    def watchdog(self) -> float:
+        """Watchdog of armed amplifiers [s]."""
+        return self._watchdog
+
+    @property
+    def is_open(self) -> bool:
+        """Whether all amplifiers are open together, armed or not, and none was lost."""
+        return self._group.is_open
+
+    @property
+    def is_released(self) -> bool:
+        """Whether all lines are closed."""
+        return self._lines_if_open is None
 
     @property
     def degraded(self) -> tuple[str, ...]:
@@ -167,11 +179,13 @@ class Controller:
         vibrations that its limits over time count. Raises LinkError, CommandError, and InputError
         for a wired channel that its amplifier does not have or a drive mode that one cannot play.
         """
+        self._is_closed = False
         lines = self._lines_if_open = self._make_lines()
         try:
             amplifiers = {name: await self._amplifier(lines, name) for name in self._urls}
             self._connected(amplifiers)
-            self._group = Group(amplifiers, watchdog=self._watchdog)  # a stop reaches them now
+            async with self._sending:  # to those of before
+                self._group = Group(amplifiers, watchdog=self._watchdog)  # a stop reaches them now
             await self._group.open()
             for name, amplifier in amplifiers.items():
                 self._serial_numbers[name] = amplifier.identity["serial_number"]
@@ -191,7 +205,7 @@ class Controller:
             )
             decider.prepare()
         except BaseException:
-            await self.close()
+            await self.release()
             raise
         self._missing = frozenset()
         self._decider_if_open = decider
@@ -241,8 +255,13 @@ class Controller:
         await self._group.clear()
 
     async def close(self) -> None:
-        """Ramp to zero in 50 ms, confirm it by reading back, disarm and close; ends `run`."""
+        """Release the amplifiers, and end `run`."""
+        self._is_closed = True
         self._wake.set()
+        await self.release()
+
+    async def release(self) -> None:
+        """Ramp to zero in 50 ms, confirm it by reading back, disarm and close all lines."""
         if self._lines_if_open is not None and self._group.lost_by:
             self._missing = frozenset(self._group.lost_by)
         lines = self._lines_if_open  # those of now: others may be opened meanwhile
@@ -255,12 +274,12 @@ class Controller:
                 self._lines_if_open = None
 
     async def run(self) -> None:
-        """Run the loop until `close` or cancellation; raises LinkError when an amplifier is lost.
+        """Run the loop until `close` or cancellation, also while amplifiers are lost or closed.
 
-        All others are stopped first. While disarmed the loop sends nothing: a lost link then shows
-        in the next request, which raises, and in `group_state`, as the daemon's supervisor checks.
+        It sends only while they are armed. An observer is told of a loss, all others are stopped
+        by then; a loss while disarmed shows in the next request, as the supervisor checks.
         """
-        while self.group_state is not GroupState.CLOSED:
+        while not self._is_closed:
             await self.step()
             self._report(lambda each: each.cycle_completed())
             await self._wait_for_event()
@@ -268,6 +287,8 @@ class Controller:
     async def step(self) -> None:
         """Run the loop once: decide, send what changed, then the heartbeat if it is due."""
         self._wake.clear()
+        if self._decider_if_open is None:
+            return
         now = clock.now()
         if self._is_armed_anew:  # not amid a turn, whose set may be on the wire
             self._is_armed_anew = False
@@ -275,8 +296,9 @@ class Controller:
         expired = self._decider.expire(now)
         decision = self._decider.decide(now)
         try:
-            if self.group_state is GroupState.ARMED:
-                await self._send(decision, now)
+            async with self._sending:
+                if self._group.is_armed:
+                    await self._send(decision, now)
                 # Not after a set that was given up: the next cycle silences it first.
                 if self._is_heartbeat_due:
                     await self._group.beat()
@@ -286,7 +308,6 @@ class Controller:
         except LinkError as error:
             lost = str(error)
             self._report(lambda each: each.link_lost(lost))
-            raise
         except DriverError as error:
             reason = str(error)
             self._report(lambda each: each.refused(reason))
@@ -298,7 +319,7 @@ class Controller:
     def deliver(self, frame: TouchFrame) -> None:
         """Process a touch frame; to be called in the loop's thread."""
         # Contacts that came since the last cycle have not been decided yet.
-        is_undecided = self.group_state is GroupState.ARMED and self._wake.is_set()
+        is_undecided = self._group.is_armed and self._wake.is_set()
         change = self._decider.update(frame, keeps_taps=is_undecided)
         self._follow(change)
         for reason in change.rejected:
@@ -311,7 +332,7 @@ class Controller:
     @property
     def _is_heartbeat_due(self) -> bool:
         """Whether to feed the watchdogs now; pending silence has priority."""
-        if self.group_state is not GroupState.ARMED or self._decider.is_silence_pending:
+        if not self._group.is_armed or self._decider.is_silence_pending:
             return False
         return clock.now() >= min(self._heartbeat_due, self._group.lost_from)
 
@@ -325,7 +346,7 @@ class Controller:
         """Act on a change of contacts, also while amplifiers are being awaited."""
         if change:
             self._wake.set()
-            if self.group_state is GroupState.ARMED:
+            if self._group.is_armed:
                 self._changed_at = clock.now()
         if self._decider.is_silence_pending:
             self._group.abort_exchange()
@@ -384,7 +405,7 @@ class Controller:
         except Preempted:
             raise
         except CommandRefused as error:
-            if self.group_state is not GroupState.ARMED:
+            if not self._group.is_armed:
                 raise
             plain = self._decider.without_shapes(decision)
             if plain is not None:
@@ -423,7 +444,7 @@ class Controller:
         except Preempted:
             raise
         except CommandRefused as error:
-            if self.group_state is not GroupState.ARMED:
+            if not self._group.is_armed:
                 raise
             _logger.debug("loop: vibration not renewed: %s", error)
             self._decider.refuse_renewal(due, error.until)
@@ -455,7 +476,7 @@ class Controller:
             is_known = True
             return played
         except CommandRefused as error:
-            is_known = self.group_state is GroupState.ARMED and not isinstance(error, Preempted)
+            is_known = self._group.is_armed and not isinstance(error, Preempted)
             raise
         finally:
             if not is_known:
@@ -466,10 +487,11 @@ class Controller:
         if self._wake.is_set():
             return
         now = clock.now()
-        until, due = now + IDLE_INTERVAL, self._decider.due
+        until = now + IDLE_INTERVAL
+        due = None if self._decider_if_open is None else self._decider.due
         if due is not None:
             until = min(until, due)
-        if self.group_state is GroupState.ARMED:
+        if self._group.is_armed:
             until = min(until, self._heartbeat_due, self._group.lost_from)
         pause = max(0.0, until - now)
         timer = asyncio.get_running_loop().call_later(pause, self._wake.set)

@@ -69,6 +69,11 @@ class Group(Members):
         self._limit: asyncio.Timeout | None = None  # of an exchange in progress
 
     @property
+    def is_open(self) -> bool:
+        """Whether all reply as far as is known: neither closed nor lost."""
+        return self.state in (GroupState.DISARMED, GroupState.ARMED)
+
+    @property
     def is_armed(self) -> bool:
         """Whether layers may be played."""
         return self.state is GroupState.ARMED

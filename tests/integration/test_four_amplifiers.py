@@ -119,7 +119,7 @@ async def test_loss_of_one_of_four_silences_all(arranged: str, lost: str) -> Non
         assert not any(four.levels()[lost])
         await asyncio.sleep(ALL - OWN)
         assert not any(level for each in four.levels().values() for level in each)
-        assert four.controller.group_state is GroupState.LOST
+        assert four.controller.group.state is GroupState.LOST
         four.far.devices[lost].recover()
         await holding
         assert not any(level for each in four.levels().values() for level in each)

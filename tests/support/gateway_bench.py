@@ -196,7 +196,6 @@ def _status() -> StatusResult:
         state="READY_TO_SWITCH_ON",
         cause="it is a script",
         remedy=None,
-        amplifiers_state="disarmed",
         assume_energised=False,
         lost_for_s=None,
         watchdog_s=0.25,

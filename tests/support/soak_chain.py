@@ -150,7 +150,7 @@ class _Run:
         self.stalled_for = 0.0
         self.turning = asyncio.Event()  # unless the control loop stalls
         self.turning.set()
-        self.is_reopening = False
+        self.lost = asyncio.Event()
         self.running: asyncio.Task[None] | None = None
         self.controller: Controller | None = None
         self.tasks: list[asyncio.Task[Any]] = []
@@ -268,13 +268,13 @@ class _Run:
     def _must_be_felt(self) -> bool:
         """Whether a first touch now must lead to a pattern."""
         at = self.loop.time() - START
-        is_armed = self.controller is not None and self.controller.group_state is GroupState.ARMED
+        is_armed = self.controller is not None and self.controller.group.state is GroupState.ARMED
         return is_armed and self.plan.is_calm(at - 0.1, at + _PATTERN)
 
     def _expect_loss(self, number: int) -> None:
         """Check that an armed controller detects an unplugged wire in time."""
         controller = self.controller
-        if controller is None or controller.group_state is not GroupState.ARMED:
+        if controller is None or controller.group.state is not GroupState.ARMED:
             return
         if number and len(self.plan.lines) == 1:
             return  # a shared line is unplugged at its first amplifier
@@ -284,7 +284,7 @@ class _Run:
         def look() -> None:
             if running is None or self.running is not running:
                 return  # stalled meanwhile
-            if self.controller is controller and controller.group_state is GroupState.ARMED:
+            if self.controller is controller and controller.group.state is GroupState.ARMED:
                 self.checks.violate("a wire is unplugged and the controller still armed")
 
         self.loop.call_later(_NOTICED, look)
@@ -300,15 +300,15 @@ class _Run:
                 self.checks.violate("could not be opened without a fault")
         elif action.what == "ready":
             await self.turning.wait()  # as in a process, whose stall also keeps requests waiting
-            if controller.group_state is not GroupState.ARMED:
+            if controller.group.state is not GroupState.ARMED:
                 if not await self._call("clear", controller.clear):  # what nobody had seen yet
                     await self._call("clear", controller.clear)
                 await self._call("arm", controller.arm)
             at = self.loop.time() - START
             is_calm = self.plan.is_calm(action.at - 0.1, at)
-            if controller.group_state is GroupState.LOST and controller is self.controller:
-                self._reopen()
-            elif is_calm and controller.group_state is not GroupState.ARMED:
+            if controller.group.state is GroupState.LOST and controller is self.controller:
+                self._lost("while disarmed")
+            elif is_calm and controller.group.state is not GroupState.ARMED:
                 self.checks.violate("could not be armed without a fault")
         else:
             await self._call(action.what, getattr(controller, action.what))
@@ -344,49 +344,53 @@ class _Run:
             self.stalled_for = lasts
             self.running.cancel()
 
-    def _reopen(self) -> None:
-        """Restart the control loop after a loss while disarmed."""
-        if self.running is not None:
-            self.note("reopen")
-            self.is_reopening = True
-            self.running.cancel()
+    def _lost(self, what: str) -> None:
+        """Have the amplifiers opened again after a loss."""
+        self.note("lost", what)
+        self.counts["links lost"] += 1
+        self.lost.set()
 
     async def _serve(self) -> None:
-        """Open, run, and open again after a loss, as a daemon does."""
+        """Open, and open again after a loss, as a daemon does; the control loop runs on."""
         pauses: Iterator[float] = iter(_PAUSES)
-        while not self.is_ending:
-            controller = self._make_controller()
-            self.witness.opens()
-            try:
-                await controller.open()
-                pauses = iter(_PAUSES)
-                self.note("open")
-                self.controller = controller
-                await self._run_on(controller)
-            except DriverError as problem:
-                self.note("lost", type(problem).__name__, problem)
-                self.counts["links lost"] += 1
-            finally:
-                self.controller = None
-                await controller.close()
-                self.witness.closes()
-            await asyncio.sleep(next(pauses, _PAUSES[-1]))
+        controller = self._make_controller()
+        turning = asyncio.create_task(self._run_on(controller))
+        try:
+            while not self.is_ending:
+                self.witness.opens()
+                self.lost.clear()
+                try:
+                    await controller.open()
+                    pauses = iter(_PAUSES)
+                    self.note("open")
+                    self.controller = controller
+                    await self.lost.wait()
+                except DriverError as problem:
+                    self._lost(f"{type(problem).__name__} {problem}")
+                finally:
+                    self.controller = None
+                    await controller.release()
+                    self.witness.closes()
+                await asyncio.sleep(next(pauses, _PAUSES[-1]))
+        finally:
+            turning.cancel()
+            await asyncio.gather(turning, return_exceptions=True)
 
     async def _run_on(self, controller: Controller) -> None:
-        """Run the control loop to its end, across stalls."""
+        """Run the control loop, across stalls."""
         while True:
             self.running = asyncio.create_task(controller.run())
             try:
                 await self.running
                 return
             except asyncio.CancelledError:
-                if self.is_reopening:
-                    self.is_reopening = False
-                    return
                 if not self.stalled_for:
                     self.running.cancel()
                     raise
                 lasts, self.stalled_for = self.stalled_for, 0.0
+            except Exception as error:
+                self.checks.violate(f"the control loop ended with {error!r}")
+                raise
             finally:
                 self.running = None
             self.turning.clear()
@@ -409,7 +413,7 @@ class _Run:
             observer=Observer(
                 pattern_applied=self._applied,
                 refused=lambda why: self.note("observer refused", why),
-                link_lost=lambda what: self.note("observer lost", what),
+                link_lost=self._lost,
             ),
         )
 
@@ -422,7 +426,7 @@ class _Run:
         controller = self.controller
         if not event["fault"] or controller is None:
             return
-        if self.arm_requests or controller.group_state is GroupState.ARMED:
+        if self.arm_requests or controller.group.state is GroupState.ARMED:
             self._spawn(self._call("stop", controller.stop))
 
     def _applied(self, applied: Applied) -> None:
@@ -436,6 +440,7 @@ class _Run:
         self.witness.operator_command("disarm")
         if self.controller is not None:
             await self.controller.close()
+            self.lost.set()
         else:
             self.serving.cancel()
         await asyncio.gather(self.serving, return_exceptions=True)

@@ -34,7 +34,7 @@ METHODS = {
     Action.STOP: "stop",
     Action.REACT: "stop",
     Action.CLEAR: "clear",
-    Action.RECONNECT: "close",
+    Action.RECONNECT: "release",
 }
 
 
@@ -206,7 +206,7 @@ async def test_failing_step_ends_in_a_stop(
             raise Planted("step")
 
         with monkeypatch.context() as patched:
-            patched.setattr("controller.daemon.supervisor.step", fail)
+            patched.setattr("controller.daemon.operation.step", fail)
             with suppress(DriverError):
                 await made.supervisor.handle(DaemonEvent(trigger, "test"))
         if state is not DaemonState.COMM_LOST:

@@ -16,7 +16,7 @@ from controller_bench import (
     make_bench,
     running,
 )
-from drivers.errors import CommandError, CommandRefused, LinkError
+from drivers.errors import CommandError, CommandRefused
 from drivers.host.group import GroupState
 from drivers.protocol.records import Refusal, Values
 from model.errors import InputError
@@ -35,19 +35,17 @@ def refusing(name: str, code: str) -> Callable[[str, Values], None]:
 
 
 @in_virtual_time
-async def test_lost_link_stops_the_others_and_ends_the_loop() -> None:
+async def test_lost_link_stops_the_others() -> None:
     """The loss is reported, and arming needs all to be opened again."""
     async with running("a", "b") as bench:
         await bench.hold(FINGER, seconds=0.1)
 
         bench.far_ends[0].line.lose("the cable was pulled")
         await asyncio.sleep(0.1)
-        assert bench.controller.group_state is GroupState.LOST
+        assert bench.controller.group.state is GroupState.LOST
         assert len(bench.far_ends[1].requests("Stop")) == 1
         (lost,) = bench.reports.lost
         assert "the cable was pulled" in lost
-        with pytest.raises(LinkError, match="the cable was pulled"):
-            await bench.ended()
         with pytest.raises(CommandError, match=r"LOST.*open"):
             await bench.controller.arm()
     assert not bench.far_ends[1].is_open
@@ -60,8 +58,7 @@ async def test_finger_of_a_silent_source_is_lifted_while_the_link_is_lost() -> N
         bench.touch(FINGER)
         await asyncio.sleep(0.05)
         bench.far_end.line.lose("the cable was pulled")
-        with pytest.raises(LinkError):
-            await bench.ended()
+        await asyncio.sleep(0)
         assert bench.reports.contacts == [1]
         await asyncio.sleep(0.151)
         assert bench.reports.contacts == [1, 0]
@@ -120,7 +117,7 @@ async def test_unexpected_exception_stops_all(kind: str) -> None:
         with pytest.raises(ZeroDivisionError):
             await bench.ended()
         assert bench.states() == {STOPPED}
-        assert bench.controller.group_state is GroupState.DISARMED
+        assert bench.controller.group.state is GroupState.DISARMED
 
 
 @in_virtual_time
@@ -134,7 +131,7 @@ async def test_stop_is_latched_until_clear() -> None:
         assert bench.far_end.state not in (STOPPED, ENABLED)
         with pytest.raises(CommandRefused):
             await bench.controller.arm()
-        assert bench.controller.group_state is GroupState.DISARMED
+        assert bench.controller.group.state is GroupState.DISARMED
         await bench.controller.clear()
         await bench.controller.arm()
         bench.touch(FINGER)
@@ -158,7 +155,7 @@ async def test_silencing_wins_over_arming(silencing: str, is_armed: bool) -> Non
     await getattr(bench.controller, silencing)()
     with pytest.raises(CommandRefused, match="arm again"):
         await arming
-    assert bench.controller.group_state is (
+    assert bench.controller.group.state is (
         GroupState.CLOSED if silencing == "close" else GroupState.DISARMED
     )
     if silencing != "close":
@@ -178,11 +175,11 @@ async def test_arm_is_refused_while_silencing(order: str) -> None:
     with pytest.raises(CommandRefused, match="arm again"):
         await bench.controller.arm()
     await silencing
-    assert bench.controller.group_state is GroupState.DISARMED
+    assert bench.controller.group.state is GroupState.DISARMED
     assert [far_end.requests("Arm") for far_end in bench.far_ends] == [[], []]
     await bench.controller.clear()
     await bench.controller.arm()
-    assert bench.controller.group_state is GroupState.ARMED
+    assert bench.controller.group.state is GroupState.ARMED
     await bench.controller.close()
 
 

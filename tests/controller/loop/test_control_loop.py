@@ -150,7 +150,7 @@ async def test_controller_silences_a_lift_while_a_reply_is_awaited(kind: str) ->
         await asyncio.sleep(0.06)
         assert bench.reports.silenced[-1].reason == NO_CONTACTS
         assert len(bench.far_end.times("Ping")) > beats
-        assert bench.controller.group_state is GroupState.ARMED
+        assert bench.controller.group.state is GroupState.ARMED
 
 
 @pytest.mark.parametrize("later", range(3))
@@ -238,7 +238,7 @@ async def test_arm_changes_nothing_while_armed() -> None:
         kinds = bench.far_end.names(begin)
         assert "Arm" not in kinds
         assert "Ping" in kinds
-        assert bench.controller.group_state is GroupState.ARMED
+        assert bench.controller.group.state is GroupState.ARMED
 
 
 @pytest.mark.parametrize("amplifiers", [["main"], ["left", "right"]])

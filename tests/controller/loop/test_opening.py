@@ -28,5 +28,5 @@ async def test_open_refuses_a_table_without_playable_frequencies() -> None:
     )
     with pytest.raises(InputError, match=r"400 to 500 Hz.*60 to 250 Hz"):
         await controller.open()
-    assert controller.group_state is GroupState.CLOSED
+    assert controller.group.state is GroupState.CLOSED
     assert not link.is_open

@@ -1,6 +1,6 @@
 """Own calls and files on the way of a touch, and what a resting finger and a stop cost.
 
-    python -m benchmarks.latency.calls [RIG ...] [--stops N]
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.latency.calls [RIG ...] [--stops N]
 
 Each rig of examples/ has a row: its amplifiers are in this process, on a line of memory each, and
 their own time is not counted. A touch: from its frame to the last byte of its set, answer included,
@@ -19,14 +19,12 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"  # before numpy loads
-
 import numpy as np
 
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.loop.loop import Controller
+from controller.loop.observer import Observer
 from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
@@ -125,7 +123,7 @@ class Count:
 
 async def measure(rig: Rig, stops: int) -> list[str]:
     """Return the cells of a rig."""
-    count, sent_at = Count(), dict[str, float]()
+    count, sent_at, played = Count(), dict[str, float](), asyncio.Event()
 
     def written(name: str) -> None:
         sent_at.setdefault(name, time.perf_counter())
@@ -138,6 +136,7 @@ async def measure(rig: Rig, stops: int) -> list[str]:
         lines=lambda: MemoryLines(rig, written),
         intent_source=EffectPlayer(SurfaceLayout(effects=default_effects(_LEVEL))),
         timing=Timing(table),
+        observer=Observer(pattern_applied=lambda applied: played.set()),
         watchdog=2.0,
     )
     await controller.open()
@@ -158,12 +157,11 @@ async def measure(rig: Rig, stops: int) -> list[str]:
     await asyncio.sleep(1.0)
     with count:
         count.calls.clear()
-        sets = controller.group.last_sent_at
+        played.clear()
         controller.deliver(
             TouchFrame("panel", asyncio.get_running_loop().time(), (Touch(2, x + 0.02, y),))
         )
-        while controller.group.last_sent_at == sets:
-            await asyncio.sleep(0)
+        await played.wait()
     touched = count.calls
     await touch()
     await rest()

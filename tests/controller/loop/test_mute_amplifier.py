@@ -14,11 +14,8 @@ async def test_mute_amplifier_is_lost_though_the_finger_was_lifted() -> None:
     async with running("a", "b", far_ends=local) as bench:
         await bench.hold(FINGER, seconds=0.2)
         bench.far_ends[1].is_deaf = True
-        began = asyncio.get_running_loop().time()
         bench.touch()
-        async with asyncio.timeout(3.0):
-            while not bench.reports.lost:
-                await asyncio.sleep(0.001)
+        await asyncio.sleep(0.6)
+        assert bench.reports.lost
         assert bench.controller.group.state is GroupState.LOST
-        assert asyncio.get_running_loop().time() - began <= 0.6
         assert not any(bench.far_ends[0].levels)

@@ -265,20 +265,6 @@ async def test_cancelled_touches_are_lifted(page: Page, era: Client) -> None:
             await contacts(era, 0)
 
 
-async def test_reload_lifts_resting_fingers(fresh: Page, era: Client) -> None:
-    """The next touch is felt."""
-    await fresh.touch("touchStart", await on_plate(fresh, *PLACES))
-    await contacts(era, 2)
-    await fresh.call("Page.reload")
-    assert await contacts(era, 0) == []
-    await fresh.until(f"{STATE} === '{READY}'")
-    await fresh.touch("touchEnd", [])
-    async with fingers_down(fresh, (0.5, 0.5)):
-        ((x, _),) = await contacts(era, 1)
-        assert x == pytest.approx(0.5 * LENGTH, abs=1e-3)
-    assert await contacts(era, 0) == []
-
-
 async def test_mouse_is_a_finger_while_its_button_is_down(page: Page, era: Client) -> None:
     """Hovering has no effect; it is lifted wherever the button is released."""
     ((x, y),) = await on_plate(page, (0.25, 0.5))
@@ -337,22 +323,6 @@ async def test_buttons_arm_disarm_stop_and_clear(page: Page, era: Client) -> Non
     await page.click("#clear")
     await until_state(era, READY)
     assert page.complaints == []
-
-
-async def test_lease_is_renewed_while_the_page_is_open(fresh: Page, era: Client) -> None:
-    """Closing the page disarms, because its user could not stop any more."""
-    await arm(fresh, era)
-
-    def left() -> float:
-        return era.status().lease_left_s or 0.0
-
-    await asyncio.to_thread(wait_for, lambda: left() < 4.2)
-    await asyncio.to_thread(wait_for, lambda: left() > 4.5)  # by itself it only falls
-    era.subscribe("state")
-    await fresh.call("Page.navigate", url="about:blank")
-    await until_state(era, READY)
-    causes = (told.data["cause"] for told in era.events(timeout=PATIENCE))
-    assert any(re.match(r"disarmed by '(http|web:\d+) 127", cause) for cause in causes)
 
 
 async def test_space_bar_stops_with_any_focus(fresh: Page, era: Client) -> None:

@@ -115,28 +115,6 @@ async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> No
         assert events[1].endswith("amplifier main: cut")
 
 
-async def test_banner_shows_the_state_of_the_gateway(tab: Page, tmp_path: Path) -> None:
-    """Token refused, unreachable, accepted again."""
-
-    async def until_shown(reason: str) -> None:
-        await tab.until(f"{REASON} === '{reason}'")
-
-    daemon = tmp_path / "none.sock"
-    with gateway_process(tmp_path, daemon) as first:
-        await tab.show(f"{first.url}#token={first.token}")
-        await until_shown("daemon-unreachable")
-        listen = ("--listen", f"127.0.0.1:{first.port}")
-        first.terminate()
-    with gateway_process(tmp_path, daemon, *listen, token="another-token-than-before"):
-        await until_shown("gateway-refused")
-        assert await tab.evaluate("!document.querySelector('#login').hidden")
-    await until_shown("gateway-unreachable")
-    assert await tab.evaluate("document.querySelector('#login').hidden")
-    with gateway_process(tmp_path, daemon, *listen):
-        await until_shown("daemon-unreachable")
-    await until_shown("gateway-unreachable")
-
-
 async def test_full_gateway_is_shown_as_full(tab: Page, tmp_path: Path) -> None:
     """Not as unreachable."""
     with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:

@@ -19,7 +19,6 @@ import pytest
 from controller.api.client import Client
 from daemon_bench import PATIENCE, PLACE
 from gateway_bench import (
-    ARM,
     ERA,
     TOKEN,
     GatewayProcess,
@@ -256,20 +255,3 @@ def test_daemon_continues_when_gateways_are_killed_under_load(
     with Client.connect(daemon, name="test") as era:
         sources = {contact.source for contact in era.status().contacts}
     assert len(sources) == 1  # the watch's own
-
-
-def test_stop_over_http_is_latched_until_clear(
-    watched: Watch, daemon: Path, tmp_path: Path
-) -> None:
-    """Arming is refused with 409 before that."""
-    with gateway_process(tmp_path, daemon) as gateway, Client.connect(daemon, name="test") as era:
-        wait_for_daemon(gateway)
-        watched.over.set()
-        wait_for_state(era, "READY_TO_SWITCH_ON")
-        assert http(gateway, body=ARM).status == 200
-        wait_for_state(era, ENABLED)
-        assert http(gateway, "/api/v1/stop", body=b"").status == 200
-        assert era.status().state == "QUICK_STOP_ACTIVE"
-        assert http(gateway, body=ARM).status == 409
-        assert http(gateway, "/api/v1/clear", body=b"").status == 200
-        wait_for_state(era, "READY_TO_SWITCH_ON")

@@ -66,19 +66,6 @@ async def test_recorder_raises_a_fault_that_lasts(tmp_path: Path) -> None:
         await recorder.finish()
 
 
-async def test_row_of_a_finger_alone_names_no_other_finger(tmp_path: Path) -> None:
-    """A touch that lifts before anything was played for it was not beside another target."""
-    rows: list[TouchRow] = []
-    recorder = recorder_of(rows, tmp_path)
-    alone = contact(1)
-    recorder.observer.contacts_changed((alone,), Change(down=(alone,)))
-    recorder.observer.contacts_changed((), Change(up=(alone,)))
-    with pytest.raises(LinkError):
-        await recorder.finish()
-    assert rows[0].reason is not None
-    assert "finger" not in rows[0].reason
-
-
 async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -112,14 +112,6 @@ def test_peak_contrast_by_hand():
     assert peak_contrast_db(target, quiet) == pytest.approx(20.0)
 
 
-def test_level_of_tone_ten_times_above_threshold_is_20_db():
-    """A tone of ten times the detection threshold has 20 dB SL; no tone has minus infinity."""
-    threshold = detection_threshold(np.array([100.0, 250.0]))
-    assert vibration([[10 * threshold[0]], [0.0]]).level_db_sl == pytest.approx(20.0)
-    nothing = FingerVibration(np.zeros(0), np.zeros((0, 3)), np.zeros(3), np.full(3, 1 / 3))
-    assert nothing.level_db_sl == -np.inf
-
-
 def test_json_has_the_documented_keys_of_every_touch():
     """Also of one that was not driven: without figures, but with the reason."""
     silent = replace(row(1.0, contrast=None, others=1), reason="too close")

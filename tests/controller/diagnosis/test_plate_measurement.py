@@ -15,7 +15,7 @@ from controller.diagnosis.plate_measurement import (
 )
 from controller.diagnosis.plate_sensors import PlateSensor
 from controller.diagnosis.tone_player import TonePlayer
-from drivers.errors import CommandError, CommandRefused
+from drivers.errors import CommandRefused
 from drivers.host.sensors import Reading, SensorReading, measure_tones
 from drivers.opening import Lines
 from memory_machine import live_in_memory
@@ -24,12 +24,11 @@ from model.identification.forward import Sensor
 from model.identification.identify import identify
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
-from model.structure.attachments import Fingertip, PointLoad
+from model.structure.attachments import PointLoad
 from model.table.build import build_table
 from model.table.question import Question
 from model.vibration.natural_modes import direct_responder
 from rig_on_wire import FarSide, far_side
-from sim.amplifier.contract import Amplifier
 from sim.bench import bench
 from sim.plant.accelerometer import Accelerometer
 from sim.sensors.accelerometers import Accelerometers
@@ -212,23 +211,6 @@ def test_two_amplifiers_hear_each_other_where_they_start_together(
     assert abs(measurement.values - fields).max() < 0.01 * abs(fields).max()
 
 
-def test_finger_that_comes_meanwhile_is_noticed(rig: Rig, truth: Rig) -> None:
-    """The first tones, played last again, sound different: refused, with nothing identified."""
-
-    async def run() -> PlateMeasurement:
-        live_in_memory()
-        async with far_side(WIRES["serial"], replace(truth, fingertip=Fingertip())) as far:
-
-            def touched(done: int, of: int) -> None:
-                if done == 4:
-                    far.bench.place_fingers({"thumb": (0.2, 0.15)}, now=far.bench.time)
-
-            return await measured(rig, far, on_step=touched)
-
-    with pytest.raises(InputError, match="at the end"):
-        identify(rig, run_virtual(run()).measurement)
-
-
 @pytest.mark.parametrize("is_cancelled", [True, False])
 def test_interrupted_measurement_ends_silent(is_cancelled: bool, rig: Rig, truth: Rig) -> None:
     """By Ctrl-C, as a cancelled task, or by an error of the caller; `measured` sees to silence."""
@@ -248,21 +230,6 @@ def test_interrupted_measurement_ends_silent(is_cancelled: bool, rig: Rig, truth
                 await task
 
     run_virtual(run())
-
-
-def test_amplifier_without_sensors_is_refused(
-    rig: Rig, truth: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Before anything is armed."""
-
-    async def run() -> None:
-        live_in_memory()
-        async with far_side(WIRES["serial"], truth) as far:
-            await measured(rig, far)
-
-    monkeypatch.setattr(Amplifier, "attach", lambda amplifier, sensing: None)
-    with pytest.raises(CommandError, match="amplifier main must measure"):
-        run_virtual(run())
 
 
 def test_overloaded_sensor_is_named(rig: Rig, truth: Rig) -> None:

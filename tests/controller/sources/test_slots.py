@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.sources.slots import EventError, Report, SlotReader, light_press
+from controller.sources.slots import EventError, Report, SlotReader
 
 Shown: TypeAlias = list[tuple[float, dict[int, tuple[float, float]]]]
 
@@ -108,15 +108,6 @@ def test_states_follow_slots(name: str) -> None:
     assert shown(reports) == expected
 
 
-def test_lost_events_leave_a_partial_report() -> None:
-    """After SYN_DROPPED the kernel has to be asked: nothing of before counts."""
-    reader = SlotReader(RANGES)
-    report(reader, "id 1 x 100 y 0")
-    lost = report(reader, "x 200 dropped 0 id -1 id 9 x 300")
-    assert (lost.is_partial, lost.states) == (True, ((),))
-    assert not report(reader, "x 400").is_partial
-
-
 @given(
     st.lists(
         st.lists(
@@ -137,24 +128,6 @@ def test_at_most_as_many_touches_as_slots(reports: list[list[tuple[str, int]]]) 
     words = [" ".join(f"{code} {value}" for code, value in each) for each in reports]
     slots = {value for each in reports for code, value in each if code == "slot"} | {0}
     assert all(len(touches) <= len(slots) for _, touches in shown(enumerate(words)))
-
-
-@pytest.mark.parametrize(
-    ("resolutions", "given_values", "load"),
-    [
-        ({}, {}, None),
-        ({0x3A: 1}, {}, (102 / 51) ** (2 / 3)),  # grams, twice the force of a tap
-        ({}, {0x3A: 102}, 1.0),
-        ({0x30: 10}, {}, (47 / 94) ** 2),  # half the diameter
-    ],
-)
-def test_load_follows_resolution_or_a_light_press(
-    resolutions: dict[int, int], given_values: dict[int, float], load: float | None
-) -> None:
-    """By force where its unit is known, else by size; unknown without either."""
-    reader = SlotReader(RANGES, light_press=light_press(resolutions, given_values))
-    ((touch,),) = report(reader, "id 1 x 100 y 30 pressure 102 major 47").states
-    assert touch.load == (None if load is None else pytest.approx(load, rel=2e-3))
 
 
 @pytest.mark.parametrize("event", [(ABS, 0x2F, -1), (SYN, 2, 0)])

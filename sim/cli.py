@@ -117,8 +117,7 @@ def sim(
     with exit_on_signal():
         from model.config.points import parse_point
         from model.rig.file import load_rig
-        from sim.far_ends.wire_assignment import assign_wires
-        from sim.far_ends.wires import Wire
+        from sim.far_ends.wires import Wire, assign_wires
         from sim.faults.fault_file import FaultFile, load_faults
         from sim.firmware.programs import find_firmware
         from sim.plant.imperfections import Imperfections, draw_imperfections

@@ -103,6 +103,23 @@ class JackClient:
         pattern = f"^{re.escape(other)}:".encode() if other else None
         return _names(libjack().jack_get_ports(self.pointer, pattern, _AUDIO, flags))
 
+    def first_ports(self, other: str, flag: int, count: int) -> list[str]:
+        """The first of such ports; raises InputError where there are fewer."""
+        found = self.ports_of(other, flag)
+        if len(found) < count:
+            what = "outputs" if flag == IS_INPUT else "inputs"  # of the other client
+            raise InputError(
+                f"--device {jack_name(other)} must have {count} {what}, got {len(found)}; list "
+                "devices with era soft-amp --list"
+            )
+        return found[:count]
+
+    def takers(self, other: str, count: int) -> list[str]:
+        """The first ports of a client that take samples; LinkError where one is played to."""
+        ports = self.first_ports(other, IS_INPUT, count)
+        self.check_free(ports, device=jack_name(other))
+        return ports
+
     def connected_to(self, port: str) -> list[str]:
         """Ports that a port is connected to."""
         found = libjack().jack_port_by_name(self.pointer, port.encode())
@@ -166,6 +183,11 @@ class JackClient:
     def close(self) -> None:
         """Leave the server."""
         libjack().jack_client_close(self.pointer)
+
+
+def jack_name(other: str) -> str:
+    """How a client is named as a device; "" for the hardware."""
+    return f"jack:{other}" if other else "jack"
 
 
 def check_free(other: str, channels: int) -> None:

@@ -10,8 +10,7 @@ import typer
 from model.commands.options import JsonOption, RigArgument, next_line
 
 if TYPE_CHECKING:
-    from sim.measuring.measure import Measured
-    from sim.measuring.stepped import Stepped
+    from sim.measuring.measure import Measured, Stepped
 
 DEFAULT_LEVEL = 0.3
 
@@ -66,9 +65,8 @@ def measure(
     from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig
     from sim.measuring.live_plot import live_plot
+    from sim.measuring.measure import check_by_steps, open_desk
     from sim.measuring.measure import measure as measured_by
-    from sim.measuring.measure import open_desk
-    from sim.measuring.stepped import check_by_steps
 
     check_place(output, example="measured.uff")
     check_ending(output, ".uff", ".unv", ".csv", what="measured responses")

@@ -165,7 +165,7 @@ def _place(
 
 def _list() -> None:
     from sim.libjack import IS_INPUT, jack_devices
-    from sim.soft_amp.portaudio import portaudio_devices
+    from sim.soft_amp.output import portaudio_devices
 
     try:
         for name, channels in jack_devices(IS_INPUT).items():

@@ -15,8 +15,8 @@ from model.errors import InputError
 from model.files.regular_file import regular_file
 
 if TYPE_CHECKING:
-    from sim.witness.endpoint import WireEndpoint
     from sim.witness.witness import Witness
+    from sim.witness_relay import WireEndpoint
 
 
 def witness(
@@ -50,8 +50,8 @@ def witness(
     Print a relay URL for each amplifier, to be used in its place, and check until Ctrl-C. Exit
     status 1 on violations.
     """
-    from sim.witness.endpoint import parse_endpoint
     from sim.witness.witness import Witness
+    from sim.witness_relay import parse_endpoint
 
     limits: dict[str, Any] = {
         "frequency_hz": _band(frequency),

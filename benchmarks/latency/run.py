@@ -29,7 +29,7 @@ from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry.limits import GuardLimits
-from sim.amplifier.capabilities import capabilities
+from sim.amplifier.readings import capabilities
 
 FLOOD_RATE = 10_000  # Hz
 WORKERS = 2  # programs at work in the loaded case, one for each core

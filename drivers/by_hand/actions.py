@@ -8,14 +8,17 @@ from typing import Any
 
 from drivers import clock
 from drivers.by_hand.reaching import (
+    capability_rows,
+    fault_rows,
     identified,
+    in_units,
     keep_alive,
     random_session,
     reached,
     round_trip,
+    status_rows,
     wire_rows,
 )
-from drivers.by_hand.rows import capability_rows, fault_rows, in_units, status_rows
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import WATCHDOG, Amplifier

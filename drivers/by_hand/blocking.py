@@ -15,8 +15,14 @@ from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import Any, TypeVar
 
-from drivers.by_hand.reaching import keep_alive, random_session, reached
-from drivers.by_hand.rows import capability_rows, fault_rows, status_rows
+from drivers.by_hand.reaching import (
+    capability_rows,
+    fault_rows,
+    keep_alive,
+    random_session,
+    reached,
+    status_rows,
+)
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused
 from drivers.host.amplifier import WATCHDOG

@@ -19,9 +19,8 @@ from drivers.conformance import (
     telling,
     watchdog,
 )
-from drivers.conformance.check import run_checks
+from drivers.conformance.check import Check, CheckResult, Report, Result, run_checks
 from drivers.conformance.opening import opened
-from drivers.conformance.report import Check, CheckResult, Report, Result
 from drivers.conformance.subject import LEVEL
 
 __all__ = ["CHECKS", "LEVEL", "Check", "CheckResult", "Report", "Result", "judge", "of_kind"]

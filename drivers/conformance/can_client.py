@@ -15,8 +15,16 @@ from drivers.codec.can_bus.segments import (
     segments,
     unpack_frames,
 )
-from drivers.conformance.client import Answer, Client, Heard, When, altered, expect_reply, read_as
-from drivers.conformance.findings import expect_equal
+from drivers.conformance.client import (
+    Answer,
+    Client,
+    Heard,
+    When,
+    altered,
+    expect_equal,
+    expect_reply,
+    read_as,
+)
 from drivers.protocol.records import Values
 from drivers.protocol.table import HELLO, IDENTITY, NAK
 from drivers.statistics import WireCounters

@@ -8,12 +8,17 @@ from typing import cast
 from drivers import clock
 from drivers.codec.can_bus.canopen import CANOPEN, cob_id
 from drivers.codec.can_bus.segments import segments
-from drivers.conformance.can_client import CanClient
-from drivers.conformance.can_objects import read_object, write_object
+from drivers.conformance.can_frames import CanClient, read_object, write_object
 from drivers.conformance.check import driving, reading
-from drivers.conformance.client import When
+from drivers.conformance.client import (
+    Late,
+    When,
+    expect,
+    expect_equal,
+    expect_one_of,
+    expect_within,
+)
 from drivers.conformance.expected import NAMES, OFF
-from drivers.conformance.findings import Late, expect, expect_equal, expect_one_of, expect_within
 from drivers.conformance.material import layer
 from drivers.conformance.subject import Subject
 from drivers.protocol.table import MESSAGES

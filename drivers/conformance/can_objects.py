@@ -4,8 +4,8 @@ import asyncio
 import struct
 
 from drivers.codec.can_bus.canopen import cob_id
-from drivers.conformance.can_client import CanClient
-from drivers.conformance.findings import Violation, expect, expect_equal
+from drivers.conformance.can_frames import CanClient
+from drivers.conformance.client import Violation, expect, expect_equal
 
 _ABORT, _UPLOAD, _WRITTEN = 0x80, 0x40, 0x60
 _TRIES, _POLL = 500, 0.001  # s

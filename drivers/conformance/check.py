@@ -4,10 +4,9 @@ from collections.abc import Callable, Iterable, Sequence
 from inspect import isawaitable
 
 from drivers import clock
-from drivers.conformance.client import Client, read_as
-from drivers.conformance.findings import Late, Optional, Violation
+from drivers.conformance.check import Check, CheckResult, Result, Steps
+from drivers.conformance.client import Client, Late, Optional, Violation, read_as
 from drivers.conformance.material import FULL
-from drivers.conformance.report import Check, CheckResult, Result, Steps
 from drivers.conformance.subject import MAX_ATTEMPTS, Subject
 from drivers.errors import CommandError
 from drivers.protocol.table import MESSAGES

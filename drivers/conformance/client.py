@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 from drivers import clock
-from drivers.conformance.findings import Violation, expect, expect_equal
+from drivers.conformance.client import Violation, expect, expect_equal
 from drivers.errors import LinkError
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REFUSALS

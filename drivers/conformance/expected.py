@@ -8,8 +8,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from drivers.conformance.client import When
-from drivers.conformance.findings import Late, expect, expect_equal, expect_one_of, expect_within
+from drivers.conformance.client import (
+    Late,
+    When,
+    expect,
+    expect_equal,
+    expect_one_of,
+    expect_within,
+)
 from drivers.playback import playback_of
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, token_after

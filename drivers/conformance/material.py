@@ -2,7 +2,7 @@
 
 import math
 
-from drivers.conformance.findings import Optional
+from drivers.conformance.client import Optional
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES, has_feature

@@ -13,9 +13,10 @@ from drivers.conformance.client import (
     Heard,
     When,
     altered,
+    expect,
+    expect_equal,
     expect_reply,
 )
-from drivers.conformance.findings import expect, expect_equal
 from drivers.protocol.records import Values
 from drivers.protocol.table import MAX_WORDS, MESSAGES
 

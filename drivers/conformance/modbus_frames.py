@@ -7,8 +7,8 @@ from functools import partial
 from typing import cast
 
 from drivers.conformance.check import driving, reading
-from drivers.conformance.findings import expect, expect_equal
-from drivers.conformance.modbus_client import (
+from drivers.conformance.client import expect, expect_equal
+from drivers.conformance.modbus_frames import (
     BOX,
     EXCEPTION,
     HEAD,

@@ -6,10 +6,10 @@ from contextlib import asynccontextmanager
 from functools import partial
 
 from drivers import trace
-from drivers.conformance.can_client import CanClient
+from drivers.conformance.can_frames import CanClient
 from drivers.conformance.client import Client, Port
-from drivers.conformance.modbus_client import ModbusClient
-from drivers.conformance.serial_client import SerialClient
+from drivers.conformance.modbus_frames import ModbusClient
+from drivers.conformance.serial_frames import SerialClient
 from drivers.errors import LinkError
 from drivers.protocol.table import MAX_WORDS
 from drivers.wires.known import address_of

@@ -7,10 +7,9 @@ from functools import partial
 
 from drivers import clock
 from drivers.conformance.check import driving
+from drivers.conformance.client import Late, Optional, expect
 from drivers.conformance.expected import flag
-from drivers.conformance.findings import Late, Optional, expect
-from drivers.conformance.material import layer
-from drivers.conformance.rows import Rows, play, send
+from drivers.conformance.material import Rows, layer, play, send
 from drivers.conformance.subject import Subject
 from drivers.protocol.table import SHORTENED_FADE
 

@@ -4,10 +4,10 @@ import math
 from typing import cast
 
 from drivers.conformance.check import driving, reading
+from drivers.conformance.client import expect, expect_equal, expect_one_of, expect_within
 from drivers.conformance.expected import ENABLED, NAMES, flag
-from drivers.conformance.findings import expect, expect_equal, expect_one_of, expect_within
-from drivers.conformance.rows import Rows, send
-from drivers.conformance.serial_client import SerialClient
+from drivers.conformance.material import Rows, send
+from drivers.conformance.serial_frames import SerialClient
 from drivers.conformance.subject import Subject
 from drivers.protocol.table import (
     FEATURES,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, TypeAlias
 
-from drivers.conformance.rows import Rows
+from drivers.conformance.material import Rows
 from drivers.conformance.subject import Subject
 
 Steps: TypeAlias = Callable[[Subject], Awaitable[None] | Rows]

@@ -4,17 +4,17 @@ import asyncio
 import math
 
 from drivers.conformance.check import driving, reading
-from drivers.conformance.client import Answer, read_as
-from drivers.conformance.expected import SLACK
-from drivers.conformance.findings import (
+from drivers.conformance.client import (
+    Answer,
     Optional,
     expect,
     expect_equal,
     expect_one_of,
     expect_within,
+    read_as,
 )
-from drivers.conformance.material import layer
-from drivers.conformance.rows import send
+from drivers.conformance.expected import SLACK
+from drivers.conformance.material import layer, send
 from drivers.conformance.subject import Subject
 from drivers.protocol.records import Record, Values
 from drivers.protocol.table import NO_CHANNEL, QUANTITIES, READING_STATES, sensor_reading

@@ -22,10 +22,10 @@ from drivers.conformance.client import (
     Heard,
     When,
     altered,
+    expect_equal,
     expect_reply,
     read_as,
 )
-from drivers.conformance.findings import expect_equal
 from drivers.protocol.records import Values
 from drivers.protocol.table import EVENT, HELLO, MAX_WORDS, NAK, VERSION
 

@@ -7,10 +7,9 @@ from typing import cast
 from drivers import clock
 from drivers.codec.serial_line.frame import pack_words
 from drivers.conformance.check import driving
-from drivers.conformance.client import When
-from drivers.conformance.findings import expect_equal
+from drivers.conformance.client import When, expect_equal
 from drivers.conformance.material import layer
-from drivers.conformance.serial_client import SerialClient
+from drivers.conformance.serial_frames import SerialClient
 from drivers.conformance.subject import Subject
 from drivers.protocol.table import MESSAGES, VERSION
 

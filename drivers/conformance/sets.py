@@ -5,9 +5,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from drivers.conformance.check import driving
-from drivers.conformance.findings import Optional, expect_equal, expect_within
-from drivers.conformance.material import FULL, layer
-from drivers.conformance.rows import Rows, Send, play, send, stage
+from drivers.conformance.client import Optional, expect_equal, expect_within
+from drivers.conformance.material import FULL, Rows, Send, layer, play, send, stage
 from drivers.conformance.subject import Subject
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, pack_layers

@@ -1,9 +1,8 @@
 """Checks of sets in parts and by tokens: staged, committed once, in their order, for a second."""
 
 from drivers.conformance.check import driving
-from drivers.conformance.findings import Optional
-from drivers.conformance.material import Material, layer
-from drivers.conformance.rows import Rows, play, send, stage
+from drivers.conformance.client import Optional
+from drivers.conformance.material import Material, Rows, layer, play, send, stage
 from drivers.conformance.subject import Subject
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, pack_layers

@@ -3,8 +3,7 @@
 from functools import partial
 
 from drivers.conformance.check import driving
-from drivers.conformance.material import layer
-from drivers.conformance.rows import Rows, play, send, stage
+from drivers.conformance.material import Rows, layer, play, send, stage
 from drivers.conformance.subject import Subject
 from drivers.protocol.sets import token_after
 from drivers.protocol.table import QUANTITIES

@@ -8,17 +8,18 @@ from functools import partial
 from typing import Any
 
 from drivers import clock
-from drivers.conformance.client import Answer, Client, read_as
-from drivers.conformance.expected import ENABLED, NAMES, OFF, Expected
-from drivers.conformance.findings import (
+from drivers.conformance.client import (
+    Answer,
+    Client,
     Late,
     Optional,
     expect,
     expect_equal,
     expect_one_of,
+    read_as,
 )
-from drivers.conformance.material import FULL, Material, layer
-from drivers.conformance.rows import Rows, Send, play, send
+from drivers.conformance.expected import ENABLED, NAMES, OFF, Expected
+from drivers.conformance.material import FULL, Material, Rows, Send, layer, play, send
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, pack_layers, parts
 from drivers.protocol.table import MESSAGES, QUANTITIES, STATES

@@ -4,11 +4,9 @@ import asyncio
 
 from drivers import clock
 from drivers.conformance.check import driving
-from drivers.conformance.client import Client, When
+from drivers.conformance.client import Client, Optional, Violation, When, expect_equal
 from drivers.conformance.expected import NAMES
-from drivers.conformance.findings import Optional, Violation, expect_equal
-from drivers.conformance.material import layer
-from drivers.conformance.rows import send, stage
+from drivers.conformance.material import layer, send, stage
 from drivers.conformance.subject import Subject
 from drivers.protocol.records import Values
 from drivers.protocol.table import EVENT, EVENT_RECORD, MESSAGES, NO_CHANNEL

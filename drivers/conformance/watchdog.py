@@ -7,11 +7,9 @@ from itertools import chain
 
 from drivers import clock
 from drivers.conformance.check import driving
-from drivers.conformance.client import When
+from drivers.conformance.client import When, expect, expect_equal, expect_within
 from drivers.conformance.expected import SLACK
-from drivers.conformance.findings import expect, expect_equal, expect_within
-from drivers.conformance.material import layer
-from drivers.conformance.rows import Rows, play, send, stage
+from drivers.conformance.material import Rows, layer, play, send, stage
 from drivers.conformance.staging import long_set
 from drivers.conformance.subject import Subject
 from drivers.protocol.sets import LayerSet

@@ -10,7 +10,7 @@ from pathlib import Path
 from serial.tools.list_ports import comports
 
 from drivers.codec.can_bus.canopen import BITRATE
-from drivers.discovery.slcan import detect_slcan
+from drivers.discovery.places import detect_slcan
 from drivers.ports.opening import remedy_of
 from drivers.urls import ADDRESS, BAUD, RTU_BAUD
 
@@ -40,7 +40,7 @@ def candidates() -> list[Candidate]:
 def with_slcan(candidate: Candidate) -> Candidate:
     """Turn a serial port into a CAN adapter if it replies as one.
 
-    Blocks; see `drivers.discovery.slcan` for what is sent. Its amplifiers are not identified.
+    Blocks; see `drivers.discovery.places` for what is sent. Its amplifiers are not identified.
     """
     if not candidate.is_serial:
         return candidate

@@ -25,19 +25,19 @@ from drivers.protocol.table import (
     STATES,
     STATUS_FLAGS,
 )
-from sim.amplifier.capabilities import capabilities
 from sim.amplifier.readings import (
     HIGH_VOLTAGE,
     LIMITED,
+    AmplifierSummary,
     FaultRecord,
     achieved,
+    capabilities,
     exceeds_full,
     fault_list,
     measured,
 )
 from sim.amplifier.set_intake import SetIntake, derated
 from sim.amplifier.state_table import TRANSITIONS
-from sim.amplifier.summary import AmplifierSummary
 from sim.amplifier.thermal_model import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD_BELOW, ThermalState
 
 SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires

@@ -28,12 +28,10 @@ from model.structure.plate import Plate
 from model.transients.base_motion import Motion
 from sim.amplifier.contract import Amplifier
 from sim.bench.placement import Placement
-from sim.bench.reading import ToneReader
-from sim.bench.sensing import REACH, Sensing
+from sim.bench.sensing import REACH, Sensing, ToneReader
 from sim.plant.accelerometer import Accelerometer
-from sim.plant.felt import Felt, measure_vibration
-from sim.plant.fingers import KEPT, Fingers, Position, Record
-from sim.plant.imperfections import Imperfections, PlateErrors, draw_noise, realised
+from sim.plant.fingers import KEPT, Felt, Fingers, Position, Record, measure_vibration
+from sim.plant.imperfections import Imperfections, PlateErrors, realised
 from sim.plant.loaded_plates import LoadedPlate
 from sim.plant.plant import SAMPLE_RATE, Plant
 from sim.plant.voiced_base import delayed, motion_of
@@ -111,7 +109,6 @@ class Bench:
         self._delayed: list[tuple[float, int, Voices]] = []
         self._applied_outputs: list[Voices] = [()] * len(rig.eras)
         self._errors = [imperfections.errors_of(era.name, rig) for era in rig.eras]
-        self._noise = [draw_noise(seed=imperfections.seed, number=n) for n in range(len(rig.eras))]
         self._shapes_at = lru_cache(_MAX_SHAPES)(
             lambda points: self._plant.reduced.at(np.frombuffer(points).reshape(-1, 2))
         )
@@ -370,13 +367,8 @@ class Bench:
 
     def _motion(self, index: int, playing: Voices) -> Motion:
         """The base motion of an ERA by the output of its channel, imperfections included."""
-        era, errors = self.rig.eras[index], self._errors[index]
-        motion = realised(motion_of(playing, stroke=era.stroke), errors)
-        if errors.noise and playing:
-            end = max(tone.silent_from for tone in playing)
-            rms = errors.noise * era.stroke
-            motion += self._noise[index].terms(rms, start=self._time, end=end)
-        return motion
+        motion = motion_of(playing, stroke=self.rig.eras[index].stroke)
+        return realised(motion, self._errors[index])
 
     def _frequencies(self, since: float, until: float) -> list[float]:
         """The frequencies [Hz] at which bases were moved by commands in a window."""

@@ -10,8 +10,7 @@ from model.errors import InputError
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.plant.imperfections import PlateErrors
-from sim.sensors.accelerometers import Accelerometers
-from sim.sensors.recorder import Recorder
+from sim.sensors.recorder import Accelerometers, Recorder
 
 
 @dataclass

@@ -52,9 +52,8 @@ import math
 from collections.abc import Mapping
 
 from model.errors import InputError
-from sim.control import finger_operations, plate_operations, sensor_operations
 from sim.control.context import SimulationContext
-from sim.control.values import Operation, Request, Response, parse_number
+from sim.control.plate_operations import OPERATIONS, Operation, Request, Response, parse_number
 from sim.faults.fault_file import parse_fault
 
 VERSION = 3
@@ -150,9 +149,7 @@ async def _step(context: SimulationContext, request: Request, now: float) -> Res
 _OPERATIONS: Mapping[str, Operation] = {
     "hello": _hello,
     "state": _state,
-    **finger_operations.OPERATIONS,
-    **sensor_operations.OPERATIONS,
-    **plate_operations.OPERATIONS,
+    **OPERATIONS,
     "inject_fault": _inject_fault,
     "faults": _faults,
     "recover": _recover,

@@ -1,7 +1,7 @@
 """The amplifiers' side of Modbus, without I/O: bytes in, bytes out.
 
 Each message is a mailbox: written from register 256 n on (tag, words), its reply read from
-256 n + 128 on (tag, result, words). Written without code of the host's side.
+256 n + 128 on (tag, result, words).
 
 Not modelled: parity and collisions on a serial line.
 """
@@ -11,18 +11,13 @@ from collections.abc import Mapping, Sequence
 
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
-from sim.far_ends.modbus.frames import RequestAdu, RtuReader, TcpReader, rtu_frame, tcp_frame
-from sim.far_ends.modbus.pdu import (
-    ILLEGAL_ADDRESS,
-    ILLEGAL_FUNCTION,
-    READ_HOLDING,
-    READ_INPUT,
+from sim.far_ends.modbus_frames import (
+    READS,
     WRITE,
-    ModbusException,
-    check_range,
-    pair,
-    registers_read,
-    to_write,
+    RequestAdu,
+    RequestReader,
+    rtu_frame,
+    tcp_frame,
 )
 from sim.transport.far_end import AmplifierPort, FarEnd, Send
 
@@ -33,8 +28,10 @@ _REPLY_HEAD = 2  # registers: tag, result
 _IDENTITY = 1065
 _TEXTS = ("vendor", "product", "serial_number", "firmware")
 _TEXT_SIZE = 32  # bytes
-_END = 1 << 16
 _BROADCAST = 0
+_ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE = 1, 2, 3
+_READ_MAX, _WRITE_MAX = 125, 123
+_WRITE_HEAD = struct.Struct(">HHB")  # address, registers, bytes
 _PRESENT = ("GetCaps", "GetStatus", "GetFaults")
 
 
@@ -51,7 +48,7 @@ class ModbusAmplifiers(FarEnd):
         self._units = {unit: _Unit(amplifier) for unit, amplifier in amplifiers.items()}
         self._send = send
         self._is_rtu = is_rtu
-        self._reader: RtuReader | TcpReader = RtuReader() if is_rtu else TcpReader()
+        self._reader = RequestReader(is_rtu=is_rtu)
 
     def receive(self, data: bytes, now: float) -> None:
         """Take bytes from the host at a time [s]."""
@@ -115,13 +112,12 @@ class _Unit:
                 message, tag, words = _written(pdu)
                 self._replies[message.number] = tag, *self._execute(message, words, now)
                 return pdu[:5]  # function, address and count
-            if function in (READ_HOLDING, READ_INPUT):
-                address, count = pair(pdu[1:])
-                check_range(address, count, end=_END)
-                return registers_read(function, self._read(address, count, now))
-        except ModbusException as exception:
+            if function in READS:
+                words = self._read(*_to_read(pdu[1:]), now)
+                return struct.pack(f">BB{len(words)}H", function, 2 * len(words), *words)
+        except _ModbusException as exception:
             return bytes([function | 0x80, exception.code])
-        return bytes([function | 0x80, ILLEGAL_FUNCTION])
+        return bytes([function | 0x80, _ILLEGAL_FUNCTION])
 
     def take_broadcast(self, pdu: bytes, now: float) -> None:
         """Carry a request out that is for all units; its reply area stays as it is."""
@@ -129,7 +125,7 @@ class _Unit:
             return
         try:
             message, _, words = _written(pdu)
-        except ModbusException:
+        except _ModbusException:
             return
         if message.is_broadcast:
             result, _ = self._execute(message, words, now)
@@ -150,7 +146,7 @@ class _Unit:
         return 0, message.reply.pack(reply)
 
     def _read(self, address: int, count: int, now: float) -> Sequence[int]:
-        """Return registers that can be read; raises ModbusException."""
+        """Return registers that can be read; raises _ModbusException."""
         number, offset = divmod(address, _BOX)
         if offset >= _REPLY and number in BY_NUMBER:
             first = number * _BOX + _REPLY
@@ -158,7 +154,7 @@ class _Unit:
         else:
             first, area = _IDENTITY, _identity(self.amplifier.identity)
         if not first <= address <= address + count <= first + len(area):
-            raise ModbusException(ILLEGAL_ADDRESS)
+            raise _ModbusException(_ILLEGAL_ADDRESS)
         return area[address - first :][:count]
 
     def _reply_area(self, message: Message, now: float) -> Sequence[int]:
@@ -175,12 +171,32 @@ class _Unit:
         return row + (0,) * (_REPLY_HEAD + MAX_WORDS - len(row))
 
 
+class _ModbusException(Exception):
+    """A Modbus exception, by its code."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+
+def _to_read(body: bytes) -> tuple[int, int]:
+    """Return address and count of the registers that are to be read; raises _ModbusException."""
+    address, count = struct.unpack(">HH", body) if len(body) == 4 else (0, 0)
+    if not 1 <= count <= _READ_MAX:
+        raise _ModbusException(_ILLEGAL_VALUE)
+    return address, count
+
+
 def _written(pdu: bytes) -> tuple[Message, int, Sequence[int]]:
-    """Return the message that is written, its tag and words; raises ModbusException."""
-    address, (tag, *words) = to_write(pdu[1:])
+    """Return the message that is written, its tag and words; raises _ModbusException."""
+    head, rest = pdu[1:6].ljust(_WRITE_HEAD.size, b"\0"), pdu[6:]
+    address, count, size = _WRITE_HEAD.unpack(head)
+    if not (1 <= count <= _WRITE_MAX and size == 2 * count == len(rest)):
+        raise _ModbusException(_ILLEGAL_VALUE)
+    tag, *words = struct.unpack(f">{count}H", rest)
     number, offset = divmod(address, _BOX)
     if offset or number not in BY_NUMBER or len(words) > MAX_WORDS:
-        raise ModbusException(ILLEGAL_ADDRESS)
+        raise _ModbusException(_ILLEGAL_ADDRESS)
     return BY_NUMBER[number], tag, words
 
 

@@ -7,10 +7,8 @@ import numpy as np
 from drivers.errors import LinkError
 from model.arrays import FloatArray
 from model.errors import InputError
-from sim.measuring.clocks import certain_drift
-from sim.measuring.estimate import Estimate
-from sim.measuring.loopback import SILENT
-from sim.measuring.multisine import Multisine
+from sim.measuring.loopback import SILENT, certain_drift
+from sim.measuring.multisine import Estimate, Multisine
 from sim.sensors.sensor_file import WiredSensor
 
 _FULL = 0.999  # of full scale

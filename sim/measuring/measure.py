@@ -1,4 +1,4 @@
-"""A rig's plate measured through a sound card."""
+"""A rig's plate measured through a sound card: runs of a multisine; stepped tones as a check."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -7,17 +7,81 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.rig.rig import Rig
-from sim.measuring.checks import check_clocks, check_coherence, check_wiring
+from sim.measuring.checks import check_clocks, check_coherence, check_levels, check_wiring
 from sim.measuring.desk import Desk
-from sim.measuring.estimate import estimate
-from sim.measuring.loopback import latency
-from sim.measuring.multisine import Multisine, default_frequencies
-from sim.measuring.run import TRIES, blocks_lost, play_run, run_time
+from sim.measuring.loopback import is_as_late, is_whole, latency
+from sim.measuring.multisine import PERIOD, Multisine, default_frequencies, estimate
 from sim.measuring.sound_card import SoundCard, open_card
 from sim.sensors.sensor_file import read_sensors
+
+_SETTLING = 1.0  # s; T60 of the paper's plate
+_TAIL = 0.05  # s; longer than the ramp
+
+TRIES = 3
+"""Attempts of a run."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What was recorded of a run: whole periods of the settled plate, (n, inputs).
+
+    loopback (f,): complex gain of the cable; is_whole: whether no block was lost, in the last
+    attempt; repeated: attempts before it.
+    """
+
+    recorded: FloatArray
+    loopback: ComplexArray
+    is_whole: bool
+    repeated: int
+
+
+def run_time(periods: int) -> float:
+    """Time [s] of a run of which so many periods are analysed."""
+    return _SETTLING + PERIOD * periods + _TAIL
+
+
+def play_run(
+    desk: Desk,
+    card: SoundCard,
+    multisine: Multisine,
+    number: int,
+    *,
+    periods: int,
+    before: ComplexArray | None,
+    tries: int = TRIES,
+) -> Run:
+    """Play a run, again where blocks were lost in it or since the first one.
+
+    before (f,): the loop-back's gain in the first run, None in that. Raises InputError, LinkError
+    for inputs that are clipped or silent.
+    """
+    signal = desk.on_outputs(multisine.signal(number, periods=run_time(periods) / PERIOD))
+    start = round(_SETTLING * multisine.rate)
+    repeated = 0
+    while True:
+        kept = card.run(signal)[start : start + periods * multisine.samples].astype(float)
+        check_levels(kept, desk.sensors, cable=(desk.output, desk.input))
+        looped = kept[:, desk.input - 1]
+        gain = multisine.found(looped) / multisine.played(number)[:, -1]
+        # The cable decides: drivers report losses that were none, and miss others.
+        same = is_whole(looped, samples=multisine.samples)
+        same = same and (before is None or is_as_late(gain, before))
+        if same or repeated == tries - 1:
+            return Run(kept, gain, same, repeated)
+        repeated += 1
+
+
+def blocks_lost() -> LinkError:
+    """The error for a run that lost blocks each time."""
+    return LinkError(
+        f"blocks of sound were lost in {TRIES} attempts of a run; end other programs, give "
+        "the sound server real-time priority, or choose larger blocks"
+    )
+
 
 LEVEL = 0.3
 """Usual largest sample of each output."""
@@ -117,3 +181,74 @@ def measure(
         repeated,
         looped,
     )
+
+
+_PERIODS = 2
+_TONES = 5
+_LOUD = 0.05  # of the largest at a frequency; maxima sit in antiresonances
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """Multisine beside stepped tones, of responses above 5 % of the largest at their frequency.
+
+    level_db, phase_deg: root mean square and largest difference; frequencies (n,) [Hz].
+    """
+
+    frequencies: FloatArray
+    level_db: tuple[float, float]
+    phase_deg: tuple[float, float]
+
+    def as_json(self) -> dict[str, object]:
+        """For programs."""
+        return {
+            "frequencies_hz": self.frequencies.tolist(),
+            "level_rms_db": self.level_db[0],
+            "level_max_db": self.level_db[1],
+            "phase_rms_deg": self.phase_deg[0],
+            "phase_max_deg": self.phase_deg[1],
+        }
+
+
+def check_by_steps(
+    desk: Desk,
+    card: SoundCard,
+    measured: Measured,
+    *,
+    level: float,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Stepped:
+    """Play some of the frequencies on each ERA alone; raises LinkError for lost blocks."""
+    known = measured.responses
+    rows = np.unique(np.linspace(0, len(known.frequencies) - 1, _TONES).round().astype(int))
+    frequencies = known.frequencies[rows]
+    values = np.empty((len(rows), desk.input, len(desk.eras) + 1), dtype=complex)
+    for era in range(len(desk.eras)):
+        for row, frequency in enumerate(frequencies):
+            values[row, :, era] = _played(desk, card, era, frequency, level)
+            progress(era * len(rows) + row + 1, len(desk.eras) * len(rows))
+    found = desk.responses(frequencies, values, measured.looped[rows])
+    return _compared(frequencies, known.values[rows], found)
+
+
+def _played(desk: Desk, card: SoundCard, era: int, frequency: float, level: float) -> ComplexArray:
+    """Amplitudes (inputs,) by full scale of one ERA; the loop-back shows lost blocks."""
+    tone = Multisine(np.array([frequency]), 1, card.rate, level)
+    signal = tone.signal(0, periods=run_time(_PERIODS))
+    sources = np.zeros((len(signal), len(desk.eras) + 1))
+    sources[:, [era, -1]] = signal
+    heard = card.run(desk.on_outputs(sources)).astype(float)
+    kept = heard[tone.samples : (1 + _PERIODS) * tone.samples]  # once settled
+    if card.gaps or not is_whole(kept[:, desk.input - 1], samples=tone.samples):
+        raise LinkError("blocks of sound were lost between stepped tones; measure again")
+    return np.asarray(tone.found(kept)[0] / tone.played(0)[0])
+
+
+def _compared(frequencies: FloatArray, one: ComplexArray, other: Responses) -> Stepped:
+    size = np.abs(one)
+    ratio = (other.values / one)[size > _LOUD * size.max(axis=(1, 2), keepdims=True)]
+    level, phase = 20 * np.log10(np.abs(ratio)), np.degrees(np.angle(ratio))
+    both = [
+        (float(np.sqrt((each**2).mean())), float(np.abs(each).max())) for each in (level, phase)
+    ]
+    return Stepped(frequencies, both[0], both[1])

@@ -14,9 +14,8 @@ from model.identification.measurement import Measurement, Repeat
 from model.rig.rig import Rig
 from sim.measuring.desk import Desk
 from sim.measuring.loopback import converters
-from sim.measuring.measure import Measured, measure, open_desk
+from sim.measuring.measure import Measured, Run, blocks_lost, measure, open_desk, play_run
 from sim.measuring.multisine import Multisine
-from sim.measuring.run import Run, blocks_lost, play_run
 from sim.measuring.sound_card import SoundCard
 
 _REPEATED = 1  # the run: phases differ between ERAs, so that modes of every symmetry vibrate

@@ -13,7 +13,9 @@ import numpy as np
 from drivers.errors import LinkError
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
+from sim.libjack import IS_INPUT, IS_OUTPUT, JackClient, jack_name, libjack
 from sim.soft_amp.library import library
+from sim.soft_amp.output import portaudio_device, portaudio_stream, sounddevice
 
 MAX_PORTS = 64
 _POLL = 0.02  # s
@@ -138,6 +140,94 @@ class SoundCard(ABC):
         """Stop, and leave the device."""
 
 
+CLIENT = "era-measure"
+
+
+def activate(
+    card: SoundCard, client: JackClient, *, outputs: int, inputs: int
+) -> tuple[list[int], list[int]]:
+    """Let a client's new ports out_1, ... and in_1, ... be those of a card; returns them."""
+    out = client.register((f"out_{n + 1}" for n in range(outputs)), IS_OUTPUT)
+    into = client.register((f"in_{n + 1}" for n in range(inputs)), IS_INPUT)
+    library = libjack()
+    ports = Ports(client=client.pointer)
+    ports.outputs[: len(out)], ports.inputs[: len(into)] = out, into
+    ports.buffer = ctypes.cast(library.jack_port_get_buffer, ctypes.c_void_p)
+    ports.frame_time = ctypes.cast(library.jack_last_frame_time, ctypes.c_void_p)
+    given = card.given(ports)
+    for name, set_callback in (
+        ("transfer_jack_process", library.jack_set_process_callback),
+        ("transfer_jack_shutdown", library.jack_on_shutdown),
+    ):
+        set_callback(client.pointer, card.address(name), given)
+    client.activate()
+    return out, into
+
+
+class JackCard(SoundCard):
+    """Ports of its own, each connected to the next one of a client; "": of the hardware."""
+
+    def __init__(self, other: str, *, outputs: int, inputs: int, limit: float) -> None:
+        super().__init__(outputs=outputs, inputs=inputs, limit=limit)
+        self.name = jack_name(other)
+        self._client = JackClient(CLIENT)
+        self._is_open = True
+        try:
+            self.rate = float(self._client.rate)
+            self._start(other, outputs, inputs)
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, other: str, outputs: int, inputs: int) -> None:
+        takers = self._client.takers(other, outputs)
+        givers = self._client.first_ports(other, IS_OUTPUT, inputs)
+        out, into = activate(self, self._client, outputs=outputs, inputs=inputs)
+        for port, taker in zip(out, takers, strict=True):
+            self._client.connect(port, taker)
+        for giver, port in zip(givers, into, strict=True):
+            self._client.connect(giver, port)
+
+    def close(self) -> None:
+        """Leave the server."""
+        if self._is_open:
+            self._is_open = False
+            self._client.close()
+
+
+_BLOCK = 512  # frames; late samples are worse than a delay, which is measured
+
+
+class PortAudioCard(SoundCard):
+    """One stream in both directions, of one device: two devices would have two clocks."""
+
+    def __init__(self, device: str, *, outputs: int, inputs: int, limit: float) -> None:
+        super().__init__(outputs=outputs, inputs=inputs, limit=limit)
+        library = sounddevice()
+        found = portaudio_device(device, outputs=outputs, inputs=inputs)
+        self.name, self.rate = found["name"], float(found["default_samplerate"])
+        try:
+            self._stream = portaudio_stream(
+                found["index"],
+                self.address("transfer_portaudio"),
+                self.given(),
+                outputs=outputs,
+                inputs=inputs,
+                samplerate=self.rate,
+                blocksize=_BLOCK,
+                latency="high",
+            )
+        except library.PortAudioError as problem:
+            raise LinkError(
+                f"--device {self.name}: cannot be opened: {problem.args[0]}; end the program that "
+                "uses it"
+            ) from None
+
+    def close(self) -> None:
+        """Stop at once, and close the device."""
+        self._stream.close(ignore_errors=True)
+
+
 def open_card(device: str, *, outputs: int, inputs: int, limit: float) -> SoundCard:
     """Open `jack`, `jack:CLIENT`, or a device of PortAudio by its name or number.
 
@@ -146,9 +236,5 @@ def open_card(device: str, *, outputs: int, inputs: int, limit: float) -> SoundC
     """
     kind, _, name = device.partition(":")
     if kind == "jack":
-        from sim.measuring.jack_card import JackCard
-
         return JackCard(name, outputs=outputs, inputs=inputs, limit=limit)
-    from sim.measuring.portaudio_card import PortAudioCard
-
     return PortAudioCard(device, outputs=outputs, inputs=inputs, limit=limit)

@@ -26,7 +26,7 @@ from sim.measuring.desk import Desk
 from sim.measuring.loopback import is_whole
 from sim.measuring.multisine import ramped
 from sim.measuring.sound_card import SoundCard, open_card
-from sim.plant.felt import fit_tones
+from sim.plant.fingers import fit_tones
 from sim.sensors.sensor_file import read_sensors
 
 _SETTLING = 1.5  # s; T60 of a plate with little damping, and an amplifier that starts later

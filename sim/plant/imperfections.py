@@ -1,6 +1,6 @@
 """Imperfections of a bench: of its amplifiers, its plate and ERAs, and the fingers on it.
 
-Errors of gain and phase, noise, latency and skew of the amplifiers; a plate and ERAs that differ
+Errors of gain and phase and delays of the amplifiers; a plate and ERAs that differ
 from the rig's, and fingers that do not weigh alike. Not modelled: clock drift, distortion, drifting
 errors, ERAs in other places.
 """
@@ -24,24 +24,20 @@ from model.vibration.convergence import finer_mesh
 _MAX_LOSS_FACTOR = 0.99
 _MIN_FACTOR = 0.05  # of a normal draw about 1, which may be negative
 
-NOISE_LINES = 32
-NOISE_LOW, NOISE_HIGH = 10.0, 1000.0  # Hz
-
 
 @dataclass(frozen=True)
 class ChannelErrors:
-    """Errors of one channel: gain factor, phase [rad], noise rms in full strokes while it plays."""
+    """Errors of one channel: gain factor, phase [rad]."""
 
     gain: float = 1.0
     phase: float = 0.0
-    noise: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if not all(math.isfinite(value) for value in (self.gain, self.phase, self.noise)):
-            raise InputError(f"{self}: gain, phase and noise must be finite numbers")
-        if self.gain < 0 or self.noise < 0:
-            raise InputError(f"{self}: gain and noise must not be negative")
+        if not all(math.isfinite(value) for value in (self.gain, self.phase)):
+            raise InputError(f"{self}: gain and phase must be finite numbers")
+        if self.gain < 0:
+            raise InputError(f"{self}: gain must not be negative")
 
     @property
     def factor(self) -> complex:
@@ -92,25 +88,23 @@ class PlateErrors:
 class Imperfections:
     """Imperfections of a bench, by default none.
 
-    channels: errors by channel; latency [s]: from a command to the base motion; skew [s]: added to
-    the latency, by amplifier; plate: errors of the plate and its ERAs; fingertip: standard
-    deviation of the logarithm of a finger's load; seed: of the noise and of these loads.
+    channels: errors by channel; delays [s]: from a command to the base motion, by amplifier; plate:
+    errors of the plate and its ERAs; fingertip: standard deviation of the logarithm of a finger's
+    load; seed: of these loads.
     """
 
     channels: Mapping[Channel, ChannelErrors] = field(default_factory=dict)
-    latency: float = 0.0
-    skew: Mapping[str, float] = field(default_factory=dict)
+    delays: Mapping[str, float] = field(default_factory=dict)
     plate: PlateErrors = field(default_factory=PlateErrors)
     fingertip: float = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
         """Check that every delay is finite and not negative."""
-        for delay in (self.latency, *(self.latency + skew for skew in self.skew.values())):
+        for name, delay in self.delays.items():
             if not (math.isfinite(delay) and delay >= 0):
                 raise InputError(
-                    f"latency plus skew must be finite and not negative, got {delay:g} s (latency "
-                    f"{self.latency:g} s, skew {dict(self.skew)})"
+                    f"delay of {name} must be finite and not negative, got {delay:g} s"
                 )
 
     def check(self, rig: Rig) -> None:
@@ -122,7 +116,7 @@ class Imperfections:
                     f"imperfections: no ERA is wired to channel {channel.number} of amplifier "
                     f"{channel.amplifier}"
                 )
-        for name in self.skew:
+        for name in self.delays:
             if name not in rig.amplifiers:
                 raise InputError(
                     f"imperfections: amplifier must be one of {', '.join(rig.amplifiers)}, "
@@ -131,7 +125,7 @@ class Imperfections:
 
     def delay(self, amplifier: str) -> float:
         """Delay from a command of this amplifier to the base motion [s]."""
-        return self.latency + self.skew.get(amplifier, 0.0)
+        return self.delays.get(amplifier, 0.0)
 
     def errors_of(self, era: str, rig: Rig) -> ChannelErrors:
         """Errors of the channel to which an ERA is wired."""
@@ -145,13 +139,10 @@ class Imperfections:
         return fingertip.multiplied(math.exp(self.fingertip * rng.standard_normal()))
 
 
-def draw_imperfections(
-    rig: Rig, *, noise: float = 0.0, latency: float = 0.0, skew: float = 0.0, seed: int = 0
-) -> Imperfections:
+def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
     """Draw the plate, ERAs, channels and fingers of a rig within its uncertainty, all normal.
 
-    noise: rms of every channel; latency [s]; skew [s]: maximum, uniformly distributed over the
-    amplifiers. The plate is solved on another mesh than the rig's, as accurate as `mesh: auto`.
+    The plate is solved on another mesh than the rig's, as accurate as `mesh: auto`.
     """
     rng = np.random.default_rng(seed)
     std = rig.uncertainty
@@ -161,7 +152,7 @@ def draw_imperfections(
 
     channels = {
         channel: ChannelErrors(
-            relative(std.gain), math.radians(std.phase_deg) * rng.standard_normal(), noise
+            relative(std.gain), math.radians(std.phase_deg) * rng.standard_normal()
         )
         for channel in rig.wiring.values()
     }
@@ -172,8 +163,7 @@ def draw_imperfections(
         stiffness={era.name: relative(std.stiffness) for era in rig.eras},
         mesh=_other_mesh(rig),
     )
-    late = {name: float(rng.uniform(0, skew)) for name in rig.amplifiers}
-    return Imperfections(channels, latency, late, plate, std.fingertip, seed)
+    return Imperfections(channels, plate=plate, fingertip=std.fingertip, seed=seed)
 
 
 def _other_mesh(rig: Rig) -> PlateMesh:
@@ -192,32 +182,3 @@ def realised(motion: Motion, errors: ChannelErrors) -> list[Term]:
     """Base motion with the gain and phase errors of its channel."""
     factor = errors.factor
     return [term._replace(c0=factor * term.c0, c1=factor * term.c1) for term in motion]
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Stationary noise from 10 to 1000 Hz as a sum of sinusoids.
-
-    One line of random frequency and phase in each of 32 equal bands, all of equal amplitude; nearly
-    normally distributed. omegas [rad/s], phases [rad] at time 0: (n,).
-    """
-
-    omegas: tuple[float, ...]
-    phases: tuple[float, ...]
-
-    def terms(self, rms: float, *, start: float, end: float) -> list[Term]:
-        """Its base motion from start to end [s]; rms [m]."""
-        size = rms * math.sqrt(2 / len(self.omegas))
-        return [
-            Term(start, end, omega, cmath.rect(size, phase + omega * start))
-            for omega, phase in zip(self.omegas, self.phases, strict=True)
-        ]
-
-
-def draw_noise(*, seed: int, number: int) -> Noise:
-    """Draw the noise of a source by its number."""
-    rng = np.random.default_rng([seed, number])
-    edges = np.linspace(NOISE_LOW, NOISE_HIGH, NOISE_LINES + 1)
-    frequencies = rng.uniform(edges[:-1], edges[1:])
-    phases = rng.uniform(0, 2 * math.pi, NOISE_LINES)
-    return Noise(tuple((2 * math.pi * frequencies).tolist()), tuple(phases.tolist()))

@@ -26,8 +26,7 @@ from model.table.question import Question
 from model.transients.base_motion import Envelopes, ramped_onset, shaped
 from model.transients.measures import ONSET_WINDOW
 from model.vibration.excitation import Excitation, base_amplitudes, peak_acceleration
-from sim.plant.felt import Felt, felt_peaks, measure_vibration
-from sim.plant.fingers import Record
+from sim.plant.fingers import Felt, Record, felt_peaks, measure_vibration
 from sim.plant.imperfections import Imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
 

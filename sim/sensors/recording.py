@@ -1,13 +1,31 @@
-"""Recordings: readings of sensors over time."""
+"""Recordings, readings of sensors over time, and their files: CSV, WAV, universal files.
 
-from collections.abc import Sequence
+The suffix selects the format: WAV is for audio tools, universal files are for modal software. Files
+are replaced atomically.
+"""
+
+import csv
+import json
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from sim.plant.felt import fit_tones
+from model.files.regular_file import regular_file
+from model.files.replacing import begins_with
+from model.files.uff import (
+    ACCELERATION,
+    TIME,
+    TIME_RESPONSE,
+    Function,
+    Universal,
+    write_universal,
+)
+from sim.plant.fingers import fit_tones
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,3 +72,159 @@ class Recording:
                 "longer"
             )
         return fit_tones(self.times, self.samples, frequencies, with_offset=True)
+
+
+_CHUNK = 10_000  # samples; written at once
+_UP = 3
+_MAX_NAME = 10
+
+
+@dataclass(frozen=True)
+class Format:
+    """A file format.
+
+    start: the first bytes of a file; max_values: limit that bounds memory; cannot_hold: why
+    recordings of these names at this sampling rate [Hz] do not fit, None where they do; sidecars:
+    the files beside one.
+    """
+
+    write: Callable[[Path, Recording], None]
+    start: bytes
+    max_values: int
+    cannot_hold: Callable[[Sequence[str], float], str | None] = lambda names, sample_rate: None
+    sidecars: Callable[[Path], tuple[Path, ...]] = lambda path: ()
+
+
+def _write_csv(path: Path, recording: Recording) -> None:
+    """Header `time_s`, `P1_m_s2`, ..., positions `x_m` and `y_m`, then samples."""
+    with open(path, "w", newline="", encoding="utf-8", opener=regular_file) as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(["time_s", *(f"{name}_m_s2" for name in recording.names)])
+        for label, positions in zip(("x_m", "y_m"), recording.points.T.tolist(), strict=True):
+            writer.writerow([label, *positions])
+        times = recording.times
+        for first in range(0, len(times), _CHUNK):
+            part = slice(first, first + _CHUNK)
+            writer.writerows(np.column_stack([times[part], recording.samples[part]]).tolist())
+
+
+def sidecar(path: Path) -> Path:
+    """The sidecar of a WAV."""
+    return path.with_name(path.name + ".json")
+
+
+def _write_wav(path: Path, recording: Recording) -> None:
+    """A channel per sensor, 32-bit float between -1 and 1: exact to 6e-8 of the largest value.
+
+    Full scale [m/s²], positions and start are in a sidecar `NAME.wav.json`, since audio tools drop
+    unknown metadata.
+    """
+    from scipy.io import wavfile
+
+    # A power of two, so that no digits are lost.
+    largest = float(max(recording.samples.max(), -recording.samples.min()))
+    full_scale = 2.0 ** math.ceil(math.log2(largest)) if largest > 0 else 1.0
+    samples = (recording.samples / full_scale).astype(np.float32)
+    wavfile.write(path, int(recording.sample_rate), samples)
+    x, y = recording.points.T.tolist()
+    metadata = {
+        "format": "era-haptics recording 1",
+        "sensors": recording.names,
+        "x_m": x,
+        "y_m": y,
+        "start_s": recording.start,
+        "sample_rate_hz": recording.sample_rate,
+        "full_scale_m_s2": full_scale,
+    }
+    sidecar(path).write_text(json.dumps(metadata, indent=1) + "\n", encoding="utf-8")
+
+
+def _whole_rate(names: Sequence[str], sample_rate: float) -> str | None:
+    if sample_rate == round(sample_rate):
+        return None
+    return f"sampling rate must be whole in WAV, got {sample_rate:g} Hz; write .csv or .uff"
+
+
+def _write_uff(path: Path, recording: Recording) -> None:
+    """A dataset 58 per sensor with 12 digits; start and sampling interval have six."""
+    nodes = {n: (x, y, 0.0) for n, (x, y) in enumerate(recording.points.tolist(), start=1)}
+    functions = [
+        Function(
+            str(path),
+            TIME_RESPONSE,
+            number,
+            0,
+            (name, ""),
+            (_UP, 0),
+            recording.times,
+            recording.samples[:, number - 1],
+            (TIME, ACCELERATION, 0),
+            ("m/s^2", ""),
+        )
+        for number, name in enumerate(recording.names, start=1)
+    ]
+    write_universal(path, Universal(nodes, functions))
+
+
+def _short_names(names: Sequence[str], sample_rate: float) -> str | None:
+    long = [name for name in names if len(name) > _MAX_NAME]
+    return f"names must have at most {_MAX_NAME} characters, got {long[0]!r}" if long else None
+
+
+_UFF = Format(_write_uff, b"    -1", 1 << 22, _short_names)  # as text in memory, 20 bytes a value
+
+FORMATS = {
+    ".csv": Format(_write_csv, b"time_s", 1 << 24),
+    ".wav": Format(_write_wav, b"RIFF", 1 << 24, _whole_rate, lambda path: (sidecar(path),)),
+    ".uff": _UFF,
+    ".unv": _UFF,
+}
+"""By suffix."""
+
+
+def write_recording(path: Path, recording: Recording) -> None:
+    """Write a recording in the format of the suffix: .csv, .wav, .uff or .unv.
+
+    Raises InputError for another suffix or what the format cannot hold, OSError.
+    """
+    if not len(recording.samples) > 1:
+        raise InputError(f"{path}: a recording must have at least two samples")
+    if not np.isfinite(recording.samples).all():
+        raise InputError(f"{path}: samples must be finite")
+    check_recordable(path, recording.names, sample_rate=recording.sample_rate)
+    kind = _format_of(path)
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    # The main file last: where it exists, its sidecar does.
+    parts = dict(zip((*kind.sidecars(part), part), (*kind.sidecars(path), path), strict=True))
+    try:
+        kind.write(part, recording)
+        for made, wanted in parts.items():
+            made.replace(wanted)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+    finally:
+        for made in parts:
+            made.unlink(missing_ok=True)
+
+
+def check_recordable(path: Path, names: Sequence[str], *, sample_rate: float) -> None:
+    """Raise InputError for a recording that the format cannot hold, or an unrelated file there."""
+    kind = _format_of(path)
+    if path.is_file() and not begins_with(path, kind.start):
+        raise InputError(
+            f"{path}: exists and is not a recording; give another name, or remove it first"
+        )
+    why_not = kind.cannot_hold(names, sample_rate)
+    if why_not is not None:
+        raise InputError(f"{path}: {why_not}")
+
+
+def max_values(path: Path) -> int:
+    """Maximum number of values of a recording in this file."""
+    return _format_of(path).max_values
+
+
+def _format_of(path: Path) -> Format:
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"{path}: suffix must be one of {', '.join(FORMATS)}")
+    return FORMATS[path.suffix.lower()]

@@ -15,8 +15,7 @@ from types import FrameType
 
 from drivers.errors import LinkError
 from model.errors import InputError
-from sim.soft_amp.counters import Counters, counters_in
-from sim.soft_amp.engine import Engine
+from sim.soft_amp.engine import Counters, Engine, counters_in
 from sim.soft_amp.output import Output, open_output
 from sim.soft_amp.settings import Settings
 

@@ -19,7 +19,7 @@ from typing import Any
 from drivers.errors import LinkError
 from model.errors import InputError
 from sim.soft_amp.__main__ import LOST
-from sim.soft_amp.counters import Counters, counters_in, new_file
+from sim.soft_amp.engine import Counters, counters_in, new_file
 from sim.soft_amp.place import Place
 from sim.soft_amp.settings import Settings
 

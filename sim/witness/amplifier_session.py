@@ -1,4 +1,7 @@
-"""The host's communication with one amplifier, as far as rules need to remember it."""
+"""The host's communication with one amplifier, as far as rules need to remember it, and deadlines.
+
+What must have happened by a time is due later by the delays of the witness itself.
+"""
 
 import math
 from collections import deque
@@ -8,10 +11,10 @@ from dataclasses import dataclass, field
 from drivers.playback import Playback
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
+from sim.witness.capture import ReportViolation
 from sim.witness.config import AmplifierConfig
 from sim.witness.expected_amplifier import ExpectedAmplifier
 from sim.witness.expected_outputs import silent
-from sim.witness.violation import ReportViolation
 
 _TOKENS_KEPT = 16  # of commits
 
@@ -79,3 +82,52 @@ class AmplifierSession:
 def is_vibrating(layers: Sequence[LayerSet]) -> bool:
     """Whether a set makes anything vibrate, or go on to."""
     return any(one.renew or any(each.is_driven for each in one.commands) for one in layers)
+
+
+_DELAYS_KEPT = 64
+
+
+class Delays:
+    """Delays of this program, in which what passed was seen late, by the time [s] of their end."""
+
+    def __init__(self) -> None:
+        self._known: deque[tuple[float, float]] = deque(maxlen=_DELAYS_KEPT)
+
+    def note(self, until: float, duration: float) -> None:
+        """Note that nothing was seen for a duration [s] until a time [s]."""
+        self._known.append((until, duration))
+
+    def since(self, time: float) -> float:
+        """Sum of the delays [s] that ended after a time [s]."""
+        return sum(duration for until, duration in self._known if until >= time)
+
+
+Expected = tuple[str, AmplifierSession, Callable[[], bool]]
+"""A rule, of which amplifier, and whether it is kept at a time."""
+
+
+class Deadlines:
+    """Rules for a host, each of which must be kept by a time [s].
+
+    max_defer [s]: before a time within which delays defer it.
+    """
+
+    def __init__(self, delays: Delays, max_defer: float) -> None:
+        self._delays = delays
+        self._max_defer = max_defer
+        self._pending: list[tuple[float, Expected, str]] = []
+
+    def expect(self, since: float, limit: float, expected: Expected, what: str) -> None:
+        """Expect a rule to be kept within a limit [s] of a time; what: to say where it is not."""
+        what = f"{what} within {limit * 1e3:g} ms"
+        self._pending.append((since + limit, expected, what))
+
+    def advance(self, time: float) -> None:
+        """Check the deadlines that have passed, but for those of a disturbed wire."""
+        pending, self._pending = self._pending, []
+        for due, expected, what in pending:
+            rule, session, is_kept = expected
+            if due + self._delays.since(due - self._max_defer) >= time:
+                self._pending.append((due, expected, what))
+            elif not (session.is_disturbed(due) or is_kept()):
+                session.report_always(rule, due, what)

@@ -12,6 +12,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token
 from drivers.protocol.table import LATCHED, QUANTITIES, REACTION, STAGED_LIFE
 from drivers.uncertain_playback import Interval
+from sim.witness.capture import ReportViolation
 from sim.witness.decoded import (
     CHANGING,
     ENABLED,
@@ -22,6 +23,7 @@ from sim.witness.decoded import (
     Sent,
     is_carried_out,
 )
+from sim.witness.expected_outputs import achieved_problem
 from sim.witness.expected_state import (
     DISABLED,
     FAULT,
@@ -32,8 +34,6 @@ from sim.witness.expected_state import (
     SWITCHED_ON,
     ExpectedState,
 )
-from sim.witness.set_replies import achieved_problem
-from sim.witness.violation import ReportViolation
 
 _WARM = QUANTITIES["temperature"].to_wire(60.0)  # from here on an amplifier may derate
 _RAMP = QUANTITIES["ramp"]

@@ -6,10 +6,9 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token
 from drivers.protocol.table import FAULTS, LATCHED, QUANTITIES, STATES, STATUS_FLAGS
 from drivers.uncertain_playback import Interval
+from sim.witness.capture import ReportViolation
 from sim.witness.decoded import ENABLED, Sent
-from sim.witness.expected_outputs import ExpectedOutputs
-from sim.witness.set_replies import SetReplies
-from sim.witness.violation import ReportViolation
+from sim.witness.expected_outputs import ExpectedOutputs, SetReplies
 
 SILENCING_RAMP = 0.005  # s; along which the watchdog and faults silence
 STOPPED = STATES["QUICK_STOP_ACTIVE"]

@@ -9,9 +9,8 @@ from collections.abc import Collection, Hashable, Mapping, Sequence
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import LATCHED, QUANTITIES
-from sim.witness.amplifier_session import AmplifierSession, is_vibrating
+from sim.witness.amplifier_session import AmplifierSession, Deadlines, Delays, is_vibrating
 from sim.witness.config import TimeLimits
-from sim.witness.deadlines import Deadlines, Delays
 from sim.witness.decoded import A_READ, FEEDING, HELLO, Request, Sent
 from sim.witness.set_rules import ExpectedSets, check_expected, check_set
 

@@ -14,7 +14,7 @@ import pytest
 import era_haptics
 from drivers.conformance import CheckResult, judge, of_kind
 from drivers.conformance.check import run_checks
-from drivers.conformance.serial_client import SerialClient
+from drivers.conformance.serial_frames import SerialClient
 from drivers.contents import Layer, Shape, Tone
 from drivers.errors import CommandRefused
 from drivers.host.amplifier import Amplifier

@@ -8,7 +8,7 @@ import pytest
 
 from firmware_script import GET_STATUS, NAK, request, stuffed, unstuffed
 from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware
-from sim.far_ends.modbus.frames import rtu_frame
+from sim.far_ends.modbus_frames import rtu_frame
 
 HELLO, GET_CAPS, PING, SET_ADDRESS, EVENT = 1, 2, 12, 15, 30
 UNKNOWN_TYPE, WRONG_STATE, UNSUPPORTED_VERSION, WRONG_SESSION = 1, 5, 8, 10

@@ -19,7 +19,7 @@ from model.rig.rig import Rig
 from model.vibration.natural_modes import direct_responder
 from sim.amplifier.contract import Amplifier as SimulatedAmplifier
 from sim.plant.accelerometer import Accelerometer
-from sim.sensors.accelerometers import Accelerometers
+from sim.sensors.recorder import Accelerometers
 from virtual_loop import in_virtual_time
 from wires import WIRES
 from words_bench import HostedRig, layer, rig_on_wire

@@ -14,9 +14,8 @@ from model.errors import InputError
 from model.rig.rig import Rig
 from registry.limits import GuardLimits
 from rig_on_wire import far_side
-from sim.witness.endpoint import parse_endpoint
 from sim.witness.witness import Witness
-from sim.witness_relay import relays
+from sim.witness_relay import parse_endpoint, relays
 from wires import WIRES
 from witness_config import witness_config
 

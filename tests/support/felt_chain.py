@@ -23,14 +23,14 @@ from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
-from sim.amplifier.summary import AmplifierSummary
+from sim.amplifier.readings import AmplifierSummary
 from sim.far_ends.wires import Wire
 from sim.plant.accelerometer import Accelerometer
-from sim.plant.felt import Felt
+from sim.plant.fingers import Felt
 from sim.plant.imperfections import draw_imperfections
-from sim.sensors.accelerometers import Accelerometers
+from sim.sensors.recorder import Accelerometers
 from sim.sensors.recording import Recording
-from sim.witness.violation import Violation
+from sim.witness.capture import Violation
 from touch_stream import Place, Situation, Stream
 from virtual_loop import run_virtual
 

@@ -8,7 +8,7 @@ from typing import cast
 from drivers import clock
 from model.rig.rig import Rig
 from sim.amplifier.contract import Amplifier
-from sim.amplifier.summary import AmplifierSummary
+from sim.amplifier.readings import AmplifierSummary
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.wires import Wire, open_wires

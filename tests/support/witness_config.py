@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from sim.amplifier.contract import Amplifier
-from sim.witness.endpoint import parse_endpoint
 from sim.witness.witness import Witness
+from sim.witness_relay import parse_endpoint
 
 
 def witness_config(

@@ -19,7 +19,7 @@ from model.vibration.excitation import Excitation, Tone
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
 from sim.far_ends.wires import Wire
-from sim.witness.violation import Violation
+from sim.witness.capture import Violation
 from sim.witness.witness import OperatorCommand
 from virtual_loop import run_virtual
 from witness_config import sense

@@ -31,8 +31,7 @@ from drivers.protocol.table import (
 )
 from drivers.statistics import WireCounters
 from sim.amplifier.contract import SILENCING_RAMP
-from sim.far_ends.can_bus.sdo import SdoServer
-from sim.far_ends.can_bus.word_objects import FAULT_NAMES, WordObjects
+from sim.far_ends.can_bus.word_objects import FAULT_NAMES, SdoServer, WordObjects
 from sim.transport.far_end import AmplifierPort, FarEnd, Send
 
 _NMT: Mapping[str, int] = CANOPEN["nmt"]

@@ -31,7 +31,7 @@ from model.vibration.natural_modes import direct_responder
 from rig_on_wire import FarSide, far_side
 from sim.bench import bench
 from sim.plant.accelerometer import Accelerometer
-from sim.sensors.accelerometers import Accelerometers
+from sim.sensors.recorder import Accelerometers
 from virtual_loop import run_virtual
 from wires import SHARED_WIRES, WIRES, on_two_amplifiers
 

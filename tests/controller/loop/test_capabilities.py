@@ -19,7 +19,7 @@ from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
 from model.transients.base_motion import BaseEnvelope
 from registry.limits import GuardLimits
-from sim.amplifier.capabilities import capabilities
+from sim.amplifier.readings import capabilities
 
 LIMITS = GuardLimits(40.0, 500.0, 0.8)
 

@@ -16,12 +16,10 @@ import era_haptics
 from drivers import clock
 from drivers.codec.serial_line.frame import FrameReader
 from drivers.conformance import CHECKS, Result, judge, of_kind
-from drivers.conformance.check import run_checks
-from drivers.conformance.client import When
+from drivers.conformance.check import Check, CheckResult, Report, run_checks
+from drivers.conformance.client import Violation, When
 from drivers.conformance.expected import Expected
-from drivers.conformance.findings import Violation
 from drivers.conformance.material import layer
-from drivers.conformance.report import Check, CheckResult, Report
 from drivers.conformance.subject import Subject
 from drivers.errors import CommandError
 from drivers.protocol.records import Values
@@ -30,8 +28,8 @@ from drivers.protocol.table import MESSAGES
 from drivers.trace import tracing
 from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
 from model.rig.rig import Rig
-from sim.amplifier.capabilities import capabilities
 from sim.amplifier.contract import Amplifier
+from sim.amplifier.readings import capabilities
 from sim.bench.bench import Bench, keep_time
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from virtual_loop import VirtualLoop, in_virtual_time

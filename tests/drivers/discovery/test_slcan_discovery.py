@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from drivers.by_hand.cli import app
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.discovery import slcan
-from drivers.discovery.slcan import SlcanAdapter, detect_slcan
+from drivers.discovery.places import SlcanAdapter, detect_slcan
 from sim.far_ends.can_bus.bus import CanBus
 from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter as FarAdapter
 from sim.transport.pseudo_terminal import make_terminal

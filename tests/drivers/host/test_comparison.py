@@ -11,7 +11,7 @@ from drivers.host.group import Group
 from drivers.host.sensors import read_measured
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
-from sim.amplifier.capabilities import capabilities
+from sim.amplifier.readings import capabilities
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine
 

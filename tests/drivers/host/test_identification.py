@@ -10,8 +10,8 @@ from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, DriverError, LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
-from sim.amplifier.capabilities import capabilities
 from sim.amplifier.contract import Amplifier
+from sim.amplifier.readings import capabilities
 from virtual_loop import in_virtual_time, run_virtual
 from words_line import KINDS, LIMITS, MemoryLine, unaltered
 

@@ -12,7 +12,7 @@ from drivers.errors import CommandError, CommandRefused
 from drivers.host.ledger import Ledger
 from drivers.playback import Playback
 from registry.limits import GuardLimits
-from sim.amplifier.capabilities import capabilities
+from sim.amplifier.readings import capabilities
 
 WIDE = GuardLimits(20.0, 1000.0, 1.0)
 CAN = capabilities(3)

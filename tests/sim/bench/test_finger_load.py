@@ -15,7 +15,7 @@ from model.structure.attachments import Fingertip, FingertipLoad
 from plate_in_time import apart, lock_in
 from sim.bench.bench import Bench
 from sim.plant.accelerometer import Accelerometer
-from sim.sensors.accelerometers import Accelerometers
+from sim.sensors.recorder import Accelerometers
 
 A, B = (0.1, 0.07), (0.29, 0.2)
 FREQUENCY = 210.0

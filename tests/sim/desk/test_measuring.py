@@ -15,9 +15,8 @@ from model.errors import InputError
 from model.rig.rig import Rig
 from sim.measuring.desk import Desk
 from sim.measuring.loopback import latency
-from sim.measuring.measure import Measured, measure
+from sim.measuring.measure import Measured, check_by_steps, measure
 from sim.measuring.multisine import Multisine, default_frequencies
-from sim.measuring.stepped import check_by_steps
 from sim.sensors.sensor_file import WiredSensor
 
 RATE = 8_000.0

@@ -3,8 +3,7 @@
 import pytest
 
 from model.errors import InputError
-from sim.far_ends.wire_assignment import assign_wires
-from sim.far_ends.wires import Wire
+from sim.far_ends.wires import Wire, assign_wires
 
 DEFAULTS = Wire("serial")
 URLS = {

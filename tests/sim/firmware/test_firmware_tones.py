@@ -7,7 +7,7 @@ import pytest
 
 from model.errors import InputError
 from sim.firmware import programs
-from sim.firmware.tones import frequencies_in
+from sim.firmware.bench import frequencies_in
 
 RATE = 16_000.0
 

@@ -7,8 +7,7 @@ from model.errors import InputError
 from model.finger.fingertip import fingertip_points
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
-from sim.plant.felt import measure_vibration
-from sim.plant.fingers import Fingers, Record
+from sim.plant.fingers import Fingers, Record, measure_vibration
 
 
 def flat_plate(rig: Rig) -> ReducedPlate:

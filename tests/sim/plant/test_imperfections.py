@@ -1,4 +1,4 @@
-"""Amplifiers that are late, noisy and wrong in gain and phase, seen from the plate they move."""
+"""Amplifiers that are late and wrong in gain and phase, seen from the plate they move."""
 
 import math
 from collections.abc import Mapping
@@ -23,7 +23,6 @@ from sim.plant.imperfections import (
     Imperfections,
     PlateErrors,
     draw_imperfections,
-    draw_noise,
 )
 
 AT = (0.08, 0.06)
@@ -87,7 +86,7 @@ def test_imperfections_latency_delays_the_motion(two_amplifiers: Rig, stop: floa
     """With 3 ms of latency the whole record, onset and stop, is the same 3 ms later."""
     drive = {"left": (Tone(0, 110.0, 0.5), Tone(1, 171.0, 0.3, phase=40.0))}
     _, prompt = played(two_amplifiers, PERFECT, drive, stop=stop)
-    _, late = played(two_amplifiers, Imperfections(latency=0.003), drive, stop=stop)
+    _, late = played(two_amplifiers, Imperfections(delays={"left": 0.003}), drive, stop=stop)
     assert np.abs(prompt).max() > 1
     assert_allclose(late[30:], prompt[:-30], rtol=0, atol=1e-8 * np.abs(prompt).max())
     assert not late[:130].any()
@@ -96,21 +95,22 @@ def test_imperfections_latency_delays_the_motion(two_amplifiers: Rig, stop: floa
 def test_imperfections_skew_shifts_the_phase(two_amplifiers: Rig) -> None:
     """One amplifier 1 ms behind the other: at 110 Hz its share lags by 39.6 degrees."""
     drive = {"right": (Tone(0, 110.0, 0.5),)}
-    skewed = Imperfections(latency=0.002, skew={"right": 0.001, "left": -0.0005})
+    skewed = Imperfections(delays={"right": 0.003, "left": 0.0015})
     shares = [
         phasor(*played(two_amplifiers, each, drive, until=3.0), 110.0, since=2.5)
-        for each in (Imperfections(latency=0.002), skewed)
+        for each in (Imperfections(delays=dict.fromkeys(("left", "right"), 0.002)), skewed)
     ]
     lag = np.degrees(np.angle(shares[0] / shares[1]))
     assert lag == pytest.approx(360 * 110 * 0.001, abs=1e-4)
-    assert skewed.delay("left") == pytest.approx(0.0015)
 
 
 def test_imperfections_latency_keeps_the_order_of_commands(two_amplifiers: Rig) -> None:
     """Two sets within the latency: both are played, each as long as it was meant to be."""
     frequencies = []
     for latency in (0.0, 0.05):
-        bench = Bench(two_amplifiers, now=0.0, imperfections=Imperfections(latency=latency))
+        bench = Bench(
+            two_amplifiers, now=0.0, imperfections=Imperfections(delays={"left": latency})
+        )
         bench.place_fingers({"a": AT}, now=0.0)
         arm(bench, 2.0, now=0.0, name="left")
         for token, (frequency, now) in enumerate([(110.0, 0.1), (170.0, 0.12)], start=1):
@@ -122,59 +122,6 @@ def test_imperfections_latency_keeps_the_order_of_commands(two_amplifiers: Rig) 
         )
     assert frequencies[0] == [(), (110.0,), (170.0,)]
     assert frequencies[1] == frequencies[0]
-
-
-def test_noise_has_its_rms_while_a_channel_plays(two_amplifiers: Rig) -> None:
-    """Its lines have together the rms that was asked for, lie all over the band, and end with it.
-
-    A tone on the neighbour brings none: the noise is the channel's own.
-    """
-    noise = draw_noise(seed=3, number=0)
-    lines = [term.omega / (2 * np.pi) for term in noise.terms(1e-6, start=0.5, end=2.0)]
-    assert lines == sorted(lines)
-    assert 10 <= lines[0] < 41
-    assert 969 < lines[-1] <= 1000
-    times = np.arange(0.5, 60.0, 0.00041)
-    motion = sum(
-        np.imag(term.c0 * np.exp(1j * term.omega * (times - term.start)))
-        for term in noise.terms(1e-6, start=0.5, end=np.inf)
-    )
-    assert np.std(motion) == pytest.approx(1e-6, rel=0.01)
-
-    noisy = Imperfections({Channel("left", 0): ChannelErrors(noise=0.02)})
-    drive = {"left": (Tone(0, 110.0, 0.2),)}
-    times, loud = played(two_amplifiers, noisy, drive, until=3.0, stop=1.5)
-    _, again = played(two_amplifiers, noisy, drive, until=3.0, stop=1.5)
-    _, clean = played(two_amplifiers, PERFECT, drive, until=3.0, stop=1.5)
-    assert_allclose(again, loud, rtol=0, atol=0)
-    hiss = loud - clean
-    assert not hiss[times <= 0.01].any()
-    assert hiss[(times > 0.5) & (times < 1.5)].std() > 0.1
-    assert np.abs(hiss[times > 2.9]).max() < 1e-3 * np.abs(hiss).max()
-    _, other = played(two_amplifiers, noisy, {"left": (Tone(1, 110.0, 0.2),)})
-    _, quiet = played(two_amplifiers, PERFECT, {"left": (Tone(1, 110.0, 0.2),)})
-    assert_allclose(other, quiet, rtol=0, atol=0)
-
-
-def test_noise_is_continuous_across_commands() -> None:
-    """Taken up at another moment it is the same noise, so that a new command does not repeat it."""
-    noise = draw_noise(seed=3, number=0)
-    at = [
-        [(term.c0 * np.exp(1j * term.omega * (1.0 - term.start))).imag for term in terms]
-        for terms in (noise.terms(1.0, start=0.5, end=2.0), noise.terms(1.0, start=0.83, end=2.0))
-    ]
-    assert_allclose(at[1], at[0], rtol=0, atol=1e-9)
-
-
-def test_noise_depends_on_the_seed(two_amplifiers: Rig) -> None:
-    """The same seed is the same noise, whatever else is set; channels differ from each other."""
-    assert draw_noise(seed=3, number=0) == draw_noise(seed=3, number=0)
-    assert draw_noise(seed=3, number=0) != draw_noise(seed=4, number=0)
-    assert draw_noise(seed=3, number=0) != draw_noise(seed=3, number=1)
-    drawn = draw_imperfections(two_amplifiers, skew=0.002, latency=0.001, seed=5)
-    assert drawn == draw_imperfections(two_amplifiers, skew=0.002, latency=0.001, seed=5)
-    assert set(drawn.channels) == set(two_amplifiers.wiring.values())
-    assert all(0.001 <= drawn.delay(name) <= 0.003 for name in two_amplifiers.amplifiers)
 
 
 def test_draw_imperfections_has_the_given_deviations(two_amplifiers: Rig) -> None:
@@ -253,11 +200,9 @@ def test_imperfections_of_the_plate_are_those_of_another_rig(coarse_rig: Rig) ->
     ("make", "words"),
     [
         (lambda: ChannelErrors(gain=-0.1), "negative"),
-        (lambda: ChannelErrors(noise=-1e-9), "negative"),
         (lambda: ChannelErrors(phase=math.nan), "finite"),
-        (lambda: Imperfections(latency=-0.001), "latency"),
-        (lambda: Imperfections(latency=0.001, skew={"left": -0.002}), "latency"),
-        (lambda: Imperfections(latency=math.inf), "latency"),
+        (lambda: Imperfections(delays={"left": -0.001}), "delay"),
+        (lambda: Imperfections(delays={"left": math.inf}), "delay"),
     ],
 )
 def test_imperfections_refuse_invalid_values(make, words: str) -> None:
@@ -271,4 +216,4 @@ def test_imperfections_refuse_unknown_channels(two_amplifiers: Rig) -> None:
     with pytest.raises(InputError, match="channel 7 of amplifier left"):
         Imperfections({Channel("left", 7): ChannelErrors()}).check(two_amplifiers)
     with pytest.raises(InputError, match="middle"):
-        Bench(two_amplifiers, now=0.0, imperfections=Imperfections(skew={"middle": 0.001}))
+        Bench(two_amplifiers, now=0.0, imperfections=Imperfections(delays={"middle": 0.001}))

@@ -7,8 +7,7 @@ import pytest
 
 from model.errors import InputError
 from recordings import read_recording
-from sim.sensors.recording import Recording
-from sim.sensors.recording_file import write_recording
+from sim.sensors.recording import Recording, write_recording
 
 
 @pytest.fixture

@@ -109,7 +109,7 @@ def test_refused_device_is_one_message(
 @pytest.mark.parametrize(
     ("changed", "key"),
     [
-        ({"channels": CHANNELS + 1}, "--channels"),
+        ({"channels": CHANNELS + 1}, "--device"),
         ({"rate": 96_000}, "--rate"),
         ({"block": 2 * BLOCK}, "--block"),
         ({"device": "jack:nothing"}, "--device"),

@@ -5,7 +5,7 @@ import pytest
 from listened_line import ListenedLine, witness_of
 from long_form import in_turn, shortly
 from random_group import RandomGroup
-from sim.witness.violation import Violation
+from sim.witness.capture import Violation
 from virtual_loop import run_virtual
 from words_line import KINDS
 

@@ -16,14 +16,8 @@ from drivers.codec.modbus.adu import (
     build_adu,
 )
 from drivers.statistics import WireCounters
-from sim.far_ends.modbus.frames import (
-    FRAME_TIMEOUT,
-    RtuReader,
-    TcpReader,
-    rtu_frame,
-    tcp_frame,
-)
-from sim.far_ends.modbus.frames import RequestAdu as FarEndRequest
+from sim.far_ends.modbus_frames import FRAME_TIMEOUT, RequestReader, rtu_frame, tcp_frame
+from sim.far_ends.modbus_frames import RequestAdu as FarEndRequest
 
 WORDS = (4711, *range(12))
 
@@ -89,15 +83,12 @@ def test_any_bytes_leave_the_reader_usable(is_rtu: bool, stream: list[bytes]) ->
     assert accepted(reader.feed(good, EXAMPLES[is_rtu][0])) == [WORDS]
 
 
-@pytest.mark.parametrize("reader_type", [RtuReader, TcpReader])
-def test_truncated_request_does_not_merge_with_the_next(
-    reader_type: type[RtuReader] | type[TcpReader],
-) -> None:
+@pytest.mark.parametrize("is_rtu", [True, False])
+def test_truncated_request_does_not_merge_with_the_next(is_rtu: bool) -> None:
     """A set that ends early, and a complete one after the longest pause within a frame."""
-    is_rtu = reader_type is RtuReader
     frame = build_adu(Write(1280, WORDS), unit=1, transaction=0, is_rtu=is_rtu).frame
     for missing in range(1, len(frame)):
-        reader = reader_type()
+        reader = RequestReader(is_rtu=is_rtu)
         assert reader.feed(frame[:-missing], 10.0) == []
         found = reader.feed(frame, 10.0 + reader.timeout + 0.01)
         assert [request.pdu for request in found] == [frame[1:-2] if is_rtu else frame[7:]]

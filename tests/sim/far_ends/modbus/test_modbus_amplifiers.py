@@ -11,8 +11,8 @@ from pymodbus.client import AsyncModbusTcpClient
 
 from drivers.protocol.table import MESSAGES, REFUSALS, STATES
 from sim.amplifier.contract import Amplifier
-from sim.far_ends.modbus.frames import FRAME_TIMEOUT, crc
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
+from sim.far_ends.modbus_frames import FRAME_TIMEOUT, rtu_frame
 
 STATUS = 256 * 9 + 128
 
@@ -29,8 +29,7 @@ class Port:
     def ask(self, pdu: bytes, unit: int = 1) -> bytes | None:
         """The response to a PDU, None without one."""
         self.sent.clear()
-        body = bytes([unit]) + pdu
-        self.end.receive(body + struct.pack("<H", crc(body)), self.now)
+        self.end.receive(rtu_frame(unit, pdu), self.now)
         self.end.tick(self.now + 2 * FRAME_TIMEOUT)
         return self.sent[0][1:-2] if self.sent else None
 

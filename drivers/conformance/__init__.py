@@ -16,8 +16,6 @@ from drivers.conformance import (
     sets,
     staging,
     states,
-    telling,
-    watchdog,
 )
 from drivers.conformance.check import Check, CheckResult, Report, Result, run_checks
 from drivers.conformance.opening import opened
@@ -33,9 +31,9 @@ CHECKS: tuple[Check, ...] = (
     *(states.stop_ends_all, states.stops_are_numbered, states.clear_too_early),
     *(states.silence, states.plays_nothing_disarmed, states.arming, states.watchdog_ranges),
     *(states.arms_again, states.sessions, states.arming_ends_fades),
-    *(watchdog.watchdog, watchdog.watchdog_unread, watchdog.what_feeds),
-    *(watchdog.what_does_not_feed, watchdog.trips_amid_other_requests),
-    *(watchdog.trips_amid_fades, watchdog.fault_list),
+    *(states.watchdog, states.watchdog_unread, states.what_feeds),
+    *(states.what_does_not_feed, states.trips_amid_other_requests),
+    *(states.trips_amid_fades, states.fault_list),
     *(sets.every_channel, sets.levels_of_every_frequency, sets.achieved, sets.steps_as_stated),
     *(sets.all_or_nothing, sets.accepts_its_ranges, staging.parts_of_sets, staging.max_set),
     *(staging.sets_expire, staging.stage_and_commit, staging.repeats_change_nothing),
@@ -47,7 +45,7 @@ CHECKS: tuple[Check, ...] = (
     *(serial_frames.damaged_frames, serial_frames.doubled_frames, serial_frames.tolerated_frames),
     *(modbus_frames.present_areas, modbus_frames.exceptions),
     *(can_frames.numbers, can_frames.network_management, can_frames.heartbeats),
-    *(telling.events, telling.broadcasts, telling.addresses, sensors.measured, sensors.readings),
+    *(reading.events, reading.broadcasts, reading.addresses, sensors.measured, sensors.readings),
 )
 """All checks, in their order of execution."""
 

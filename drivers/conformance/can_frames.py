@@ -1,27 +1,191 @@
-"""Checks of a CAN bus: numbers of requests, network management, heartbeats, objects."""
+"""A CAN bus, frame by frame, objects by SDO, and the checks of them."""
 
 import asyncio
 import struct
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import cast
 
 from drivers import clock
-from drivers.codec.can_bus.canopen import CANOPEN, cob_id
-from drivers.codec.can_bus.segments import segments
-from drivers.conformance.can_frames import CanClient, read_object, write_object
+from drivers.codec.can_bus.canopen import CANOPEN, CanFrame, cob_id
+from drivers.codec.can_bus.segments import (
+    NODE_MAX,
+    NUMBER_MAX,
+    REPLY,
+    REQUEST,
+    Assembler,
+    pack_frames,
+    segments,
+    unpack_frames,
+)
 from drivers.conformance.check import driving, reading
 from drivers.conformance.client import (
+    Answer,
+    Client,
+    Heard,
     Late,
+    Violation,
     When,
+    altered,
     expect,
     expect_equal,
     expect_one_of,
+    expect_reply,
     expect_within,
+    read_as,
 )
 from drivers.conformance.expected import NAMES, OFF
 from drivers.conformance.material import layer
 from drivers.conformance.subject import Subject
-from drivers.protocol.table import MESSAGES
+from drivers.protocol.records import Values
+from drivers.protocol.table import HELLO, IDENTITY, MESSAGES, NAK
+from drivers.statistics import WireCounters
+
+_NMT: Mapping[str, int] = CANOPEN["nmt"]
+_SETTLING = 0.005  # s; after a command of network management
+
+
+class CanClient(Client):
+    """A bus; number: of the last request. frames: all of the node."""
+
+    kind = "can"
+    addresses = NODE_MAX
+
+    def __init__(self, address: int) -> None:
+        super().__init__(address)
+        self.number = 0
+        self.frames: list[CanFrame] = []
+        self._counters = WireCounters()
+        self._replies = Assembler(self._counters)
+        self._events = Assembler(self._counters, is_numbered=False)
+
+    def received(self, data: bytes) -> None:
+        """Take packed frames from the port."""
+        now = clock.now()
+        for frame in unpack_frames(data):
+            if frame.id & NODE_MAX != self.address:
+                continue
+            self.frames.append(frame)
+            if frame.id != REPLY + self.address:
+                continue
+            is_event = frame.data[:1] == b"\0"
+            before = self._counters.unexpected_frames
+            message = (self._events if is_event else self._replies).add(frame.data, now)
+            if message is not None:
+                self.take(Heard(now, *message), is_event=is_event)
+            elif self._counters.unexpected_frames > before:  # again, or an older one
+                self.take(Heard(now, frame.data[0], frame.data[2], ()))
+
+    async def command(self, command: str, *, to: int | None = None) -> None:
+        """Send a command of network management; to: a node, 0 for all, None for this one."""
+        node = self.address if to is None else to
+        self.put(cob_id("nmt"), bytes((_NMT[command], node)))
+        await asyncio.sleep(_SETTLING)
+
+    def put(self, can_id: int, *data: bytes) -> None:
+        """Send frames of one identifier."""
+        self.port.write(pack_frames(CanFrame(can_id, each) for each in data))
+
+    def next_number(self) -> int:
+        """Return the number of a new request."""
+        self.number = self.number % NUMBER_MAX + 1
+        return self.number
+
+    async def hello(self) -> Values:
+        """Set the node operational and read the identity."""
+        await self.command("start")
+        answer = await self.exchange(HELLO, ())
+        return read_as("identity", IDENTITY.unpack, answer.words, is_strict=False)
+
+    async def exchange(self, number: int, words: Sequence[int]) -> Answer:
+        """Send a message and await its reply."""
+        sequence, sent = self.next_number(), clock.now()
+        self.put(REQUEST + self.address, *segments(sequence, number, words))
+        heard = expect_reply(await self.next(lambda each: each.number == sequence), number)
+        if heard.type == NAK:
+            return self.refusal(sent, heard.at, number, heard.words)
+        expect_equal(heard.type, number, "type of a reply")
+        return Answer("", None, heard.words, When(sent, heard.at))
+
+    def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
+        """Return the frames of a request."""
+        node = self.address if to is None else to
+        sequence = self.next_number() if node else 0
+        return self.packed(segments(sequence, number, words), to=node)
+
+    def packed(self, data: Sequence[bytes], *, to: int | None = None) -> bytes:
+        """Return frames with these data to a node."""
+        node = self.address if to is None else to
+        return pack_frames(CanFrame(REQUEST + node, each) for each in data)
+
+    def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
+        """Yield frames with damage of all kinds, each under the next number."""
+
+        def frames() -> list[bytes]:
+            return segments(self.next_number(), number, words)
+
+        first, *rest = frames()
+        yield "seven bytes in its first frame", self.packed([first[:7], *rest])
+        yield "another node", self.packed(frames(), to=self.address % NODE_MAX + 1)
+        first, *rest = frames()
+        yield "121 words", self.packed([first[:3] + b"\x79" + first[4:], *rest])
+        first, *rest = frames()
+        yield "the number of a broadcast", self.packed([b"\0" + first[1:], *rest])
+        if rest:
+            yield "its last frame missing", self.packed(frames()[:-1])
+            yield "its first frame missing", self.packed(frames()[1:])
+            first, *rest = frames()
+            yield "two frames of one place", self.packed([altered(rest[-1], 2), *rest, first])
+
+    def data_of(self, name: str) -> list[bytes]:
+        """Return the data of the frames heard of a kind, by the name of its identifier."""
+        can_id = cob_id(name, self.address)
+        return [frame.data for frame in self.frames if frame.id == can_id]
+
+
+_ABORT, _UPLOAD, _WRITTEN = 0x80, 0x40, 0x60
+_TRIES, _POLL = 500, 0.001  # s
+
+
+async def _exchange(client: CanClient, data: bytes) -> bytes:
+    client.frames.clear()
+    client.put(cob_id("sdo_request", client.address), data)
+    for _ in range(_TRIES):
+        await asyncio.sleep(_POLL)
+        if replies := client.data_of("sdo_answer"):
+            return replies[0]
+    raise Violation("reply to an SDO", expected="one within 0.5 s", seen="none")
+
+
+async def write_object(
+    client: CanClient, index: int, data: bytes, subindex: int = 0, *, is_taken: bool = True
+) -> None:
+    """Write an object of up to four bytes, which must be taken or refused."""
+    command = 0x23 | 4 - len(data) << 2
+    answer = await _exchange(client, struct.pack("<BHB4s", command, index, subindex, data))
+    required = _WRITTEN if is_taken else _ABORT
+    expect_equal(answer[0], required, f"reply to a write of object {index:04x}")
+
+
+async def read_object(
+    client: CanClient, index: int, subindex: int = 0, *, is_there: bool = True
+) -> bytes:
+    """Read an object, expedited or in segments, which must be there or not; returns its bytes."""
+    answer = await _exchange(client, struct.pack("<BHB4x", _UPLOAD, index, subindex))
+    what = f"reply to a read of {index:04x}/{subindex}"
+    expect_equal(answer[0] & 0xE0, _UPLOAD if is_there else _ABORT, what)
+    if answer[0] & 2 or not is_there:
+        return answer[4 : 8 - (answer[0] >> 2 & 3)]
+    (size,) = struct.unpack_from("<L", answer, 4)
+    data, toggle = b"", 0
+    while len(data) < size:
+        answer = await _exchange(client, bytes([0x60 | toggle]) + bytes(7))
+        is_next = answer[0] & 0xF0 == toggle
+        expect(is_next, f"segment of the {what}", expected="the next", seen=answer.hex())
+        data += answer[1 : 8 - (answer[0] >> 1 & 7)]
+        toggle ^= 0x10
+    return data
+
 
 _PLACE = "can.md#messages-as-frames"
 _PING, _SET, _STATUS = (MESSAGES[name].number for name in ("Ping", "Set", "GetStatus"))

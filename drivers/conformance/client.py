@@ -1,20 +1,61 @@
-"""A host below the host: one raw message at a time, and the times of all that is heard.
+"""A host below the host: one raw message at a time, the times of all that is heard, and findings.
 
 A client of a kind of wire makes frames and reads them; nothing is repeated or given up by itself,
-and what was not asked for is kept, so that checks see it.
+and what was not asked for is kept, so that checks see it. A check finds a violation of the
+contract, nothing to check, or that it came too late.
 """
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 from drivers import clock
-from drivers.conformance.client import Violation, expect, expect_equal
 from drivers.errors import LinkError
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import NAK_RECORD, NO_CHANNEL, REFUSALS
+
+
+class Violation(Exception):
+    """The amplifier does other than the contract: what must be what, and what was seen."""
+
+    def __init__(self, what: str, *, expected: object, seen: object) -> None:
+        self.expected, self.seen = str(expected), f"{what}: {seen}"
+        super().__init__(f"{what} must be {expected}, got {seen}")
+
+
+class Optional(Exception):
+    """The amplifier, or its wire, does not have what is checked, as the contract allows."""
+
+
+class Late(Exception):
+    """This machine was too late for what the check needs: it must be made again."""
+
+
+def expect(condition: bool, what: str, *, expected: object, seen: object) -> None:
+    """Raise Violation unless the condition holds."""
+    if not condition:
+        raise Violation(what, expected=expected, seen=seen)
+
+
+def expect_equal(seen: object, expected: object, what: str) -> None:
+    """Raise Violation unless both are equal."""
+    if seen != expected:
+        raise Violation(what, expected=expected, seen=seen)
+
+
+def expect_within(seen: float, low: float, high: float, what: str) -> None:
+    """Raise Violation unless a number is within limits."""
+    if not low <= seen <= high:
+        raise Violation(what, expected=f"{low:.6g} to {high:.6g}", seen=f"{seen:.6g}")
+
+
+def expect_one_of(seen: object, known: Collection[object], what: str) -> None:
+    """Raise Violation unless something is known."""
+    if seen not in known:
+        raise Violation(what, expected=" or ".join(map(str, known)), seen=seen)
+
 
 REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
 QUIET = 0.03  # s; in which something that must not be replied to would be

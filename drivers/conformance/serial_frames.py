@@ -1,17 +1,147 @@
-"""Checks of frames on any wire, and of those on a serial line."""
+"""A serial line, frame by frame; checks of frames on any wire, and of those on a serial line."""
 
 import asyncio
+import zlib
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import cast
 
+from cobs import cobs
+
 from drivers import clock
-from drivers.codec.serial_line.frame import pack_words
+from drivers.codec.serial_line.frame import (
+    NEUTRAL,
+    REPLY,
+    Frame,
+    FrameReader,
+    encode_frame,
+    pack_words,
+    unpack_identity,
+    unpack_words,
+)
 from drivers.conformance.check import driving
-from drivers.conformance.client import When, expect_equal
+from drivers.conformance.client import (
+    Answer,
+    Client,
+    Heard,
+    When,
+    altered,
+    expect_equal,
+    expect_reply,
+    read_as,
+)
 from drivers.conformance.material import layer
-from drivers.conformance.serial_frames import SerialClient
 from drivers.conformance.subject import Subject
-from drivers.protocol.table import MESSAGES, VERSION
+from drivers.protocol.records import Values
+from drivers.protocol.table import EVENT, HELLO, MAX_WORDS, MESSAGES, NAK, VERSION
+
+_SEQUENCES = 1 << 16
+_SEQUENCE_AT, _CRC_SIZE = 3, 4
+
+
+class SerialClient(Client):
+    """A serial line; sequence: number of the last request."""
+
+    kind = "serial"
+
+    def __init__(self, address: int) -> None:
+        super().__init__(address)
+        self.sequence = 0
+        self.invalid = 0
+        self._reader = FrameReader(on_invalid=self._count)
+
+    def received(self, data: bytes) -> None:
+        """Take bytes from the port."""
+        for frame in self._reader.feed(data):
+            is_text = frame.kind == HELLO | REPLY
+            if len(frame.payload) % 2 and not is_text:
+                self.invalid += 1
+                continue
+            words = () if is_text else unpack_words(frame.payload)
+            heard = Heard(clock.now(), frame.sequence, frame.kind, words, frame)
+            self.take(heard, is_event=frame.kind == EVENT)
+
+    async def hello(self) -> Values:
+        """Read the identity."""
+        return await self.identity(b"", NEUTRAL)
+
+    async def identity(self, payload: bytes, version: int) -> Values:
+        """Read the identity by a Hello of any length and version."""
+        frame = (await self._replied(HELLO, payload, version)).frame
+        seen = frame.kind, frame.version
+        expect_equal(seen, (HELLO | REPLY, NEUTRAL), "type, version of the reply to Hello")
+        return read_as("identity", unpack_identity, frame.payload)
+
+    async def exchange(self, number: int, words: Sequence[int]) -> Answer:
+        """Send a message and await its reply."""
+        return await self.exchange_payload(number, pack_words(words), VERSION)
+
+    async def exchange_payload(self, number: int, payload: bytes, version: int) -> Answer:
+        """Send a payload under a version and await its reply."""
+        sent = clock.now()
+        heard = await self._replied(number, payload, version)
+        answer = Answer("", None, heard.words, When(sent, heard.at))
+        if heard.type == NAK | REPLY:
+            answer = self.refusal(sent, heard.at, number, heard.words)
+        is_refused, is_neutral = bool(answer.code), answer.code == "UNSUPPORTED_VERSION"
+        required = (NAK if is_refused else number) | REPLY, NEUTRAL if is_neutral else VERSION
+        seen = heard.type, heard.frame.version
+        expect_equal(seen, required, f"type, version of the reply to message {number}")
+        return answer
+
+    async def _replied(self, number: int, payload: bytes, version: int) -> Heard:
+        self.port.write(self.frame(number, payload, version=version))
+        sequence = self.sequence
+        found = await self.next(lambda each: each.number == sequence and each.type != EVENT)
+        heard = expect_reply(found, number)
+        expect_equal(heard.frame.address, self.address, "address of a reply")
+        return heard
+
+    def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
+        """Return the frame of a request."""
+        return self.frame(number, pack_words(words), to=to)
+
+    def frame(
+        self, number: int, payload: bytes, *, to: int | None = None, version: int = VERSION
+    ) -> bytes:
+        """Return the frame of a payload under the next sequence number."""
+        self.sequence = (self.sequence + 1) % _SEQUENCES
+        address = self.address if to is None else to
+        return encode_frame(Frame(number, address, self.sequence, payload, version))
+
+    def damaged(self, number: int, words: Sequence[int]) -> Iterator[tuple[str, bytes]]:
+        """Yield frames with damage of all kinds."""
+        good = self.request(number, words)
+        content = cobs.decode(good[1:-1])
+        long = content[:-_CRC_SIZE] + bytes(2 * MAX_WORDS + 2 - 2 * len(words))
+        reply = bytes([content[0] | REPLY]) + content[1:-_CRC_SIZE]
+        other = self.address % self.addresses + 1
+        bits = (
+            (f"a wrong byte {at}", altered(content, at)) for at in (-4, -3, -2, -1, _SEQUENCE_AT)
+        )
+        yield from ((what, _framed(each)) for what, each in bits)
+        yield from {
+            "its last byte missing": good[:-2] + b"\0",
+            "its first byte missing": b"\0" + good[2:],
+            "a broken stuffing": b"\0\xff" + good[2:],
+            "no CRC": _framed(content[:-_CRC_SIZE]),
+            "more than 240 bytes of payload": _framed(_checked(long)),
+            "the bit of a reply": _framed(_checked(reply)),
+            "another address": self.request(number, words, to=other),
+        }.items()
+
+    def _count(self, piece: bytes) -> None:
+        self.invalid += 1
+
+
+def _checked(body: bytes) -> bytes:
+    return body + zlib.crc32(body).to_bytes(_CRC_SIZE, "little")
+
+
+def _framed(content: bytes) -> bytes:
+    stuffed: bytes = cobs.encode(content)
+    return b"\0" + stuffed + b"\0"
+
 
 _PLACE = "protocol.md#checks-in-this-order"
 _PING, _SET = MESSAGES["Ping"].number, MESSAGES["Set"].number

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from drivers.by_hand.cli import app
 from drivers.codec.can_bus.canopen import CanFrame
-from drivers.discovery import slcan
+from drivers.discovery import places
 from drivers.discovery.places import SlcanAdapter, detect_slcan
 from sim.far_ends.can_bus.bus import CanBus
 from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter as FarAdapter
@@ -64,7 +64,7 @@ async def adapter() -> AsyncIterator[Adapter]:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """The adapter is on a machine that may be busy: it is given time to reply."""
-    monkeypatch.setattr(slcan, "_REPLY_TIMEOUT", 5.0)
+    monkeypatch.setattr(places, "_REPLY_TIMEOUT", 5.0)
 
 
 async def test_other_device_receives_two_characters(adapter: Adapter) -> None:

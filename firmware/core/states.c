@@ -221,5 +221,5 @@ uint64_t amplifier_now(const struct amplifier *amplifier)
 
 uint16_t amplifier_watchdog_left(const struct amplifier *amplifier)
 {
-    return (uint16_t)((amplifier->fed.samples + SAMPLES_PER_MS / 2) / SAMPLES_PER_MS);
+    return timer_left(&amplifier->fed, amplifier_now(amplifier));
 }

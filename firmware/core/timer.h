@@ -36,4 +36,13 @@ static inline bool timer_is_late(const struct timer *timer, uint64_t now, uint32
     return timer->samples > 0 && now >= timer->until + slack;
 }
 
+// The time left in ms, by samples or by real time, whichever is less.
+static inline uint16_t timer_left(const struct timer *timer, uint64_t now)
+{
+    uint64_t left = (uint64_t)timer->samples * 1000 / SAMPLES_PER_MS;
+    if (timer->samples > 0 && timer->until < now + left)
+        left = timer->until > now ? timer->until - now : 0;
+    return (uint16_t)((left + 500) / 1000);
+}
+
 #endif

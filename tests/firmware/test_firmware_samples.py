@@ -306,3 +306,16 @@ def test_stalled_loop_is_silent_as_soon_as_it_runs(
     firmware.receive(SERIAL, request(GET_STATUS))
     status = unstuffed(firmware.sent(SERIAL).split(b"\0")[-2])
     assert (status[5], status[7]) == (7, 1)  # FAULT, of the watchdog
+
+
+def test_watchdog_left_is_real_time_after_a_stall(replaying: Path) -> None:
+    """Of 250 ms, 0.21 s after it was fed, 40 are left, though samples were made for 0.11 s only."""
+    firmware = MovedFirmware(replaying)
+    firmware.receive(SERIAL, arm(250))
+    firmware.move(0.1)
+    firmware.stall(0.2, is_converter_still=True)
+    firmware.move(0.21)
+    firmware.receive(SERIAL, request(GET_STATUS))
+    status = unstuffed(firmware.sent(SERIAL).split(b"\0")[-2])
+    assert status[5] == 4  # OPERATION_ENABLED
+    assert int.from_bytes(status[13:15], "little") == pytest.approx(40, abs=1)

@@ -1,9 +1,12 @@
 """A plate measured through a sound card in memory, and what is refused."""
 
+import ctypes
+import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.model_in_time import DeskModel
@@ -14,9 +17,11 @@ from drivers.errors import LinkError
 from model.errors import InputError
 from model.rig.rig import Rig
 from sim.measuring.desk import Desk
+from sim.measuring.live_plot import STEPS, levels, live_plot, plot
 from sim.measuring.loopback import latency
 from sim.measuring.measure import Measured, check_by_steps, measure
 from sim.measuring.multisine import Multisine, default_frequencies
+from sim.measuring.sound_card import SoundCard
 from sim.sensors.sensor_file import WiredSensor
 
 RATE = 8_000.0
@@ -185,3 +190,117 @@ def test_delay_follows_from_the_slope_of_phases() -> None:
     drawn = np.exp(2j * np.pi * np.random.default_rng(0).uniform(size=len(lines)))
     with pytest.raises(LinkError, match="loop-back"):
         latency(drawn, lines)
+
+
+PLOT_RATE = 2000.0
+MULTISINE = Multisine(np.array([61.0, 121.0, 181.0, 241.0]), 3, PLOT_RATE, 0.3)
+PLOTTED = tuple(WiredSensor(f"P{n}", 0.1, 0.1, n, 1.0) for n in (1, 2))
+GAINS = np.array([[0.5, -0.25, 1.0], [0.05, 0.0, 0.0]])  # of inputs by sources
+
+
+def recorded(runs: int) -> list[np.ndarray]:
+    """Two periods of each run, of inputs that are sums of the sources."""
+    periods = [MULTISINE.signal(run, periods=3)[round(PLOT_RATE * 0.5) :] for run in range(runs)]
+    return [each[: round(2 * PLOT_RATE)] @ GAINS.T for each in periods]
+
+
+def test_all_runs_show_the_sum_over_the_sources() -> None:
+    """By hand: the root of 0.25 + 0.0625 + 1 and 0.05, at every frequency."""
+    found = levels(MULTISINE, recorded(3), [0, 1])
+    exact = 10 * np.log10([0.25 + 0.0625 + 1, 0.0025])
+    np.testing.assert_allclose(found, np.tile(exact[:, None], 4), atol=1e-6)
+
+
+def test_plot_has_a_line_for_each_sensor_and_fits() -> None:
+    """The loudest sensor at the highest step, the other 27 dB lower; inputs by their peaks."""
+    runs = recorded(3)
+    first, second, axis, count = plot(MULTISINE, runs, PLOTTED, width=80, height=24).splitlines()
+    assert first.count(STEPS[-1]) == 4
+    difference = 10 * np.log10((0.25 + 0.0625 + 1) / 0.0025)  # 27.2 dB, in steps of 7.5
+    assert second.count(STEPS[int(8 - difference / 7.5)]) == 4
+    assert f"{-difference:.1f} dB" in second
+    peak = max(np.abs(each[:, 0]).max() for each in runs)
+    assert f"{100 * peak:.1f} %" in first
+    assert "61 Hz" in axis
+    assert count.startswith("3 of 3 runs")
+    few = plot(MULTISINE, runs, PLOTTED, width=80, height=6).splitlines()
+    assert (len(few), "1 more" in few[-1]) == (3, True)
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_plot_is_shown_on_a_terminal_only(
+    monkeypatch: pytest.MonkeyPatch, is_terminal: bool
+) -> None:
+    """After the first of three runs."""
+    written = io.StringIO()
+    console = Console(file=written, force_terminal=is_terminal, width=80, height=24)
+    monkeypatch.setattr("rich.console.Console", lambda **_options: console)
+    with live_plot(MULTISINE, PLOTTED) as show:
+        show(recorded(1))
+    assert ("1 of 3 runs" in written.getvalue()) == is_terminal
+
+
+FRAMES = 64
+# paInputUnderflow, paInputOverflow, paOutputUnderflow, paOutputOverflow of portaudio.h
+LOST = (0x1, 0x2, 0x4, 0x8)
+PRIMING = 0x10  # paPrimingOutput: nothing is lost
+
+
+class CallbackCard(SoundCard):
+    """Calls the callback as PortAudio does, with a number of flags for each block."""
+
+    def __init__(self, flags: list[int]) -> None:
+        super().__init__(outputs=1, inputs=1, limit=1.0)
+        self._flags = flags
+
+    def start(self, blocks: int) -> np.ndarray:
+        """Let blocks of zeros be played; returns the memory that is recorded to."""
+        return self.begin(np.zeros((blocks * FRAMES, 1)))
+
+    def call(self) -> int:
+        """All blocks; returns the gaps that were counted."""
+        kind = ctypes.CFUNCTYPE(
+            ctypes.c_int,
+            ctypes.c_void_p,
+            ctypes.c_void_p,
+            ctypes.c_ulong,
+            ctypes.c_void_p,
+            ctypes.c_ulong,
+            ctypes.c_void_p,
+        )
+        callback = kind(self.address("transfer_portaudio"))
+        block = np.ones(FRAMES, dtype=np.float32)
+        out = np.zeros(FRAMES, dtype=np.float32)
+        recorded, played, given = block.ctypes.data, out.ctypes.data, self.given()
+        for flags in self._flags:
+            assert callback(recorded, played, FRAMES, None, flags, given) == 0
+        return self._transfer.gaps
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+@pytest.mark.parametrize(
+    ("flags", "gaps"),
+    [
+        *(([0, flag, 0], 1) for flag in LOST),
+        ([0, LOST[0] | LOST[2], LOST[1]], 2),
+        ([0, PRIMING, 0], 0),
+        ([LOST[1], 0, 0], 0),  # before the first frame
+        ([0, 0, 0, LOST[1]], 0),  # after the last one
+    ],
+)
+def test_lost_blocks_are_gaps_while_something_plays(flags: list[int], gaps: int) -> None:
+    """Each block with a flag of a loss, from the second to the last, is one gap."""
+    card = CallbackCard(flags)
+    heard = card.start(3)
+    assert card.call() == gaps
+    assert heard.all()
+
+
+@pytest.mark.parametrize("sample", [1.01, np.nan])
+def test_samples_beyond_the_limit_are_not_played(sample: float) -> None:
+    """The last check before a device; a sample that is no number would pass for none."""
+    card = CallbackCard([])
+    with pytest.raises(ValueError, match="at most 1"):
+        card.run(np.full((FRAMES, 1), sample))

@@ -1,4 +1,4 @@
-"""Amplifiers of protocol 3 on every wire: what a finger feels, faults, shared lines, time."""
+"""Simulated amplifiers on real wires: which wire each gets, and what they do there."""
 
 import asyncio
 from dataclasses import replace
@@ -11,16 +11,83 @@ from drivers import clock
 from drivers.errors import CommandRefused, LinkError
 from drivers.protocol.table import FAULTS, STATES
 from memory_machine import live_in_memory
+from model.errors import InputError
 from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import fingertip_points
 from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, FingertipLoad
 from plate_in_time import apart
-from sim.far_ends.wires import Wire
+from sim.far_ends.wires import Wire, assign_wires
 from sim.faults.fault_window import FaultKind, FaultWindow
 from virtual_loop import VirtualLoop, in_virtual_time
 from wires import SHARED_WIRES, WIRES, on_two_amplifiers
 from words_bench import layer, rig_on_wire
+
+DEFAULTS = Wire("serial")
+URLS = {
+    "a": "serial:///dev/ttyUSB0?baud=115200&address=3",
+    "b": "serial:///dev/ttyUSB0?address=4",
+    "c": "modbus+tcp://192.168.1.7:5020/9",
+    "d": "modbus+rtu:///dev/ttyS1?baud=19200#2",
+    "e": "can+socketcand://localhost:29536/can0#5",
+    "f": "can+slcan:///dev/ttyACM0?bitrate=500000#7",
+}
+
+
+def test_assign_wires_follows_the_urls() -> None:
+    """Kind, port and address are those of the URL; equal lines are shared."""
+    assigned = assign_wires(URLS, common=None, options=[], defaults=DEFAULTS)
+    assert [(wire.kind, wire.port, wire.address) for wire in assigned.values()] == [
+        ("serial", 0, 3),
+        ("serial", 0, 4),
+        ("modbus-tcp", 5020, 9),
+        ("modbus-rtu", 0, 2),
+        ("socketcand", 29536, 5),
+        ("slcan", 0, 7),
+    ]
+    assert assigned["a"] == assigned["b"]
+    assert assigned["a"].shared
+
+
+def test_assign_wires_prefers_own_option_to_common_to_url() -> None:
+    """The result is in the order of the rig."""
+    modbus = Wire("modbus-tcp", port=1502)
+    assigned = assign_wires(
+        URLS, common=modbus, options=["c=slcan", "a=socketcand:7"], defaults=DEFAULTS
+    )
+    assert list(assigned) == list(URLS)
+    assert assigned["a"] == Wire("socketcand", port=7)
+    assert assigned["b"] == modbus
+    assert assigned["c"] == Wire("slcan")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["main"],
+        ["mian=serial"],
+        ["main=serial", "main=slcan"],
+        ["main=serail"],
+        ["main=serial:3"],
+        ["main=modbus-tcp:65536"],
+        ["main=modbus-tcp:x"],
+    ],
+)
+def test_assign_wires_refuses_an_invalid_option(options: list[str]) -> None:
+    """The error names the option as given."""
+    with pytest.raises(InputError, match=f"--wire {options[-1]}"):
+        assign_wires({"main": "sim://"}, common=None, options=options, defaults=DEFAULTS)
+
+
+@pytest.mark.parametrize(
+    "url", ["sim://", "can+socketcan://can0#1", "modbus+tcp://10.0.0.1/1", "modbus+tcp://h:99999/1"]
+)
+def test_assign_wires_refuses_a_url_without_a_wire(url: str) -> None:
+    """The error names the amplifier and its URL."""
+    with pytest.raises(InputError, match="amplifier main: ") as problem:
+        assign_wires({"main": url}, common=None, options=[], defaults=DEFAULTS)
+    assert url in str(problem.value)
+
 
 SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcand": 500_000}
 

@@ -1,5 +1,6 @@
-"""The recorder of a bench."""
+"""Accelerometers on a bench, recordings of them and of fingers, and their files."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,83 @@ from bench_driving import play
 from drivers.contents import Tone
 from full_disk import full_disk
 from model.errors import InputError
+from model.reduction.free_plate import solve_free_plate
+from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
+from model.structure.attachments import footprints_of
+from model.transients.base_motion import Term
 from recordings import read_recording
 from sim.bench.bench import Bench
-from sim.plant.accelerometer import Accelerometer
+from sim.plant.accelerometer import Accelerometer, positions, readings
+from sim.plant.plant import Plant
 from sim.sensors.recorder import Recorder
+from sim.sensors.recording import Recording, write_recording
+
+RATE = 5000.0
+
+
+def recording(samples: np.ndarray, *, start: float = 0.0) -> Recording:
+    """A recording of sensors P1, P2, ... somewhere."""
+    names = tuple(f"P{n + 1}" for n in range(samples.shape[1]))
+    return Recording(names, np.zeros((samples.shape[1], 2)), RATE, start, samples)
+
+
+def test_accelerometer_noise_is_white_and_has_its_density() -> None:
+    """White noise of 0.002 m/s²/sqrt(Hz) over 2500 Hz is 0.1 m/s² rms, and flat."""
+    sensor = Accelerometer("P1", 0, 0, noise_density=0.002)
+    rng = np.random.default_rng(1)
+    read = readings([sensor], np.zeros((200_000, 1)), sample_rate=RATE, rng=rng)
+    assert read.std() == pytest.approx(0.002 * math.sqrt(2500), rel=0.01)
+    power = np.abs(np.fft.rfft(read[:, 0])) ** 2
+    low, high = power[1:50_000].mean(), power[50_000:].mean()
+    assert low == pytest.approx(high, rel=0.03)
+
+
+def test_accelerometer_applies_scale_range_and_resolution() -> None:
+    """A reading is scaled, clipped and rounded."""
+    sensor = Accelerometer("P1", 0, 0, reach=5.0, resolution=0.25, scale=2.0)
+    truth = np.array([[0.1], [0.2], [1.06], [40.0], [-40.0]])
+    read = readings([sensor], truth, sample_rate=RATE, rng=np.random.default_rng(0))
+    assert read[:, 0].tolist() == [0.25, 0.5, 2.0, 5.0, -5.0]
+
+
+def test_tones_are_told_apart_with_their_phases() -> None:
+    """Two tones 10 Hz apart and an offset, at a late time."""
+    t = 4321.7 + np.arange(1000) / RATE
+    signal = 2 * np.sin(2 * np.pi * 110 * t + 0.7) + 0.3 * np.sin(2 * np.pi * 120 * t - 2) + 5
+    found = recording(signal[:, None], start=4321.7).tones([110.0, 120.0])
+    np.testing.assert_allclose(found[:, 0], [2 * np.exp(0.7j), 0.3 * np.exp(-2j)], atol=1e-6)
+    with pytest.raises(InputError, match="4"):
+        recording(signal[:4, None]).tones([110.0, 120.0])
+
+
+def test_tones_on_the_plate_are_those_of_the_model(coarse_rig: Rig) -> None:
+    """From noisy readings, once settled, as the steady state in frequency within 1 %."""
+    rig, at = coarse_rig, ((0.08, 0.06), (0.21, 0.17))
+    sensors = [
+        Accelerometer("", *each, noise_density=1e-3, reach=500.0, resolution=1e-3) for each in at
+    ]
+    reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras))
+    plant = Plant(reduced, rig.eras)
+    plant.set_input(0, [Term(0.0, math.inf, 2 * math.pi * 130.0, rig.eras[0].stroke + 0j)])
+    plant.skip(2.5)
+    times, truth = plant.advance(3.0, sample_rate=RATE, shapes=reduced.at(positions(sensors)))
+    read = readings(sensors, truth, sample_rate=RATE, rng=np.random.default_rng(0))
+    found = recording(read, start=float(times[0])).tones([130.0])[0]
+    free = solve_free_plate(rig.plate, rig.mesh)
+    expected = free.acceleration(rig.eras, np.array([130.0]), np.array(at))[0, 0]
+    np.testing.assert_allclose(np.abs(found), np.abs(expected), rtol=0.01)
+
+
+def test_sensors_and_recordings_refuse_invalid_values() -> None:
+    """Negative noise, NaN positions and empty windows."""
+    with pytest.raises(InputError, match="noise density"):
+        Accelerometer("P1", 0, 0, noise_density=-1.0)
+    with pytest.raises(InputError, match="x must be finite"):
+        Accelerometer("P1", math.nan, 0)
+    with pytest.raises(InputError, match="7 to 8"):
+        recording(np.zeros((5, 1))).during(7.0, 8.0)
+
 
 HALF_STROKE = Tone(0, 110.0, 0.5)
 
@@ -129,3 +202,45 @@ def test_recorder_keeps_the_old_file_without_samples(coarse_rig: Rig, tmp_path: 
         recorder.finish()
     assert path.read_text() == "time_s,old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.fixture
+def recorded() -> Recording:
+    """Two sensors, awkward numbers, begun late."""
+    samples = np.random.default_rng(3).standard_normal((500, 2)) * [40.0, 1e-4] - 1 / 3
+    points = np.array([[0.1, 0.2], [1 / 30, 0.05]])
+    return Recording(("P1", "left edge"), points, 5000.0, 12.25, samples)
+
+
+# Relative to the largest value: every digit, 24 bits, 12 digits.
+@pytest.mark.parametrize(("ending", "step"), [("csv", 0.0), ("wav", 6e-8), ("uff", 1e-11)])
+def test_recording_round_trip(
+    recorded: Recording, tmp_path: Path, ending: str, step: float
+) -> None:
+    """Other tools read all values within the resolution of the format; WAV within full scale."""
+    path = tmp_path / f"run.{ending}"
+    write_recording(path, recorded)
+    back = read_recording(path)
+    assert back.names == recorded.names
+    np.testing.assert_allclose(back.points, recorded.points, rtol=1e-12)
+    assert (back.sample_rate, back.start) == (5000.0, 12.25)
+    largest = np.abs(recorded.samples).max()
+    np.testing.assert_allclose(back.samples, recorded.samples, rtol=0, atol=step * largest)
+
+
+def test_write_recording_refuses_what_a_format_cannot_hold(
+    recorded: Recording, tmp_path: Path
+) -> None:
+    """Unknown suffix, values that are not finite, fractional rates in WAV, long names in UFF."""
+    with pytest.raises(InputError, match=r"run.txt: .*csv"):
+        write_recording(tmp_path / "run.txt", recorded)
+    bad = Recording(recorded.names, recorded.points, 5000.0, 0.0, recorded.samples * np.nan)
+    with pytest.raises(InputError, match="finite"):
+        write_recording(tmp_path / "run.csv", bad)
+    slow = Recording(recorded.names, recorded.points, 4999.5, 0.0, recorded.samples)
+    with pytest.raises(InputError, match=r"4999.5"):
+        write_recording(tmp_path / "run.wav", slow)
+    named = Recording(("P1", "a long name"), recorded.points, 5000.0, 0.0, recorded.samples)
+    with pytest.raises(InputError, match="a long name"):
+        write_recording(tmp_path / "run.uff", named)
+    assert not list(tmp_path.iterdir())

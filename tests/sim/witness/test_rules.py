@@ -1,4 +1,4 @@
-"""Every rule of the witness, on conversations written by hand."""
+"""Rules of the witness: each violation is found; correct traffic and own delays are none."""
 
 import re
 from pathlib import Path
@@ -10,6 +10,8 @@ import amplifier_violations
 import hand_written as hand
 import host_violations
 from hand_written_talk import Talk
+from sim.witness.capture import read_capture
+from sim.witness.witness import Witness
 
 BROKEN = {**host_violations.BROKEN, **amplifier_violations.BROKEN}
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "witness.md"
@@ -49,3 +51,94 @@ def test_sound_conversation_breaks_no_rule() -> None:
     talk.exchange(hand.ARM, (10, 250), hand.status(latch=1))
     talk.exchange(hand.DISARM, (50,), hand.status(hand.SWITCHED_OFF, latch=1))
     assert talk.found == []
+
+
+@pytest.mark.parametrize(("after", "broken"), [(0.028, []), (0.018, ["credit"])])
+def test_request_may_have_waited_in_a_transport(after: float, broken: list[str]) -> None:
+    """A host gives a request up 30 ms after it wrote it, of which its bytes waited for 2 ms."""
+    talk = Talk().armed()
+    talk.sends(hand.SET, hand.part(5, hand.layer(0)))
+    talk.rest(after).sends(hand.GET_STATUS)
+    talk.sequence -= 1
+    talk.rest(0.0005).replies(hand.SET, hand.taken(5))
+    talk.sequence += 1
+    talk.replies(hand.GET_STATUS, hand.status())
+    assert talk.found == broken
+
+
+def test_stop_may_overtake_a_heartbeat() -> None:
+    """It waits for 8 ms for the reply, which comes with its own."""
+    talk = Talk().armed().playing()
+    talk.sends(hand.PING, (9,))
+    talk.rest(0.008).sends(hand.STOP, (5,))
+    playing: dict[str, Any] = {"token": 5, "levels": (5000, 0)}
+    talk.sequence -= 1
+    talk.replies(hand.PING, hand.status(tokens=(5, 0, 0, 0), **playing))
+    talk.sequence += 1
+    talk.rest(0.001).replies(hand.STOP, hand.status(hand.STOPPED, latch=1, **playing))
+    assert talk.rest(0.006).says(hand.STOPPED, kind=hand.GET_STATUS, token=5, latch=1).found == []
+
+
+@pytest.mark.parametrize(("left", "broken"), [(240, []), (231, []), (225, ["watchdog"])])
+def test_watchdog_left_is_as_a_host_allows(left: int, broken: list[str]) -> None:
+    """Within 11 ms, as the page says; 9 ms after Arm 241 ms are left."""
+    talk = Talk().armed().rest(0.008).says(kind=hand.GET_STATUS, left=left)
+    assert talk.found == broken
+
+
+@pytest.mark.parametrize(("delay", "broken"), [(0.0, ["answer"]), (0.1, [])])
+def test_reply_is_not_late_by_the_delay_of_the_witness(delay: float, broken: list[str]) -> None:
+    """It is seen 100 ms after its request, of which this program did not run for that long."""
+    talk = Talk().armed()
+    talk.sends(hand.GET_STATUS)
+    talk.rest(0.1)
+    if delay:
+        talk.witness.delayed(talk.time, delay)
+    talk.replies(hand.GET_STATUS, hand.status(left=199))
+    assert talk.found == broken
+
+
+def test_commit_without_a_reply_shows_in_the_next_status() -> None:
+    """A broadcast, and one whose reply is lost: the token says that it was carried out."""
+    talk = Talk().armed().staged(5, hand.layer(0, hand.tone(0, 100, 0.5)))
+    talk.sends(hand.COMMIT, (9, 5), address=0)
+    talk.says(kind=hand.GET_STATUS, left=247, token=5, levels=(40, 0), tokens=(5, 0, 0, 0))
+    talk.rest(0.03).says(token=5, levels=(5000, 0), tokens=(5, 0, 0, 0))
+    assert talk.found == []
+
+
+@pytest.mark.parametrize("to", [1, 0])
+def test_amplifier_is_followed_to_its_new_address(to: int) -> None:
+    """Set for serial number "7" by itself or as a broadcast; the status at address 3 is its own."""
+    talk = Talk().identified()
+    words = (3, 1, 0x3700)
+    if to:
+        talk.exchange(hand.SET_ADDRESS, words, hand.status(hand.SWITCHED_OFF))
+    else:
+        talk.sends(hand.SET_ADDRESS, words, address=0)
+    talk.exchange(hand.GET_STATUS, (), hand.status(hand.SWITCHED_OFF, limited=True), address=3)
+    talk.sends(hand.GET_STATUS, address=3)
+    assert talk.rest(0.04).found == ["plays", "answer"]
+
+
+def test_ramp_of_a_stop_is_clipped() -> None:
+    """65.535 s are those 1000 ms that an amplifier has: half of the level after half a second."""
+    talk = Talk().armed().playing()
+    latched: dict[str, Any] = {"latch": 1, "token": 5}
+    talk.exchange(hand.STOP, (65535,), hand.status(hand.STOPPED, levels=(5000, 0), **latched))
+    talk.rest(0.497).says(hand.STOPPED, kind=hand.GET_STATUS, levels=(2500, 0), **latched)
+    talk.rest(0.6).says(hand.STOPPED, kind=hand.GET_STATUS, **latched)
+    assert [each for each in talk.found if each != "stop"] == []
+
+
+def test_capture_replays_as_it_was_heard(tmp_path: Path) -> None:
+    """What was recorded while a rule was broken breaks it again, with the same frames around."""
+    talk = Talk().armed().playing().says(token=5, levels=(4000, 0), tokens=(5, 0, 0, 0))
+    path = tmp_path / "capture.txt"
+    path.write_text("\n".join(talk.capture), encoding="utf-8")
+    witness = Witness(talk.config)
+    for piece in read_capture(path, wires=witness.wires):
+        witness.record_bytes(piece.wire, piece.direction, piece.time, piece.data)
+    assert [*map(str, witness.finish())] == [*map(str, talk.witness.finish())]
+    assert [one.invariant for one in witness.finish()] == ["plays"]
+    assert witness.frames == len(talk.capture)

@@ -9,10 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused
 from drivers.host.amplifier import Amplifier
-from drivers.host.group import Group
 from drivers.host.jobs import Priority
 from drivers.host.line import Line
 from drivers.opening import Lines
@@ -56,34 +54,6 @@ async def opened(url: str) -> AsyncIterator[Amplifier]:
         yield amplifier
     finally:
         await lines.close()
-
-
-@pytest.mark.parametrize("line", LINES)
-async def test_host_plays_layers_and_stops(line: str, firmware: Path) -> None:
-    """Two layers of one commit, one of them silenced; the stop is confirmed by silent channels."""
-    with running_firmware(firmware, *options(line)) as (url, _):
-        async with opened(url) as amplifier:
-            group = Group({"a": amplifier}, watchdog=2.0)
-            await group.open()
-            await group.arm()
-            fingers = [
-                Layer(0, (Tone(0, 100.0, 0.5), Tone(1, 130.0, 0.25)), 0.0),
-                Layer(5, (Tone(1, 250.0, 0.5),), 0.0),
-            ]
-            await group.apply({"a": fingers})
-            assert (await amplifier.read_status())["levels"] == [5000, 7500, 0, 0]
-            await group.apply({"a": [Layer(0, (), 0.0)]})
-            await group.beat()
-            status = await amplifier.read_status()
-            assert status["levels"] == [0, 5000, 0, 0]
-            assert [bool(token) for token in status["tokens"]] == [False] * 5 + [True] + [False] * 2
-            stopped = (await group.stop())["a"]
-            assert stopped.is_confirmed
-            status = await amplifier.read_status()
-            assert status["levels"] == [0] * 4
-            assert status["state"] == STATES["QUICK_STOP_ACTIVE"]
-            await group.clear()
-            assert (await amplifier.read_status())["state"] == STATES["SWITCH_ON_DISABLED"]
 
 
 @pytest.mark.parametrize("line", LINES)

@@ -53,25 +53,3 @@ def test_host_that_vanishes_leaves_silence(kind: str, replaying: Path) -> None:
         assert (status["state"], status["fault"]) == (STATES["FAULT"], FAULTS["WATCHDOG"])
 
     run_virtual(run())
-
-
-@pytest.mark.parametrize("kind", LINES)
-def test_stop_is_confirmed_once_it_is_silent(kind: str, replaying: Path) -> None:
-    """Amid an onset; the sets before it end with it, and after clear and arm others play."""
-
-    async def run() -> None:
-        end = FirmwareLine(kind, replaying)
-        group = Group({"a": end.host}, watchdog=WATCHDOG)
-        await group.open()
-        for _ in range(2):
-            await group.arm()
-            await group.apply({"a": layers()})
-            await asyncio.sleep(0.03)
-            assert max((await end.host.read_status())["levels"]) > 2000
-            assert (await group.stop())["a"].is_confirmed
-            end.firmware.samples()
-            await asyncio.sleep(0.02)
-            assert not end.firmware.samples().any()
-            await group.clear()
-
-    run_virtual(run())

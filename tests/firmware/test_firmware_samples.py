@@ -7,22 +7,14 @@ import numpy as np
 import pytest
 
 from firmware_script import (
-    COMMIT,
     DISARM,
     GET_STATUS,
-    NAK,
     PER_MS,
-    PING,
-    SESSION,
-    SET,
-    SET_REPLY,
     STOP,
     Script,
     apply,
     arm,
     command,
-    layer,
-    play,
     replay,
     request,
     stuffed,
@@ -32,8 +24,6 @@ from model.arrays import FloatArray
 from moved_firmware import RATE, SERIAL, MovedFirmware
 
 TOLERANCE = 6e-5  # of full level: two steps of a 16-bit sample, and phases over seconds
-BAD_TOKEN, INCOMPLETE = 6, 12
-FLAGS, LIMITED = 2, 4  # of a status
 
 
 def seconds(count: int) -> FloatArray:
@@ -75,23 +65,6 @@ def test_frame_with_any_wrong_bit_is_not_answered(replaying: Path) -> None:
     ]
     _, replies = replay(replaying, [(10, each) for each in damaged], 20)
     assert replies == []
-
-
-def test_sets_cross_fade_along_raised_cosines(replaying: Path) -> None:
-    """An interrupted fade goes on from its present gain; one that ends sooner keeps its end."""
-    script: Script = [
-        (0, arm()),
-        (0, apply(1, command(0, 100, 0.5))),
-        (100, apply(2, command(0, 130, 0.4, 90), ramp_ms=40)),
-        (120, apply(3, ramp_ms=100)),
-    ]
-    samples, _ = replay(replaying, script, 230)
-    t = seconds(len(samples))
-    first = tone(t, 100, 0.5) * falling(t - 0.1, 0.04)
-    rising = np.where(t < 0.12, 1 - falling(t - 0.1, 0.04), 0.5 * falling(t - 0.12, 0.1))
-    second = np.where(t >= 0.1, tone(t - 0.1, 130, 0.4, 90) * rising, 0)
-    assert np.abs(samples[:, 0] - first - second).max() < TOLERANCE
-    assert not samples[220 * PER_MS :].any()
 
 
 @pytest.fixture(scope="module")
@@ -152,134 +125,6 @@ def test_oldest_fade_ends_sooner_where_no_voice_is_free(replaying: Path) -> None
     level = np.where(t < 0.001, 0, np.where(t < 0.017, fading, cut))
     # The others rise to 0.001 at the most.
     assert np.abs(samples[:, 0] - level * tone(t - 0.001, 100, 0.5)).max() < 0.002
-
-
-def test_layers_add_up_within_full_level(replaying: Path) -> None:
-    """Two layers of one commit start together; one that is not named plays on, to the sample."""
-    script: Script = [
-        (0, arm()),
-        (10, play(1, layer(0, command(0, 100, 0.8)), layer(3, command(0, 250, 0.6, 90)))),
-        (60, request(GET_STATUS)),
-        (60, play(2, layer(3, ramp_ms=20))),
-        (100, request(GET_STATUS)),
-        (100, request(GET_STATUS)),
-    ]
-    samples, replies = replay(replaying, script, 150)
-    t = seconds(len(samples)) - 0.01
-    both = tone(t, 100, 0.8) + tone(t, 250, 0.6, 90) * falling(t - 0.05, 0.02)
-    expected = np.where(t < 0, 0, np.clip(both, -1, 1))
-    assert np.abs(samples[:, 0] - expected).max() < TOLERANCE
-    flags = [words[FLAGS] for kind, words in replies if kind == 0x80 | GET_STATUS]
-    assert [each & LIMITED for each in flags] == [LIMITED, LIMITED, 0]
-
-
-def test_token_is_played_once(replaying: Path) -> None:
-    """A set under the token that plays is confirmed and has no effect; an older one is refused."""
-    script = [(0, arm()), (0, apply(7, command(0, 100, 0.5)))]
-    again = [(10, apply(7, command(0, 100, 0.2))), (10, apply(6, command(0, 100, 0.2)))]
-    samples, replies = replay(replaying, [*script, *again], 30)
-    assert replies[-2:] == [(SET_REPLY, (7, 0b101, 0)), (NAK, (SET, BAD_TOKEN, 255))]
-    assert np.array_equal(samples, replay(replaying, script, 30)[0])
-
-
-def test_set_comes_in_parts_in_any_order(replaying: Path) -> None:
-    """Cut amid a command: the missing part is named, and what is not whole is not committed."""
-    words = layer(0, command(0, 100, 0.5), command(1, 130, 0.4))
-    first, second = [SESSION, 7, 0 << 8 | 2 << 1, *words[:5]], [SESSION, 7, 1 << 8 | 2 << 1]
-    script = [
-        (0, arm()),
-        (10, request(SET, *second, *words[5:])),
-        (11, request(COMMIT, SESSION, 7)),
-        (12, request(SET, *first)),
-        (13, request(COMMIT, SESSION, 7)),
-    ]
-    samples, replies = replay(replaying, script, 50)
-    assert replies[1] == (SET_REPLY, (7, 0b100, 0))
-    assert replies[2] == (NAK, (COMMIT, INCOMPLETE, 255))
-    assert replies[3] == (SET_REPLY, (7, 0b110, 0))
-    t = seconds(len(samples)) - 0.013
-    for channel, each in enumerate([tone(t, 100, 0.5), tone(t, 130, 0.4)]):
-        assert np.abs(samples[:, channel] - np.where(t < 0, 0, each)).max() < TOLERANCE
-
-
-def test_envelopes_move_along_straight_lines(replaying: Path) -> None:
-    """An onset from zero over two knots to the level, the ending to silence by valid_for."""
-    onset, ending = [(0.1, 90.0), (1.0, -0.01)], [(0.3, -120.0)]
-    script: Script = [
-        (0, arm()),
-        (
-            3,
-            apply(
-                1,
-                command(2, 110, 0.2, 30, onset=(12.5, onset), ending=(7.3, ending)),
-                valid_for_ms=60,
-            ),
-        ),
-    ]
-    samples, _ = replay(replaying, script, 100)
-    t = seconds(len(samples)) - 0.003
-    steps = [0, 0.0125, 0.025, 0.0375, 0.06, 0.0673, 0.0746]
-    knots = [(0, 0), *onset, (0.2, 30), (0.2, 30), *ending, (0, 0)]
-    values = [level * np.exp(1j * np.radians(phase)) for level, phase in knots]
-    amplitude = np.interp(t, steps, values, left=0)
-    expected = (amplitude * np.exp(2j * np.pi * 110 * t)).imag
-    assert np.abs(samples[:, 2] - expected).max() < TOLERANCE
-    assert not samples[:, [0, 1, 3]].any()
-
-
-@pytest.mark.parametrize("ramp_ms", [0, 100])
-def test_brake_goes_on_from_the_present_amplitude(replaying: Path, ramp_ms: int) -> None:
-    """With keep phase, an onset to level 0 begins where the vibration is, on its own t.
-
-    Amid a ramp of 100 ms that is half of its level.
-    """
-    brake = (10, [(0.5, -180.0)])
-    script: Script = [
-        (0, arm()),
-        (0, apply(1, command(0, 90, 0.4, 20), ramp_ms=ramp_ms)),
-        (50, apply(2, command(0, 90, 0, keep_phase=True, onset=brake), ramp_ms=500)),
-    ]
-    samples, _ = replay(replaying, script, 100)
-    t = seconds(len(samples))
-    full = 0.4 * np.exp(1j * np.radians(20))
-    rising = 1 - falling(t, ramp_ms / 1000) if ramp_ms else np.ones(len(t))
-    braking = np.interp(t, [0.05, 0.06, 0.07], [full / 2 if ramp_ms else full, -0.5, 0])
-    amplitude = np.where(t < 0.05, full * rising, braking)
-    expected = (amplitude * np.exp(2j * np.pi * 90 * t)).imag
-    assert np.abs(samples[:, 0] - expected).max() < TOLERANCE
-
-
-def test_watchdog_silences_to_the_sample(replaying: Path) -> None:
-    """It trips at its time after the last request of the session, and fades over 5 ms."""
-    ping = request(PING, SESSION)
-    script: Script = [
-        (0, arm(100)),
-        (0, apply(1, command(3, 200, 1.0, 90))),
-        (60, ping),
-        (90, request(GET_STATUS)),
-        (100, request(PING, 1)),
-    ]
-    samples, _ = replay(replaying, script, 200)
-    t = seconds(len(samples))
-    expected = tone(t, 200, 1.0, 90) * falling(t - 0.16, 0.005)
-    assert np.abs(samples[:, 3] - expected).max() < TOLERANCE
-    assert not samples[165 * PER_MS :].any()
-
-
-def test_shorter_stop_ends_sooner_and_a_longer_one_changes_nothing(replaying: Path) -> None:
-    """From the present amplitude along the ramp that ends first."""
-    script: Script = [
-        (0, arm()),
-        (0, apply(1, command(0, 150, 0.8))),
-        (100, request(STOP, 100)),
-        (140, request(STOP, 20)),
-        (150, request(STOP, 200)),
-    ]
-    samples, _ = replay(replaying, script, 200)
-    t = seconds(len(samples))
-    at_140 = falling(np.array([0.04]), 0.1)[0]
-    gain = np.where(t < 0.14, falling(t - 0.1, 0.1), at_140 * falling(t - 0.14, 0.02))
-    assert np.abs(samples[:, 0] - gain * tone(t, 150, 0.8)).max() < TOLERANCE
 
 
 @pytest.mark.parametrize("is_converter_still", [False, True])

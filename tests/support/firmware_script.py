@@ -16,7 +16,6 @@ SESSION = 9
 ARM, DISARM, SET, COMMIT, STOP, GET_STATUS, PING = 3, 4, 5, 6, 8, 9, 12
 PART = 117  # words
 NAK = 0x9F
-SET_REPLY = 0x85
 
 Words = list[int]
 Shape = tuple[float, Sequence[tuple[float, float]]]

@@ -2,10 +2,8 @@
 
 import asyncio
 import re
-from collections.abc import Callable
 from pathlib import Path
 
-import minimalmodbus
 import pytest
 
 from drivers.by_hand import actions
@@ -13,8 +11,7 @@ from drivers.by_hand.discovery import identify_all
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
 from drivers.opening import Lines
-from drivers.protocol.records import Values
-from drivers.protocol.table import FEATURES, STATES
+from drivers.protocol.table import FEATURES
 from drivers.trace import tracing
 from drivers.urls import with_address
 from registry.limits import GuardLimits
@@ -63,42 +60,6 @@ async def test_stop_of_a_mute_amplifier_may_play() -> None:
     assert (result["silence"], result["may_play_for_s"]) == ("may_play", None)
     assert "no reply" in result["cause"]
     assert "state" not in result
-
-
-def stale(status: Values, stops: int) -> Values:
-    """A status of an earlier stop, as a converter may have kept it."""
-    return {**status, "state": STATES["QUICK_STOP_ACTIVE"], "levels": [0], "latch": 1}
-
-
-def of_no_channel(status: Values, stops: int) -> Values:
-    """A status of this stop, with the level of no channel."""
-    return {**stale(status, stops), "channels": 0, "levels": [], "latch": 1 + stops}
-
-
-@pytest.mark.parametrize("lie", [stale, of_no_channel])
-async def test_status_that_proves_nothing_confirms_no_silence(
-    lie: Callable[[Values, int], Values], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It plays on, and says after each Stop what an earlier status said, or nothing of channels."""
-    monkeypatch.setattr(actions, "_STOP_TIMEOUT", 0.3)
-    async with WORD_WIRES["serial"](1) as far:
-        await leave_playing(far)
-        amplifier, stops = far.amplifiers[1], 0
-        handle = amplifier.handle
-
-        def lying(name: str, values: Values, now: float) -> Values:
-            nonlocal stops
-            stops += name == "Stop"
-            if stops and name in ("Stop", "GetStatus"):
-                return lie(handle("GetStatus", {}, now), stops)
-            return handle(name, values, now)
-
-        monkeypatch.setattr(amplifier, "handle", lying)
-        result = await actions.stop(far.url(1))
-        assert stops >= 2
-        assert far.level(1) == pytest.approx(0.5)
-    assert result["silence"] == "may_play"
-    assert "switch it off" in result["cause"]
 
 
 async def test_identity_has_units_and_the_limits_of_the_wire() -> None:
@@ -231,27 +192,3 @@ async def test_discovery_only_identifies(tmp_path: Path) -> None:
     assert [type(other) for other in others] == [LinkError, LinkError]
     requests = re.findall(r" request (\w+)\(", (tmp_path / "trace").read_text("utf-8"))
     assert set(requests) <= {"Hello", "GetCaps", "GetStatus"}
-
-
-async def test_foreign_master_reads_the_status() -> None:
-    """minimalmodbus, function 4, from register 0980 on: a tag, result 0, then the status.
-
-    State 4, no fault, high voltage on; behind latch, watchdog and measurements the token, one
-    channel and its level of half.
-    """
-    async with WORD_WIRES["modbus+rtu"](1) as far:
-        await leave_playing(far)
-        port = far.url(1).partition("://")[2].partition("?")[0]
-
-        def read() -> list[int]:
-            master = minimalmodbus.Instrument(port, 1)
-            master.serial.baudrate = 19_200
-            master.serial.timeout = 5.0
-            try:
-                return list(master.read_registers(0x0980, 12, functioncode=4))
-            finally:
-                master.serial.close()
-
-        words = await asyncio.to_thread(read)
-        assert words[1:5] == [0, 4, 0, 1]
-        assert (words[9], words[10] >> 8, words[11]) == (5, 1, 5000)

@@ -1,7 +1,6 @@
 """The simulated amplifier of protocol 3 against docs/decisions/0061 and arithmetic by hand."""
 
 import math
-from itertools import product
 
 import pytest
 
@@ -55,78 +54,7 @@ def refused(amplifier: Amplifier, name: str, values: Values, at: float = 0.1) ->
     return raised.value.code
 
 
-def in_state(state: str) -> tuple[Amplifier, float]:
-    """An amplifier in a state, and a time at which it is."""
-    amplifier = Amplifier("a", channels=1)
-    if state == "NOT_READY" or state == READY:
-        amplifier.state = state
-    elif state != OFF:
-        amplifier.handle("Arm", ARM, 0.0)
-        play(amplifier, 1, 0.0, tone(), ramp=0)
-    if state == ON:
-        amplifier.handle("Disarm", {"ramp": 1000}, 0.1)
-    elif state == STOPPED:
-        amplifier.handle("Stop", {"ramp": 0}, 0.1)
-    elif state in (REACTION, FAULT):
-        amplifier.trip("ARC", 0.1)
-    amplifier.tick(at := 0.2 if state == FAULT else 0.101)
-    assert amplifier.state == state
-    return amplifier, at
-
-
-REQUESTS: dict[str, Values] = {
-    **{"Arm": {"session": 8, "watchdog": 250}, "Disarm": {"ramp": 5}, "Stop": {"ramp": 5}},
-    **{"Commit": {"session": 7, "token": 1}, "Silence": {"session": 7, "ramp": 5}},
-    "Set": part_of(2, LayerSet(0, 5, 0)),
-    "SetAddress": {"address": 2, "serial_number": "SIM-a"},
-}
 # From docs/reference: the state that follows each request, by state; "-": refused.
-FOLLOWING = {
-    "NOT_READY": dict.fromkeys(REQUESTS, "-") | {"Disarm": "NOT_READY", "Stop": "NOT_READY"},
-    OFF: dict.fromkeys(REQUESTS, "-")
-    | {"Arm": ENABLED, "Disarm": OFF, "Stop": STOPPED, "SetAddress": OFF},
-    READY: dict.fromkeys(REQUESTS, "-")
-    | {"Arm": ENABLED, "Disarm": READY, "Stop": STOPPED, "SetAddress": READY},
-    ON: dict.fromkeys(REQUESTS, "-") | {"Arm": ENABLED, "Disarm": ON, "Stop": STOPPED},
-    ENABLED: dict.fromkeys(REQUESTS, ENABLED)
-    | {"Arm": "-", "Disarm": ON, "Stop": STOPPED, "SetAddress": "-"},
-    **{
-        state: dict.fromkeys(REQUESTS, "-") | {"Disarm": state, "Stop": state}
-        for state in (STOPPED, REACTION, FAULT)
-    },
-}
-
-
-@pytest.mark.parametrize(("state", "name"), list(product(STATES, REQUESTS)))
-def test_requests_lead_where_the_state_table_says(state: str, name: str) -> None:
-    """Every pair of state and request; a refused one changes nothing."""
-    amplifier, at = in_state(state)
-    if FOLLOWING[state][name] == "-":
-        assert refused(amplifier, name, REQUESTS[name], at) in ("WRONG_STATE", "WRONG_SESSION")
-    else:
-        amplifier.handle(name, REQUESTS[name], at)
-        assert amplifier.state == FOLLOWING[state][name]
-
-
-def test_watchdog_that_expired_unseen_has_expired_when_it_was_due() -> None:
-    """Fed at 0.1 s: at 0.3525 s half of the ramp of 5 ms is over, at 0.355 s it is silent."""
-    amplifier = armed()
-    play(amplifier, 1, 0.1, tone(), ramp=0)
-    assert levels(amplifier, 0.3525) == [2500, 0]
-    status = amplifier.handle("GetStatus", {}, 0.3551)
-    assert (status["state"], status["fault"]) == (STATES[FAULT], FAULTS["WATCHDOG"])
-    assert (status["levels"], status["tokens"], status["latch"]) == ([0, 0], [0] * 8, 1)
-
-
-def test_late_copy_of_an_older_set_discards_no_staged_one() -> None:
-    """Set 10 is staged, a copy of 9 comes late: refused, and 10 plays."""
-    amplifier = armed()
-    for token in (9, 10):
-        one = LayerSet(0, 0, 0, (tone(0, 2000, 1000 * token),))
-        assert amplifier.handle("Set", part_of(token, one, now=False), 0.05)["staged"]
-    late = part_of(9, LayerSet(0, 0, 0), now=False)
-    assert refused(amplifier, "Set", late) == "BAD_TOKEN"
-    assert amplifier.handle("Commit", {"session": 7, "token": 10}, 0.1)["levels"] == [10000, 0]
 
 
 def test_heat_derates_and_then_trips() -> None:
@@ -189,16 +117,3 @@ def test_high_voltage_is_on_while_armed_and_discharges() -> None:
     assert measured["channel_current"] == pytest.approx(math.pi * 100 * voltage * 1e-3, abs=1)
     amplifier.handle("Disarm", {"ramp": 0}, 0.1)
     assert amplifier.handle("GetStatus", {}, 0.12)["voltage"] == round(1800 / math.e)
-
-
-def test_sum_that_lasts_is_limited_in_every_status() -> None:
-    """Two layers of 0.7 exceed full level, as each status since says; one alone does not."""
-    amplifier = armed()
-    shown = []
-    for token, layer in enumerate((0, 1), 1):
-        play(amplifier, token, 0.1 * token, tone(level=7000, frequency=2000 + layer), layer=layer)
-        flags = [
-            amplifier.handle("GetStatus", {}, 0.1 * token + at)["flags"] for at in (0.05, 0.09)
-        ]
-        shown.append([each >> 2 & 1 for each in flags])
-    assert shown == [[0, 0], [1, 1]]

@@ -14,7 +14,7 @@ import pytest
 
 from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.errors import LinkError
-from drivers.protocol.table import REFUSALS, STATES
+from drivers.protocol.table import REFUSALS
 from model.rig.rig import Rig
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
@@ -213,20 +213,6 @@ def test_session_wins_over_what_a_request_asks_for() -> None:
     assert line.ask(5, "0800 0100 0200 0100").payload[2] == REFUSALS["WRONG_SESSION"]
     assert line.ask(5, "0700 0100 0200 0100").payload[2] == REFUSALS["BAD_LENGTH"]
     assert line.ask(3, "0800 D007").payload[2] == REFUSALS["WRONG_SESSION"]
-
-
-@pytest.mark.parametrize(("kind", "state"), [(4, "SWITCH_ON_DISABLED"), (8, "QUICK_STOP_ACTIVE")])
-def test_stop_and_disarm_are_not_refused_for_their_ramp(kind: int, state: str) -> None:
-    """65.535 s counts as the longest ramp of 1 s, after which it is silent."""
-    line = OnALine()
-    line.ask(3, "0700 D007")
-    line.ask(5, "0700 0100 0300 0100 0000 0000 0000 0008 1027 0000")  # level 1 at once
-    assert line.ask(kind, "FFFF").kind == kind | 0x80
-    line.amplifier.tick(0.5)
-    assert line.amplifier.playback.level(0, 0.5) == pytest.approx(0.5)
-    line.amplifier.tick(1.001)
-    assert (line.amplifier.state, line.amplifier.playback.level(0, 1.0)) == (state, 0.0)
-    assert line.amplifier.state in STATES
 
 
 def test_echo_of_an_event_gets_no_reply() -> None:

@@ -24,7 +24,6 @@ SET = (  # session 1234, token 7: layer 0 along 0 ms, channel 0 at 100 Hz and ha
     (0x201, "0203881300000000"),
 )
 COMMIT = (0x200, "0000060234120700")
-STOP = (0x201, "0300080105000000")  # along 5 ms
 
 
 class Bus:
@@ -59,17 +58,6 @@ def bus() -> Bus:
     return bus
 
 
-def test_status_has_the_bytes_of_the_decision(bus: Bus) -> None:
-    """18 words: disarmed, 25.0 degrees, one channel, eight layers, silent."""
-    assert bus.put(0.0, (0x201, "1100090000000000")) == [
-        (0x181, "1100091201000000"),
-        (0x181, "1101000000000000"),
-        (0x181, "1102fa0000000000"),
-        (0x181, "1103080100000000"),
-        *((0x181, f"110{index}000000000000") for index in (4, 5, 6)),
-    ]
-
-
 @pytest.mark.parametrize("lost", range(4))
 def test_set_without_one_of_its_frames_is_not_played(bus: Bus, lost: int) -> None:
     """No reply, nothing to commit; the repetition under a newer number is."""
@@ -79,34 +67,6 @@ def test_set_without_one_of_its_frames_is_not_played(bus: Bus, lost: int) -> Non
     assert bus.level(0.1) == 0.0
     bus.put(0.11, *((can_id, f"03{data[2:]}") for can_id, data in SET), COMMIT)
     assert bus.level(0.11) == 0.5
-
-
-def test_refusal_names_request_and_code(bus: Bus) -> None:
-    """Commit before Arm: state; type 29: unknown; Arm without a watchdog: length."""
-    assert bus.put(0.0, (0x201, "0100060234120700")) == [
-        (0x181, "01001f0306000500"),
-        (0x181, "0101ff0000000000"),
-    ]
-    for number, request, code in ((2, "1d00", 1), (3, "0301", 2)):
-        (_, first), _ = bus.put(0.0, (0x201, f"0{number}00{request}34120700"))
-        assert first == f"0{number}001f03{request[:2]}000{code}00"
-
-
-@pytest.mark.parametrize("command", ["0201", "8000", "8200"])
-def test_master_that_takes_it_out_of_operation_stops_it(bus: Bus, command: str) -> None:
-    """Silent within 5 ms, latched."""
-    bus.put(0.0, ARM, *SET, COMMIT)
-    bus.put(0.1, (0x000, command))
-    assert bus.level(0.106) == 0.0
-    assert bus.far[0].state == "QUICK_STOP_ACTIVE"
-
-
-def test_broadcast_of_another_message_is_not_obeyed(bus: Bus) -> None:
-    """An Arm on identifier 200, and a commit there under a number."""
-    bus.put(0.0, (0x200, f"00{ARM[1][2:]}"))
-    assert bus.far[0].state == "SWITCH_ON_DISABLED"
-    bus.put(0.0, ARM, *SET, (0x200, f"03{COMMIT[1][2:]}"))
-    assert bus.level(0.0) == 0.0
 
 
 class Reader(canopen.Network):

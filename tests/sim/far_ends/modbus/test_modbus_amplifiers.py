@@ -2,80 +2,17 @@
 
 import asyncio
 import os
-import struct
 import tty
 
 import minimalmodbus
 import pytest
 from pymodbus.client import AsyncModbusTcpClient
 
-from drivers.protocol.table import MESSAGES, REFUSALS, STATES
+from drivers.protocol.table import STATES
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
-from sim.far_ends.modbus_frames import FRAME_TIMEOUT, rtu_frame
 
 STATUS = 256 * 9 + 128
-
-
-class Port:
-    """Amplifiers of four channels at units 1 and 2 of a line; PDUs in, PDUs out."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-        self.sent: list[bytes] = []
-        self.amplifiers = {unit: Amplifier(str(unit), channels=4) for unit in (1, 2)}
-        self.end = ModbusAmplifiers(self.amplifiers, self.sent.append, is_rtu=True)
-
-    def ask(self, pdu: bytes, unit: int = 1) -> bytes | None:
-        """The response to a PDU, None without one."""
-        self.sent.clear()
-        self.end.receive(rtu_frame(unit, pdu), self.now)
-        self.end.tick(self.now + 2 * FRAME_TIMEOUT)
-        return self.sent[0][1:-2] if self.sent else None
-
-    def write(self, address: int, *registers: int, unit: int = 1) -> bytes | None:
-        """Write registers."""
-        count = len(registers)
-        head = struct.pack(">BHHB", 16, address, count, 2 * count & 0xFF)
-        return self.ask(head + struct.pack(f">{count}H", *registers), unit)
-
-    def read(self, address: int, count: int, unit: int = 1, function: int = 3) -> tuple[int, ...]:
-        """Read registers; the code of an exception alone."""
-        pdu = self.ask(struct.pack(">BHH", function, address, count), unit)
-        assert pdu is not None
-        return tuple(pdu[1:]) if pdu[0] & 0x80 else struct.unpack(f">{count}H", pdu[2:])
-
-
-def test_broadcast_reaches_all_units_and_has_no_response() -> None:
-    """A stop silences both; to arm is for one unit alone; other units are silent."""
-    port = Port()
-    for unit in (1, 2):
-        port.write(0x300, 1, 9, 250, unit=unit)
-    assert port.write(0x800, 2, 5, unit=0) is None
-    port.now = 0.01
-    for unit in (1, 2):
-        assert port.read(STATUS + 2, 1, unit) == (STATES["QUICK_STOP_ACTIVE"],)
-        assert port.read(0x880, 2, unit) == (0, 0)
-        port.write(0xB00, 3, 1, unit=unit)
-    assert port.write(0x300, 4, 8, 250, unit=0) is None
-    assert port.read(STATUS + 2, 1, 2) == (STATES["SWITCH_ON_DISABLED"],)
-    assert port.write(0x900, 5, unit=3) is None
-
-
-def test_address_is_taken_once_its_reply_was_read() -> None:
-    """By the amplifier of this serial number; after a broadcast at once."""
-    port = Port()
-    serial = MESSAGES["SetAddress"].request.pack({"address": 9, "serial_number": "SIM-2"})
-    port.write(0xF00, 1, *serial)
-    assert port.read(0xF80, 2) == (1, REFUSALS["BAD_VALUE"] << 8 | 255)
-    assert port.write(0xF00, 2, *serial, unit=2) is not None
-    assert port.read(STATUS, 1, 2) == (0,)
-    assert port.read(0xF80, 2, 2) == (2, 0)
-    assert port.write(0x900, 3, unit=2) is None
-    assert port.write(0x900, 3, unit=9) is not None
-    again = MESSAGES["SetAddress"].request.pack({"address": 4, "serial_number": "SIM-1"})
-    assert port.write(0xF00, 4, *again, unit=0) is None
-    assert [port.write(0x900, 5, unit=unit) is None for unit in (1, 4, 9)] == [True, False, False]
 
 
 def drive(master: minimalmodbus.Instrument) -> None:

@@ -9,7 +9,10 @@ import typer
 from model.counting import counted
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from controller.effects.layout_check import CheckedEffect
+    from model.arrays import FloatArray
 
 layout_app = typer.Typer(no_args_is_help=True, help="Check a surface layout.")
 
@@ -35,15 +38,17 @@ def check(
         typer.Option("--output", "-o", metavar="PICTURE", help="Picture to write, e.g. P.png."),
     ] = None,
 ) -> None:
-    """Simulate what every region makes felt.
+    """Simulate what every region makes felt, and which can be felt apart at once.
 
-    In time, by touches over the region, alone and with a resting second finger. Exit status 1 if
-    it falls short of the layout.
+    In time, by touches over the region, alone and with a resting second finger; and what two and
+    three fingers at once are promised at their worst places. Exit status 1 if a region falls short
+    of the layout.
     """
     import time
 
     from controller.effects.layout_check import check_layout
     from controller.effects.layout_file import load_layout
+    from controller.effects.layout_together import check_together, matrix_of
     from model.commands.options import progress_bar
     from model.files.replacing import check_picture_name
     from model.table.file import load_table
@@ -55,21 +60,27 @@ def check(
     started = time.perf_counter()
     with progress_bar("effects") as progress:
         checked = check_layout(layout, table, progress=progress)
+    with progress_bar("regions at once") as progress:
+        together = check_together(layout, table, progress=progress)
     elapsed = time.perf_counter() - started
     files = []
     if picture is not None:
         from controller.effects.check_picture import check_figure
         from model.figures.drawing import save_figure
 
-        save_figure(check_figure(layout, table, checked), picture)
+        save_figure(check_figure(layout, table, checked, together), picture)
         files = [str(picture)]
     problems = sum(len(each.problems) for each in checked)
     if as_json:
         regions = [each.as_json() for each in checked]
-        print(json.dumps({"regions": regions, "files": files, "check_time_s": elapsed}))
+        at_once = [each.as_json() for each in together]
+        found = {"regions": regions, "promised_together": at_once}
+        print(json.dumps({**found, "files": files, "check_time_s": elapsed}))
     else:
         for each in checked:
             print("\n".join(_lines(each)))
+        if together:
+            print("\n".join(_matrix(*matrix_of(together))))
         touches = sum(len(each.touches) for each in checked)
         outcome = counted(problems, "problem") if problems else "good"
         print(
@@ -105,6 +116,21 @@ def _lines(each: "CheckedEffect") -> list[str]:
         held = f"  up to {each.held_back_db:.1f} dB weaker"
         lines.append(f"{held} so that it feels half of it at most")
     return [*lines, *(f"  PROBLEM {problem}" for problem in each.problems)]
+
+
+def _matrix(names: "Sequence[str]", promised: "FloatArray") -> list[str]:
+    """Format what fingers in every two regions are promised."""
+    width = max(map(len, names)) + 4
+    lines = [
+        "promised contrast of the worst finger in dB, of effects that last: below the diagonal in "
+        "two regions at once, above it in three, with the worst third",
+        "(from 12 own, from 6 mixed, below shared or held back)",
+        f"{'':{width}}" + "".join(f"{number:6d}" for number in range(1, len(names) + 1)),
+    ]
+    for number, (name, row) in enumerate(zip(names, promised.tolist(), strict=True), start=1):
+        cells = (f"{value:6.1f}" if value == value else f"{'-':>6}" for value in row)
+        lines.append(f"{f'{number:2d} {name}':{width}}" + "".join(cells))
+    return lines
 
 
 def _span(values: list[float]) -> str:

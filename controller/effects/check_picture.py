@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
@@ -13,29 +14,37 @@ from matplotlib.patches import Polygon as Outline
 
 from controller.effects.layout import SurfaceLayout
 from controller.effects.layout_check import CheckedEffect
+from controller.effects.layout_together import Together, matrix_of
 from controller.effects.shapes import Circle, Rectangle, Shape
 from controller.effects.simulated_touch import Position, SimulatedTouch
 from model.arrays import FloatArray
 from model.figures.drawing import draw_eras, label_plate
+from model.table.request import OWN_CONTRAST_DB
 from model.table.table import LocalizationTable
 
 _LEVEL_EDGES = [-12.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 12.0]  # dB
 _MAX_CONTRAST = 30.0  # dB
 _NO_PROMISE = "#bbbbbb"
 _CIRCLE_CORNERS = 60
+_BRIGHT = 0.6  # of a scale of colours, from which black is read better than white
 _SIZES = (90.0, 36.0, 10.0)  # of marks; those of a region's further effects lie within
 
 
 def check_figure(
-    layout: SurfaceLayout, table: LocalizationTable, checked: Sequence[CheckedEffect]
+    layout: SurfaceLayout,
+    table: LocalizationTable,
+    checked: Sequence[CheckedEffect],
+    together: Sequence[Together] = (),
 ) -> Figure:
     """Draw three panels, with one mark for each touch; crosses where nothing is felt.
 
     Level: what is felt less what is promised, the worse of alone and beside a resting finger;
-    frequency; and how far a resting finger feels less on nine of ten plates.
+    frequency; and how far a resting finger feels less on nine of ten plates. Below, fingers in two
+    and in three regions at once, at their worst places, and what the worst one is promised.
     """
     ratio = table.plate.width / table.plate.length
-    figure = Figure(figsize=(18.0, 5.0 * ratio + 1.6), layout="constrained")
+    rows = 2 if together else 1
+    figure = Figure(figsize=(18.0, rows * (5.0 * ratio + 1.6)), layout="constrained")
     panels: list[tuple[str, Callable[[CheckedEffect, SimulatedTouch], float | None]]] = [
         ("felt minus promised / dB", _off_level),
         ("frequency / Hz", _frequency),
@@ -47,8 +56,10 @@ def check_figure(
         (LogNorm(low, max(high, 1.01 * low)), "viridis"),
         (Normalize(0.0, _MAX_CONTRAST), "viridis"),
     ]
-    subplots = figure.subplots(1, len(panels))
-    for axes, (label, value), (norm, colors) in zip(subplots, panels, scales, strict=True):
+    subplots = figure.subplots(rows, len(panels), squeeze=False)
+    if together:
+        _draw_together(figure, [*subplots[1]], layout, table, together)
+    for axes, (label, value), (norm, colors) in zip(subplots[0], panels, scales, strict=True):
         _draw_layout(axes, layout, table)
         _draw_touches(axes, checked, value, norm, colors)
         bar = figure.colorbar(ScalarMappable(norm, colors), ax=axes, label=label, shrink=0.85)
@@ -57,6 +68,35 @@ def check_figure(
             bar.set_ticks(ticks, labels=[str(each) for each in ticks], minor=False)
             bar.minorticks_off()
     return figure
+
+
+def _draw_together(
+    figure: Figure,
+    panels: Sequence[Axes],
+    layout: SurfaceLayout,
+    table: LocalizationTable,
+    together: Sequence[Together],
+) -> None:
+    """Draw fingers at once at their worst places, joined by lines, the worst on top; the matrix."""
+    colors, norm = colormaps["viridis"], Normalize(0.0, 2 * OWN_CONTRAST_DB)
+    for axes, count in zip(panels, (2, 3), strict=False):
+        _draw_layout(axes, layout, table)
+        axes.set_title(f"fingers in {count} regions at once, at their worst places", fontsize=9)
+        shown = [each for each in together if len(each.regions) == count]
+        for each in sorted(shown, key=lambda each: -each.worst_db):
+            x, y = _columns([*each.at, each.at[0]])
+            axes.plot(x, y, "o-", color=colors(norm(each.worst_db)), lw=1.2, ms=4)
+    axes, (names, promised) = panels[-1], matrix_of(together)
+    axes.imshow(promised, cmap=colors, norm=norm)
+    for (row, column), value in np.ndenumerate(promised):
+        if not math.isnan(value):
+            ink = "black" if norm(value) > _BRIGHT else "white"
+            axes.text(column, row, f"{value:.0f}", ha="center", va="center", color=ink, fontsize=8)
+    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.set_title("two at once below the diagonal, three above", fontsize=9)
+    label = "promised contrast of the worst finger / dB"
+    figure.colorbar(ScalarMappable(norm, colors), ax=axes, label=label, shrink=0.85)
 
 
 def _off_level(each: CheckedEffect, touch: SimulatedTouch) -> float | None:

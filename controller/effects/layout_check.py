@@ -25,7 +25,7 @@ LEVEL_TOLERANCE, MARGIN_TOLERANCE = 2.0, 4.0
 _BAND_TOLERANCE = 0.05  # of a frequency; less than anyone tells apart
 _ALIKE = 1.25  # ratio of frequencies that hardly differ in feel
 
-MAX_TOUCHES = 30  # of one region
+MAX_TOUCHES, MAX_PLACES = 30, 210  # of one region, of all
 _MIN_STEP = 0.008  # m; nearer touches hardly differ
 _RESTING_AWAY = 0.06  # m; at least, from a touch to a resting finger
 
@@ -116,9 +116,10 @@ def check_layout(
     simulator = TouchSimulator(table)
     parts = [*_parts(layout)]
     checked = []
+    count = max(1, min(MAX_TOUCHES, MAX_PLACES // max(1, len(parts))))
     for number, (region, on, name) in enumerate(parts):
         progress(number, len(parts))
-        checked.append(_check(layout, region, on, name, table, simulator))
+        checked.append(_check(layout, region, on, name, table, simulator, count))
     progress(len(parts), len(parts))
     return checked
 
@@ -141,11 +142,12 @@ def _check(
     name: str,
     table: LocalizationTable,
     simulator: TouchSimulator,
+    count: int,
 ) -> CheckedEffect:
     effect = layout.effects[name]
     is_own = region is not None and region.has_level
     level = region.level_db_sl if region is not None and is_own else effect.level_db_sl
-    places, area = _raster(layout, region, table.plate)
+    places, area = raster(layout, region, table.plate, count)
     start = region.shape.centre if region is not None else (places[0] if places else (0.0, 0.0))
     sensation = strongest_sensation(effect, region, level_db_sl=level, at=start)
     called = ELSEWHERE if region is None else region.name
@@ -167,10 +169,10 @@ def _check(
     return CheckedEffect(called, name, on, sensation.level_db_sl, tuple(touches), tuple(problems))
 
 
-def _raster(
-    layout: SurfaceLayout, region: Region | None, plate: Plate
+def raster(
+    layout: SurfaceLayout, region: Region | None, plate: Plate, count: int = MAX_TOUCHES
 ) -> tuple[list[Position], float]:
-    """Positions [m] spread evenly over a region, and the area of each [m²].
+    """Return at most so many positions [m], evenly over a region, and the area of each [m²].
 
     Without what later regions cover.
     """
@@ -188,7 +190,7 @@ def _raster(
             for column in range(nx)
         ]
         found = [at for at in places if layout.region_at(*at) is region]
-        if len(found) <= MAX_TOUCHES:
+        if len(found) <= count:
             return found, dx * dy
         step *= 1.1
 

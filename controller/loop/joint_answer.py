@@ -49,7 +49,7 @@ def query_jointly(
     before: what fingers feel now; protected: those that must not notice others' contents. Raises
     InputError for fingers that are too close.
     """
-    requests = _requests(table, targets, capabilities, protected)
+    requests = requests_of(table, targets, capabilities.frequencies, protected)
     fingers = [Finger((each.x, each.y), each.load, _bound(each, protected)) for each in quiet]
     found = _answer(table, requests, fingers, _kept(requests, targets, before))
     places = [each.at for each in requests]
@@ -90,17 +90,17 @@ def query_jointly(
     )
 
 
-def _requests(
+def requests_of(
     table: LocalizationTable,
     targets: Sequence[tuple[Contact, Target]],
-    capabilities: PlaybackCapabilities,
+    playable: tuple[float, float],
     protected: frozenset[ContactKey],
 ) -> list[Request]:
-    """One request per finger."""
+    """Return one request per finger; playable: the lowest and highest frequency [Hz]."""
     return [
         Request(
             (contact.x, contact.y),
-            playable_band(target.band, table.frequencies, capabilities.frequencies),
+            playable_band(target.band, table.frequencies, playable),
             FELT_DB_SL if target.level_db_sl is None else target.level_db_sl,
             target.priority,
             may_share=target.may_share,

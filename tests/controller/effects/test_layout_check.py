@@ -197,6 +197,11 @@ def test_command_prints_one_object_and_writes_a_picture(tmp_path: Path) -> None:
     assert 18 <= key["felt_db_sl"]["min"] <= key["felt_db_sl"]["max"] <= 22
     assert len(strip["problems"]) == 1  # its frequency
     assert 0.0 <= strip["held_back_db"] < 2.0
+    (both,) = found["promised_together"]
+    assert both["regions"] == ["key", "strip"]
+    assert both["promised_worst_db"] <= min(both["promised_contrast_db"])
+    assert {*both["promised_verdicts"]} <= {"own", "mixed", "shared", "held back"}
+    assert len(both["at_m"]) == 2
 
 
 def test_command_ends_with_zero_for_a_good_layout(tmp_path: Path) -> None:
@@ -204,3 +209,6 @@ def test_command_ends_with_zero_for_a_good_layout(tmp_path: Path) -> None:
     status, output = run(tmp_path, LAYOUT.replace("notches}\n", "notches, band: [130, 190]}\n"))
     assert status == 0
     assert "strip, on_move: notches, 20 dB SL" in output
+    (row,) = (line.split() for line in output.splitlines() if line.startswith(" 2 strip"))
+    assert float(row[2]) > 0
+    assert row[3] == "-"

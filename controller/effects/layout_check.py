@@ -25,7 +25,7 @@ LEVEL_TOLERANCE, MARGIN_TOLERANCE = 2.0, 4.0
 _BAND_TOLERANCE = 0.05  # of a frequency; less than anyone tells apart
 _ALIKE = 1.25  # ratio of frequencies that hardly differ in feel
 
-MAX_TOUCHES, MAX_PLACES = 30, 210  # of one region, of all
+MAX_TOUCHES, MAX_POSITIONS = 30, 120  # of one region, of all
 _MIN_STEP = 0.008  # m; nearer touches hardly differ
 _RESTING_AWAY = 0.06  # m; at least, from a touch to a resting finger
 
@@ -116,7 +116,7 @@ def check_layout(
     simulator = TouchSimulator(table)
     parts = [*_parts(layout)]
     checked = []
-    count = max(1, min(MAX_TOUCHES, MAX_PLACES // max(1, len(parts))))
+    count = max(1, min(MAX_TOUCHES, MAX_POSITIONS // max(1, len(parts))))
     for number, (region, on, name) in enumerate(parts):
         progress(number, len(parts))
         checked.append(_check(layout, region, on, name, table, simulator, count))

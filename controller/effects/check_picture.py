@@ -26,6 +26,7 @@ _LEVEL_EDGES = [-12.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 12.0]  # dB
 _MAX_CONTRAST = 30.0  # dB
 _NO_PROMISE = "#bbbbbb"
 _CIRCLE_CORNERS = 60
+_MAX_JOINED = 12  # fingers at once that are drawn joined, of each count
 _BRIGHT = 0.6  # of a scale of colours, from which black is read better than white
 _SIZES = (90.0, 36.0, 10.0)  # of marks; those of a region's further effects lie within
 
@@ -48,7 +49,7 @@ def check_figure(
     panels: list[tuple[str, Callable[[CheckedEffect, SimulatedTouch], float | None]]] = [
         ("felt minus promised / dB", _off_level),
         ("frequency / Hz", _frequency),
-        ("above a resting second finger on nine of ten plates / dB", _contrast),
+        ("above a resting second finger\non nine of ten plates / dB", _contrast),
     ]
     low, high = float(table.frequencies[0]), float(table.frequencies[-1])
     scales: list[tuple[Normalize, str]] = [
@@ -81,9 +82,13 @@ def _draw_together(
     colors, norm = colormaps["viridis"], Normalize(0.0, 2 * OWN_CONTRAST_DB)
     for axes, count in zip(panels, (2, 3), strict=False):
         _draw_layout(axes, layout, table)
-        axes.set_title(f"fingers in {count} regions at once, at their worst places", fontsize=9)
-        shown = [each for each in together if len(each.regions) == count]
-        for each in sorted(shown, key=lambda each: -each.worst_db):
+        of_count = [each for each in together if len(each.regions) == count]
+        shown = sorted(of_count, key=lambda each: each.worst_db)[:_MAX_JOINED]
+        title = f"fingers in {count} regions at once, at their worst places"
+        if len(shown) < len(of_count):
+            title += f": the worst {len(shown)} of {len(of_count)}"
+        axes.set_title(title, fontsize=9)
+        for each in reversed(shown):
             x, y = _columns([*each.at, each.at[0]])
             axes.plot(x, y, "o-", color=colors(norm(each.worst_db)), lw=1.2, ms=4)
     axes, (names, promised) = panels[-1], matrix_of(together)

@@ -12,10 +12,14 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 import controller.demo.far_end
 import controller.demo.run
 import controller.demo.scene
+import live_demonstration
+from controller.api.client import Client
+from controller.cli.demo import app
 from controller.cli.main import run
 from controller.demo.recorder import TouchRecorder
 from controller.demo.scene import Scene, layout_of_people
@@ -23,6 +27,7 @@ from controller.sources.capture import RecordedDatagram, read_capture, write_cap
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 from daemon_bench import until
+from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from patient_daemon import wait_long
 
@@ -229,3 +234,37 @@ def far_end_of(pid):
             return int(children[0])
         time.sleep(0.05)
     raise AssertionError("the demonstration started no process")
+
+
+def test_page_and_daemon(tmp_path: Path) -> None:
+    """It says where its page is, its daemon is disarmed and answers; Ctrl-C leaves nothing."""
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
+    socket = tmp_path / "era-haptics" / "daemon.sock"
+    with subprocess.Popen(
+        [sys.executable, live_demonstration.__file__],
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("dashboard: http://127.0.0.1:")
+            with Client.connect(socket, timeout=60) as daemon:
+                daemon.subscribe("state")
+                while (state := daemon.status().state) != "READY_TO_SWITCH_ON":
+                    assert state != "OPERATION_ENABLED"
+                    next(daemon.events(timeout=60))
+                assert daemon.hello("test").rig.simulated
+                assert daemon.status().watchdog_s == 2.0
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 0
+        finally:
+            process.kill()
+    assert not socket.exists()
+
+
+def test_touches_come_from_the_page() -> None:
+    """A recording, or JSON of its rows, is refused beside it."""
+    for option in (["--touches", "x.tuio"], ["--json"]):
+        done = CliRunner().invoke(app, ["demo", "--dashboard", *option])
+        assert isinstance(done.exception, InputError)

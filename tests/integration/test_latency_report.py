@@ -1,5 +1,6 @@
-"""Repeated attempts and the report of the latency benchmark on a disturbed machine."""
+"""Repeated attempts and the reports of benchmarks on a disturbed machine."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,6 +12,10 @@ from benchmarks.latency.match import Command, Matched, match, read_commands
 from benchmarks.latency.programs import Ended
 from benchmarks.latency.report import cases, flooded_lines, report
 from benchmarks.latency.run import Case, Disturbed, Failed, Found, attempt
+from benchmarks.plate.measure import Measured
+from benchmarks.plate.problem import DAMPING, PAPER, STIFFNESS, STROKE, accelerations
+from benchmarks.plate.programs import Setting, installed_peers, settings
+from benchmarks.plate.report import best
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import LatencySummary
 from drivers.codec.serial_line.frame import pack_words
@@ -166,3 +171,35 @@ def test_set_in_parts_plays_once_it_is_whole() -> None:
     lines = [line(1, "a", "Set", second), line(2, "a", "Set", first)]
     (read,) = read_commands(lines, ("a",))
     assert (read.time, read.sequence, len(read.commands)) == (pytest.approx(0.002), 2, 32)
+
+
+def test_a_peer_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing fails; a sentence on each names the package."""
+    for package, module in (("ngsolve", "ngsolve_plate"), ("skfem", "scikit_fem_plate")):
+        monkeypatch.setitem(sys.modules, package, None)
+        monkeypatch.delitem(sys.modules, f"benchmarks.plate.peers.{module}", raising=False)
+    found, missing = installed_peers()
+    assert found == []
+    assert [sentence.split()[0] for sentence in missing] == ["ngsolve", "skfem"]
+
+
+def test_a_rigid_mass_on_one_era_is_an_oscillator() -> None:
+    """x = (k + i omega c) s / (k + i omega c - m omega²), by hand."""
+    omega, mass = PAPER.omega, 0.28
+    receptance = (-1 / (mass * omega**2))[:, None, None].astype(complex)
+    spring = STIFFNESS + 1j * omega * DAMPING
+    expected = -(omega**2) * spring * STROKE / (spring - mass * omega**2)
+    found = accelerations(PAPER, receptance, receptance)
+    np.testing.assert_allclose(found[:, 0, 0], expected, rtol=1e-12)
+
+
+def test_the_quickest_setting_that_reaches_an_error_is_shown() -> None:
+    """A quicker one that is less accurate, and an accurate one that is slower, are not."""
+    setting: Setting = settings(PAPER, [])[0]
+    found = [
+        Measured(setting, error, error, [seconds], [seconds])
+        for error, seconds in ((0.02, 1.0), (0.009, 2.0), (0.004, 3.0))
+    ]
+    chosen = best(found, 1.0, lambda m: m.corners, lambda m: m.nothing)
+    assert chosen is found[1]
+    assert best(found, 0.1, lambda m: m.corners, lambda m: m.nothing) is None

@@ -33,10 +33,8 @@ from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.wires import Wire
 from sim.witness.witness import OperatorCommand
 from small_table import small_table
-from soak_checks import Checks
-from soak_contacts import SourceContacts
+from soak_judges import Checks, SoakWitness, SourceContacts
 from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence
-from soak_witness import SoakWitness
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual
 
 _RELEASE = 0.020  # s; from the last finger up to zero

@@ -15,9 +15,11 @@ from typer.testing import CliRunner
 from controller.api.client_protocol import Notification
 from controller.api.jsonrpc import RpcError
 from controller.cli.daemon import app, show_event, show_status, status, touch
+from controller.cli.main import run
 from controller.daemon.run import run_daemon
 from daemon_bench import ready_daemon, until_state, write_daemon
 from drivers.errors import CommandError
+from gateway_bench import UNCONFIRMED, ScriptedDaemon
 from model.errors import InputError
 from sim.faults.fault_window import FaultWindow
 
@@ -141,3 +143,19 @@ def test_daemon_imports_no_package_of_other_commands() -> None:
     ).stdout.split()
     assert "scipy.linalg" in modules
     assert not set(modules) & {"scipy.optimize", "scipy.ndimage", "matplotlib", "starlette"}
+
+
+def test_stop_exits_with_3_and_names_amplifiers_unless_all_are_silent(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Success only if every amplifier is confirmed silent, or else the unconfirmed ones."""
+    modules = ["controller.cli.daemon"]
+    with ScriptedDaemon(tmp_path) as daemon:
+        command = ["stop", "--socket", str(daemon.socket)]
+        assert run(command, modules) == 0
+        daemon.silence = UNCONFIRMED
+        assert run(command, modules) == 3
+        errors = capsys.readouterr().err
+        assert "side" in errors
+        assert "main" not in errors
+    assert run(command, modules) == 3

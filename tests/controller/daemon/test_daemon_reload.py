@@ -1,12 +1,68 @@
-"""What a reload applies and refuses."""
+"""What a reload applies and refuses, read in another process, and what it costs the loop."""
 
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from controller.daemon.config import DaemonConfig, load_daemon_config
+from controller.daemon.config_reader import read_in_child
 from controller.daemon.reload import changed_keys, reload_problem
+from daemon_bench import ENABLED, ready_daemon
+from model.errors import InputError
 from model.rig.file import example_rig_path
+
+MAX_CALLS = 2000
+"""Most calls of a callback that handles input of clients or files: about 1 ms."""
+
+
+@dataclass
+class CallbackWork:
+    """The callbacks so far: how many functions each called, in Python and in C, and its name."""
+
+    calls: list[tuple[int, str]] = field(default_factory=list)
+
+    def assert_short(self, limit: int = MAX_CALLS) -> None:
+        """Fail if any callback called more functions than a limit."""
+        long = [(calls, what) for calls, what in self.calls if calls > limit]
+        assert not long, "\n".join(f"{calls} calls: {what}" for calls, what in long)
+
+
+@contextmanager
+def counted_callbacks() -> Iterator[CallbackWork]:
+    """Count the calls of all callbacks of event loops in this thread while the context lasts.
+
+    Unlike a time they are the same on every machine.
+    """
+    work = CallbackWork()
+    run: Callable[[asyncio.Handle], Any] = asyncio.Handle._run
+
+    def counted(handle: asyncio.Handle) -> None:
+        calls = 0
+
+        def count(frame: object, event: str, argument: object) -> None:
+            nonlocal calls
+            calls += event in ("call", "c_call")
+
+        sys.setprofile(count)
+        try:
+            run(handle)
+        finally:
+            sys.setprofile(None)
+        work.calls.append((calls, repr(handle)[:300]))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(asyncio.Handle, "_run", counted)
+        yield work
+
 
 DEFAULTS = {
     "rig": "rig.yaml",
@@ -88,3 +144,77 @@ def test_reload_raises_no_level_while_armed(folder: Path, change: dict[str, str]
     old, new = config(folder), config(folder, **change)
     assert problem(old, new, is_armed=True) is not None
     assert problem(old, new, is_armed=False) is None
+
+
+REGIONS = 64  # as many as a layout may have
+
+
+def write_layout(path: Path) -> None:
+    """A layout of many regions, each with an effect of its own."""
+    lines = ["effects:"]
+    lines += [f"  e{each}: {{kind: buzz, level: {10 + each % 10}}}" for each in range(REGIONS)]
+    lines += ["regions:"]
+    for each in range(REGIONS):
+        x, y = 0.01 * (each % 20), 0.01 * (each // 20)
+        corners = f"start: [{x}, {y}], end: [{x + 0.009:g}, {y + 0.009:g}]"
+        lines.append(f"  r{each}: {{rectangle: {{{corners}}}, on_press: e{each}}}")
+    path.write_text("\n".join([*lines, "elsewhere: null", ""]), encoding="utf-8")
+
+
+async def test_reload_costs_the_loop_nothing(tmp_path: Path) -> None:
+    """A large layout, added while armed and subscribed."""
+    write_layout(tmp_path / "large.yaml")
+    async with ready_daemon(tmp_path, "level_db_sl: 20\n") as (bench, era):
+        await era.subscribe("layout", "log")
+        await era.arm("me", lease_s=60)
+        with (tmp_path / "daemon.yaml").open("a", encoding="utf-8") as file:
+            file.write("layout: large.yaml\n")
+        with counted_callbacks() as work:
+            await bench.daemon.reload()
+        assert bench.daemon._config.layout is not None
+        assert len(work.calls) > 10
+        work.assert_short()
+        assert (await era.status()).state == ENABLED
+
+
+async def test_reload_reads_its_files_in_another_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No thread of the daemon holds the interpreter's lock for it; problems come back as text."""
+
+    def fail(*arguments: object, **options: object) -> None:
+        raise AssertionError("read in the daemon's process")
+
+    write_layout(tmp_path / "large.yaml")
+    async with ready_daemon(tmp_path) as (bench, _):
+        for name in ("controller.daemon.config", "controller.effects.layout_file"):
+            monkeypatch.setattr(f"{name}.read_document", fail)
+        with (tmp_path / "daemon.yaml").open("a", encoding="utf-8") as file:
+            file.write("layout: large.yaml\n")
+        await bench.daemon.reload()
+        layout = bench.daemon._config.layout
+        assert layout is not None
+        assert len(layout.regions) == REGIONS
+    with pytest.raises(InputError) as raised:
+        read_in_child(tmp_path / "missing.yaml")
+    assert "missing.yaml" in str(raised.value)
+
+
+def test_reading_a_configuration_in_a_child_is_bounded_in_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An error of the system, as if the child had failed; a child cannot start in no time."""
+    monkeypatch.setattr("controller.daemon.config_reader._TIMEOUT", 0.0)
+    with pytest.raises(OSError, match="took longer"):
+        read_in_child(tmp_path / "daemon.yaml")
+
+
+def test_child_ends_by_none_of_the_daemons_own_signals() -> None:
+    """A signal to the whole service reopens the log or does nothing; SIGTERM ends a child."""
+    command = [sys.executable, "-P", "-u", "-m", "controller.daemon.child_main", str(os.getpid())]
+    with subprocess.Popen([*command, "http.server", "0"], stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        child.stdout.readline()  # it serves
+        for number in (signal.SIGHUP, signal.SIGUSR1, signal.SIGTERM):
+            child.send_signal(number)
+        assert child.wait(20) == -signal.SIGTERM

@@ -8,6 +8,7 @@ from itertools import product
 
 import pytest
 
+from controller.daemon.deferred_calls import DeferredCalls
 from controller.daemon.states import (
     TRANSITIONS,
     Action,
@@ -22,6 +23,7 @@ from controller.loop.observer import Observer
 from controller_bench import BenchLines, FarEnd, make_bench
 from drivers.errors import DriverError
 from newest_contact import BuzzNewestContact
+from stop_path import stop_path
 from virtual_loop import in_virtual_time
 
 READY, ENABLED = DaemonState.READY_TO_SWITCH_ON, DaemonState.OPERATION_ENABLED
@@ -213,3 +215,27 @@ async def test_failing_step_ends_in_a_stop(
             assert made.far_end.requests("Stop")
             assert made.far_end.state != "OPERATION_ENABLED"
         await made.arm_again()
+
+
+@in_virtual_time
+async def test_flush_makes_each_call_once() -> None:
+    """In order, with those that are added meanwhile; nothing is left for the event loop."""
+    problems: list[object] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: problems.append(context))
+    calls, made = DeferredCalls(), list[int]()
+    calls.add(lambda: made.append(1))
+    calls.add(lambda: calls.add(lambda: made.append(3)))
+    calls.add(lambda: made.append(2))
+    calls.flush()
+    await asyncio.sleep(1.0)
+    assert made == [1, 2, 3]
+    assert not problems
+
+
+def test_stop_takes_one_turn_and_few_functions() -> None:
+    """Nothing waits on its way, and what it passes through can be read in a few minutes."""
+    path, calls = stop_path()
+    assert path[0].endswith("Connection.buffer_updated")
+    assert path[-1].endswith("Line._send")
+    assert len(path) < 20, path
+    assert calls < 100

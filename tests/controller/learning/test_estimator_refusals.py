@@ -1,15 +1,24 @@
-"""What an estimator does with patterns that it cannot use and files of other plates."""
+"""What estimator and daemon do with patterns, files, answers and messages they cannot use."""
 
+import pickle
+from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 
+from controller.learning.answers_in_use import AnswersInUse
 from controller.learning.estimator import Estimator, replies
-from controller.learning.messages import Estimate, Note, Start
+from controller.learning.messages import HEAD, Answers, Estimate, Note, Start, packed, unpacked
+from controller.loop.loop import Controller
+from drivers.contents import Layer, Tone
+from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.learned_table import LearnedTable
 from model.identification.settled import SettledPattern
+from model.table.table import LocalizationTable
+from model.table.timing import Timing
 from paper_plate import make_paper_rig
 from small_table import small_table
 
@@ -77,3 +86,42 @@ def test_files_of_writers_that_were_killed_are_removed(tmp_path: Path) -> None:
     estimator(tmp_path / "learned.npz")
     assert not left.exists()
     assert other.exists()
+
+
+class Taking:
+    """A controller that keeps what it answers by."""
+
+    def __init__(self) -> None:
+        self.taken: list[LocalizationTable] = []
+
+    def replace_answers(self, table: LocalizationTable, timing: Timing | None) -> None:
+        """Note a table."""
+        self.taken.append(table)
+
+
+def test_answers_of_another_table_are_refused() -> None:
+    """By its fingerprint, and nothing is replaced; those of the own one are, and can be reset."""
+    base, controller = small_table(), Taking()
+    in_use = AnswersInUse(cast(Controller, controller), base, None)
+    other = replace(base, masses=(), eras=base.eras[::-1])
+    with pytest.raises(InputError, match="table"):
+        in_use.replace(Answers(other.fingerprint, other, is_complete=True))
+    assert controller.taken == []
+    own = replace(base)
+    in_use.replace(Answers(base.fingerprint, own, is_complete=False))
+    in_use.reset()
+    assert controller.taken == [own, base]
+
+
+def test_message_has_its_length_before_it() -> None:
+    """Eight bytes, the largest first; then what it is made of again."""
+    message = packed(Note("the plate settles", is_final=True))
+    assert int.from_bytes(message[:HEAD], "big") == len(message) - HEAD
+    assert unpacked(message[HEAD:]) == Note("the plate settles", is_final=True)
+
+
+def test_no_command_comes_by_a_message() -> None:
+    """What an amplifier could play is refused, wherever it stands in it."""
+    layer = Layer(0, (Tone(0, 110.0, 1.0),))
+    with pytest.raises(pickle.UnpicklingError, match="drivers"):
+        unpacked(pickle.dumps(Note([layer])))  # type: ignore[arg-type]

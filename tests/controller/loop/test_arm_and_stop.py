@@ -1,4 +1,4 @@
-"""Arming, stopping, closing, and what several amplifiers do together."""
+"""Opening, arming, stopping, closing, losing, and what several amplifiers do together."""
 
 import asyncio
 import logging
@@ -13,6 +13,7 @@ from controller_bench import (
     OTHER,
     STOPPED,
     BenchLines,
+    FarEnd,
     make_bench,
     running,
 )
@@ -20,7 +21,9 @@ from drivers.errors import CommandError, CommandRefused
 from drivers.host.group import GroupState
 from drivers.protocol.records import Refusal, Values
 from model.errors import InputError
+from model.table.timing import Timing
 from newest_contact import BuzzNewestContact
+from small_table import small_problem, small_table
 from virtual_loop import in_virtual_time
 
 
@@ -291,3 +294,37 @@ async def test_controller_refuses_amplifiers_that_do_not_fit_the_rig() -> None:
     with pytest.raises(InputError, match=r"ERA NE .*main, got 1; .*rig file"):
         await bench.controller.open()
     assert not bench.far_end.is_open
+
+
+@in_virtual_time
+async def test_open_refuses_a_table_without_playable_frequencies() -> None:
+    """With the bands of amplifier and table; nothing stays open."""
+    link = FarEnd(channels=4)
+    link.amplifier.capabilities["frequency_min"] = 8000  # 400 Hz
+    link.amplifier.capabilities["frequency_max"] = 20_000
+    table = small_table()
+    controller = Controller(
+        small_problem().rig,
+        table,
+        lines=lambda: BenchLines({"main": link}),
+        intent_source=BuzzNewestContact(),
+        timing=Timing(table),
+    )
+    with pytest.raises(InputError, match=r"400 to 500 Hz.*60 to 250 Hz"):
+        await controller.open()
+    assert controller.group.state is GroupState.CLOSED
+    assert not link.is_open
+
+
+@in_virtual_time
+async def test_mute_amplifier_is_lost_though_the_finger_was_lifted() -> None:
+    """Silence that it does not hear, repeated, does not put off when it must have fallen silent."""
+    local = [FarEnd(baud=921_600), FarEnd(baud=921_600)]
+    async with running("a", "b", far_ends=local) as bench:
+        await bench.hold(FINGER, seconds=0.2)
+        bench.far_ends[1].is_deaf = True
+        bench.touch()
+        await asyncio.sleep(0.6)
+        assert bench.reports.lost
+        assert bench.controller.group.state is GroupState.LOST
+        assert not any(bench.far_ends[0].levels)

@@ -289,3 +289,11 @@ def test_a_pulse_is_held_back_where_others_use_the_whole_stroke(table: Table) ->
     assert [each.targets[0][0].key.id for each in selection.contents] == [1]
     (held,) = selection.not_served
     assert held.held_back == "the contents of other fingers use the whole stroke; lift a finger"
+
+
+@pytest.mark.parametrize(
+    ("until", "due"), [(None, None), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
+)
+def test_due_of_an_expired_intent_is_later(until: float | None, due: float | None) -> None:
+    """So that it does not keep the loop busy."""
+    assert HapticIntent((), until=until).due(5.0) == due

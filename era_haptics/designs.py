@@ -46,6 +46,7 @@ def design(
     layouts: str | PathLike[str] | None = None,
     where: str | PathLike[str] = EDGE,
     contacts: str | PathLike[str] | None = None,
+    contents: int = 1,
     apart: float = DEFAULT_APART,
     lowest: float = DEFAULT_LOWEST,
     finalists: int = DEFAULT_FINALISTS,
@@ -56,14 +57,20 @@ def design(
     """Find or compare layouts of ERAs, the best robust felt contrast first, as `era design` does.
 
     eras: how many, as many as the rig's for None; layouts: None to search, `random:N` or a file to
-    rank layouts; where: `edge`, `anywhere` or a file; contacts: a file, anywhere for None; apart
-    [m]: least distance of two ERAs; lowest [Hz]: least rigid-body frequency of a supported plate;
-    finalists: given layouts that are judged by their tables' answers; starts: of a search; workers:
-    processes. Raises InputError.
+    rank layouts; where: `edge`, `anywhere` or a file; contacts: a file, anywhere for None;
+    contents: at the same time, a finger for each; apart [m]: least distance of two ERAs; lowest
+    [Hz]: least rigid-body frequency of a supported plate; finalists: given layouts that
+    are judged by their tables' answers; starts: of a search; workers: processes. Raises InputError.
     """
     expect_rig(rig)
     count = len(rig.eras) if eras is None else eras
-    counts = {"eras": count, "finalists": finalists, "starts": starts, "workers": workers}
+    counts = {
+        "eras": count,
+        "contents": contents,
+        "finalists": finalists,
+        "starts": starts,
+        "workers": workers,
+    }
     for name, value in {**counts, "seed": seed}.items():
         if not is_whole(value):
             raise InputError(f"{name} must be a whole number, got {shown(value)}")
@@ -73,7 +80,7 @@ def design(
     expect_at_least(lowest, MIN_RIGID_BODY_FREQUENCY, what="lowest")
     path = None if contacts is None else expect_path(contacts, what="contacts")
     area = area_of(str(expect_path(where, what="where")), rig.plate)
-    rule = contact_rule(path, rig.plate)
+    rule = contact_rule(path, rig.plate, contents)
     problem = DesignProblem(
         rig, count, area, rule, apart=float(apart), lowest=float(lowest), seed=seed
     )

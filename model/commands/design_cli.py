@@ -65,6 +65,9 @@ def design(
             help="Where ERAs may stand: a picture of the plate, white there, or polygons in YAML.",
         ),
     ] = "edge",
+    contents: Annotated[
+        int, typer.Option(min=1, help="Contents at the same time, a finger for each.")
+    ] = 1,
     contacts: ContactsOption = None,
     apart: Annotated[
         str, typer.Option(metavar="LENGTH", help="Least distance of two ERAs.")
@@ -137,7 +140,7 @@ def design(
     if not 0 < distance < max(rig.plate.length, rig.plate.width):
         raise InputError(f"--apart must be above 0 and below the plate's length, got {apart}")
     started = time.perf_counter()
-    area, contacts_rule = area_of(where, rig.plate), contact_rule(contacts, rig.plate)
+    area, contacts_rule = area_of(where, rig.plate), contact_rule(contacts, rig.plate, contents)
     problems = [
         DesignProblem(rig, count, area, contacts_rule, kept, distance, lowest, seed, stiffness=each)
         for count in counts
@@ -263,6 +266,8 @@ def _show(result: dict[str, Any], *, own_count: int) -> None:
             f"{name:8s} {x:7.1f}  {y:7.1f}   {era['sensitivity_db_per_mm']:9.3f}   "
             f"{era['static_load_n']:8.2f}"
         )
+    if result["contents"] > 1:
+        print(f"{result['contents']} contents at the same time, contrast of the worst finger:")
     for title, key in (("this layout", "contrast_db"), (own, "own_contrast_db")):
         if result[key] is not None:
             medians = " / ".join(

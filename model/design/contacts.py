@@ -1,4 +1,4 @@
-"""Contact sets for which a plate is designed: a target and some quiet fingers each."""
+"""Contact sets for which a plate is designed: fingers with contents, and some quiet ones."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,8 +24,14 @@ from model.structure.plate import Plate
 DEFAULT_APART = 0.05
 """Distance [m] between the fingers of a set."""
 
-DEFAULT_QUIET = (1, 3)
-"""Fewest and most quiet fingers."""
+DEFAULT_QUIET = {True: (1, 3), False: (0, 1)}
+"""Fewest and most quiet fingers beside one content, and beside several."""
+
+MAX_CONTENTS = 6
+"""Contents at the same time; more have no contrast left on any plate."""
+
+MIN_FINGERS = 2
+"""Fingers of a set."""
 
 _ROUNDING = 1e-9  # m
 _MAX_TRIES = 20_000
@@ -40,7 +46,8 @@ class ContactRule:
     """Distribution of contact sets: anywhere, in regions, or those given.
 
     quiet: fewest and most quiet fingers; apart [m]: between fingers; draw: of places; given: sets
-    of contacts (fingers, 2) [m], target first, which replace all that; text: identifies the rule.
+    of contacts (fingers, 2) [m], which replace all that; text: identifies the rule; contents: how
+    many fingers of a set, its first ones, feel a content of their own.
     """
 
     quiet: tuple[int, int]
@@ -48,6 +55,7 @@ class ContactRule:
     draw: Draw
     given: tuple[FloatArray, ...] = ()
     text: str = "anywhere"
+    contents: int = 1
 
     def sets(self, count: int, *, seed: int) -> list[FloatArray]:
         """Draw about a count of sets, as many for each number of quiet fingers.
@@ -60,10 +68,10 @@ class ContactRule:
             return [self.given[number] for number in order[:count]]
         low, high = self.quiet
         kinds = high - low + 1
-        return [self._one(rng, 1 + low + number % kinds) for number in range(count)]
+        return [self._one(rng, self.contents + low + number % kinds) for number in range(count)]
 
     def pooled_sets(self, fingers: int, *, seed: int) -> list[FloatArray]:
-        """Sets of a number of fingers only, spread out, each the target once for each number.
+        """Sets of a number of fingers only, far apart, each the first once for each number.
 
         For what is computed once for each finger. Sets given are taken as they are, up to three for
         each finger.
@@ -78,21 +86,21 @@ class ContactRule:
             gaps = np.linalg.norm(drawn[:, None] - pool, axis=-1).min(axis=1)
             pool = np.vstack([pool, drawn[best_of(gaps)]])
         return [
-            pool[self._others(rng, pool, target, quiet)]
+            pool[self._others(rng, pool, first, self.contents - 1 + quiet)]
             for quiet in range(low, high + 1)
-            for target in range(fingers)
+            for first in range(fingers)
         ]
 
     def _others(
-        self, rng: np.random.Generator, pool: FloatArray, target: int, quiet: int
+        self, rng: np.random.Generator, pool: FloatArray, first: int, count: int
     ) -> IntArray:
-        """Numbers of a target and quiet fingers of a pool that are far enough apart."""
+        """Numbers of a finger and a count of others of a pool that are far enough apart."""
         for _ in range(_MAX_TRIES):
-            others = rng.choice(len(pool), quiet, replace=False)
-            numbers = np.concatenate([[target], others])
+            others = rng.choice(len(pool), count, replace=False)
+            numbers = np.concatenate([[first], others])
             if self._is_apart(pool[numbers]):
                 return np.asarray(numbers)
-        raise self._no_room(quiet + 1)
+        raise self._no_room(count + 1)
 
     def _one(self, rng: np.random.Generator, fingers: int) -> FloatArray:
         for _ in range(_MAX_TRIES):
@@ -113,19 +121,23 @@ class ContactRule:
         )
 
 
-def anywhere(plate: Plate) -> ContactRule:
-    """One to three quiet fingers and the target anywhere on a plate."""
+def anywhere(plate: Plate, contents: int = 1) -> ContactRule:
+    """Fingers with contents and DEFAULT_QUIET ones anywhere on a plate."""
     whole = _Shape(np.zeros(2), np.array([plate.length, plate.width]), everywhere)
-    return ContactRule(DEFAULT_QUIET, DEFAULT_APART, partial(_drawn, (whole,), plate))
+    draw = partial(_drawn, (whole,), plate)
+    return ContactRule(DEFAULT_QUIET[contents == 1], DEFAULT_APART, draw, contents=contents)
 
 
-def contact_rule(path: Path | None, plate: Plate) -> ContactRule:
+def contact_rule(path: Path | None, plate: Plate, contents: int = 1) -> ContactRule:
     """The rule of a file, regions as those of a surface layout, or sets; `anywhere` for None.
 
-    Raises ConfigError for what is wrong in it.
+    contents: at the same time, each for a finger of its own. Raises ConfigError for what is wrong
+    in the file.
     """
+    if not 1 <= contents <= MAX_CONTENTS:
+        raise InputError(f"contents must be 1 to {MAX_CONTENTS}, got {contents}")
     if path is None:
-        return anywhere(plate)
+        return anywhere(plate, contents)
     document = read_document(path, if_empty="it must have regions or sets")
     validation = Validation(document, _ContactsSection)
     for name in validation.mapping(("regions",)):
@@ -140,8 +152,14 @@ def contact_rule(path: Path | None, plate: Plate) -> ContactRule:
                 f"({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) m",
             )
     section = validation.finish()
-    given = tuple(np.array([each.target, *each.quiet]) for each in section.sets)
+    given = tuple(np.array([*each.first, *each.quiet]) for each in section.sets)
     problems = [
+        f"sets[{number}] must have {contents} fingers with contents, target or own, and another "
+        f"finger, got {len(each.first)} and {len(each.quiet)} quiet ones"
+        for number, each in enumerate(section.sets)
+        if len(each.first) != contents or len(each.first) + len(each.quiet) < MIN_FINGERS
+    ]
+    problems += [
         f"sets[{number}] must be on the plate, from (0, 0) to ({plate.length:g}, {plate.width:g}) "
         f"m, got ({x:g}, {y:g}) m"
         for number, contacts in enumerate(given)
@@ -150,16 +168,18 @@ def contact_rule(path: Path | None, plate: Plate) -> ContactRule:
     ]
     if bool(section.sets) == bool(section.regions):
         problems.append(f"must have regions or sets, got {'both' if section.sets else 'neither'}")
-    low, high = section.quiet
-    if not 1 <= low <= high < MAX_CONTACTS:
+    low, high = section.quiet or DEFAULT_QUIET[contents == 1]
+    least = max(0, MIN_FINGERS - contents)
+    if not least <= low <= high <= MAX_CONTACTS - contents:
         problems.append(
-            f"quiet must be two numbers from 1 to {MAX_CONTACTS - 1}, ascending, got {low}, {high}"
+            f"quiet must be two numbers from {least} to {MAX_CONTACTS - contents}, ascending, got "
+            f"{low}, {high}"
         )
     if problems:
         raise InputError(f"{document.source}: {problems[0]}")
     shapes = [_shape(region) for region in section.regions.values()]
     draw = partial(_drawn, shapes, plate)
-    return ContactRule((low, high), section.apart, draw, given, text=document.text)
+    return ContactRule((low, high), section.apart, draw, given, document.text, contents)
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,14 +242,23 @@ class _RegionSection(Section):
 
 
 class _SetSection(Section):
-    target: PointSection
-    quiet: Annotated[list[PointSection], Field(min_length=1, max_length=MAX_CONTACTS - 1)]
+    target: PointSection | None = None
+    own: Annotated[list[PointSection], Field(max_length=MAX_CONTENTS, default_factory=list)]
+    quiet: Annotated[
+        list[PointSection],
+        Field(max_length=MAX_CONTACTS - MAX_CONTENTS, default_factory=list),
+    ]
+
+    @property
+    def first(self) -> list[PointSection]:
+        """Fingers with contents."""
+        return self.own if self.target is None else [self.target, *self.own]
 
 
 class _ContactsSection(Section):
     """Contacts of a design. Effects and the like of a surface layout are passed over."""
 
-    quiet: Annotated[tuple[int, int], Strict(strict=False)] = DEFAULT_QUIET
+    quiet: Annotated[tuple[int, int], Strict(strict=False)] | None = None
     apart: Annotated[float, Quantity(LENGTH, at_least=0.026, at_most=10)] = DEFAULT_APART
     regions: Annotated[
         dict[Identifier, _RegionSection], Field(min_length=1, max_length=256, default_factory=dict)

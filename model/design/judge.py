@@ -1,16 +1,17 @@
 """What a layout gives on fresh contact sets: the answers of its localization table."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from model.arrays import FloatArray, IntArray
 from model.finger.perception import STRONG_DB_SL
 from model.rig.rig import Rig
+from model.table.answer import answer
 from model.table.build import build_table
-from model.table.pattern_choice import UnreachableLevel
-from model.table.question import Question
+from model.table.request import Finger, Request
 from model.table.table import LocalizationTable
 
 _LEVEL_MARGIN = 0.1  # dB
@@ -18,9 +19,9 @@ _LEVEL_MARGIN = 0.1  # dB
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """Answers at contact sets (s,): robust felt contrast [dB], robust level [dB SL] at the target.
+    """Answers at contact sets (s,): robust felt contrast [dB] of the worst finger.
 
-    quiet (s,): numbers of quiet fingers.
+    quiet (s,): numbers of quiet fingers; level_db_sl (s,): robust level of the weakest content.
     """
 
     quiet: IntArray
@@ -48,30 +49,27 @@ class Judged:
 
     @property
     def reached_share(self) -> float:
-        """Share of the sets whose target nine of ten plates give the wanted level."""
+        """Share of the sets whose contents have the level on nine of ten plates."""
         return float((self.level_db_sl >= STRONG_DB_SL - _LEVEL_MARGIN).mean())
 
 
-def judge(rig: Rig, sets: Sequence[FloatArray]) -> Judged:
-    """Query a rig's table in mode phased at contact sets (fingers, 2) [m], target first.
+def judge(rig: Rig, sets: Sequence[FloatArray], *, contents: int = 1) -> Judged:
+    """What a rig's table answers at contact sets (fingers, 2) [m], fingers with contents first.
 
-    For the level STRONG_DB_SL, where it cannot be reached for the highest found. Raises InputError
-    for ERAs that do not support the plate.
+    For contents of STRONG_DB_SL, where it cannot be reached for the highest found, none of which is
+    shared or held back. Raises InputError for ERAs that do not support the plate.
     """
     table = build_table(rig, drive_mode="phased")
-    rows = [_answer(table, contacts) for contacts in sets]
-    quiet = np.array([len(contacts) - 1 for contacts in sets])
-    contrast, level = np.array(rows).T
+    contrast, level = np.array([_answer(table, contacts, contents) for contacts in sets]).T
+    quiet = np.array([len(contacts) - contents for contacts in sets])
     return Judged(quiet, contrast, level)
 
 
-def _answer(table: LocalizationTable, contacts: FloatArray) -> tuple[float, float]:
-    target, *quiet = [(float(x), float(y)) for x, y in contacts]
-    question = Question((target,), tuple(quiet))
-    try:
-        pattern = table.query(question)
-    except UnreachableLevel as error:
-        pattern = table.query(replace(question, level_db_sl=error.reachable_db_sl))
-    contrast = pattern.robust_felt_contrast_db
-    assert contrast is not None  # noqa: S101  a set has a quiet finger
-    return contrast, pattern.robust_level_db_sl or pattern.level_db_sl
+def _answer(table: LocalizationTable, contacts: FloatArray, contents: int) -> tuple[float, float]:
+    places = [(float(x), float(y)) for x, y in contacts]
+    requests = [Request(at) for at in places[:contents]]
+    fingers = [Finger(at) for at in places[contents:]]
+    found = answer(table, requests, fingers, min_contrast_db=-math.inf)
+    assert found.promised_worst_db is not None  # noqa: S101  a set has two fingers
+    level = min(layer.promised_level_db_sl for layer in found.layers)
+    return found.promised_worst_db, level

@@ -136,6 +136,7 @@ def summary(design: Design) -> dict[str, Any]:
             for rank, each in enumerate(design.layouts[:MAX_SHOWN], start=1)
         ],
         "lowest_rigid_body_hz": lowest,
+        "contents": problem.contacts.contents,
         "sets": len(design.sets),
         "resumed": design.resumed_count,
     }

@@ -8,20 +8,21 @@ from model.figures.drawing import COLORS, draw_eras, label_plate
 
 
 def contrast_figure(design: Design) -> Figure:
-    """Robust felt contrast of fresh contact sets at their targets, a panel by quiet fingers."""
+    """Robust felt contrast of fresh contact sets at their contents, a panel by quiet fingers."""
+    contents = design.problem.contacts.contents
     plate, judged = design.problem.rig.plate, design.best.answers
     eras = design.problem.eras(design.best.found.positions)
     ratio = plate.width / plate.length
     kinds = judged.kinds
     figure = Figure(figsize=(3.4 * len(kinds) + 1, 3.0 * ratio + 1.2), layout="compressed")
     grid = figure.subplots(1, len(kinds), squeeze=False, sharey=True)[0]
-    targets = np.array([contacts[0] for contacts in design.sets])
+    places = np.array([contacts[:contents] for contacts in design.sets])  # (sets, contents, 2)
     ends = np.percentile(judged.contrast_db, [2, 98])
     for axes, quiet in zip(grid, kinds, strict=True):
         chosen = judged.quiet == quiet
         image = axes.scatter(
-            *(100 * targets[chosen].T),
-            c=judged.contrast_db[chosen],
+            *(100 * places[chosen].reshape(-1, 2).T),
+            c=np.repeat(judged.contrast_db[chosen], contents),
             cmap=COLORS,
             vmin=ends[0],
             vmax=ends[1],

@@ -307,7 +307,7 @@ def _answers(problems: Sequence[DesignProblem], task: tuple[int, FloatArray | No
     """What positions of ERAs, None for the rig's own, give on fresh contact sets."""
     problem, positions = problems[task[0]], task[1]
     rig = problem.rig if positions is None else problem.rig_with(positions)
-    return vars(judge(rig, problem.judged_sets()))
+    return vars(judge(rig, problem.judged_sets(), contents=problem.contacts.contents))
 
 
 def _arrays(layouts: Sequence[Found]) -> Arrays:

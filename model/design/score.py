@@ -12,7 +12,9 @@ ERAs e of dynamic stiffness Z on the plate, a finger f of dynamic stiffness D an
 with dh of the plates thicker and thinner by a standard deviation, each solved exactly and counting
 half, dc by the ERAs' damping, s_j of each ERA's stiffness and the finger's load. The score of a set
 is |h_t w|² / max_q w^H R_q w of the best weights w at the best frequency, less a tenth of what they
-miss the wanted level by: an answer that has to reach it loses little.
+miss the wanted level by: an answer that has to reach it loses little. Of several contents that of
+the worst, all other fingers quiet: their foreign levels add to little more than the highest
+(docs/decisions, 0067), each searched at as many times the level, since they share the stroke.
 """
 
 import math
@@ -72,10 +74,17 @@ class Mounts:
 class Scorer:
     """Scores layouts on a rig's plate, solved once, with contact sets on it.
 
-    frequencies (f,) [Hz]; sets: contacts (fingers, 2) [m] of each, target first.
+    frequencies (f,) [Hz]; sets: contacts (fingers, 2) [m] of each, those with contents first.
     """
 
-    def __init__(self, rig: Rig, frequencies: FloatArray, sets: Sequence[FloatArray]) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        frequencies: FloatArray,
+        sets: Sequence[FloatArray],
+        *,
+        contents: int = 1,
+    ) -> None:
         self._rig = rig
         self._frequencies, self._omega = frequencies, 2 * np.pi * frequencies
         uncertainty = rig.uncertainty
@@ -85,7 +94,8 @@ class Scorer:
         tip = rig.fingertip
         finger = np.zeros(len(frequencies)) if tip is None else tip.dynamic_stiffness(self._omega)
         self._finger = finger.astype(np.complex64)[:, None]
-        least = LEVEL_RESERVE * 10 ** (STRONG_DB_SL / 20)
+        self._contents = contents
+        least = LEVEL_RESERVE * contents * 10 ** (STRONG_DB_SL / 20)
         threshold = detection_threshold(frequencies, rig.threshold)
         self._wanted = (least * threshold).astype(np.float32)
         self._free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(frequencies.max()))
@@ -139,8 +149,18 @@ class Scorer:
     def mean(self, places: Places, chosen: IntArray, mounts: Mounts) -> float:
         """Mean score [dB] of ERAs at chosen places (n,), each number of fingers counting alike."""
         target, power = self._forms(places, chosen, mounts)
-        scores = [self._score(target, power, fingers) for fingers in self._groups]
-        return float(np.mean([each.mean() for each in scores]))
+        scores = [self._of_sets(target, power, fingers).mean() for fingers in self._groups]
+        return float(np.mean(scores))
+
+    def _of_sets(
+        self, target: Complex64Array, power: Complex64Array, fingers: IntArray
+    ) -> FloatArray:
+        """Score [dB] of the worst content of sets (s, k) of fingers, (s,)."""
+        each = [
+            self._score(target, power, np.roll(fingers, -number, axis=1))
+            for number in range(self._contents)
+        ]
+        return np.asarray(np.min(each, axis=0))
 
     def _forms(
         self, places: Places, chosen: IntArray, mounts: Mounts
@@ -193,7 +213,7 @@ class Scorer:
     def _score(
         self, target: Complex64Array, power: Complex64Array, fingers: IntArray
     ) -> FloatArray:
-        """Score [dB] of sets (s, k) of fingers, (s,)."""
+        """Score [dB] of sets (s, k) of fingers, (s,), the first to feel what no other does."""
         f, _, n = target.shape
         s, q = len(fingers), fingers.shape[1] - 1
         quiet = fingers[:, 1:]

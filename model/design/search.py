@@ -48,7 +48,9 @@ class LayoutSearch:
         """Solve the plate for all candidates; raises InputError for an area without room."""
         self.problem = problem
         sets = problem.contacts.pooled_sets(design_problem.SEARCH_FINGERS, seed=problem.seed)
-        self._scorer = Scorer(problem.rig, problem.searched_frequencies, sets)
+        self._scorer = Scorer(
+            problem.rig, problem.searched_frequencies, sets, contents=problem.contacts.contents
+        )
         kept = problem.kept_positions
         self._k = len(kept)
         self._places = self._scorer.places(np.vstack([kept, problem.candidates]))

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from model.cli import app
@@ -126,6 +127,61 @@ def test_given_layouts_are_ranked_kept_and_the_best_written(small, tmp_path: Pat
     again = json.loads(design(*arguments, "-o", str(tmp_path)).stdout)
     assert again["resumed"] == 2
     assert again["layouts"] == found["layouts"]
+
+
+LAYOUTS = """layouts:
+  corners: [[0, 0], [12 in, 0], [12 in, 9 in], [0, 9 in]]
+  skew:    [[1 in, 0], [11 in, 0], [9 in, 9 in], [0, 7 in]]
+  narrow:  [[4 in, 0], [8 in, 0], [8 in, 9 in], [4 in, 9 in]]
+"""
+TWO_CONTENTS = """sets:
+  - {own: [[3 cm, 3 cm], [26 cm, 18 cm]]}
+  - {own: [[5 cm, 18 cm], [20 cm, 4 cm]], quiet: [[28 cm, 20 cm]]}
+"""
+OWN_LINES = """{"own": [{"at": [0.03, 0.03]}, {"at": [0.26, 0.18]}]}
+{"own": [{"at": [0.05, 0.18]}, {"at": [0.2, 0.04]}], "quiet": [[0.28, 0.2]]}
+"""
+
+
+def test_layouts_are_ranked_by_the_promise_of_two_contents(small, tmp_path: Path) -> None:
+    """By what tables of all layouts, built and queried as commands, promise at the worst finger."""
+    names = {"layouts.yaml": LAYOUTS, "contacts.yaml": TWO_CONTENTS, "own.jsonl": OWN_LINES}
+    for name, text in names.items():
+        (tmp_path / name).write_text(text)
+    rig = read_document(RIG).data
+    promised = {}
+    for name, places in yaml.safe_load(LAYOUTS)["layouts"].items():
+        of, table = tmp_path / f"{name}.yaml", tmp_path / f"{name}.npz"
+        eras = zip(rig["eras"].values(), places, strict=True)
+        moved = {f"E{n}": {**era, "at": at} for n, (era, at) in enumerate(eras, start=1)}
+        of.write_text(json.dumps({**rig, "eras": moved}))
+        arguments = ["table", "build", str(of), "-o", str(table), "--mode", "phased"]
+        assert CliRunner().invoke(app, arguments).exit_code == 0
+        lines = ["table", "query", str(table), "--batch", str(tmp_path / "own.jsonl"), "--json"]
+        answers = map(json.loads, CliRunner().invoke(app, lines).stdout.splitlines())
+        promised[name] = [each["robust_worst_db"] for each in answers]
+    means = {name: sum(each) / 2 for name, each in promised.items()}
+    result = design(
+        *("--layouts", str(tmp_path / "layouts.yaml"), "--contents", "2", "--json"),
+        *("--contacts", str(tmp_path / "contacts.yaml"), "-o", str(tmp_path / "out")),
+    )
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    ranked = {each["layout"]: each["contrast_db"] for each in found["layouts"]}
+    assert list(ranked) == sorted(means, key=means.get, reverse=True)
+    for name, (without, with_quiet) in promised.items():
+        expected = {"median_0_quiet": without, "median_1_quiet": with_quiet, "mean": means[name]}
+        assert ranked[name] == pytest.approx(expected, abs=0.01)
+    assert found["contents"] == 2
+
+
+@pytest.mark.parametrize("contents", ["0", "3", "7"])
+def test_contents_other_than_those_of_the_sets_are_refused(small, tmp_path, contents) -> None:
+    """None, one more than the sets have, more than any plate keeps apart."""
+    path = tmp_path / "contacts.yaml"
+    path.write_text(TWO_CONTENTS)
+    result = design("--contents", contents, "--contacts", str(path), "-o", str(tmp_path / "out"))
+    assert result.exit_code == 2 or isinstance(result.exception, InputError)
 
 
 def test_layouts_of_which_none_supports_the_plate_are_refused(small, tmp_path: Path) -> None:

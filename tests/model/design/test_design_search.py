@@ -252,6 +252,23 @@ def test_scores_count_plates_of_other_thickness_exactly(monkeypatch) -> None:
     assert dense < dense_score(certain, some.own_positions, pairs, some.searched_frequencies) - 1
 
 
+def test_the_score_of_two_contents_is_that_of_the_worse(monkeypatch) -> None:
+    """Each with the other finger quiet, by a dense solve of either."""
+    monkeypatch.setattr(problem_module, "SEARCH_FREQUENCIES", 2)
+    strong = tuple(replace(era, stroke=0.01) for era in rig().eras)
+    loud = replace(rig(), uncertainty=GAINS, eras=strong)
+    (pair,) = replace(anywhere(loud.plate), quiet=(1, 1)).sets(1, seed=4)
+    for one, other in ((pair, pair[::-1]), (pair[::-1], pair)):
+        some = problem(rig=loud, contacts=replace(anywhere(loud.plate, 2), given=(one,)))
+        (found,) = LayoutSearch(some).scored([some.own_positions])
+        each = [
+            dense_score(loud, some.own_positions, (way,), some.searched_frequencies)
+            for way in (one, other)
+        ]
+        assert abs(each[0] - each[1]) > 0.5
+        assert found.score_db == pytest.approx(min(each), abs=0.05)
+
+
 def test_given_layouts_are_the_rigs_own_named_and_random_ones(tmp_path) -> None:
     """Each once, in the area and apart; a longer list begins with a shorter one."""
     some = problem()

@@ -71,6 +71,7 @@ class AsyncClient:
         self._lease: ArmResult | None = None  # of `armed`
         self._lease_lost: LeaseLost | None = None
         self._renewing: asyncio.Task[None] | None = None
+        self._seen: int | None = None  # epoch of the last status, stop or state event
 
     @classmethod
     async def connect(
@@ -137,8 +138,11 @@ class AsyncClient:
         return await self._call(StopResult, "stop")
 
     async def clear(self) -> None:
-        """Acknowledge a stop, or a fault whose cause is gone."""
-        await self._call(Empty, "clear")
+        """Acknowledge a stop, or a fault whose cause is gone, as this client has seen it.
+
+        One that came after its last `status`, `stop` or state event is not: RpcError.
+        """
+        await self._call(Empty, "clear", epoch=self._seen)
 
     async def forget(self) -> None:
         """Discard what was learned of the plate; answers are those of the table as built."""
@@ -244,14 +248,20 @@ class AsyncClient:
                         )
                     else:
                         await self._changed.wait()
-        return self._events.popleft() if self._events else None
+        if not self._events:
+            return None
+        event = self._events.popleft()
+        self._seen = event.data.get("epoch", self._seen)
+        return event
 
     async def call(self, method: str, params: Message, result: type[_ResultT]) -> _ResultT:
         """Call any method and return its result."""
         if self._lease_lost is not None and method not in ("stop", "disarm"):
             raise self._lease_lost.with_traceback(None)
         found = await self._within_timeout(self._send(method, params))
-        return read_result(found, result)
+        read = read_result(found, result)
+        self._seen = getattr(read, "epoch", self._seen)
+        return read
 
     async def _call(self, result: type[_ResultT], method: str, **values: object) -> _ResultT:
         """Call a method with these parameters."""
@@ -360,6 +370,7 @@ class AsyncClient:
         try:
             found = await self._within_timeout(self._send("status", Empty()))
             status = read_result(found, StatusResult)
+            self._seen = status.epoch
         except (RpcError, Unreachable):
             return LeaseLost(str(reason))
         return LeaseLost(headline(status.state, status.cause))

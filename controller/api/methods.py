@@ -21,6 +21,7 @@ from controller.api.schema import (
     DaemonStateName,
     EffectDescription,
     Empty,
+    Epoch,
     LatencySummary,
     LearningSummary,
     Message,
@@ -64,6 +65,7 @@ class StatusResult(Message):
     )
     cause: str = Field(description="why the daemon is in this state")
     remedy: str | None = Field(description="what to do about it; null if nothing")
+    epoch: Epoch
     assume_energised: bool = Field(description="whether lost amplifiers may still be playing")
     lost_for_s: float | None = Field(
         description="how long a link has been lost; null if all are up"
@@ -138,7 +140,16 @@ class DisarmParams(RequestedBy):
 class StopResult(Message):
     """Every amplifier is confirmed silent."""
 
+    epoch: Epoch
     amplifiers: dict[str, AmplifierSilence] = Field(default={}, description="by name")
+
+
+class ClearParams(RequestedBy):
+    """What is acknowledged; a later stop, fault or loss is not."""
+
+    epoch: Epoch | None = Field(
+        None, description="as last seen in a status, stop or state event; null: whatever is latched"
+    )
 
 
 class TouchParams(Message):
@@ -230,7 +241,7 @@ METHODS: dict[str, Method] = {
         in_reserve=True,
     ),
     "clear": Method(
-        RequestedBy,
+        ClearParams,
         Empty,
         "acknowledge a stop, or a fault whose cause is gone",
         is_repeated=False,  # it would acknowledge a stop that came meanwhile

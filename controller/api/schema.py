@@ -93,6 +93,9 @@ Name: TypeAlias = Annotated[
 """A short text on one line, without control characters."""
 
 Count: TypeAlias = Annotated[int, Field(ge=0)]
+Epoch: TypeAlias = Annotated[
+    int, Field(ge=0, description="rises with every change of state, stop, fault and loss")
+]
 
 
 class Message(BaseModel):

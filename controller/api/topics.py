@@ -11,6 +11,7 @@ from controller.api.schema import (
     ContactStatus,
     Count,
     DaemonStateName,
+    Epoch,
     LatencySummary,
     LearningStateName,
     Message,
@@ -30,6 +31,7 @@ class StateEvent(Message):
     )
     cause: str
     remedy: str | None = Field(description="what to do about it; null if nothing")
+    epoch: Epoch
 
 
 class ContactsEvent(Message):

@@ -12,6 +12,7 @@ from controller.api.methods import (
     METHODS,
     ArmParams,
     ArmResult,
+    ClearParams,
     DisarmParams,
     EffectsResult,
     HelloParams,
@@ -114,6 +115,7 @@ class ApiService:
             state=machine.state.value,
             cause=machine.cause,
             remedy=machine.remedy,
+            epoch=machine.epoch,
             assume_energised=self._supervisor.assume_energised(now),
             lost_for_s=None if machine.lost is None else now - machine.lost.at,
             watchdog_s=self._controller.watchdog,
@@ -191,13 +193,22 @@ class ApiService:
     def _stop(self, client: Connection, params: RequestedBy) -> Awaitable[StopResult]:
         """Stop; the amplifiers' requests are queued when this returns."""
         cause = f"stopped by {params.client or client.name!a}"
-        return _silence(self._supervisor.stop(cause, "clear (era clear), then arm again"))
+        stopping = self._supervisor.stop(cause, "clear (era clear), then arm again")
+        return _silence(stopping, self._supervisor.machine.epoch)
 
-    async def _clear(self, client: Connection, params: RequestedBy) -> Empty:
+    async def _clear(self, client: Connection, params: ClearParams) -> Empty:
         machine = self._supervisor.machine
         if machine.state is DaemonState.COMM_LOST:
             raise _wrong_state(machine, ErrorCode.LINK)
         if machine.state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT):
+            if params.epoch not in (None, machine.epoch):
+                raise RpcError(
+                    ErrorCode.WRONG_STATE,
+                    f"epoch must be that of what is latched now, {machine.epoch}, got "
+                    f"{params.epoch}: another stop, fault or loss came since",
+                    where="epoch",
+                    remedy="look at the status, then clear again",
+                )
             await self._supervisor.handle(
                 DaemonEvent(Trigger.CLEAR, f"acknowledged by {params.client or client.name!a}")
             )
@@ -263,14 +274,14 @@ def _armed_already(machine: StateMachine) -> RpcError:
     return RpcError(ErrorCode.LEASE, what, remedy="wait, or disarm first: every client may")
 
 
-async def _silence(stopping: Awaitable[Mapping[str, Stopped]]) -> StopResult:
-    """Await a stop; raises NotSilent unless every amplifier is confirmed silent."""
+async def _silence(stopping: Awaitable[Mapping[str, Stopped]], epoch: int) -> StopResult:
+    """Await a stop of an epoch; raises NotSilent unless every amplifier is confirmed silent."""
     outcomes = await stopping
     now = clock.now()
     amplifiers = {name: amplifier_silence(each, now) for name, each in outcomes.items()}
     if not (outcomes and all(outcome.is_confirmed for outcome in outcomes.values())):
         raise NotSilent(amplifiers)
-    return StopResult(amplifiers=amplifiers)
+    return StopResult(epoch=epoch, amplifiers=amplifiers)
 
 
 def _wrong_state(machine: StateMachine, code: ErrorCode = ErrorCode.WRONG_STATE) -> RpcError:

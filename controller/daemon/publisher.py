@@ -83,12 +83,7 @@ class EventPublisher:
 
     def state_changed(self, old: StateMachine, new: StateMachine) -> None:
         """Publish a transition; outside OPERATION_ENABLED nothing plays."""
-        self.hub.publish(
-            "state",
-            lambda: StateEvent(
-                old=old.state.value, new=new.state.value, cause=new.cause, remedy=new.remedy
-            ),
-        )
+        self.hub.publish("state", lambda: _state_event(old, new))
         if self.view.applied is not None and new.state is not DaemonState.OPERATION_ENABLED:
             # The control loop does not report the end of what others have silenced.
             self.view.applied = None
@@ -158,9 +153,7 @@ class EventPublisher:
 
     def _state_event(self) -> StateEvent:
         now = self._machine()
-        return StateEvent(
-            old=now.state.value, new=now.state.value, cause=now.cause, remedy=now.remedy
-        )
+        return _state_event(now, now)
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         self.view.contacts = contacts
@@ -177,3 +170,13 @@ class EventPublisher:
         if silenced.latency is not None:
             self.latencies.add(silenced.latency)
         self.hub.publish("silence", self.view.silence_event)
+
+
+def _state_event(old: StateMachine, new: StateMachine) -> StateEvent:
+    return StateEvent(
+        old=old.state.value,
+        new=new.state.value,
+        cause=new.cause,
+        remedy=new.remedy,
+        epoch=new.epoch,
+    )

@@ -43,7 +43,7 @@ def test_people_see_the_word_that_the_page_has_for_each_state() -> None:
     shown = {row[0]: row[1].strip("*") for row in rows("daemon.md", "| state | shown |")}
     assert list(shown) == [state.value for state in DaemonState]
     for state, word in shown.items():
-        event = StateEvent(old="FAULT", new=state, cause="a cable was cut", remedy=None)
+        event = StateEvent(old="FAULT", new=state, cause="a cable was cut", remedy=None, epoch=1)
         assert event.model_dump()["word"] == word
         assert headline(state, event.cause) == f"{word}: a cable was cut"
         assert headline(state, f"{word} by 'era'") == f"{word} by 'era'"

@@ -320,6 +320,10 @@ async def test_buttons_arm_disarm_stop_and_clear(page: Page, era: Client) -> Non
     await page.until(
         "document.querySelector('#log li')?.innerText", lambda text: "era clear" in text
     )
+    era.stop()  # which the page has not shown
+    await page.click("#clear")
+    await page.until("document.querySelector('#problem').textContent", lambda text: "since" in text)
+    assert era.status().state == STOPPED
     await page.click("#clear")
     await until_state(era, READY)
     assert page.complaints == []

@@ -109,7 +109,7 @@ async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> No
         await tab.click("#stop")
         await tab.until(f"{problem} === ''")
         for (old, _), (new, cause) in pairwise(states):
-            daemon.publish("state", StateEvent(old=old, new=new, cause=cause, remedy=None))
+            daemon.publish("state", StateEvent(old=old, new=new, cause=cause, remedy=None, epoch=1))
             events = await tab.until(EVENTS, lambda events, cause=cause: cause in events[0])
         assert "told to end" in events[0]
         assert events[1].endswith("amplifier main: cut")

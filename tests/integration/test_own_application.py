@@ -208,7 +208,7 @@ async def test_page_leaves_a_silent_network_and_repeats_no_arm(tmp_path: Path) -
             network.restore()
             await tab.until(SAID, lambda text: text.startswith("ready: "))
         cut = StateEvent(
-            old="READY_TO_SWITCH_ON", new="FAULT", cause="a cable was cut", remedy=None
+            old="READY_TO_SWITCH_ON", new="FAULT", cause="a cable was cut", remedy=None, epoch=1
         )
         daemon.publish("state", cut)
         await tab.until(f"{SAID} === 'fault: a cable was cut'")

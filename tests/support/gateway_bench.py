@@ -154,7 +154,7 @@ class ScriptedDaemon:
             case "stop" if self.silence:
                 raise NotSilent(self.silence)
             case "stop":
-                return StopResult(amplifiers={})
+                return StopResult(epoch=1)
             case _:
                 return Empty()
 
@@ -185,7 +185,11 @@ class ScriptedDaemon:
 
 def _ready() -> StateEvent:
     return StateEvent(
-        old="READY_TO_SWITCH_ON", new="READY_TO_SWITCH_ON", cause="it is a script", remedy=None
+        old="READY_TO_SWITCH_ON",
+        new="READY_TO_SWITCH_ON",
+        cause="it is a script",
+        remedy=None,
+        epoch=0,
     )
 
 
@@ -196,6 +200,7 @@ def _status() -> StatusResult:
         state="READY_TO_SWITCH_ON",
         cause="it is a script",
         remedy=None,
+        epoch=0,
         assume_energised=False,
         lost_for_s=None,
         watchdog_s=0.25,

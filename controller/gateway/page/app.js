@@ -24,6 +24,7 @@ const at = (id) => document.getElementById(id);
 const log = at("log");
 let connection;
 let state = null;
+let epoch = null;  // of what is shown: a clear acknowledges nothing that came later
 let knownAlarms;  // of the plate; undefined before the first event of it
 let daemon = null;  // result of hello; null while disconnected
 let ownName;  // of this page, in the daemon's log
@@ -102,7 +103,8 @@ function showBanner() {
   at("banner").classList.toggle("grave", reason !== "simulated");
 }
 
-function showState(next, word, cause) {
+function showState(next, word, cause, newEpoch = null) {
+  epoch = newEpoch;
   if (next !== null) lostSince = next === "COMM_LOST" ? lostSince ?? new Date() : null;
   state = next;
   showBanner();
@@ -115,7 +117,7 @@ function showState(next, word, cause) {
 }
 
 function showStatus(status) {
-  showState(status.state, status.word, status.cause);
+  showState(status.state, status.word, status.cause, status.epoch);
   watchdog = status.watchdog_s;
   if (status.lost_for_s !== null) {
     lostSince = new Date(Date.now() - 1000 * status.lost_for_s);
@@ -161,9 +163,9 @@ function summariseSilence() {
 }
 
 const HANDLERS = {
-  state({ old, new: next, word, cause, remedy }) {
+  state({ old, new: next, word, cause, remedy, epoch: newEpoch }) {
     const isChange = state !== null && old !== next && !TRANSIENT.includes(next);
-    showState(next, word, cause);
+    showState(next, word, cause, newEpoch);
     summariseSilence();
     if (next === "COMM_LOST") {
       showLinkLoss(cause, remedy);
@@ -225,6 +227,12 @@ async function play(effect) {
   await attempt(() => connection.call("play", { effect, x_m, y_m }));
 }
 
+// What came since the state was shown is not acknowledged, but shown.
+async function clear() {
+  await attempt(() => connection.call("clear", { epoch }));
+  connection.call("status").then(showStatus, () => {});
+}
+
 function updateEffects() {
   connection.call("effects").then(({ effects }) => showEffects(at("effects-section"), at("effects"), effects, play)).catch(() => {});
 }
@@ -269,6 +277,7 @@ function connect(token) {
     closed,
     failed,
     lifted: () => fingers.clear(),
+    stopped: (result) => { epoch = Math.max(epoch, result.epoch); },
     event: ({ topic, data }) => HANDLERS[topic]?.(data),
     field: (buffer) => fieldView.show(decodeField(buffer)),
   });
@@ -276,7 +285,7 @@ function connect(token) {
 
 at("arm").addEventListener("click", () => attempt(() => connection.arm(`dashboard (${ownName})`)));
 at("disarm").addEventListener("click", () => attempt(() => connection.disarm()).then(showButtons));
-at("clear").addEventListener("click", () => attempt(() => connection.call("clear")));
+at("clear").addEventListener("click", clear);
 at("stop").addEventListener("click", stop);
 at("motion").addEventListener("change", ({ target }) => fieldView.setMotion(target.checked));
 at("login").addEventListener("submit", (event) => {

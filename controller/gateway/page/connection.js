@@ -27,7 +27,7 @@ const noResponse = () => new RpcError({ code: 0, message: "the gateway does not 
 export class Connection {
   // topics: to subscribe to. handlers, all optional: opened(hello, name) once the daemon has responded,
   // closed(), failed(why) after each loss or failed attempt to connect, event({ topic, data, lost }),
-  // disarmed() when the daemon refuses to renew the lease, lifted() when all fingers were lifted because
+  // disarmed() when the daemon refuses to renew the lease, stopped(result) of each stop, lifted() when all fingers were lifted because
   // the page lost the focus or is hidden: forget them; field(ArrayBuffer). name: of this page, in
   // the daemon's log. why: "daemon" if the daemon does not respond, "refused" because of the token,
   // "full" if the gateway responds but accepts no WebSocket, "unreachable". gateway: its URL.
@@ -218,7 +218,9 @@ export class Connection {
   stop() {
     this.lease = null;
     const overWebSocket = this.call("stop");  // first: it needs nothing of what a browser may lack
-    return Promise.any([overWebSocket, this.callOverHttp("stop")]);
+    const stops = [overWebSocket, this.callOverHttp("stop")];
+    for (const each of stops) each.then(this.handlers.stopped, () => {});
+    return Promise.any(stops);
   }
 
   // Call a method without parameters over HTTP; a promise of its result.

@@ -56,6 +56,18 @@ def delay_arming(
     return released
 
 
+async def test_clear_acknowledges_no_stop_that_its_client_has_not_seen(tmp_path: Path) -> None:
+    """Another client's after its own, until it has read the status; its own it has seen."""
+    async with ready_daemon(tmp_path) as (bench, era), await bench.client() as other:
+        await era.stop()
+        await other.stop()
+        with pytest.raises(RpcError, match="another stop"):
+            await era.clear()
+        assert (await era.status()).state == "QUICK_STOP_ACTIVE"
+        await era.clear()
+        assert (await other.status()).state == READY
+
+
 async def test_lease_lasts_from_armed_state_when_arming_takes_longer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -140,9 +140,9 @@ def test_http_connections_leave_places_of_the_daemon_to_others(
 
 def test_http_body_may_have_line_feeds(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:
     """They are spaces of JSON; between requests to the daemon they are the end of one."""
-    for method in ("stop", "clear"):
+    for method in ("stop", "forget"):
         assert http(gateway, f"/api/v1/{method}", body=b'{"client":"a"\n}').status == 200
-    assert daemon.calls == [(name, RequestedBy(client="a")) for name in ("stop", "clear")]
+    assert daemon.calls == [(name, RequestedBy(client="a")) for name in ("stop", "forget")]
 
 
 def test_http_method_without_parameters_needs_no_body(

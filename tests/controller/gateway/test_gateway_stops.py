@@ -113,7 +113,10 @@ async def test_stop_is_repeated_if_the_connection_is_lost(
         theirs.close()
 
     async with await asyncio.start_unix_server(serve, path):
-        assert await lasting.LastingLink(path).request("stop", RequestedBy()) == {"amplifiers": {}}
+        assert await lasting.LastingLink(path).request("stop", RequestedBy()) == {
+            "epoch": 1,
+            "amplifiers": {},
+        }
     assert lost == 2
 
 

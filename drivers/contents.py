@@ -3,7 +3,6 @@
 The ledger of an amplifier (`drivers.host.ledger`) checks them and makes the integers of the wire.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 
@@ -52,11 +51,3 @@ class Layer:
     valid_for: float = 0.0
     after: bool = False
     renew: bool = False
-
-
-def is_silence(layers: Iterable[Layer]) -> bool:
-    """Whether layers only fall silent."""
-    for layer in layers:  # noqa: SIM110  a generator would be a call for each
-        if layer.tones or layer.renew:
-            return False
-    return True

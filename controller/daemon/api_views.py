@@ -27,10 +27,9 @@ from controller.loop.routing import Drive
 from controller.sources.contacts import Contact, ContactKey
 from drivers import clock
 from drivers.host.amplifier import Amplifier
-from drivers.host.comparison import name_of
 from drivers.host.members import is_lost
 from drivers.host.stop import Stopped
-from drivers.protocol.table import FAULTS, QUANTITIES, STATES, STATUS_FLAGS
+from drivers.protocol.table import FAULTS, QUANTITIES, STATES, STATUS_FLAGS, name_of
 from drivers.statistics import LinkStatistics
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable

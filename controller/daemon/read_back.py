@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 
 from drivers.host.amplifier import Amplifier
-from drivers.host.comparison import name_of
 from drivers.protocol.records import Values
-from drivers.protocol.table import FAULTS, STATES
+from drivers.protocol.table import FAULTS, STATES, name_of
 
 READ_BACK_INTERVAL = 0.02  # s
 

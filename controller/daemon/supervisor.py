@@ -41,11 +41,10 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import Amplifier
-from drivers.host.comparison import name_of
 from drivers.host.stop import Stopped
 from drivers.pauses import pauses
 from drivers.protocol.records import Values
-from drivers.protocol.table import FAULTS, NO_CHANNEL
+from drivers.protocol.table import FAULTS, NO_CHANNEL, name_of
 from model.errors import InputError
 
 STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers

@@ -19,8 +19,8 @@ from controller.loop.validity import Validity, first_lasts, valid_for
 from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
 from controller.sources.touch import TouchFrame
 from drivers.errors import CommandRefused
-from drivers.host.joint_sets import Played
 from drivers.host.ledger import is_vibrating
+from drivers.host.members import Played
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES
 from model.rig.rig import Rig

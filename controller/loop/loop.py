@@ -25,7 +25,7 @@ from drivers.errors import (
 )
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.host.group import Group
-from drivers.host.joint_sets import Played
+from drivers.host.members import Played
 from drivers.host.stop import Stopped
 from drivers.host.timing import HEARTBEAT
 from drivers.opening import Lines

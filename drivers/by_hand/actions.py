@@ -22,12 +22,19 @@ from drivers.by_hand.reaching import (
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import WATCHDOG, Amplifier
-from drivers.host.comparison import name_of
 from drivers.host.jobs import Priority
 from drivers.host.sensors import check_tones, measure_tones, read_measured, read_sensors
 from drivers.host.timing import STOP_RAMP, check_watchdog
 from drivers.protocol.records import bits_of
-from drivers.protocol.table import COMMAND, FAULTS, LATCHED, QUANTITIES, STATES, has_feature
+from drivers.protocol.table import (
+    COMMAND,
+    FAULTS,
+    LATCHED,
+    QUANTITIES,
+    STATES,
+    has_feature,
+    name_of,
+)
 from drivers.urls import with_address
 
 _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address

@@ -12,7 +12,6 @@ from typing import Any
 
 from drivers import clock
 from drivers.host.amplifier import Amplifier
-from drivers.host.comparison import name_of
 from drivers.host.limits import FREQUENCY_FLOOR
 from drivers.host.timing import TAKEN_WORDS, set_words, shortest_watchdog
 from drivers.opening import Lines
@@ -25,6 +24,7 @@ from drivers.protocol.table import (
     QUANTITIES,
     STATES,
     STATUS_FLAGS,
+    name_of,
 )
 from registry.limits import GuardLimits
 

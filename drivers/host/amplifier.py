@@ -1,35 +1,29 @@
 """One amplifier of protocol 3, whatever its wire: who it is, and its requests."""
 
 import asyncio
-from collections.abc import Sequence
+import math
 from dataclasses import replace
-from functools import partial
 
 from drivers import clock
-from drivers.contents import Layer, is_silence
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout, Preempted
-from drivers.host.budget import COMMIT_DELAY
-from drivers.host.comparison import (
-    MAX_CONTRADICTIONS,
-    achieved_problem,
-    check_capabilities,
-    check_identity,
-    name_of,
-)
-from drivers.host.dialogue import Dialogue, Staged
-from drivers.host.jobs import JointStart, Priority
+from drivers.host.dialogue import MAX_CONTRADICTIONS, Dialogue
+from drivers.host.jobs import Priority
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
 from drivers.host.stop import Stop, Stopped
-from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT, STOP_RAMP
-from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, LayerSet, is_newer_token, pack_layers, parts
+from drivers.host.timing import REPLY_TIMEOUT, STOP_RAMP
+from drivers.protocol.records import Values, bits_of
+from drivers.protocol.sets import Command, LayerSet, is_newer_token
 from drivers.protocol.table import (
     ENABLED,
     FAULTS,
     QUANTITIES,
     STATES,
+    VERSION,
+    has_feature,
+    name_of,
 )
+from drivers.statistics import LinkStatistics
 from registry.limits import GuardLimits
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
@@ -42,6 +36,9 @@ SECOND_REPLY = 0.02  # s; for one of another amplifier at the same address
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
+_POSITIVE = ("frequency_step", "level_step", "phase_step")
+_FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")
+_HALF_TURN = 180 * QUANTITIES["phase"].per_unit
 
 
 class Amplifier(Dialogue):
@@ -155,56 +152,6 @@ class Amplifier(Dialogue):
             )
         return status
 
-    async def stage(self, token: int, layers: Sequence[Layer], *, now: bool = False) -> Staged:
-        """Stage a set under a token, or play it at once.
-
-        It is admitted by the ledger when its turn on the line has come. Raises CommandRefused with
-        the reason; Preempted where a stop came first.
-        """
-        cuts: list[Values] = []
-        admitted: list[Staged] = []
-
-        def first() -> Values:
-            if not cuts:
-                admitted.append(self._admit(token, layers, cuts, now=now))
-            return cuts[0]
-
-        priority = Priority.SILENCE if is_silence(layers) else Priority.SET
-        taken = await self.line.submit(self, priority, "Set", {}, make=first)
-        for part in cuts[1:]:
-            make = partial(self.while_admitted, token, part)
-            taken = await self.line.submit(self, priority, "Set", part, make=make)
-        (staged,) = admitted
-        if not (taken["played"] or (taken["staged"] and self._admitted is staged)):
-            raise Preempted(f"amplifier {self.name}: set {token} was not staged")
-        return staged if taken["exact"] else replace(staged, is_exact=False)
-
-    def _admit(
-        self, token: int, layers: Sequence[Layer], cuts: list[Values], *, now: bool
-    ) -> Staged:
-        """Have the ledger admit a set, and cut it into parts; raises CommandRefused."""
-        moment = self._time()
-        # Longest time from the admission of a set until it is committed.
-        delay = max(COMMIT_DELAY, ATTEMPTS * len(self.line.members) * self.exchange_time("Set"))
-        admitted = self.ledger.admit(layers, moment, delay=delay)
-        stream = pack_layers(admitted)
-        if len(stream) > self.capabilities["set_words"]:
-            limit = self.capabilities["set_words"]
-            raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
-        cuts += parts(stream, session=self.session, token=token, now=now)
-        staged = self._admitted = Staged(token, admitted, is_exact=True, until=moment + delay)
-        return staged
-
-    def commit(self, token: int, *, start: JointStart | None = None) -> "asyncio.Future[Values]":
-        """Play the staged set; the future has the status, which shows its tokens.
-
-        start: together with the commits of other lines. Or raises Preempted where a stop or
-        disarm came first, CommandRefused where it is too late for what the ledger has admitted.
-        """
-        values = {"session": self.session, "token": token}
-        make = partial(self.while_admitted, token, values)
-        return self.line.submit(self, Priority.SET, "Commit", values, make=make, start=start)
-
     async def read_achieved(self, one: LayerSet) -> LayerSet:
         """Read what plays of a layer of the set committed last; the ledger goes on with it.
 
@@ -293,6 +240,23 @@ class Amplifier(Dialogue):
         """Send a request that needs nothing of the ledger; returns the values of its reply."""
         return await self.line.submit(self, priority, name, values, timeout=timeout)
 
+    @property
+    def statistics(self) -> LinkStatistics:
+        """Counts of its requests, and of all frames on its line."""
+        return replace(self.counts, **vars(self.line.wire.counters))
+
+    def wire_ramp(self, ramp: float) -> int:
+        """Return the nearest ramp that the amplifier has: silence is never refused for it."""
+        highest = self.capabilities.get("ramp_max", _RAMP.maximum)
+        if math.isnan(ramp):
+            return _RAMP.to_wire(STOP_RAMP)
+        return min(_RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high)), int(highest))
+
+    def is_silent(self, status: Values) -> bool:
+        """Whether a status has the levels of all channels, and all are zero."""
+        known = self.capabilities.get("channels")
+        return known == len(status["levels"]) and not any(status["levels"])
+
     async def _listen_for_another_host(self, status: Values) -> None:
         """Wait for a watchdog that rises unasked; raises LinkError."""
         end = clock.now() + LISTENING
@@ -304,3 +268,70 @@ class Amplifier(Dialogue):
             if status["watchdog_left"] > left:
                 raise self._driven_by_another()
             left = status["watchdog_left"]
+
+
+def check_identity(identity: Values, name: str, serial_number: str | None) -> None:
+    """Raise LinkError unless an amplifier of a name speaks this version and is the expected one.
+
+    serial_number: the expected one, None for any.
+    """
+    if not identity["versions"] >> VERSION & 1:  # bit n: version n
+        spoken = map(str, bits_of(identity["versions"]))
+        raise LinkError(
+            f"amplifier {name} speaks protocol {', '.join(spoken) or 'none'}, needs {VERSION}; "
+            "update it"
+        )
+    serial = identity["serial_number"]
+    if serial_number not in (None, serial):
+        raise LinkError(
+            f"amplifier {name}: serial number must be {serial_number}, got {serial}; connect the "
+            "expected amplifier, or restart with this one"
+        )
+
+
+def check_capabilities(can: Values, name: str, *, is_output: bool | None) -> None:
+    """Raise LinkError for capabilities that no amplifier can have, or other than the rig's.
+
+    is_output: what the rig says of full level: the output of a linear amplifier, else a motion;
+    None where there is no rig.
+    """
+    for each in _POSITIVE:
+        if not can[each] > 0:
+            raise LinkError(f"amplifier {name}: {each} must be above 0, got {can[each]}")
+    for each in ("watchdog", "envelope_step", "frequency"):
+        low, high = can[f"{each}_min"], can[f"{each}_max"]
+        if low > high:
+            raise LinkError(
+                f"amplifier {name}: {each}_min must be at most {each}_max, got {low} and {high}"
+            )
+    has_output = has_feature(can, "output")
+    if is_output is not None and has_output is not is_output:
+        raise LinkError(
+            f"amplifier {name}: full level must be {_FULL_LEVEL[is_output]} as in the rig file, "
+            f"got {_FULL_LEVEL[has_output]}; correct the rig file, or connect another amplifier"
+        )
+
+
+def achieved_problem(sent: LayerSet, achieved: LayerSet, can: Values) -> str | None:
+    """Describe what a layer that plays contradicts; None if it is what was sent, to the steps.
+
+    can: values of the capabilities. Envelopes are not compared: an amplifier does not report them.
+    """
+    commands = {command.channel: command for command in sent.commands if command.level}
+    played = {command.channel: command for command in achieved.commands if command.level}
+    if commands.keys() != played.keys():
+        return f"channels of layer {sent.layer} must be {[*commands]}, got {[*played]}"
+    for channel, command in commands.items():
+        got = played[channel]
+        phase = (got.phase - command.phase + _HALF_TURN) % (2 * _HALF_TURN) - _HALF_TURN
+        for name, difference in (
+            ("frequency", got.frequency - command.frequency),
+            ("level", got.level - command.level),
+            ("phase", phase),
+        ):
+            if abs(difference) > (can[f"{name}_step"] + 1) / 2:
+                return (
+                    f"{name} achieved on channel {channel} in layer {sent.layer} must be "
+                    f"{getattr(command, name)}, got {getattr(got, name)} (steps of the wire)"
+                )
+    return None

@@ -206,43 +206,6 @@ def worst(channels: Sequence[ChannelBounds]) -> tuple[list[float], float]:
     return levels, max(sum(level**2 for level in each) for each in corners)
 
 
-def plain_bounds(
-    playback: Playback, layers: Sequence[LayerSet], time: float, *, until: float
-) -> tuple[list[float], list[float]] | None:
-    """Return levels of all channels before and after a cross-fade along one ramp.
-
-    Between the two they are convex, and so are sums of their squares, so that `worst` is at one of
-    the ends. None where envelopes, several ramps or ends of layers make it less plain.
-    """
-    ramp, may_end = layers[0].ramp, playback.next_due <= until
-    if playback.next_due < math.inf and playback.waiting:
-        return None
-    named: list[int] = []
-    after = [0.0] * playback.channels
-    for one in layers:
-        if one.ramp != ramp or one.after or (may_end and playback.end_of(one.layer) <= until):
-            return None
-        if not one.renew:
-            named.append(one.layer)
-        for command in one.commands:
-            if command.onset is not None or command.ending is not None:
-                return None
-            after[command.channel] += command.level / _LEVEL.per_unit
-    before = [0.0] * playback.channels
-    for channel, voices in enumerate(playback.all_voices):
-        for voice in voices:
-            transition = voice.transition
-            if transition.knots or voice.ending is not None:
-                return None
-            peak = abs(transition.last)
-            if transition.first and time < transition.end:
-                peak = max(peak, abs(transition.first))
-            before[channel] += peak
-            if voice.has_ended or voice.layer not in named:
-                after[channel] += peak
-    return before, after
-
-
 def all_bounds(
     playback: Playback, layers: Sequence[LayerSet], time: float, *, until: float
 ) -> list[ChannelBounds]:

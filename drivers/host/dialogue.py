@@ -1,29 +1,116 @@
-"""What one amplifier was sent and has replied: its ledger, watchdog, latch and contradictions."""
+"""What one amplifier was sent and has replied: sets, ledger, watchdog, latch, contradictions."""
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
 
+from drivers.contents import Layer
 from drivers.errors import CommandError, CommandRefused, LinkDegraded, LinkError, Preempted
-from drivers.host.comparison import MAX_CONTRADICTIONS, name_of, problem_of
-from drivers.host.feeding import Feeding
-from drivers.host.ledger import Ledger
-from drivers.host.line import Line
-from drivers.host.timing import FAST, SET_WORDS, STOP_RAMP, TAKEN_WORDS
+from drivers.host.jobs import JointStart, Priority
+from drivers.host.ledger import Ledger, is_silence
+from drivers.host.limits import COMMIT_DELAY
+from drivers.host.timing import ATTEMPTS, FAST, SET_WORDS, TAKEN_WORDS
 from drivers.host.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, is_newer_token
-from drivers.protocol.table import ENABLED, FAULTS, MESSAGES, QUANTITIES
+from drivers.protocol.sets import LayerSet, is_newer_token, pack_layers, parts
+from drivers.protocol.table import (
+    ENABLED,
+    FAULTS,
+    MESSAGES,
+    QUANTITIES,
+    REACTION,
+    STATUS_FLAGS,
+    name_of,
+)
 from drivers.statistics import LinkStatistics
 
+if TYPE_CHECKING:
+    import asyncio
+
+    from drivers.host.line import Line
+
+SILENCING = 0.005 + REACTION
+"""From the expiry of a watchdog until the outputs are silent, at the most [s]."""
+MAX_CONTRADICTIONS = 2
+"""Contradictions in a row that are a fault; a single one may be a moment between two sets."""
 _SAME_MOMENT = 0.01  # s; statuses that are closer show a contradiction once
 _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
+_LEFT = QUANTITIES["watchdog_left"]
 _STATUS = MESSAGES["GetStatus"].reply
 _SILENCING = ("Stop", "Disarm", "Silence")
 _CHANGING = ("Arm", "Disarm", "Stop", "Clear")
 _EVENT_WORDS = 11  # of a frame of its own, which precedes the reply to what changes the state
 _logger = logging.getLogger(__name__)
+
+
+@dataclass
+class Feeding:
+    """When its watchdog was fed, as far as the host knows: what may have, and what surely did.
+
+    delay, is_kept: of the wire; watchdog [s]. may: when [s] the last request that may have fed went
+    out. plays: the last such that does not also silence it, arrives: when it arrives unless it is
+    delayed: how long the amplifier may play follows from it. fade [s]: longest ramp since, of a
+    silence without reply, a stop or a disarm. since, confirmed_at: when the last request that
+    surely did went out, and its reply came.
+    """
+
+    delay: float = 0.0
+    is_kept: bool = False
+    watchdog: float = 0.0
+    may: float = -math.inf
+    plays: float = -math.inf
+    arrives: float = -math.inf
+    fade: float = 0.0
+    since: float = -math.inf
+    confirmed_at: float = -math.inf
+
+    @property
+    def lost_from(self) -> float:
+        """When the watchdog has silenced it, and one that does not reply is lost [s].
+
+        A request without reply may still be under way; what is confirmed came before its reply, and
+        not always in the time of the line: a busy machine may have kept it.
+        """
+        is_confirmed = self.plays <= self.since
+        arrival = self.confirmed_at if is_confirmed else self.arrives + self.delay
+        return arrival + self.watchdog + self.fade + SILENCING
+
+    @property
+    def may_play_until(self) -> float:
+        """When the watchdog must have silenced it, even where it is fed once more [s].
+
+        What an adapter has kept comes at any time, all at once: after the watchdog without effect.
+        Of several attempts without reply one may have arrived, and the next been kept.
+        """
+        may_be_fed_again = self.is_kept and self.plays > self.since
+        return self.lost_from + (self.watchdog if may_be_fed_again else 0.0)
+
+    def sent(self, now: float, arrives: float) -> None:
+        """Note a request that may feed and let it play on: when it was sent, and arrives [s]."""
+        self.may = self.plays = now
+        self.arrives, self.fade = arrives, 0.0
+
+    def confirmed(self, sent_at: float, now: float) -> None:
+        """Note at a time [s] the reply to a request that fed, sent at another [s]."""
+        self.since, self.confirmed_at = sent_at, now
+        if sent_at > self.plays:
+            self.plays, self.fade = sent_at, 0.0
+
+    def problem(self, left: float, sent_at: float, now: float) -> str | None:
+        """Describe an impossible time that is left [s] in a reply to a request; None if possible.
+
+        sent_at: of the request, which is not one that feeds; now: of the reply.
+        """
+        lowest = self.watchdog - (now - self.since) - REACTION
+        # One that may have fed and was not confirmed may have come just before this request.
+        fed_at = self.confirmed_at if self.may <= self.since else sent_at
+        highest = min(self.watchdog, self.watchdog - (sent_at - fed_at)) + REACTION
+        if lowest <= left <= highest:
+            return None
+        return f"watchdog left must be {max(lowest, 0):.3f} to {highest:.3f} s, got {left:.3f} s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +129,7 @@ class Staged:
 class Dialogue:
     """The exchanges with one amplifier, whose line is open; as it sees it."""
 
-    def __init__(self, line: Line, address: int, name: str) -> None:
+    def __init__(self, line: "Line", address: int, name: str) -> None:
         self.line, self.address, self.name = line, address, name
         self.capabilities: Values = {}
         self.session = 0
@@ -69,10 +156,9 @@ class Dialogue:
         self._time = line.time
         self._ledger: Ledger | None = None
         self._admitted: Staged | None = None
-        self._contradictions = 0
+        self._contradictions = self._misachieved = 0  # in a row: statuses, achieved layers
         self._contradicted_at = -math.inf
         self._was_unfed = False  # the status of the last contradiction
-        self._misachieved = 0  # sets in a row that were achieved as another
         self._other_host_at = -math.inf  # when it was heard last
         self._are_several = False  # two amplifiers have replied since this was reset
         line.members[address] = self
@@ -84,18 +170,6 @@ class Dialogue:
             raise CommandError(f"amplifier {self.name} must be opened first")
         return self._ledger
 
-    def wire_ramp(self, ramp: float) -> int:
-        """Return the nearest ramp that the amplifier has: silence is never refused for it."""
-        highest = self.capabilities.get("ramp_max", _RAMP.maximum)
-        if math.isnan(ramp):
-            return _RAMP.to_wire(STOP_RAMP)
-        return min(_RAMP.to_wire(min(max(ramp, 0.0), _RAMP.high)), int(highest))
-
-    def is_silent(self, status: Values) -> bool:
-        """Whether a status has the levels of all channels, and all are zero."""
-        known = self.capabilities.get("channels")
-        return known == len(status["levels"]) and not any(status["levels"])
-
     def exchange_time(self, name: str) -> float:
         """Return how long the longest request of a name and its reply take on the wire [s]."""
         if name not in self._times:
@@ -106,74 +180,66 @@ class Dialogue:
             self._times[name] = self.line.wire.exchange_time(*words)
         return self._times[name]
 
-    @property
-    def statistics(self) -> LinkStatistics:
-        """Counts of its requests, and of all frames on its line."""
-        return replace(self.counts, **vars(self.line.wire.counters))
+    async def stage(self, token: int, layers: Sequence[Layer], *, now: bool = False) -> Staged:
+        """Stage a set under a token, or play it at once.
 
-    def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
-        """Note a request that is sent now and may reach it, at a time [s] unless it is delayed."""
-        if name == "Hello":
-            return
-        if MESSAGES[name].feeds and (name == "Arm" or values["session"] == self.session):
-            if name == "Silence" and self.silence_cause is not None:
-                self.feeding.unheard(_RAMP.from_wire(values["ramp"]), now)
-            else:
-                self.feeding.sent(now, arrives)
-        elif name in ("Stop", "Disarm"):
-            self.feeding.fades(_RAMP.from_wire(values["ramp"]))
-            self.silences += 1
-        if name == "Arm":
-            self.may_be_armed = True
+        It is admitted by the ledger when its turn on the line has come. Raises CommandRefused with
+        the reason; Preempted where a stop came first.
+        """
+        cuts: list[Values] = []
+        admitted: list[Staged] = []
+
+        def first() -> Values:
+            if not cuts:
+                admitted.append(self._admit(token, layers, cuts, now=now))
+            return cuts[0]
+
+        priority = Priority.SILENCE if is_silence(layers) else Priority.SET
+        taken = await self.line.submit(self, priority, "Set", {}, make=first)
+        for part in cuts[1:]:
+            make = partial(self.while_admitted, token, part)
+            taken = await self.line.submit(self, priority, "Set", part, make=make)
+        (staged,) = admitted
+        if not (taken["played"] or (taken["staged"] and self._admitted is staged)):
+            raise Preempted(f"amplifier {self.name}: set {token} was not staged")
+        return staged if taken["exact"] else replace(staged, is_exact=False)
+
+    def _admit(
+        self, token: int, layers: Sequence[Layer], cuts: list[Values], *, now: bool
+    ) -> Staged:
+        """Have the ledger admit a set, and cut it into parts; raises CommandRefused."""
+        moment = self._time()
+        # Longest time from the admission of a set until it is committed.
+        delay = max(COMMIT_DELAY, ATTEMPTS * len(self.line.members) * self.exchange_time("Set"))
+        admitted = self.ledger.admit(layers, moment, delay=delay)
+        stream = pack_layers(admitted)
+        if len(stream) > (limit := self.capabilities["set_words"]):
+            raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
+        cuts += parts(stream, session=self.session, token=token, now=now)
+        staged = self._admitted = Staged(token, admitted, is_exact=True, until=moment + delay)
+        return staged
+
+    def commit(self, token: int, *, start: JointStart | None = None) -> "asyncio.Future[Values]":
+        """Play the staged set; the future has the status, which shows its tokens.
+
+        start: together with the commits of other lines. Or raises Preempted where a stop or
+        disarm came first, CommandRefused where it is too late for what the ledger has admitted.
+        """
+        values = {"session": self.session, "token": token}
+        make = partial(self.while_admitted, token, values)
+        return self.line.submit(self, Priority.SET, "Commit", values, make=make, start=start)
+
+    def while_admitted(self, token: int, values: Values) -> Values:
+        """Return the values of a request of a set; raises DriverError unless it may play now."""
         admitted = self._admitted
-        if name in _SILENCING or name == "Arm":
-            self._admitted = None
-            if name == "Silence":
-                self.played_at = now
-        elif admitted is not None and values.get("token") == admitted.token and self._ledger:
-            is_last = name == "Set" and values["now"] and values["index"] == values["parts"] - 1
-            if name == "Commit" or is_last:
-                self.played_at = now
-                self._ledger.sent(admitted.token, admitted.layers, now)
-
-    def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
-        """Note the reply to a request that was sent at a time [s].
-
-        Raises CommandRefused once its statuses contradict what was sent, twice in a row.
-        """
-        now = self._time()
-        self.silence_cause = None
-        self.counts.last_round_trip = now - sent_at
-        message = MESSAGES.get(name)
-        if message is None:
-            return
-        if message.feeds:
-            self.feeding.confirmed(sent_at, now)
-        if message.reply is _STATUS:
-            self._note_status(name, values, reply, sent_at, now)
-        elif name == "Set" and reply["played"]:
-            self._confirm(values["token"], now)
-
-    def note_unasked(self, arrival: Event | OtherHost | Several) -> None:
-        """Note what came without a request; an event is handed on.
-
-        Another host must feed the watchdog within its longest time.
-        """
-        if isinstance(arrival, OtherHost):
-            self._other_host_at = self._time()
-        elif isinstance(arrival, Several):
-            self._are_several = True
-        else:
-            for listener in self.listeners:
-                try:
-                    listener(arrival.values)
-                except Exception:
-                    _logger.exception("amplifier %s: a listener failed", self.name)
-
-    def check_other_host(self) -> None:
-        """Raise LinkError if another host drives it."""
-        if self._time() - self._other_host_at <= _WATCHDOG.high:
-            raise self._driven_by_another()
+        if admitted is None or admitted.token != token:
+            raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
+        if (now := self._time()) > admitted.until:
+            raise CommandRefused(
+                f"amplifier {self.name}: set {token} must be committed {now - admitted.until:.3g} "
+                "s earlier; the wire is too slow or too busy"
+            )
+        return values
 
     def next_request(self, name: str, values: Values) -> float:
         """Return how much later than on a fast wire the reply to a request may come [s].
@@ -199,17 +265,68 @@ class Dialogue:
             raise self.disarmed(self.status)
         return longer
 
-    def while_admitted(self, token: int, values: Values) -> Values:
-        """Return the values of a request of a set; raises DriverError unless it may play now."""
+    def note_sent(self, name: str, values: Values, now: float, arrives: float) -> None:
+        """Note a request that is sent now and may reach it, at a time [s] unless it is delayed."""
+        if name == "Hello":
+            return
+        feeding = self.feeding
+        if MESSAGES[name].feeds and (name == "Arm" or values["session"] == self.session):
+            if name == "Silence" and self.silence_cause is not None:
+                # If it is heard that is within the time of the watchdog, and the ramp follows:
+                # repeated without reply, it does not put off when the amplifier must be silent.
+                feeding.may = now
+                feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
+            else:
+                feeding.sent(now, arrives)
+        elif name in ("Stop", "Disarm"):
+            feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
+            self.silences += 1
         admitted = self._admitted
-        if admitted is None or admitted.token != token:
-            raise Preempted(f"amplifier {self.name}: a stop, disarm or newer set came first")
-        if (now := self._time()) > admitted.until:
-            raise CommandRefused(
-                f"amplifier {self.name}: set {token} must be committed {now - admitted.until:.3g} "
-                "s earlier; the wire is too slow or too busy"
-            )
-        return values
+        if name in _SILENCING or name == "Arm":
+            self._admitted = None
+            self.may_be_armed = self.may_be_armed or name == "Arm"
+            self.played_at = now if name == "Silence" else self.played_at
+        elif admitted is not None and values.get("token") == admitted.token and self._ledger:
+            is_last = name == "Set" and values["now"] and values["index"] == values["parts"] - 1
+            if name == "Commit" or is_last:
+                self.played_at = now
+                self._ledger.sent(admitted.token, admitted.layers, now)
+
+    def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
+        """Note the reply to a request that was sent at a time [s].
+
+        Raises CommandRefused once its statuses contradict what was sent, twice in a row.
+        """
+        now = self._time()
+        self.silence_cause = None
+        self.counts.last_round_trip = now - sent_at
+        message = MESSAGES.get(name)
+        if message is None:
+            return
+        if message.feeds:
+            self.feeding.confirmed(sent_at, now)
+        if message.reply is _STATUS:
+            self._note_status(name, values, reply, sent_at, now)
+        elif name == "Set" and reply["played"]:
+            self._confirm(values["token"], now)
+
+    def note_unasked(self, arrival: Event | OtherHost | Several) -> None:
+        """Note what came without a request; an event is handed on."""
+        if isinstance(arrival, OtherHost):
+            self._other_host_at = self._time()
+        elif isinstance(arrival, Several):
+            self._are_several = True
+        else:
+            for listener in self.listeners:
+                try:
+                    listener(arrival.values)
+                except Exception:
+                    _logger.exception("amplifier %s: a listener failed", self.name)
+
+    def check_other_host(self) -> None:
+        """Raise LinkError if another host drives it, which must feed within the longest time."""
+        if self._time() - self._other_host_at <= _WATCHDOG.high:
+            raise self._driven_by_another()
 
     def _confirm(self, token: int, now: float) -> None:
         """Note that the amplifier plays the set with this token, as it says."""
@@ -236,23 +353,23 @@ class Dialogue:
         self._confirm(status["token"], now)
         if not self.session or name in ("Arm", "Clear") or status["state"] != ENABLED:
             return
-        fed = MESSAGES[name].feeds
-        problem = problem_of(status, self._ledger, self.feeding, sent_at=sent_at, now=now, fed=fed)
+        # A status after a request that feeds says nothing of how the watchdog runs down.
+        fed, problem = MESSAGES[name].feeds, None
+        if not status["flags"] >> STATUS_FLAGS["high_voltage"] & 1:
+            problem = "high voltage must be on, got off"
+        elif not fed:
+            left = _LEFT.from_wire(status["watchdog_left"])
+            problem = self.feeding.problem(left, sent_at, now)
+        problem = problem or self._ledger.problem_of(status, sent_at, now)
         if problem is None:
-            # A status after a request that feeds says nothing of how the watchdog runs down.
             if not (fed and self._was_unfed):
                 self._contradictions, self._contradicted_at = 0, -math.inf
-        else:
-            self._was_unfed = not fed
-            self.note_contradiction(problem, now)
-
-    def note_contradiction(self, problem: str, now: float) -> None:
-        """Count a contradiction at a time [s]; raises CommandRefused for the second in a row."""
-        if now - self._contradicted_at < _SAME_MOMENT:
             return
-        self._contradictions, self._contradicted_at = self._contradictions + 1, now
-        if self._contradictions >= MAX_CONTRADICTIONS:
-            raise self.contradicted(problem)
+        self._was_unfed = not fed
+        if now - self._contradicted_at >= _SAME_MOMENT:
+            self._contradictions, self._contradicted_at = self._contradictions + 1, now
+            if self._contradictions >= MAX_CONTRADICTIONS:
+                raise self.contradicted(problem)
 
     def contradicted(self, problem: str) -> CommandRefused:
         """Return the error of contradictions in a row."""

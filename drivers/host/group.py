@@ -16,13 +16,13 @@ from drivers.errors import (
     DriverError,
     LinkDegraded,
     LinkError,
+    LinkTimeout,
     Preempted,
 )
 from drivers.host.amplifier import DISARM_RAMP, WATCHDOG, Amplifier
 from drivers.host.jobs import Priority
-from drivers.host.joint_sets import JointSets, Played
 from drivers.host.line import Line
-from drivers.host.members import Heartbeats, Members, is_lost, retried, seen
+from drivers.host.members import Members, Played, is_lost, retried
 from drivers.host.stop import Stopped
 from drivers.host.timing import STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values
@@ -30,6 +30,7 @@ from drivers.protocol.table import ENABLED, QUANTITIES
 
 _T = TypeVar("_T")
 _SESSION, _TOKEN = QUANTITIES["session"], QUANTITIES["token"]
+_MAX_STATUS_LOAD = 0.05  # of the line's time, for statuses that show whether the watchdog runs down
 _logger = logging.getLogger(__name__)
 
 
@@ -56,17 +57,17 @@ class Group(Members):
         watchdog: float = WATCHDOG,
         draw: Callable[[int, int], int] = random.randint,
     ) -> None:
-        super().__init__(amplifiers)
+        super().__init__(amplifiers, draw(_TOKEN.minimum, _TOKEN.maximum))
         self.state = GroupState.CLOSED
         self._watchdog = watchdog
         self._draw = draw
-        self._heartbeats = Heartbeats(self)
         self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
-        self._sets = JointSets(self, draw(_TOKEN.minimum, _TOKEN.maximum))
         self._stopped = 0  # epoch of the last stop, until it is cleared
         self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # of stops
         self._limit: asyncio.Timeout | None = None  # of an exchange in progress
+        self._running_read_at: dict[str, float] = {}  # statuses just before a heartbeat
+        self._readings: dict[str, asyncio.Future[Values]] = {}  # of amplifiers that do not reply
 
     @property
     def is_open(self) -> bool:
@@ -77,11 +78,6 @@ class Group(Members):
     def is_armed(self) -> bool:
         """Whether layers may be played."""
         return self.state is GroupState.ARMED
-
-    @property
-    def is_set_incomplete(self) -> bool:
-        """Whether possibly only some amplifiers have committed the last set."""
-        return self._sets.is_incomplete
 
     async def open(self) -> None:
         """Identify all amplifiers and leave them disarmed.
@@ -145,7 +141,7 @@ class Group(Members):
                 if self.lost_by:
                     self.lose()
                 raise
-            self._sets.is_incomplete = False
+            self.is_set_incomplete = False
             self.state = GroupState.ARMED
 
     async def _disarm_armed(self, arming: "asyncio.Future[list[Any]]") -> None:
@@ -173,7 +169,7 @@ class Group(Members):
         amplifiers before it is raised.
         """
         self._check_armed()
-        done = await self._exchange(self._sets.play(layers))
+        done = await self._exchange(self.play(layers))
         if isinstance(done, CommandRefused):
             raise done
         return done
@@ -186,17 +182,39 @@ class Group(Members):
         self._check_armed()
         requests = [each.silence(ramp) for each in self.amplifiers.values()]
         await self._exchange(self.all(requests))
-        self._sets.is_incomplete = False
+        self.is_set_incomplete = False
         return self.last_sent_at
 
     async def beat(self) -> None:
         """Feed the watchdog of every amplifier that replies; raises as `apply`.
 
         Of one that does not reply the status is read meanwhile; one that replies again must still
-        play its set.
+        play its set. A watchdog that runs down, and starts anew with each heartbeat, shows that it
+        would silence the amplifier: so its status is read just before it is fed.
         """
         self._check_armed()
-        await self._exchange(self._heartbeats.beat())
+        await self._exchange(self._beat())
+
+    async def _beat(self) -> None:
+        for each in self.amplifiers.values():  # before the others are waited for: they stop then
+            if is_lost(each):
+                raise LinkTimeout(each.line.loss or each.silence_cause)
+        await self.all([self._feed(each, self.epoch) for each in self.amplifiers.values()])
+
+    async def _feed(self, amplifier: Amplifier, before: int) -> None:
+        name = amplifier.name
+        if amplifier.silence_cause is None:
+            # The status first, unless the wire is too slow for that.
+            pause = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
+            if (now := clock.now()) - self._running_read_at.get(name, 0.0) >= pause:
+                self._running_read_at[name] = now
+                await amplifier.read_status(Priority.HEARTBEAT)
+            self.check_none_since(before)
+            await amplifier.ping()
+        elif name not in self._readings or self._readings[name].done():
+            reading = asyncio.ensure_future(amplifier.read_status(Priority.READING))
+            reading.add_done_callback(_seen)
+            self._readings[name] = reading
 
     def abort_exchange(self) -> None:
         """End an `apply`, `silence` or `beat` in progress, so that silence can be sent next.
@@ -281,7 +299,7 @@ class Group(Members):
         if queued is None or queued.done():
             first = next(iter(self.amplifiers.values()))
             sent = line.submit(None, Priority.STOP, "Stop", {"ramp": first.wire_ramp(ramp)})
-            sent.add_done_callback(seen)
+            sent.add_done_callback(_seen)
             self._broadcasts[line] = sent
 
     async def _outcomes(
@@ -366,3 +384,9 @@ class Group(Members):
         """Enter the state LOST, in which nothing is played."""
         if self.state is not GroupState.CLOSED:
             self.state = GroupState.LOST
+
+
+def _seen(sent: "asyncio.Future[Values]") -> None:
+    """Retrieve an error that nobody awaits: what each amplifier says afterwards decides."""
+    if not sent.cancelled():
+        sent.exception()

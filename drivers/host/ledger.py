@@ -12,17 +12,19 @@ from dataclasses import replace
 
 from drivers.contents import Layer
 from drivers.errors import CommandRefused
-from drivers.host.bounds import all_bounds, plain_bounds, worst
-from drivers.host.budget import COMMIT_DELAY, Budget, Vibration
-from drivers.host.limits import RATE_CEILING, TOLERANCE, Rounding, wire_limits
+from drivers.host.bounds import all_bounds, worst
+from drivers.host.limits import COMMIT_DELAY, TOLERANCE, Budget, Rounding, Vibration, wire_limits
 from drivers.playback import playback_of
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.table import QUANTITIES, has_feature
 from registry.limits import GuardLimits
 
 _LEVEL, _STEP = QUANTITIES["level"], QUANTITIES["envelope_step"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
+_STEPS = 2  # of levels, by which a status may differ
+_MEASURING_ERROR = 0.002  # of full level, where an amplifier measures its levels
+_WEAK = 0.25  # largest measuring error, relative to a weak level
 _logger = logging.getLogger(__name__)
 
 
@@ -38,7 +40,7 @@ class Ledger:
         self.limits = wire_limits(limits, capabilities)
         self.capabilities = capabilities
         self._rounding = Rounding(self.limits, capabilities)
-        self._budget = Budget(replace(limits, rate=min(limits.rate, RATE_CEILING)))
+        self._budget = Budget(limits)
         self.playback = playback_of(capabilities)
         self.lag = 0.0  # s; by which what plays may be later than `playback` says
         self._doubt: tuple[int, tuple[LayerSet, ...], float, Vibration | None] | None = None
@@ -144,6 +146,51 @@ class Ledger:
         else:
             self.refused()
 
+    def problem_of(self, status: Values, sent_at: float, now: float) -> str | None:
+        """Describe what the status of an armed one contradicts; None if it agrees.
+
+        sent_at, now [s]: of the request and its reply. Levels of voices that change are bounded
+        from above alone: their commit is known as an interval.
+        """
+        playback = self.playback
+        playback.advance(now - self.lag)
+        if len(status["levels"]) != playback.channels:
+            return f"levels must be {playback.channels}, got {len(status['levels'])}"
+        if len(status["tokens"]) != self.capabilities["layers"]:
+            return f"layers must be {self.capabilities['layers']}, got {len(status['tokens'])}"
+        is_steady = playback.next_due - 2 * self.lag > now
+        if is_steady:  # else a layer may have ended, or not yet
+            expected = playback.tokens
+            for layer, token in enumerate(status["tokens"]):
+                if token != expected.get(layer, 0):
+                    return f"token of layer {layer} must be {expected.get(layer, 0)}, got {token}"
+        late, tolerance = sent_at - self.lag, _STEPS * max(self.capabilities["level_step"], 1)
+        for channel, level in enumerate(status["levels"]):
+            highest, is_settled = 0.0, is_steady
+            for voice in playback.all_voices[channel]:
+                transition = voice.transition
+                if transition.end <= late:
+                    highest += abs(transition.last)
+                    continue
+                is_settled = False
+                if transition.knots:
+                    highest += transition.peak(late)
+                else:
+                    highest += max(abs(transition.first), abs(transition.last))
+            high = round(min(highest, 1.0) * _LEVEL.per_unit)
+            low = (
+                round(min(playback.level(channel, now), 1.0) * _LEVEL.per_unit) if is_settled else 0
+            )
+            if low - tolerance <= level <= high + tolerance:  # nearly always
+                continue
+            if has_feature(self.capabilities, "levels_measured"):
+                error = round(_MEASURING_ERROR * _LEVEL.per_unit)
+                low -= min(error, round(_WEAK * low))
+                high += min(error, round(_WEAK * high))
+            if not low - tolerance <= level <= high + tolerance:
+                return f"level of channel {channel} must be {low} to {high} (1e-4), got {level}"
+        return None
+
     def _silence(
         self, layers: tuple[LayerSet, ...], now: float, delay: float
     ) -> tuple[LayerSet, ...]:
@@ -203,16 +250,42 @@ class Ledger:
         return None
 
     def _is_plain_and_within(self, layers: Sequence[LayerSet], late: float, until: float) -> bool:
-        """Whether a cross-fade that needs no closer look is within the limits: nearly every set."""
-        ends = plain_bounds(self.playback, layers, late, until=until)
-        if ends is None:
+        """Whether a cross-fade along one ramp is within the limits: nearly every set.
+
+        Between its two ends levels are convex, and so are sums of their squares, so that the worst
+        is at one of them. False where envelopes, several ramps or ends of layers need more.
+        """
+        playback, ramp, highest = self.playback, layers[0].ramp, self.limits.level
+        may_end = playback.next_due <= until
+        if playback.next_due < math.inf and playback.waiting:
             return False
-        before, after = ends
-        highest, power = self.limits.level / _LEVEL.per_unit * TOLERANCE, self.limits.power
-        if max(before) > highest or max(after) > highest:
+        named: list[int] = []
+        after = [0.0] * playback.channels
+        for one in layers:
+            if one.ramp != ramp or one.after or (may_end and playback.end_of(one.layer) <= until):
+                return False
+            if not one.renew:
+                named.append(one.layer)
+            for command in one.commands:
+                if command.onset is not None or command.ending is not None:
+                    return False
+                after[command.channel] += command.level / _LEVEL.per_unit
+        before = [0.0] * playback.channels
+        for channel, voices in enumerate(playback.all_voices):
+            for voice in voices:
+                transition = voice.transition
+                if transition.knots or voice.ending is not None:
+                    return False
+                peak = abs(transition.last)
+                if transition.first and late < transition.end:
+                    peak = max(peak, abs(transition.first))
+                before[channel] += peak
+                if voice.has_ended or voice.layer not in named:
+                    after[channel] += peak
+        if max(*before, *after) > highest / _LEVEL.per_unit * TOLERANCE:
             return False
-        highest_power = max(math.hypot(*before), math.hypot(*after)) ** 2
-        return power == math.inf or highest_power <= power * TOLERANCE
+        power = max(math.hypot(*before), math.hypot(*after)) ** 2
+        return power <= self.limits.power * TOLERANCE
 
     def _within_budget(
         self, layers: tuple[LayerSet, ...], now: float, delay: float
@@ -246,6 +319,14 @@ def _lasts(one: LayerSet) -> float:
     if not is_vibrating(one):
         return _fade(one)
     return _fade(one) + (_VALID_FOR.from_wire(one.valid_for) or math.inf)
+
+
+def is_silence(layers: Sequence[Layer]) -> bool:
+    """Whether layers only fall silent."""
+    for layer in layers:  # noqa: SIM110  a generator would be a call for each
+        if layer.tones or layer.renew:
+            return False
+    return True
 
 
 def is_vibrating(*layers: LayerSet) -> bool:

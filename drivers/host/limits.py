@@ -1,4 +1,4 @@
-"""What a set may contain: limits in force, and layers as the wire rounds them, in integers.
+"""What a set may contain: limits in force, layers as the wire rounds them, and limits over time.
 
 Limits are the least of rig, amplifier, channels and ceilings. Levels, frequencies and phases are
 rounded to the nearest step, ramps and steps upward, and `valid_for` never to 0, which means without
@@ -6,9 +6,11 @@ end; what the wire cannot have, or limits forbid, is refused.
 """
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import index
+from typing import TypeAlias
 
 from drivers.contents import Layer, Shape, Tone
 from drivers.errors import CommandError, CommandRefused
@@ -21,7 +23,15 @@ FREQUENCY_FLOOR = 10.0
 """Below it a plate on springs only moves as a rigid body, and nothing is felt [Hz]."""
 RATE_CEILING = 2000.0
 """No wire carries more sets a second, so a higher rate can only be a runaway loop."""
+DUTY_WINDOW = 10.0
+"""Window of the duty limit [s]; short against the thermal time constant of an amplifier."""
+COMMIT_DELAY = 0.1
+"""Longest time [s] from sending a set until it is played: three attempts of 30 ms each."""
+_RATE_WINDOW = 1.0  # s
 _SLACK = 1e-6  # of a step; sums of floats
+
+Vibration: TypeAlias = tuple[float | None, float]
+"""Earliest start [s] of a vibration, None without one, and its latest end [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,3 +209,97 @@ class Rounding:
 
 def _refused(channel: int, text: str) -> CommandRefused:
     return CommandRefused(f"channel {channel}: {text}", channel=channel)
+
+
+class Budget:
+    """Sets sent and the longest time they may vibrate; times [s] are arguments."""
+
+    def __init__(self, limits: GuardLimits) -> None:
+        self._limits, self._rate = limits, min(limits.rate, RATE_CEILING)
+        self.is_unlimited = limits.on_time == math.inf and limits.duty >= 1
+        self._duty_time = limits.duty * DUTY_WINDOW if limits.duty < 1 else math.inf
+        allowed = max(1, int(self._rate * _RATE_WINDOW))
+        # Sets that were delayed on their way arrive closer together than they were sent.
+        self._window = max(_RATE_WINDOW, allowed / self._rate) + COMMIT_DELAY
+        self._sent: deque[float] = deque(maxlen=allowed)
+        self._vibrations: deque[tuple[float, float]] = deque()  # ended ones: start, end
+        self._start: float | None = None  # earliest start of the current one
+        self._end = 0.0  # its latest end
+
+    def remaining(self, now: float, *, fade: float, delay: float) -> float:
+        """Longest valid_for [s] of a vibration that is sent now, infinite if unlimited.
+
+        fade [s]: how long it takes to end after that; delay [s]: allowance until it is played,
+        while the current vibration goes on. Raises CommandRefused if no time is left or the rate is
+        exceeded.
+        """
+        if len(self._sent) == self._sent.maxlen and now < self._sent[0] + self._window:
+            raise CommandRefused(
+                f"rate must be at most {self._rate:g} command sets a second; send fewer, "
+                "the limit stops runaway loops",
+                until=self._sent[0] + self._window,
+            )
+        if self.is_unlimited:
+            return math.inf
+        is_vibrating = self._start is not None and now < self._end
+        spent = fade + (delay if is_vibrating else 0.0)
+        used = now - self._start if is_vibrating and self._start is not None else 0.0
+        return min(
+            _left("on-time limit", used, self._limits.on_time, spent),
+            _left(f"duty limit over {DUTY_WINDOW:g} s", self._used(now), self._duty_time, spent),
+        )
+
+    def fade_left(self, now: float) -> float:
+        """Longest time [s] in which the current vibration may fade if silence is sent now."""
+        if self._start is None or now >= self._end:
+            return math.inf
+        used = max(self._used(now) - self._duty_time, now - self._start - self._limits.on_time)
+        return max(0.0, -used - COMMIT_DELAY)
+
+    def sent(self, now: float, *, lasts: float) -> Vibration:
+        """Note a set that vibrates for at most a time [s], fade included; what vibrated before."""
+        self._sent.append(now)
+        self._close(now)
+        before = self._start, self._end
+        if self._start is None:
+            self._start, self._end = now, now
+        self._end = max(self._end, now + COMMIT_DELAY + lasts)
+        return before
+
+    def restore(self, before: Vibration | None) -> None:
+        """Note that the set sent last was refused; before: as `sent` returned."""
+        if before is not None:
+            self._start, self._end = before
+
+    def confirm(self, sent_at: float, now: float, *, end: float) -> None:
+        """Note that the set sent at a time [s] plays, and ends at another at the latest."""
+        self._close(now)
+        if self._start is None and now < end:
+            self._start = sent_at
+        self._end = end
+
+    def _close(self, now: float) -> None:
+        """Store the current vibration once it has ended."""
+        if self._start is not None and self._end <= now:
+            self._vibrations.append((self._start, self._end))
+            self._start = None
+        while self._vibrations and self._vibrations[0][1] < now - DUTY_WINDOW:
+            self._vibrations.popleft()
+
+    def _used(self, now: float) -> float:
+        """Vibration time within the window before now [s]."""
+        opened = now - DUTY_WINDOW
+        current = () if self._start is None else ((self._start, min(now, self._end)),)
+        spans = [end - max(start, opened) for start, end in (*self._vibrations, *current)]
+        return sum((max(0.0, span) for span in spans), start=0.0)
+
+
+def _left(name: str, used: float, limit: float, spent: float) -> float:
+    """Return the time [s] of a limit that is not spent; CommandRefused if none."""
+    left = limit - used - spent
+    if left <= 0:
+        raise CommandRefused(
+            f"{name} of {limit:.3g} s reached ({used:.3g} s used, {spent:.3g} s to end); pause the "
+            "vibration"
+        )
+    return left

@@ -1,30 +1,58 @@
-"""The amplifiers of a group: which reply, which are lost; requests, heartbeats, stops of all.
+"""The amplifiers of a group: which reply, which are lost, and what they play together.
 
-Heartbeats show as well that amplifiers still play what they should. A watchdog that runs down, and
-starts anew with each of them, shows that it would silence the amplifier: so its status is read just
-before it is fed. One that does not reply is not fed.
+A set is staged on all amplifiers that it names, then committed at one moment, or on none. A token
+is newer than another by less than half of 2^16 (RFC 1982): an amplifier that was left out of 40 000
+sets would take the next one for an older one. It commits one that changes nothing before.
 """
 
 import asyncio
 import math
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 from drivers import clock
-from drivers.errors import LinkError, LinkTimeout, Preempted
+from drivers.contents import Layer
+from drivers.errors import CommandRefused, LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
-from drivers.host.jobs import Priority
+from drivers.host.dialogue import Staged
+from drivers.host.jobs import JointStart, Priority
+from drivers.host.ledger import is_silence
+from drivers.host.line import Line
 from drivers.protocol.records import Values
+from drivers.protocol.sets import LayerSet, token_after
+from drivers.protocol.table import ENABLED, STATES, name_of
 
+INTERVAL = 1 << 12
+"""Tokens after which the gaps are looked at again."""
+_MAX_GAP = 1 << 14
+_SPAN = 1 << 16
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
 _T = TypeVar("_T")
 
 
-class Members:
-    """Amplifiers by name, and the stops, disarms and closes of all of them."""
+@dataclass(frozen=True)
+class Played:
+    """What amplifiers play of a set, by name, as they have achieved it; token: of the set.
 
-    def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
+    sent_at [s]: when the last commit went out.
+    """
+
+    token: int
+    layers: Mapping[str, tuple[LayerSet, ...]]
+    sent_at: float
+
+
+class Members:
+    """Amplifiers by name, the sets of all of them under tokens from a first one on, and stops."""
+
+    def __init__(self, amplifiers: Mapping[str, Amplifier], token: int) -> None:
         self.amplifiers = dict(amplifiers)
+        self.token = token
+        """Of the last set."""
+        self.is_set_incomplete = False
+        """Whether possibly only some amplifiers have committed the last set."""
         self.epoch = 0
         """Stops, disarms and closes so far: nothing from before arms, plays or feeds after one."""
         self.silencing: set[asyncio.Future[Any]] = set()
@@ -91,8 +119,7 @@ class Members:
         try:
             if len(requests) == 1:  # without a further iteration of the event loop
                 return [await requests[0]]
-            results = await asyncio.gather(*requests, return_exceptions=True)
-            return self.checked(results)
+            return self.checked(await asyncio.gather(*requests, return_exceptions=True))
         except LinkError as error:
             self.note(error)
             raise
@@ -119,6 +146,86 @@ class Members:
         if isinstance(error, Preempted):  # by the cause, which is to be told
             return 2
         return 0 if isinstance(error, LinkError) else 1
+
+    async def play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | CommandRefused:
+        """Stage and commit layers by amplifier; a refusal before the first commit is returned."""
+        before = self.epoch
+        if self.token % INTERVAL == 0:
+            await self._close_gaps()
+        self.token = token = token_after(self.token)
+        is_silent = all(map(is_silence, layers.values()))
+        staging: list[Awaitable[Staged]] = []
+        for name, of_one in layers.items():
+            staging.append(self.amplifiers[name].stage(token, of_one, now=is_silent))
+        results = await asyncio.gather(*staging, return_exceptions=True)
+        refusals: dict[str, CommandRefused] = {}
+        has_failed = is_silent
+        for name, result in zip(layers, results, strict=True):
+            if isinstance(result, CommandRefused) and not result.is_disarmed:
+                if not isinstance(result, Preempted):
+                    refusals[name] = result
+            elif isinstance(result, BaseException):
+                has_failed = True
+        if refusals and not has_failed:
+            return _merged(refusals)
+        staged = dict(zip(layers, self.checked(results), strict=True))
+        if not is_silent:
+            self.check_none_since(before)
+            self.is_set_incomplete = len(layers) > 1
+            await self._commit(staged)
+        self.is_set_incomplete = False
+        played: dict[str, tuple[LayerSet, ...]] = {}
+        inexact: list[str] = []
+        sent_at = -math.inf
+        for name, one in staged.items():
+            played[name], sent_at = one.layers, max(sent_at, self.amplifiers[name].played_at)
+            if not one.is_exact:
+                inexact.append(name)
+        if inexact:
+            reading = [_achieved(self.amplifiers[name], staged[name]) for name in inexact]
+            played.update(zip(inexact, await self.all(reading), strict=True))
+        return Played(token, played, sent_at)
+
+    async def _commit(self, staged: Mapping[str, Staged]) -> None:
+        """Commit on every line at one moment, by one broadcast where amplifiers share it.
+
+        Raises CommandRefused where one does not play its set then.
+        """
+        token, until = self.token, math.inf
+        by_line: dict[Line, list[str]] = {}
+        for name, one in staged.items():
+            by_line.setdefault(self.amplifiers[name].line, []).append(name)
+            until = min(until, one.until)
+        start = None
+        if len(by_line) > 1:
+            start = JointStart(len(by_line), until=until)
+        requests: dict[str, Awaitable[Values]] = {}
+        broadcasts: list[Awaitable[Values]] = []
+        for line, sharing in by_line.items():
+            if len(sharing) == 1:
+                requests[sharing[0]] = self.amplifiers[sharing[0]].commit(token, start=start)
+                continue
+            make = partial(_commit_of, [self.amplifiers[name] for name in sharing], token)
+            sent = line.submit(None, Priority.SET, "Commit", {}, make=make, start=start)
+            broadcasts.append(sent)
+            for name in sharing:
+                requests[name] = _status_of(self.amplifiers[name], token, sent)
+        # With the broadcasts: one that waits is not sent where this is given up.
+        statuses = await self.all([*requests.values(), *broadcasts])
+        for name, status in zip(requests, statuses, strict=False):
+            _check_plays(name, status, staged[name])
+
+    async def _close_gaps(self) -> None:
+        """Have amplifiers whose token is far behind commit a set that changes nothing."""
+        unchanged = []
+        for amplifier in self.amplifiers.values():
+            committed = amplifier.committed  # 0: any is newer
+            if committed > 0 and (self.token - committed) % _SPAN > _MAX_GAP:
+                unchanged += [(amplifier, layer) for layer in _unchanged(amplifier)]
+        if unchanged:
+            self.token = token_after(self.token)
+            sets = [each.stage(self.token, [layer], now=True) for each, layer in unchanged]
+            await asyncio.gather(*sets)
 
 
 def is_lost(amplifier: Amplifier) -> bool:
@@ -152,47 +259,62 @@ async def _to_completion(task: "asyncio.Future[_T]") -> _T:
     return task.result()
 
 
-def seen(sent: "asyncio.Future[Values]") -> None:
-    """Retrieve an error that nobody awaits: what each amplifier says afterwards decides."""
-    if not sent.cancelled():
-        sent.exception()
+def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:
+    """Join refusals by amplifier; `until` is known only if all of them pass by themselves."""
+    known = [each.until for each in refusals.values() if each.until is not None]
+    return CommandRefused(
+        "; ".join(f"{name}: {refusal}" for name, refusal in refusals.items()),
+        channel=next(iter(refusals.values())).channel,
+        until=max(known) if len(known) == len(refusals) else None,
+    )
 
 
-_MAX_STATUS_LOAD = 0.05  # of the line's time, for statuses that show whether the watchdog runs down
+def _commit_of(several: Sequence[Amplifier], token: int) -> Values:
+    """Return the commit of all amplifiers of a line; raises unless each may play its set now."""
+    values = {"session": several[0].session, "token": token}
+    for amplifier in several:
+        amplifier.while_admitted(token, values)
+    return values
 
 
-class Heartbeats:
-    """Heartbeats of the amplifiers of a group."""
+def _check_plays(name: str, status: Values, staged: Staged) -> None:
+    """Raise CommandRefused unless a status shows that a set plays, in each of its layers."""
+    for one in staged.layers:
+        is_lasting = False
+        for command in one.commands:
+            is_lasting = is_lasting or (command.level > 0 and not one.after)
+        got = dict(enumerate(status["tokens"])).get(one.layer)
+        if is_lasting and got != staged.token:
+            raise CommandRefused(
+                f"amplifier {name}: token of layer {one.layer} must be {staged.token}, got {got}"
+            )
+    if status["token"] != staged.token or status["state"] != ENABLED:
+        raise CommandRefused(
+            f"amplifier {name}: token must be {staged.token} while armed, got {status['token']} in "
+            f"state {name_of(STATES, status['state'])}"
+        )
 
-    def __init__(self, members: Members) -> None:
-        self._members = members
-        self._running_read_at: dict[str, float] = {}
-        self._readings: dict[str, asyncio.Future[Values]] = {}  # of amplifiers that do not reply
 
-    async def beat(self) -> None:
-        """Feed the watchdog of every amplifier that replies, and read the status of the others.
+async def _achieved(amplifier: Amplifier, staged: Staged) -> tuple[LayerSet, ...]:
+    """Read the layers of a set that plays, as the amplifier has achieved them."""
+    return tuple([await amplifier.read_achieved(one) for one in staged.layers])
 
-        Raises LinkTimeout where one is lost, Preempted where they are armed no longer, and what
-        the requests raise.
-        """
-        amplifiers = self._members.amplifiers.values()
-        for amplifier in amplifiers:  # before the others are waited for: they are stopped then
-            if is_lost(amplifier):
-                raise LinkTimeout(amplifier.line.loss or amplifier.silence_cause)
-        before = self._members.epoch
-        await self._members.all([self._beat(each, before) for each in amplifiers])
 
-    async def _beat(self, amplifier: Amplifier, before: int) -> None:
-        name = amplifier.name
-        if amplifier.silence_cause is None:
-            # A status just before the watchdog is fed, unless the wire is too slow for that.
-            pause = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
-            if (now := clock.now()) - self._running_read_at.get(name, 0.0) >= pause:
-                self._running_read_at[name] = now
-                await amplifier.read_status(Priority.HEARTBEAT)
-            self._members.check_none_since(before)
-            await amplifier.ping()
-        elif name not in self._readings or self._readings[name].done():
-            reading = asyncio.ensure_future(amplifier.read_status(Priority.READING))
-            reading.add_done_callback(seen)
-            self._readings[name] = reading
+async def _status_of(amplifier: Amplifier, token: int, sent: Awaitable[Values]) -> Values:
+    """Read the status after a broadcast that was sent, and commit again where that was lost."""
+    status = await amplifier.read_status(Priority.SET)
+    if status["token"] == token:
+        return status
+    await sent
+    return await amplifier.commit(token)
+
+
+def _unchanged(amplifier: Amplifier) -> list[Layer]:
+    """Return a layer that is silent, or renewed without end; none if all end soon by themselves."""
+    playback = amplifier.ledger.playback
+    for number in range(amplifier.capabilities["layers"]):
+        if number not in playback.tokens:
+            return [Layer(number)]
+        if playback.is_endless(number):
+            return [Layer(number, renew=True)]
+    return []

@@ -12,7 +12,6 @@ from itertools import pairwise
 from drivers import clock
 from drivers.errors import CommandError, CommandRefused, FrameError
 from drivers.host.amplifier import Amplifier
-from drivers.host.comparison import name_of
 from drivers.host.jobs import Priority
 from drivers.protocol.records import Record, Refusal, Rows, Values
 from drivers.protocol.table import (
@@ -22,6 +21,7 @@ from drivers.protocol.table import (
     SENSOR_UNITS,
     UNKNOWN_PLACE,
     has_feature,
+    name_of,
     sensor_reading,
 )
 

@@ -3,14 +3,17 @@
 import asyncio
 import contextlib
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from drivers import clock
-from drivers.host.comparison import is_stopping
-from drivers.host.dialogue import Dialogue
 from drivers.host.jobs import Priority
 from drivers.host.timing import ATTEMPTS
 from drivers.protocol.records import Values
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.sets import is_newer_token
+from drivers.protocol.table import LATCHED, QUANTITIES
+
+if TYPE_CHECKING:
+    from drivers.host.amplifier import Amplifier
 
 _INTERVAL = 0.005  # s; between attempts to stop, in addition to the ramp
 _RAMP = QUANTITIES["ramp"]
@@ -36,7 +39,7 @@ class Stop:
     the levels of all channels at zero: another one may be old, kept on its way.
     """
 
-    def __init__(self, amplifier: Dialogue, ramp: float, timeout: float) -> None:
+    def __init__(self, amplifier: "Amplifier", ramp: float, timeout: float) -> None:
         self.is_sent = False
         """Whether its first request has gone out: what comes later needs a stop of its own."""
         self._amplifier = amplifier
@@ -95,3 +98,10 @@ class Stop:
             cause = cause or f"silence was not reported within {self._timeout:g} s"
         loss = amplifier.line.loss
         return Stopped(False, amplifier.feeding.may_play_until, loss or cause)
+
+
+def is_stopping(status: Values, before: int | None) -> bool:
+    """Whether a status shows that a stop was carried out since a latch was the newest."""
+    if before is None or status["state"] not in LATCHED:
+        return False
+    return status["latch"] > 0 and is_newer_token(status["latch"], before)

@@ -299,3 +299,8 @@ def nak_of(refusal: Refusal, number: int) -> list[int]:
 def has_feature(capabilities: Values, name: str) -> bool:
     """Whether capabilities state a feature, of FEATURES."""
     return bool(capabilities["features"] >> FEATURES[name] & 1)
+
+
+def name_of(names: Mapping[str, int], number: int) -> str:
+    """Return the name of a number of the table, or the number."""
+    return next((name for name, each in names.items() if each == number), str(number))

@@ -31,7 +31,7 @@ from drivers.contents import Layer, Shape, Tone
 from drivers.errors import DriverError
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.amplifier import Amplifier as Host
-from drivers.host.feeding import SILENCING
+from drivers.host.dialogue import SILENCING
 from drivers.host.group import Group
 from drivers.host.stop import Stopped
 from drivers.protocol.records import Values

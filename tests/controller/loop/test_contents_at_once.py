@@ -24,7 +24,7 @@ from controller.loop.selection import unshaped
 from controller.sources.contacts import Contact, ContactKey
 from drivers.contents import Layer
 from drivers.errors import CommandRefused
-from drivers.host.joint_sets import Played
+from drivers.host.members import Played
 from model.arrays import Complex64Array
 from model.errors import InputError
 from model.table.pattern import Pattern

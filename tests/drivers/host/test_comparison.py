@@ -6,7 +6,7 @@ import pytest
 
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused
-from drivers.host.comparison import achieved_problem
+from drivers.host.amplifier import achieved_problem
 from drivers.host.group import Group
 from drivers.host.sensors import read_measured
 from drivers.protocol.records import Values

@@ -182,7 +182,7 @@ async def test_amplifier_that_was_left_out_for_long_takes_the_next_set(
     )
     before = ends[1].far["b"].playback.voices_of(0)
     for count in range(1, 17):
-        group._sets.token = 4096 * count % 65536 or 1
+        group.token = 4096 * count % 65536 or 1
         await group.apply({"a": [loud(0, 0.5)]})
         await group.beat()
     after = ends[1].far["b"].playback.voices_of(0)

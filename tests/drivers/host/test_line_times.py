@@ -8,7 +8,7 @@ import pytest
 from armed_group import grouped, layer, tone, with_group
 from drivers.contents import Layer, Shape
 from drivers.errors import DriverError, LinkTimeout
-from drivers.host.feeding import SILENCING
+from drivers.host.dialogue import SILENCING
 from drivers.host.group import Group
 from drivers.host.modbus_wire import ModbusWire
 from drivers.host.serial_wire import SerialWire

@@ -50,7 +50,7 @@ def test_only_wires_use_encoders() -> None:
     below = {"backends", "codec", "protocol"}
     above = [file for file in users - wires if not below & set(file.parts)]
     assert {file.parent for file in above} == {CONFORMANCE, WIRES, HOST}
-    assert [file.name for file in above if file.parent == HOST] == ["amplifier.py"]
+    assert [file.name for file in above if file.parent == HOST] == ["dialogue.py"]
 
 
 def test_only_what_a_ledger_admits_is_packed() -> None:
@@ -63,7 +63,7 @@ def test_only_what_a_ledger_admits_is_packed() -> None:
     )
     admitted = [
         ast.unparse(node.targets[0])
-        for node in nodes(HOST / "amplifier.py")
+        for node in nodes(HOST / "dialogue.py")
         if isinstance(node, ast.Assign) and ".ledger.admit(" in ast.unparse(node.value)
     ]
     assert admitted == [packed]

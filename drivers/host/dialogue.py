@@ -298,7 +298,6 @@ class Dialogue:
         Raises CommandRefused once its statuses contradict what was sent, twice in a row.
         """
         now = self._time()
-        self.silence_cause = None
         self.counts.last_round_trip = now - sent_at
         message = MESSAGES.get(name)
         if message is None:

@@ -13,6 +13,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple, final
 
 from drivers.errors import CommandRefused, Preempted
+from drivers.host.timing import ATTEMPTS
 from drivers.protocol.records import Values
 
 if TYPE_CHECKING:
@@ -141,11 +142,11 @@ class Job:
     name: str
     values: Values
     make: Callable[[], Values] | None
-    attempts: int
     timeout: float
     queued_at: float
     result: "asyncio.Future[Values]"
     start: JointStart | None = None
+    attempts: int = ATTEMPTS
     is_held: bool = False
     is_released: bool = False
     not_before: float = 0.0
@@ -215,7 +216,3 @@ class JobQueue:
     def supersedes(self, job: Job) -> bool:
         """Whether one that waits makes a job obsolete."""
         return any(job.is_superseded_by(other.priority, other.member) for other in self.jobs)
-
-    def next_due(self, now: float) -> float:
-        """When [s] the first of those that pause is due, after the present time; 0 if none is."""
-        return min((job.not_before for job in self.jobs if job.not_before > now), default=0.0)

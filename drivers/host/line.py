@@ -16,6 +16,7 @@ from drivers.host.jobs import Job, JobQueue, JointStart, Priority
 from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT
 from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 from drivers.protocol.records import Values
+from drivers.protocol.table import BROADCAST
 from drivers.trace import Direction
 
 if TYPE_CHECKING:
@@ -83,8 +84,7 @@ class Line:
         CommandRefused. start: with the commits of other lines.
         """
         future = self._loop.create_future()
-        now = self._loop.time()
-        job = Job(*(member, priority, name, values, make, ATTEMPTS, timeout, now, future, start))
+        job = Job(member, priority, name, values, make, timeout, self.time(), future, start)
         if trace.has_requests():
             future.add_done_callback(partial(_trace, job))
         if self.loss is not None:
@@ -94,12 +94,10 @@ class Line:
             self._start(job)
             self._schedule()
             return future
-        if self._queue.jobs:
-            for queued in self._queue.superseded_by(priority, member):
-                self._fail(queued, Preempted(SUPERSEDED))
+        for queued in self._queue.superseded_by(priority, member):
+            self._fail(queued, Preempted(SUPERSEDED))
         self._queue.add(job)
-        if self._current is not None:
-            self._preempt()
+        self._preempt()
         self.pump()
         return future
 
@@ -118,29 +116,112 @@ class Line:
                 continue
             self._sent_until = 0.0  # what is replied to has arrived
             if isinstance(arrival, More):
-                if self._must_yield(job):
-                    self._current = None
-                    self.wire.withdraw()
-                    self._not_answered(job)
-                    continue
-                try:
-                    self._send(arrival.data, f"{job.name}, read")
-                except LinkTimeout as error:
-                    self._current = None
-                    self.wire.withdraw()
-                    self._blocked(job, error)
-                    continue
-                except LinkError as error:
-                    self.lose(str(error))
-                    return
-                # Each of the two responses may begin late.
-                job.due = max(job.due, self._loop.time() + job.longer + job.timeout)
-                job.delays, job.is_last_look = 0, False
-                continue
-            self._current = None
-            self._end(job, arrival)
+                self._go_on(job, arrival.data)
+            else:
+                self._current = None
+                self._end(job, arrival)
         if self._queue.jobs:
             self.pump()
+
+    def lose(self, cause: str) -> None:
+        """Fail every request: the port is lost, or closed."""
+        self.loss = cause
+        current, self._current = self._current, None
+        for job in (*([] if current is None else [current]), *self._queue.jobs):
+            self._fail(job, LinkError(cause))
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def pump(self) -> None:
+        """Put the next request on the line, if it is free."""
+        if self._is_pumping:
+            return
+        self._is_pumping = True
+        try:
+            while self.loss is None and self._current is None and self._queue.jobs:
+                job = self._queue.next(self.time())
+                if job is None:
+                    break
+                if job.start is not None and not job.is_held:
+                    # The line is kept for a commit until all others are free.
+                    job.is_held = True
+                    takes = self.wire.transit(_COMMIT_WORDS)
+                    job.start.arrive(takes, job.result, partial(self._release, job))
+                if job.start is not None and not job.is_released:
+                    break
+                self._queue.take(job, self.time())
+                if job.result.done():
+                    self._fail(job, Preempted(SUPERSEDED))  # its caller has gone: so have others
+                else:
+                    self._start(job)
+        finally:
+            self._is_pumping = False
+        self._schedule()
+
+    def _release(self, job: Job) -> None:
+        """Send a commit that was held, unless its result is known by now."""
+        job.is_released = True
+        self.pump()
+
+    def _start(self, job: Job) -> None:
+        """Make a request in its turn and send it, noted for all that it reaches: no other way."""
+        try:
+            if job.make is not None:
+                job.values = job.make()
+            member, address = job.member, BROADCAST
+            if member is not None:
+                address = member.address
+                job.longer = member.next_request(job.name, job.values)
+            data = self.wire.request(address, job.name, job.values)
+            now = job.sent_at = self.time()
+            begins = max(now, self._sent_until)  # behind what is still on its way
+            for each in self.members.values():
+                if address in (BROADCAST, each.address):
+                    each.note_sent(job.name, job.values, now, begins + self.wire.takes)
+            self._send(job, data)
+            if self.loss is not None:  # by what the port did
+                raise LinkError(self.loss)
+        except Exception as error:  # no caller may wait for ever
+            self._fail(job, error)
+            return
+        job.start = None
+        if member is None:
+            job.result.set_result({})
+            return
+        job.due = begins + job.longer + job.timeout
+        # A slow wire: as long as on others until it counts as degraded.
+        job.attempts -= 2 if job.longer and job.attempts == ATTEMPTS else 1
+        job.delays, job.is_last_look = 0, False
+        self._current = job
+
+    def _go_on(self, job: Job, data: bytes) -> None:
+        """Send the rest of the request on the line, unless one that silences waits."""
+        if self._must_yield(job):
+            self._not_answered(job)
+            return
+        try:
+            self._send(job, data)
+        except LinkError as error:
+            self._current = None
+            self.wire.withdraw()
+            self._fail(job, error)
+            return
+        # Each of the two responses may begin late.
+        job.due = max(job.due, self.time() + job.longer + job.timeout)
+        job.delays, job.is_last_look = 0, False
+
+    def _send(self, job: Job, data: bytes) -> None:
+        if trace.is_active():
+            what = job.name if job.member is None else f"{job.name} to {job.member.address}"
+            trace.frame(Direction.OUT, data, self.name, lambda: what)
+        begins = max(self.time(), self._sent_until)
+        self._sent_until, self._free_at = begins + self.wire.takes, begins + self.wire.busy
+        try:
+            self._port.write(data)
+        except LinkTimeout as error:  # it takes nothing: the amplifier counts as degraded
+            if job.member is not None:
+                job.member.silence_cause = str(error)
+            raise
 
     def _must_yield(self, job: Job) -> bool:
         """Whether a request gives way to one that silences."""
@@ -151,8 +232,9 @@ class Line:
     def _end(self, job: Job, arrival: Reply | Nak | Broken) -> None:
         """End the request that was on the line by what came back."""
         member = job.member
-        if member is None:
+        if member is None:  # no broadcast is on the line
             return
+        member.silence_cause = None
         if isinstance(arrival, Reply):
             try:
                 member.note_reply(job.name, job.values, arrival.values, job.sent_at)
@@ -161,134 +243,33 @@ class Line:
                 return
             if not job.result.done():
                 job.result.set_result(arrival.values)
-            return
-        member.silence_cause = None
-        if isinstance(arrival, Nak):
-            self._refused(job, member, arrival)
-        else:
+        elif isinstance(arrival, Broken):
             self._fail(job, FrameError(f"{self.name}: {arrival.reason}"))
-
-    def lose(self, cause: str) -> None:
-        """Fail every request: the port is lost, or closed."""
-        self.loss = cause
-        current, self._current = self._current, None
-        for job in (*([] if current is None else [current]), *self._queue.jobs):
-            self._fail(job, LinkError(cause))
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-
-    def pump(self) -> None:
-        """Put the next request on the line, if it is free."""
-        if self._is_pumping:
-            return
-        self._is_pumping = True
-        try:
-            while self.loss is None and self._current is None and self._queue.jobs:
-                job = self._queue.next(self._loop.time())
-                if job is None or (job.start is not None and not self._may_start(job)):
-                    break
-                self._queue.take(job, self._loop.time())
-                if job.result.done():
-                    self._fail(job, Preempted(SUPERSEDED))  # its caller has gone: so have others
-                else:
-                    self._start(job)
-        finally:
-            self._is_pumping = False
-        self._schedule()
-
-    def _may_start(self, job: Job) -> bool:
-        """Whether a commit is to be sent now; the line is kept for it until all others are free."""
-        if not job.is_held and job.start is not None:
-            job.is_held = True
-            takes = self.wire.transit(_COMMIT_WORDS)
-            job.start.arrive(takes, job.result, partial(self._release, job))
-        return job.start is None or job.is_released
-
-    def _release(self, job: Job) -> None:
-        """Send a commit that was held, unless its result is known by now."""
-        job.is_released = True
-        self.pump()
-
-    def _start(self, job: Job) -> None:
-        try:
-            if job.make is not None:
-                job.values = job.make()
-            now = job.sent_at = self._loop.time()
-            if job.member is None:
-                self._write(0, job.name, job.values, now)
-                job.start = None
-                job.result.set_result({})
+        else:
+            member.counts.refusals += 1
+            if arrival.code == "BUSY" and job.attempts > 0:
+                self._repeat(job, member, pause=BUSY_PAUSE)
                 return
-            job.longer = job.member.next_request(job.name, job.values)
-            try:
-                begins = self._write(job.member.address, job.name, job.values, now)
-            except LinkTimeout as error:
-                self._blocked(job, error)
-                return
-            if self.loss is not None:  # by what the port did
-                raise LinkError(self.loss)
-            job.start = None
-            job.due = begins + job.longer + job.timeout
-            if job.longer and job.attempts == ATTEMPTS:
-                job.attempts -= 1  # a slow wire: as long as on others until it counts as degraded
-            job.attempts -= 1
-            job.delays, job.is_last_look = 0, False
-            self._current = job
-        except Exception as error:  # no caller may wait for ever
-            self._fail(job, error)
+            channel = "" if arrival.channel is None else f", channel {arrival.channel}"
+            refusal = CommandRefused(
+                f"{self.name}: the amplifier refused the request: {arrival.code}{channel}",
+                channel=arrival.channel,
+                may_play=job.had_no_reply,
+                is_disarmed=arrival.code in _NOT_ARMED,
+            )
+            self._fail(job, refusal)
 
-    def _write(self, address: int, name: str, values: Values, now: float) -> float:
-        """Send a request, the only way out, and note it for all that it reaches.
-
-        Returns when [s] it begins: behind what is still on its way.
-        """
-        data = self.wire.request(address, name, values)
-        begins = max(now, self._sent_until)
-        for member in self.members.values():
-            if address in (0, member.address):
-                member.note_sent(name, values, now, begins + self.wire.takes)
-        self._send(data, name if address == 0 else f"{name} to {address}")
-        return begins
-
-    def _send(self, data: bytes, what: str) -> None:
-        if trace.is_active():
-            trace.frame(Direction.OUT, data, self.name, lambda: what)
-        begins = max(self._loop.time(), self._sent_until)
-        self._sent_until, self._free_at = begins + self.wire.takes, begins + self.wire.busy
-        self._port.write(data)
-
-    def _blocked(self, job: Job, error: LinkTimeout) -> None:
-        """End a request that the port has not taken: the amplifier counts as degraded."""
-        if job.member is not None:
-            job.member.silence_cause = str(error)
-        self._fail(job, error)
-
-    def _refused(self, job: Job, member: "Dialogue", nak: Nak) -> None:
-        member.counts.refusals += 1
-        if nak.code == "BUSY" and job.attempts > 0:
-            self._repeat(job, pause=BUSY_PAUSE)
-            return
-        channel = "" if nak.channel is None else f", channel {nak.channel}"
-        text = f"{self.name}: the amplifier refused the request: {nak.code}{channel}"
-        refusal = CommandRefused(
-            text,
-            channel=nak.channel,
-            may_play=job.had_no_reply,
-            is_disarmed=nak.code in _NOT_ARMED,
-        )
-        self._fail(job, refusal)
-
-    def _repeat(self, job: Job, *, pause: float = 0.0) -> None:
+    def _repeat(self, job: Job, member: "Dialogue", *, pause: float = 0.0) -> None:
         """Queue a request again, unless another one of its amplifier comes before it."""
         if self._queue.supersedes(job):
             self._fail(job, Preempted(SUPERSEDED))
-        else:
-            if job.member is not None:
-                job.member.counts.retries += 1
-            job.not_before = self._loop.time() + pause if pause else 0.0
-            # Behind those of its priority, so that a mute amplifier does not keep others waiting.
-            self._queue.add(job)
+            return
+        member.counts.retries += 1
+        if pause:
+            job.not_before = self.time() + pause
+            self._loop.call_at(job.not_before, self.pump)
+        # Behind those of its priority, so that a mute amplifier does not keep others waiting.
+        self._queue.add(job)
 
     def _fail(self, job: Job, error: Exception) -> None:
         """End a request with an error, unless its caller has gone."""
@@ -306,18 +287,17 @@ class Line:
         if current is None or current.priority.is_stop_class:
             return
         waiting = [job.priority for job in self._queue.jobs if job.priority < current.priority]
-        free_at = max(self._loop.time(), self._free_at)
+        free_at = max(self.time(), self._free_at)
         if current.priority is Priority.READING and min(waiting, default=8) <= Priority.SET:
             current.due = min(current.due, free_at)
         elif min(waiting, default=8) <= Priority.SILENCE:
             current.due = min(current.due, free_at + GRACE)
 
     def _schedule(self) -> None:
-        """Have the timer look again by the next time that matters; it is never cancelled."""
-        if self._current is not None:
-            due = min(self._current.due, self._loop.time() + _LOOK_INTERVAL)
-        elif not self._queue.jobs or (due := self._queue.next_due(self._loop.time())) <= 0.0:
+        """Have the timer look at the request on the line by the next time that matters."""
+        if self._current is None:
             return
+        due = min(self._current.due, self.time() + _LOOK_INTERVAL)
         if self._timer is None or self._timer.when() > due:
             if self._timer is not None:
                 self._timer.cancel()
@@ -330,50 +310,45 @@ class Line:
         and the reply has as much time left as it had then.
         """
         self._timer = None
-        now = self._loop.time()
-        job = self._current
+        job, now = self._current, self.time()
         if job is None:
-            self.pump()
             return
         since = max(planned, job.sent_at)
         if now - since > _LATE and job.delays < _DELAYS:
             job.delays += 1
             left = 0.0 if self._must_yield(job) else job.due - since
             job.due = now + max(left, _LATE)
-        if now < job.due:
-            self._schedule()
-            return
-        self._port.poll()
-        if self._current is not job or self._loop.time() < job.due:
-            self._schedule()
-            return
-        if not job.is_last_look:
-            job.due, job.is_last_look = now, True
-            self._schedule()
-            return
-        self._current = None
-        self.wire.withdraw()
-        self._not_answered(job)
-        self.pump()
+        if now >= job.due:
+            self._port.poll()
+            if self._current is job and self.time() >= job.due:
+                if job.is_last_look:
+                    self._not_answered(job)
+                    self.pump()
+                    return
+                job.due, job.is_last_look = now, True
+        self._schedule()
 
     def _not_answered(self, job: Job) -> None:
-        now = self._loop.time()
-        was_cut = job.priority is Priority.READING and now - job.sent_at < job.timeout
+        """Take the request off the line, and repeat it or give it up."""
+        self._current = None
+        self.wire.withdraw()
+        member = job.member
+        if member is None:
+            return
+        was_cut = job.priority is Priority.READING and self.time() - job.sent_at < job.timeout
         if was_cut or self._must_yield(job):
             job.attempts += 1
-            self._repeat(job)
+            self._repeat(job, member)
             return
         job.had_no_reply = True
-        if job.member is not None:
-            job.member.counts.timeouts += 1
+        member.counts.timeouts += 1
         cause = f"{self.name}: no reply within {1e3 * job.timeout:g} ms"
         if self._port.is_blocked:
             cause += "; check flow control and the adapter: the port takes no bytes"
         if job.attempts > 0:
-            self._repeat(job)
+            self._repeat(job, member)
             return
-        if job.member is not None:
-            job.member.silence_cause = cause
+        member.silence_cause = cause
         self._fail(job, LinkTimeout(f"{cause}; check that the amplifier is switched on"))
 
 

@@ -159,6 +159,6 @@ async def test_stop_supersedes_what_feeds_plays_arms_or_acknowledges() -> None:
     queue = JobQueue()
     for priority in Priority:
         result = asyncio.get_running_loop().create_future()
-        queue.add(Job(None, priority, "", {}, None, 3, 0.03, 0.0, result))
+        queue.add(Job(None, priority, "", {}, None, 0.03, 0.0, result))
     obsolete = {job.priority for job in queue.superseded_by(Priority.STOP, None)}
     assert obsolete == {Priority.HEARTBEAT, Priority.SET, Priority.ARM, Priority.CLEAR}

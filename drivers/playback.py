@@ -95,18 +95,13 @@ class Playback:
         """Carry out what is due by a time: ends of `valid_for`, sets that wait, faded voices."""
         if time < self._changes_at:
             return
-        while (due := self._next_due()) is not None and due[0] <= time:
-            self._carry_out(*due)
+        while self.next_due <= time:
+            self.carry_out(*min(self.dues))
         self._drop_faded(time - self.uncertainty)
         self._note_changes()
 
-    def carry_out(self, due: tuple[float, int]) -> None:
-        """Carry out one of what is due, also before what is due of other layers sooner."""
-        self._carry_out(*due)
-        self._note_changes()
-
-    def _carry_out(self, at: float, number: int) -> None:
-        """End a layer at a time, or start what waits there."""
+    def carry_out(self, at: float, number: int) -> None:
+        """End a layer at a time, or start what waits there; others may be due sooner."""
         layer = self._layers[number]
         # What has faded before is gone; a set that waited for its end may continue a voice.
         self._drop_faded(math.nextafter(at - self.uncertainty, -math.inf), number)
@@ -116,6 +111,7 @@ class Playback:
             self._start(one, token, at)
         else:
             self._end(number, at)
+        self._note_changes()
 
     def _drop_faded(self, time: float, layer: int | None = None) -> None:
         """Drop the voices that are silent from a time on, of one layer or of all."""
@@ -130,8 +126,10 @@ class Playback:
 
     def _note_changes(self) -> None:
         """Note when a voice has faded, or a layer ends or starts, next."""
-        due = self._next_due()
-        first = self.next_due = math.inf if due is None else due[0]
+        first = math.inf
+        for layer in self._layers.values():
+            first = min(first, layer.ends, math.inf if layer.waiting is None else layer.waiting[0])
+        self.next_due = first
         for voices in self.all_voices:
             for voice in voices:
                 if not voice.transition.last and voice.transition.end < first:
@@ -294,9 +292,6 @@ class Playback:
             if due < math.inf:
                 dues.append((due, number))
         return dues
-
-    def _next_due(self) -> tuple[float, int] | None:
-        return min(self.dues, default=None)
 
     def _onsets_end(self, layer: int, time: float) -> float:
         ends = (

@@ -152,7 +152,7 @@ class UncertainPlayback:
         after, half = self.copied(), max(self.half)
         for each in self.playback.dues:
             if each[0] == due:
-                after.playback.carry_out(each)
+                after.playback.carry_out(*each)
         after._mark(self.playback.all_voices, (due - half, due + half))
         return after
 

@@ -194,7 +194,8 @@ def voices_after(
     uncertainty: float,
 ) -> list[Voice]:
     """Return the voices of a channel once a command of a layer plays; None silences the layer."""
-    is_driven = command is not None and command.is_driven
+    # As `Command.is_driven`, without a call.
+    is_driven = command is not None and (command.level > 0 or command.onset is not None)
     is_fading = is_driven or (command is not None and command.skip_ending)
     is_new = is_driven
     after: list[Voice] = []

@@ -22,7 +22,8 @@ from drivers.contents import Layer, Tone
 from drivers.errors import DriverError, LinkDegraded, LinkError
 from drivers.garbage_collection import no_long_collections
 from drivers.host.amplifier import Amplifier
-from drivers.host.group import GroupState, is_lost
+from drivers.host.group import is_lost
+from drivers.host.members import GroupState
 from drivers.host.timing import HEARTBEAT, loss_detection_time
 from drivers.protocol.sets import LayerSet
 from long_form import shortly

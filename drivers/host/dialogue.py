@@ -88,17 +88,6 @@ class Feeding:
         may_be_fed_again = self.is_kept and self.plays > self.since
         return self.lost_from + (self.watchdog if may_be_fed_again else 0.0)
 
-    def sent(self, now: float, arrives: float) -> None:
-        """Note a request that may feed and let it play on: when it was sent, and arrives [s]."""
-        self.may = self.plays = now
-        self.arrives, self.fade = arrives, 0.0
-
-    def confirmed(self, sent_at: float, now: float) -> None:
-        """Note at a time [s] the reply to a request that fed, sent at another [s]."""
-        self.since, self.confirmed_at = sent_at, now
-        if sent_at > self.plays:
-            self.plays, self.fade = sent_at, 0.0
-
     def problem(self, left: float, sent_at: float, now: float) -> str | None:
         """Describe an impossible time that is left [s] in a reply to a request; None if possible.
 
@@ -209,8 +198,9 @@ class Dialogue:
     ) -> Staged:
         """Have the ledger admit a set, and cut it into parts; raises CommandRefused."""
         moment = self._time()
+        takes = self._times.get("Set") or self.exchange_time("Set")
         # Longest time from the admission of a set until it is committed.
-        delay = max(COMMIT_DELAY, ATTEMPTS * len(self.line.members) * self.exchange_time("Set"))
+        delay = max(COMMIT_DELAY, ATTEMPTS * len(self.line.members) * takes)
         admitted = self.ledger.admit(layers, moment, delay=delay)
         stream = pack_layers(admitted)
         if len(stream) > (limit := self.capabilities["set_words"]):
@@ -247,7 +237,7 @@ class Dialogue:
         Raises for what plays or feeds, while it must not go out: LinkError while degraded or beside
         another host, CommandRefused once a status has shown that it is not armed any more.
         """
-        takes = self._times[name] if name in self._times else self.exchange_time(name)
+        takes = self._times.get(name) or self.exchange_time(name)
         if name == "Set" and takes > FAST:  # much shorter, nearly always
             words = SET_WORDS + len(values["stream"])
             takes = self.line.wire.exchange_time(words, TAKEN_WORDS)
@@ -277,7 +267,8 @@ class Dialogue:
                 feeding.may = now
                 feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
             else:
-                feeding.sent(now, arrives)
+                feeding.may = feeding.plays = now
+                feeding.arrives, feeding.fade = arrives, 0.0
         elif name in ("Stop", "Disarm"):
             feeding.fade = max(feeding.fade, _RAMP.from_wire(values["ramp"]))
             self.silences += 1
@@ -303,7 +294,10 @@ class Dialogue:
         if message is None:
             return
         if message.feeds:
-            self.feeding.confirmed(sent_at, now)
+            feeding = self.feeding
+            feeding.since, feeding.confirmed_at = sent_at, now
+            if sent_at > feeding.plays:
+                feeding.plays, feeding.fade = sent_at, 0.0
         if message.reply is _STATUS:
             self._note_status(name, values, reply, sent_at, now)
         elif name == "Set" and reply["played"]:

@@ -3,13 +3,11 @@
 import asyncio
 import logging
 import random
-from collections.abc import Callable, Coroutine, Mapping, Sequence
-from enum import Enum, auto
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import Any, TypeVar
 
 from drivers import clock
-from drivers.contents import Layer
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -22,7 +20,7 @@ from drivers.errors import (
 from drivers.host.amplifier import DISARM_RAMP, WATCHDOG, Amplifier
 from drivers.host.jobs import Priority
 from drivers.host.line import Line
-from drivers.host.members import Members, Played, is_lost, retried
+from drivers.host.members import GroupState, Members, is_lost
 from drivers.host.stop import Stopped
 from drivers.host.timing import STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values
@@ -30,17 +28,9 @@ from drivers.protocol.table import ENABLED, QUANTITIES
 
 _T = TypeVar("_T")
 _SESSION, _TOKEN = QUANTITIES["session"], QUANTITIES["token"]
+_REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
 _MAX_STATUS_LOAD = 0.05  # of the line's time, for statuses that show whether the watchdog runs down
 _logger = logging.getLogger(__name__)
-
-
-class GroupState(Enum):
-    """State of all amplifiers together: CLOSED until opened and in the end, LOST by a LinkError."""
-
-    CLOSED = auto()
-    DISARMED = auto()
-    ARMED = auto()
-    LOST = auto()
 
 
 class Group(Members):
@@ -58,26 +48,15 @@ class Group(Members):
         draw: Callable[[int, int], int] = random.randint,
     ) -> None:
         super().__init__(amplifiers, draw(_TOKEN.minimum, _TOKEN.maximum))
-        self.state = GroupState.CLOSED
         self._watchdog = watchdog
         self._draw = draw
         self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
+        self._silencing: set[asyncio.Future[Any]] = set()  # stops and disarms in progress
         self._stopped = 0  # epoch of the last stop, until it is cleared
         self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # of stops
-        self._limit: asyncio.Timeout | None = None  # of an exchange in progress
         self._running_read_at: dict[str, float] = {}  # statuses just before a heartbeat
         self._readings: dict[str, asyncio.Future[Values]] = {}  # of amplifiers that do not reply
-
-    @property
-    def is_open(self) -> bool:
-        """Whether all reply as far as is known: neither closed nor lost."""
-        return self.state in (GroupState.DISARMED, GroupState.ARMED)
-
-    @property
-    def is_armed(self) -> bool:
-        """Whether layers may be played."""
-        return self.state is GroupState.ARMED
 
     async def open(self) -> None:
         """Identify all amplifiers and leave them disarmed.
@@ -107,7 +86,7 @@ class Group(Members):
                 )
             if self._stopped:  # an amplifier that restarted does not know
                 raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
-            if self.silencing:  # the result would depend on the order of frames
+            if self._silencing:  # the result would depend on the order of frames
                 raise CommandRefused(
                     "amplifiers are being stopped or disarmed; arm again if that is still wanted"
                 )
@@ -120,7 +99,7 @@ class Group(Members):
                     return
                 self._leave_armed()
                 before = self.epoch
-                await self.silenced(self._disarm(amplifiers, STOP_RAMP))
+                await self._silenced(self._disarm(amplifiers, STOP_RAMP))
                 self.check_none_since(before)
             for amplifier in amplifiers:
                 amplifier.check_other_host()  # before a disarm of what failed ends its vibration
@@ -133,7 +112,7 @@ class Group(Members):
                 self.check_none_since(before)
             except BaseException as error:
                 self.note(error)
-                await self.silenced(self._disarm_armed(arming))
+                await self._silenced(self._disarm_armed(arming))
                 if isinstance(error, DriverError):
                     self.check_none_since(before)
                 if self.is_degraded_only(error):
@@ -149,7 +128,7 @@ class Group(Members):
         await arming
         disarmed = await asyncio.gather(
             *[
-                retried(each, partial(each.disarm, STOP_RAMP))
+                _retried(each, partial(each.disarm, STOP_RAMP))
                 for each in self.amplifiers.values()
                 if each.may_be_armed
             ],
@@ -158,32 +137,6 @@ class Group(Members):
         failures = [each for each in disarmed if isinstance(each, BaseException)]
         if not all(isinstance(each, LinkError) for each in failures):  # a mute one stops none
             await self.stop()
-
-    async def apply(self, layers: Mapping[str, Sequence[Layer]]) -> Played:
-        """Play layers on the amplifiers of these names, all from one moment on.
-
-        Refused on one means committed on none, and CommandRefused; silence alone is not staged. One
-        that is no longer armed does not refuse a set: it stops all.
-        Raises Preempted where a stop, disarm or `abort_exchange` came first, and LinkDegraded where
-        one does not reply: then it is unknown whether the set plays. What else fails stops all
-        amplifiers before it is raised.
-        """
-        self._check_armed()
-        done = await self._exchange(self.play(layers))
-        if isinstance(done, CommandRefused):
-            raise done
-        return done
-
-    async def silence(self, ramp: float) -> float:
-        """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed.
-
-        Returns when [s] the last request went out. Raises as `apply`.
-        """
-        self._check_armed()
-        requests = [each.silence(ramp) for each in self.amplifiers.values()]
-        await self._exchange(self.all(requests))
-        self.is_set_incomplete = False
-        return self.last_sent_at
 
     async def beat(self) -> None:
         """Feed the watchdog of every amplifier that replies; raises as `apply`.
@@ -216,52 +169,17 @@ class Group(Members):
             reading.add_done_callback(_seen)
             self._readings[name] = reading
 
-    def abort_exchange(self) -> None:
-        """End an `apply`, `silence` or `beat` in progress, so that silence can be sent next.
-
-        What was not sent is not sent any more; a request on the wire is waited for at most 8 ms.
-        """
-        if self._limit is not None and not self._limit.expired():
-            self._limit.reschedule(clock.now())
-
-    def _check_armed(self) -> None:
-        if self.state is not GroupState.ARMED:
-            raise CommandRefused("the amplifiers must be armed; clear a stop, then arm")
-
-    async def _exchange(self, exchange: Coroutine[Any, Any, _T]) -> _T:
-        """Run an exchange of the control loop; any unexplained failure stops all amplifiers."""
-        before = self.epoch
-        limit = asyncio.timeout(None)
-        try:
-            try:
-                async with limit as self._limit:
-                    return await exchange
-            finally:
-                self._limit = None
-        except Exception as error:
-            self.note(error)
-            if limit.expired() and (isinstance(error, TimeoutError | Preempted)):
-                raise Preempted("given up, since silence comes first") from error
-            if self.is_degraded_only(error):
-                raise LinkDegraded(str(error)) from error
-            is_explained = self.epoch != before and self.state is not GroupState.LOST
-            if is_explained and isinstance(error, DriverError):
-                raise Preempted("a stop or disarm came first") from error
-            replying = [name for name, each in self.amplifiers.items() if not each.silence_cause]
-            await self.stop(waits_for=replying)
-            raise
-
     async def disarm(self, ramp: float = DISARM_RAMP) -> None:
         """Ramp [s] to silence and switch the high voltage off, read back from every amplifier.
 
         It goes on to its end if its caller is cancelled. Where one fails all are stopped.
         """
         self._leave_armed()
-        await self.silenced(self._disarm([*self.amplifiers.values()], ramp))
+        await self._silenced(self._disarm([*self.amplifiers.values()], ramp))
 
     async def _disarm(self, members: Sequence[Amplifier], ramp: float) -> None:
         try:
-            await self.all([retried(each, partial(each.disarm, ramp)) for each in members])
+            await self.all([_retried(each, partial(each.disarm, ramp)) for each in members])
         except BaseException:
             await self.stop()
             raise
@@ -291,7 +209,7 @@ class Group(Members):
                 stops[name] = asyncio.get_running_loop().create_future()
                 stops[name].set_exception(error)
         names = [*stops] if waits_for is None else waits_for
-        return self.silenced(self._outcomes({name: stops[name] for name in names}))
+        return self._silenced(self._outcomes({name: stops[name] for name in names}))
 
     def _broadcast(self, line: Line, ramp: float) -> None:
         """Request a stop of all amplifiers of a line, unless one is queued."""
@@ -320,7 +238,7 @@ class Group(Members):
 
         Raises Preempted while amplifiers are being stopped or disarmed: nothing precedes that.
         """
-        if self.silencing:
+        if self._silencing:
             raise Preempted("amplifiers are being stopped or disarmed; clear again afterwards")
         stopped = self._stopped
         try:
@@ -349,7 +267,7 @@ class Group(Members):
     async def _read(self, priority: Priority) -> dict[str, Values]:
         amplifiers = self.amplifiers.values()
         statuses = await self.all(
-            [retried(each, partial(each.read_status, priority)) for each in amplifiers]
+            [_retried(each, partial(each.read_status, priority)) for each in amplifiers]
         )
         return dict(zip(self.amplifiers, statuses, strict=True))
 
@@ -370,9 +288,16 @@ class Group(Members):
             if not members:
                 return
             try:
-                await self.silenced(self._disarm(members, ramp))
+                await self._silenced(self._disarm(members, ramp))
             except DriverError as error:
                 _logger.error("amplifiers: stopped, because closing failed: %s", error)
+
+    def _silenced(self, work: Coroutine[Any, Any, _T]) -> Coroutine[Any, Any, _T]:
+        """Begin a stop or disarm; nothing arms until it ends, whoever is cancelled meanwhile."""
+        task = asyncio.ensure_future(work)
+        self._silencing.add(task)
+        task.add_done_callback(self._silencing.discard)
+        return _to_completion(task)
 
     def _leave_armed(self) -> None:
         """Leave ARMED for DISARMED, if armed, so that nothing more is played."""
@@ -380,13 +305,33 @@ class Group(Members):
         if self.is_armed:
             self.state = GroupState.DISARMED
 
-    def lose(self) -> None:
-        """Enter the state LOST, in which nothing is played."""
-        if self.state is not GroupState.CLOSED:
-            self.state = GroupState.LOST
-
 
 def _seen(sent: "asyncio.Future[Values]") -> None:
     """Retrieve an error that nobody awaits: what each amplifier says afterwards decides."""
     if not sent.cancelled():
         sent.exception()
+
+
+async def _retried(amplifier: Amplifier, request: Callable[[], Awaitable[_T]]) -> _T:
+    """Repeat a request until it is answered or the amplifier is lost."""
+    while True:
+        try:
+            return await request()
+        except LinkTimeout:
+            if is_lost(amplifier):
+                raise
+            await asyncio.sleep(_REPEAT_INTERVAL)
+
+
+async def _to_completion(task: "asyncio.Future[_T]") -> _T:
+    """Await work, however often the caller is cancelled meanwhile; re-raise that at the end."""
+    cancellation = None
+    while not task.done():
+        try:
+            await asyncio.wait({task})
+        except asyncio.CancelledError as error:
+            cancellation = error
+    if cancellation is not None:
+        task.exception()  # retrieved: what has failed is said by the amplifiers
+        raise cancellation
+    return task.result()

@@ -94,10 +94,11 @@ class Line:
             self._start(job)
             self._schedule()
             return future
-        for queued in self._queue.superseded_by(priority, member):
+        for queued in self._queue.superseded_by(priority, member) if self._queue.jobs else ():
             self._fail(queued, Preempted(SUPERSEDED))
         self._queue.add(job)
-        self._preempt()
+        if self._current is not None:
+            self._preempt(self._current)
         self.pump()
         return future
 
@@ -281,10 +282,9 @@ class Line:
             start, job.start = job.start, None
             start.fail(error)
 
-    def _preempt(self) -> None:
+    def _preempt(self, current: Job) -> None:
         """Shorten the time of the request on the line for one that must not wait."""
-        current = self._current
-        if current is None or current.priority.is_stop_class:
+        if current.priority.is_stop_class:
             return
         waiting = [job.priority for job in self._queue.jobs if job.priority < current.priority]
         free_at = max(self.time(), self._free_at)

@@ -7,19 +7,29 @@ sets would take the next one for an older one. It commits one that changes nothi
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum, auto
 from functools import partial
 from typing import Any, TypeVar
 
 from drivers import clock
 from drivers.contents import Layer
-from drivers.errors import CommandRefused, LinkError, LinkTimeout, Preempted
+from drivers.errors import (
+    CommandRefused,
+    DriverError,
+    LinkDegraded,
+    LinkError,
+    LinkTimeout,
+    Preempted,
+)
 from drivers.host.amplifier import Amplifier
 from drivers.host.dialogue import Staged
 from drivers.host.jobs import JointStart, Priority
 from drivers.host.ledger import is_silence
 from drivers.host.line import Line
+from drivers.host.stop import Stopped
+from drivers.host.timing import STOP_RAMP
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import ENABLED, STATES, name_of
@@ -28,7 +38,6 @@ INTERVAL = 1 << 12
 """Tokens after which the gaps are looked at again."""
 _MAX_GAP = 1 << 14
 _SPAN = 1 << 16
-_REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
 _T = TypeVar("_T")
 
 
@@ -44,19 +53,28 @@ class Played:
     sent_at: float
 
 
+class GroupState(Enum):
+    """State of all amplifiers together: CLOSED until opened and in the end, LOST by a LinkError."""
+
+    CLOSED = auto()
+    DISARMED = auto()
+    ARMED = auto()
+    LOST = auto()
+
+
 class Members:
     """Amplifiers by name, the sets of all of them under tokens from a first one on, and stops."""
 
     def __init__(self, amplifiers: Mapping[str, Amplifier], token: int) -> None:
         self.amplifiers = dict(amplifiers)
+        self.state = GroupState.CLOSED
         self.token = token
         """Of the last set."""
         self.is_set_incomplete = False
         """Whether possibly only some amplifiers have committed the last set."""
         self.epoch = 0
         """Stops, disarms and closes so far: nothing from before arms, plays or feeds after one."""
-        self.silencing: set[asyncio.Future[Any]] = set()
-        """Stops and disarms in progress."""
+        self._limit: asyncio.Timeout | None = None  # of an exchange in progress
 
     @property
     def degraded(self) -> tuple[str, ...]:
@@ -87,8 +105,26 @@ class Members:
         """When [s] a set or silence was last sent to any amplifier."""
         return max((each.played_at for each in self.amplifiers.values()), default=-math.inf)
 
+    @property
+    def is_open(self) -> bool:
+        """Whether all reply as far as is known: neither closed nor lost."""
+        return self.state in (GroupState.DISARMED, GroupState.ARMED)
+
+    @property
+    def is_armed(self) -> bool:
+        """Whether layers may be played."""
+        return self.state is GroupState.ARMED
+
     def lose(self) -> None:
-        """Note that one is lost."""
+        """Enter the state LOST, in which nothing is played."""
+        if self.state is not GroupState.CLOSED:
+            self.state = GroupState.LOST
+
+    def stop(
+        self, ramp: float = STOP_RAMP, *, waits_for: Sequence[str] | None = None
+    ) -> Coroutine[Any, Any, Mapping[str, Stopped]]:
+        """Stop every amplifier along a ramp [s]."""
+        raise NotImplementedError
 
     def is_degraded_only(self, error: BaseException) -> bool:
         """Whether an error says no more than that an amplifier does not reply for now."""
@@ -106,13 +142,6 @@ class Members:
                 "amplifiers were disarmed, stopped or closed meanwhile; arm again if that is still "
                 "wanted"
             )
-
-    def silenced(self, work: Coroutine[Any, Any, _T]) -> Coroutine[Any, Any, _T]:
-        """Begin a stop or disarm; nothing arms until it ends, whoever is cancelled meanwhile."""
-        task = asyncio.ensure_future(work)
-        self.silencing.add(task)
-        task.add_done_callback(self.silencing.discard)
-        return _to_completion(task)
 
     async def all(self, requests: Sequence[Awaitable[_T]]) -> list[_T]:
         """Await all requests to their ends, then raise the most severe error."""
@@ -147,7 +176,68 @@ class Members:
             return 2
         return 0 if isinstance(error, LinkError) else 1
 
-    async def play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | CommandRefused:
+    async def apply(self, layers: Mapping[str, Sequence[Layer]]) -> Played:
+        """Play layers on the amplifiers of these names, all from one moment on.
+
+        Refused on one means committed on none, and CommandRefused; silence alone is not staged. One
+        that is no longer armed does not refuse a set: it stops all.
+        Raises Preempted where a stop, disarm or `abort_exchange` came first, and LinkDegraded where
+        one does not reply: then it is unknown whether the set plays. What else fails stops all
+        amplifiers before it is raised.
+        """
+        self._check_armed()
+        done = await self._exchange(self._play(layers))
+        if isinstance(done, CommandRefused):
+            raise done
+        return done
+
+    async def silence(self, ramp: float) -> float:
+        """Let all layers of all amplifiers fall silent along a ramp [s]; they stay armed.
+
+        Returns when [s] the last request went out. Raises as `apply`.
+        """
+        self._check_armed()
+        requests = [each.silence(ramp) for each in self.amplifiers.values()]
+        await self._exchange(self.all(requests))
+        self.is_set_incomplete = False
+        return self.last_sent_at
+
+    def abort_exchange(self) -> None:
+        """End an `apply`, `silence` or `beat` in progress, so that silence can be sent next.
+
+        What was not sent is not sent any more; a request on the wire is waited for at most 8 ms.
+        """
+        if self._limit is not None and not self._limit.expired():
+            self._limit.reschedule(clock.now())
+
+    def _check_armed(self) -> None:
+        if self.state is not GroupState.ARMED:
+            raise CommandRefused("the amplifiers must be armed; clear a stop, then arm")
+
+    async def _exchange(self, exchange: Coroutine[Any, Any, _T]) -> _T:
+        """Run an exchange of the control loop; any unexplained failure stops all amplifiers."""
+        before = self.epoch
+        limit = asyncio.timeout(None)
+        try:
+            try:
+                async with limit as self._limit:
+                    return await exchange
+            finally:
+                self._limit = None
+        except Exception as error:
+            self.note(error)
+            if limit.expired() and (isinstance(error, TimeoutError | Preempted)):
+                raise Preempted("given up, since silence comes first") from error
+            if self.is_degraded_only(error):
+                raise LinkDegraded(str(error)) from error
+            is_explained = self.epoch != before and self.state is not GroupState.LOST
+            if is_explained and isinstance(error, DriverError):
+                raise Preempted("a stop or disarm came first") from error
+            replying = [name for name, each in self.amplifiers.items() if not each.silence_cause]
+            await self.stop(waits_for=replying)
+            raise
+
+    async def _play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | CommandRefused:
         """Stage and commit layers by amplifier; a refusal before the first commit is returned."""
         before = self.epoch
         if self.token % INTERVAL == 0:
@@ -232,31 +322,6 @@ def is_lost(amplifier: Amplifier) -> bool:
     """Whether it cannot be reached: its line is gone, or it is mute beyond its watchdog."""
     is_over = clock.now() >= amplifier.feeding.lost_from
     return amplifier.line.loss is not None or (amplifier.silence_cause is not None and is_over)
-
-
-async def retried(amplifier: Amplifier, request: Callable[[], Awaitable[_T]]) -> _T:
-    """Repeat a request until it is answered or the amplifier is lost."""
-    while True:
-        try:
-            return await request()
-        except LinkTimeout:
-            if is_lost(amplifier):
-                raise
-            await asyncio.sleep(_REPEAT_INTERVAL)
-
-
-async def _to_completion(task: "asyncio.Future[_T]") -> _T:
-    """Await work, however often the caller is cancelled meanwhile; re-raise that at the end."""
-    cancellation = None
-    while not task.done():
-        try:
-            await asyncio.wait({task})
-        except asyncio.CancelledError as error:
-            cancellation = error
-    if cancellation is not None:
-        task.exception()  # retrieved: what has failed is said by the amplifiers
-        raise cancellation
-    return task.result()
 
 
 def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:

@@ -23,6 +23,7 @@ from drivers.host.wire import (
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import (
     BROADCAST,
+    BY_NUMBER,
     EVENT,
     HELLO,
     MESSAGES,
@@ -67,7 +68,22 @@ class SerialWire:
         """Return what these bytes complete."""
         arrivals: list[Arrival] = []
         for frame in self._reader.feed(data):
-            arrivals += self._arrivals(frame)
+            self.counters.frames_in += 1
+            pending = self._pending
+            if frame.kind == EVENT:
+                words = () if len(frame.payload) % 2 else unpack_words(frame.payload)
+                arrivals += read_event(frame.address, EVENT, words, self.counters)
+            elif (
+                pending is None
+                or not frame.kind & REPLY
+                or (frame.address, frame.sequence) != (pending.address, pending.sequence)
+            ):
+                self.counters.unexpected_frames += 1
+                if self._is_second(frame):
+                    arrivals.append(Several(frame.address))
+            else:
+                self._pending, self._replied = None, frame
+                arrivals.append(self._reply(frame, pending))
         return arrivals
 
     def withdraw(self) -> None:
@@ -82,31 +98,20 @@ class SerialWire:
         """Return how long a request and a reply of so many words take [s]; 0 behind a server."""
         return self.transit(words) + self.transit(reply)
 
-    def _arrivals(self, frame: Frame) -> list[Arrival]:
-        self.counters.frames_in += 1
-        if frame.kind == EVENT:
-            words = () if len(frame.payload) % 2 else unpack_words(frame.payload)
-            return read_event(frame.address, EVENT, words, self.counters)
-        pending = self._pending
-        if (
-            pending is None
-            or not frame.kind & REPLY
-            or (frame.address, frame.sequence) != (pending.address, pending.sequence)
-        ):
-            self.counters.unexpected_frames += 1
-            return [Several(frame.address)] if self._is_second(frame) else []
-        self._pending, self._replied = None, frame
+    def _reply(self, frame: Frame, request: Frame) -> Arrival:
+        """Read the reply to a request."""
         kind = frame.kind ^ REPLY
+        if kind != NAK and frame.version != request.version:
+            return Broken(f"version of the reply must be {request.version}, got {frame.version}")
         try:
-            if kind != NAK and frame.version != pending.version:
-                return [
-                    Broken(f"version of the reply must be {pending.version}, got {frame.version}")
-                ]
-            if kind == pending.kind == HELLO:
-                return [Reply(unpack_identity(frame.payload))]
-            return [read_reply(pending.kind, kind, unpack_words(frame.payload))]
+            if kind == request.kind == HELLO:
+                return Reply(unpack_identity(frame.payload))
+            if kind != request.kind:
+                return read_reply(request.kind, kind, unpack_words(frame.payload))
+            words = unpack_words(frame.payload)  # nearly always
+            return Reply(BY_NUMBER[kind].reply.unpack(words, is_strict=False))
         except Refusal as refusal:
-            return [Broken(str(refusal))]
+            return Broken(str(refusal))
 
     def _is_second(self, frame: Frame) -> bool:
         """Whether a frame is another reply to the request that was replied to last."""

@@ -15,7 +15,7 @@ import pytest
 
 import model
 from chain import Chain
-from drivers.host.group import GroupState
+from drivers.host.members import GroupState
 from long_form import in_turn
 from model.fem.mesh import Mesh
 from model.rig.file import load_rig

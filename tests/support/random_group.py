@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 from drivers.contents import Layer, Shape, Tone
 from drivers.errors import CommandRefused, LinkError, Preempted
-from drivers.host.group import Group, GroupState
+from drivers.host.group import Group
 from drivers.host.jobs import Priority
+from drivers.host.members import GroupState
 from drivers.protocol.table import STATES
 from listened_line import ListenedLine
 from words_line import unaltered

@@ -20,7 +20,7 @@ from controller.loop.observer import Applied, Observer
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from drivers.host.amplifier import Amplifier
-from drivers.host.group import GroupState
+from drivers.host.members import GroupState
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from memory_machine import live_in_memory

@@ -18,7 +18,7 @@ from controller_bench import (
     running,
 )
 from drivers.errors import CommandError, CommandRefused
-from drivers.host.group import GroupState
+from drivers.host.members import GroupState
 from drivers.protocol.records import Refusal, Values
 from model.errors import InputError
 from model.table.timing import Timing

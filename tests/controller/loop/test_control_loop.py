@@ -8,7 +8,7 @@ from controller.loop.intent import NO_CONTACTS
 from controller.loop.observer import Observer
 from controller.sources.touch import Touch, TouchFrame
 from controller_bench import FINGER, OTHER, Bench, armed, running
-from drivers.host.group import GroupState
+from drivers.host.members import GroupState
 from drivers.host.timing import HEARTBEAT
 from drivers.protocol.records import Values
 from model.vibration.excitation import Tone

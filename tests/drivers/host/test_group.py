@@ -12,7 +12,8 @@ from armed_group import grouped, layer, losing, tone, with_group
 from drivers.contents import Shape, Tone
 from drivers.errors import CommandRefused, LinkDegraded, LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
-from drivers.host.group import Group, GroupState
+from drivers.host.group import Group
+from drivers.host.members import GroupState
 from drivers.host.wire import Broken
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet

@@ -1,18 +1,19 @@
-"""Tasks on a real Dask cluster of two worker processes.
+"""Clusters, choices and quantities."""
 
-Dask, which takes a second to load, is loaded by those tests that run.
-"""
-
+import math
 import os
 import signal
 import sys
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
 from model import cluster
+from model.choice import NEARLY, best_along, best_by, best_first, best_of, best_rows, ranked_by
 from model.cluster import check_address, on_cluster
 from model.errors import InputError
+from model.quantities import in_display_unit, percent, with_error
 
 TASKS = {number: number for number in range(6)}
 
@@ -99,3 +100,99 @@ def test_every_worker_checks_its_code() -> None:
     """Nothing is called on a worker that joins later, with other code."""
     with pytest.raises(InputError, match="same era-haptics"):
         cluster._run_same_code("0.0.1+123456789abc", pytest.fail, "called")
+
+
+def test_the_first_of_the_nearly_equal_best_is_chosen():
+    """Whatever rounding adds to scores that are equal, of any sign, along any axis."""
+    for scores in ([1.0, 3.0, 2.0, 3.0], [-5.0, -1.0, -2.0, -1.0], [0.0, np.inf, 1.0, np.inf]):
+        for seed in range(20):
+            rounding = 1 + NEARLY / 4 * np.random.default_rng(seed).uniform(-1, 1, 4)
+            rounded = np.array(scores) * rounding
+            assert best_of(rounded) == 1
+            assert best_along(np.column_stack([rounded, rounded[::-1]]), axis=0).tolist() == [1, 0]
+            assert best_along(rounded[None], axis=1).tolist() == [1]
+
+
+def test_what_is_better_by_more_than_rounding_is_chosen():
+    """However little more."""
+    assert best_of([1.0, 1 + 3 * NEARLY]) == 1
+    assert best_first([1.0, 1 + 3 * NEARLY]).tolist() == [1, 0]
+
+
+def test_an_order_keeps_nearly_equal_scores_as_they_came():
+    """Best first, and of none there is an empty one."""
+    for seed in range(20):
+        rounding = 1 + NEARLY / 4 * np.random.default_rng(seed).uniform(-1, 1, 5)
+        assert best_first([2.0, 7.0, 2.0, 0.0, 7.0] * rounding).tolist() == [1, 4, 0, 2, 3]
+    assert best_first([1.0, np.inf, -np.inf, np.inf]).tolist() == [1, 3, 0, 2]
+    assert best_first([]).tolist() == []
+
+
+def test_best_rows_are_the_same_whatever_rounding_adds():
+    """Three of five in each column, the highest first, of nearly equal ones the first."""
+    scores = np.array([[2.0, -4.0], [7.0, -1.0], [2.0, -1.0], [0.0, -9.0], [7.0, -4.0]])
+    for seed in range(20):
+        rounding = 1 + NEARLY / 4 * np.random.default_rng(seed).uniform(-1, 1, scores.shape)
+        assert best_rows(scores * rounding, 3).T.tolist() == [[1, 4, 0], [1, 2, 0]]
+
+
+def test_items_are_chosen_and_ranked_by_their_scores():
+    """Of those with nearly equal lengths the first one first."""
+    items = ["aa", "b", "cc", "ddd", "eee"]
+    assert best_by(items, lambda item: len(item) + NEARLY * (item == "eee")) == "ddd"
+    assert ranked_by(items, lambda item: len(item) + NEARLY * (item == "cc")) == [
+        "ddd",
+        "eee",
+        "aa",
+        "cc",
+        "b",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "digits", "expected"),
+    [
+        (70e9, "Pa", 3, "70 GPa"),
+        (19041.2, "N/m", 5, "19.041 kN/m"),
+        (0.0015, "m", 3, "1.5 mm"),
+        (0.012006, "kg", 2, "12 g"),
+        (4.8489, "N s/m", 3, "4.85 N s/m"),
+        (0.01302, "", 2, "0.013"),
+        (1.2, "m", 3, "1200 mm"),
+        (0.9996, "m", 3, "1000 mm"),
+        (117e3, "N/m", 2, "117 kN/m"),
+    ],
+)
+def test_in_display_unit_scales_to_giga_kilo_or_milli(
+    value: float, unit: str, digits: int, expected: str
+) -> None:
+    """Giga, kilo and milli where plates have them; any other unit as it is, and none without."""
+    assert in_display_unit(value, unit, digits=digits) == expected
+
+
+@pytest.mark.parametrize(
+    ("share", "expected"),
+    [(1.43, "143 %"), (0.124, "12 %"), (0.0999, "10 %"), (0.0123, "1.2 %"), (0.0, "0 %")],
+)
+def test_percent_has_two_significant_digits(share: float, expected: str) -> None:
+    """Whole per cents from ten on, below with two digits."""
+    assert percent(share) == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "unit", "expected"),
+    [
+        (74.0241e9, 0.8712e9, "Pa", "74.02 ± 0.87 GPa"),
+        (0.0130284, 2.72e-5, "", "0.013028 ± 0.000027"),
+        (0.0119941, 0.000996, "kg", "12.0 ± 1.0 g"),
+        (1231.4, 217.0, "Hz", "1231 ± 217 Hz"),
+        (1.25, math.inf, "", "1.25 ± inf"),
+        (1.0, 0.0, "m", "1000 ± 0 mm"),
+    ],
+)
+def test_with_error_shows_no_digit_below_two_of_the_error(
+    value: float, error: float, unit: str, expected: str
+) -> None:
+    """Value and error have the same decimals, in the unit of plates."""
+    assert with_error(value, error, unit) == expected
+    assert with_error(value, error, unit, sign="+") == f"+{expected}"

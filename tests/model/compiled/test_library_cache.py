@@ -1,15 +1,20 @@
-"""Compiled libraries in the cache folder: safe, whole, and not piled up."""
+"""The compiled library: found and built by a compiler, cached, and refused where it is damaged."""
 
+import ctypes
 import hashlib
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from model.compiled import library_cache
+from model.compiled import compiler, library_cache
 from model.compiled.compiler import compile_library
+from model.compiled.kernels import kernels
+from model.errors import InputError
 
 _PROGRAM = """
 import sys
@@ -128,3 +133,43 @@ def test_least_recently_used_libraries_are_removed(folder: Path) -> None:
     kept |= {path.name}
     assert {each.name for each in folder.iterdir()} == kept | {f"{name}.sha256" for name in kept}
     assert os.confstr("CS_GNU_LIBC_VERSION").replace(" ", "") in path.name
+
+
+def test_machine_without_a_compiler_has_none(without_kernels: Callable[[], None]) -> None:
+    """No library, and no error; with one there is a library."""
+    assert kernels() is not None
+    without_kernels()
+    assert kernels() is None
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    """Of a function that returns seven."""
+    path = tmp_path / "seven.c"
+    path.write_text("int seven(void) { return 7; }")
+    return path
+
+
+@pytest.mark.parametrize("cc", ["/nowhere/cc", "false", "sleep 60 #"])
+def test_compiler_that_gives_no_library_is_bad_input(
+    cc: str, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither is there a file then, nor a part of one."""
+    monkeypatch.setenv("CC", cc)
+    monkeypatch.setattr(compiler, "_TIMEOUT", 0.01)
+    with pytest.raises(InputError):
+        compile_library(tmp_path / "seven.so", [source], flags=(), what="seven")
+    assert [path.name for path in tmp_path.iterdir()] == ["seven.c"]
+
+
+def test_threads_compile_the_same_at_once(source: Path, tmp_path: Path) -> None:
+    """Each in a folder of its own, so that no thread loads a part of the library."""
+    path = tmp_path / "seven.so"
+
+    def load(_: int) -> int:
+        compile_library(path, [source], flags=(), what="seven")
+        return int(ctypes.CDLL(str(path)).seven())
+
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(load, range(4))) == [7] * 4
+    assert {each.name for each in tmp_path.iterdir()} == {"seven.c", "seven.so"}

@@ -1,11 +1,35 @@
+"""Configuration: sections, units, points, and edits that keep what a file says."""
+
+import subprocess
+import sys
+from decimal import Decimal
 from pathlib import Path
 from typing import Annotated
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ruamel.yaml.comments import CommentedMap
 
-from model.config.document import ConfigError, read_document
+from model.config.document import ConfigError, parse_document, read_document
+from model.config.editing import data_text, edited_text
+from model.config.points import in_metres, parse_frequencies
 from model.config.sections import Quantity, Section, Validation
-from model.config.units import FREQUENCY, LENGTH
+from model.config.units import (
+    COMMON_FACTORS,
+    DAMPING,
+    DENSITY,
+    FREQUENCY,
+    LENGTH,
+    MASS,
+    MODULUS,
+    RATIO,
+    STIFFNESS,
+    Dimension,
+    quantity,
+    unit_factor,
+)
+from model.errors import InputError
 
 
 class Inner(Section):
@@ -106,3 +130,174 @@ def test_validation_returns_valid_parts_of_an_invalid_file(tmp_path: Path) -> No
     assert validation.field(("parts", "a", "word"), Inner) is None
     assert list(validation.mapping(("parts",))) == ["a", "b"]
     assert validation.mapping(("rate",)) == {}
+
+
+TEXT = """\
+# A rig.
+plate:
+    length: 0.300 # measured
+
+    layers:
+      - {thickness: 1.50 mm}
+eras: {SW: {at: [0, 0], damping: 1.5}} # one
+"""
+
+
+def test_edited_text_keeps_what_was_not_changed() -> None:
+    """Comments, indentation, order and numbers stay as they were written."""
+
+    def change(data: CommentedMap) -> None:
+        data["plate"].insert(0, "width", 0.2)
+        data["eras"]["SW"].pop("damping")
+        data["eras"]["SW"]["damping"] = 2.5
+
+    edited = edited_text(parse_document("rig.yaml", TEXT), change)
+    expected = TEXT.replace("    length", "    width: 0.2\n    length")
+    assert edited == expected.replace("damping: 1.5", "damping: 2.5")
+
+
+def test_edited_text_has_one_kind_of_line_end_when_the_file_has_crlf() -> None:
+    """A file with CR LF, comments included, is written with LF throughout."""
+    document = parse_document("f.yaml", "# first\r\na: 1  # one\r\n# last\r\nb: 2\r\n")
+    text = edited_text(document, lambda data: data.update(a=3))
+    assert "\r" not in text
+    assert parse_document("f.yaml", text).data == {"a": 3, "b": 2}
+
+
+def test_edited_text_refuses_comments_that_it_cannot_keep() -> None:
+    """A file that would come out changed is left alone."""
+    document = parse_document("rig.yaml", "a: # between\n\n  value\n\n")
+    assert document.data == {"a": "value"}
+    with pytest.raises(ConfigError, match=r"rig\.yaml"):
+        edited_text(document, lambda data: None)
+
+
+def test_data_text_is_read_back_as_it_was() -> None:
+    """Words of YAML 1.1 and numbers among text come back too."""
+    data = {"z": ["NO", "0x10", "1", 1, 1.5, None, True], "a": {"b": "12 in", "c": "1:30"}}
+    assert parse_document("new", data_text(data)).data == data
+    assert list(parse_document("new", data_text(data)).data) == ["z", "a"]
+
+
+@pytest.mark.parametrize(
+    ("place", "remedy"),
+    [
+        ((8.0, 6.0), "0.08,0.06"),
+        ((20.0, 0.0), "0.2,0"),
+        ((80.0, 60.0), "0.08,0.06"),
+        ((0.4, 0.1), ""),
+        ((1.0, 0.1), ""),
+        ((-8.0, 6.0), ""),
+        ((800.0, 6.0), ""),
+        ((float("nan"), 6.0), ""),
+        ((float("inf"), 6.0), ""),
+    ],
+)
+def test_in_metres_converts_places_that_smaller_units_put_on_the_plate(
+    place: tuple[float, float], remedy: str
+) -> None:
+    """The plate is 0.3 m by 0.2 m; no finger is half a centimetre from a corner."""
+    assert in_metres(*place, length=0.3, width=0.2).rpartition(" ")[2] == remedy
+
+
+@pytest.mark.parametrize(
+    "text", ["0:100:10", "100:60:10", "60:320:0", "60:320:1e-9", "60:nan:10", "60,110,60", "sixty"]
+)
+def test_parse_frequencies_refuses_what_is_no_range_or_list(text: str) -> None:
+    """Ranges from zero, downwards or too fine, a frequency twice, and words are refused."""
+    with pytest.raises(InputError, match="--frequencies"):
+        parse_frequencies(text)
+
+
+SI = {
+    # An inch is 25.4 mm by definition; micro is written with the micro sign or the Greek letter.
+    LENGTH: {
+        "12 in": 0.3048, "9in": 0.2286, "1.5 mm": 0.0015, "2 mm": 0.002, "100 um": 1e-4,
+        "100 µm": 1e-4, "100 μm": 1e-4, "1 ft": 0.3048, ".5 m": 0.5, "1e-3 m": 0.001,
+        "-2 cm": -0.02, 3: 3.0, -1.5: -1.5, 0: 0.0,
+    },
+    MODULUS: {"70 GPa": 70e9, "70000 N/mm^2": 70e9, "70 kN/mm²": 70e9, "70e9": 70e9},
+    DENSITY: {"2700 kg/m^3": 2700, "2700 kg/m**3": 2700, "2700 kg/m³": 2700, "2.7 g/cm^3": 2700},
+    STIFFNESS: {"17 kN/m": 17000, "17 N/mm": 17000, "17000": 17000},
+    DAMPING: {"2 N s/m": 2, "2 N*s/m": 2, "2 N·s/m": 2, "2 kg/s": 2},
+    MASS: {"5 g": 0.005},
+    FREQUENCY: {"0.25 kHz": 250},
+    RATIO: {"1 %": 0.01, "5e-2": 0.05},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("dimension", SI, ids=lambda dimension: dimension.name)
+def test_quantity_converts_to_si_exactly(dimension: Dimension) -> None:
+    """Common units and spellings are exact to the last bit; a bare number is in SI."""
+    expected = SI[dimension]
+    assert {value: quantity(value, dimension) for value in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "dimension"),
+    [
+        ("1.5 kg", LENGTH),
+        ("70 GN", MODULUS),
+        ("1.5 mm^2", LENGTH),
+        ("2 %", LENGTH),
+        ("1 m", RATIO),
+        ("17 lb/in", STIFFNESS),  # pounds are a mass
+        ("100 rpm", FREQUENCY),  # has the dimension of Hz, but 100 rpm are not 100 Hz
+        ("100 rad/s", FREQUENCY),
+        ("100 Bq", FREQUENCY),
+        ("1 deg", RATIO),
+    ],
+)
+def test_quantity_refuses_another_dimension(value: object, dimension: Dimension) -> None:
+    """The error has the value, the dimension wanted and an example."""
+    with pytest.raises(InputError) as caught:
+        quantity(value, dimension)
+    message = str(caught.value)
+    assert all(part in message for part in (repr(value), dimension.name, dimension.example))
+
+
+NO_VALUES = [
+    "9**9**9 m", "9^9^9 m", "2 m^99999999", "2 m**9**9**9", "(3) m", "3 * 4 m",
+    "__import__('os') m", "1,5 mm", "1.5 mmm", "1.5 m/", "m", "", " ", "one m", "1" * 41,
+    "1 " + "m" * 41, "1e999 m", "1e99 Ym Ym Ym Ym Ym", "nan", "inf m", float("nan"), float("inf"),
+    -float("inf"), 10**400, True, False, None, [1], {"m": 1}, b"1 m",
+    "٣ m",  # digits of another script
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("value", NO_VALUES)
+def test_quantity_refuses_what_is_not_a_value(value: object) -> None:
+    """Nothing is evaluated or guessed; the error is short and has a remedy."""
+    with pytest.raises(InputError, match=r"1\.5 mm") as caught:
+        quantity(value, LENGTH)
+    assert len(str(caught.value)) < 200
+
+
+@given(st.text(max_size=60) | st.text(alphabet="0123456789.eE+-*/^% mkgNsPainHz()", max_size=60))
+def test_quantity_raises_input_error_only(text: str) -> None:
+    """No text raises anything but InputError."""
+    try:
+        quantity(text, LENGTH)
+    except InputError:
+        return
+
+
+def test_quantity_of_bare_numbers_does_not_load_pint() -> None:
+    """A rig of bare numbers does not pay for loading the unit library."""
+    script = (
+        "import sys; from model.config.units import LENGTH, quantity; "
+        "quantity('0.3', LENGTH); quantity(2, LENGTH); print('pint' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize(
+    ("si", "unit"), [(si, unit) for si, factors in COMMON_FACTORS.items() for unit in factors]
+)
+def test_common_factors_are_those_of_pint(si: str, unit: str) -> None:
+    """They agree to the last digit, so that it does not matter which of the two is used."""
+    factor = unit_factor(f"1 {unit}", unit, Dimension("a value", si, ""))
+    assert factor == Decimal(COMMON_FACTORS[si][unit])

@@ -1,5 +1,6 @@
-"""Responses that are not what they claim are refused before a rig is fitted to them."""
+"""Whether measured responses can be of one plate, and of which polarity."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from long_form import shortly
 from model.calibration.responses import Responses
 from model.diagnosis import causes
 from model.diagnosis.consistency import check_consistency
+from model.diagnosis.polarity import phases_of_drive
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.rig.rig import Rig
@@ -76,3 +78,20 @@ def test_plate_of_another_length_is_refused_by_its_length(
     found = measured(perturbed(longer, frequencies=FREQUENCIES), frequencies=FREQUENCIES)
     with pytest.raises(InputError, match=r"plate\.length"):
         check_consistency(rig, found)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "sign"), [(0.0, 1), (80.0, 1), (-80.0, 1), (100.0, -1), (-100.0, -1), (180.0, -1)]
+)
+def test_phases_of_drive_inverts_beyond_a_quarter_turn(degrees: float, sign: int) -> None:
+    """Measured is what was predicted, turned by an angle; that is found, and the nearer sign."""
+    rng = np.random.default_rng(0)
+    predicted = rng.standard_normal((5, 1, 4)) + 1j * rng.standard_normal((5, 1, 4))
+    turned = predicted * np.exp(1j * math.radians(degrees))
+    observation = Responses(
+        tuple("ABCD"), np.zeros((4, 2)), np.arange(5.0), turned, has_phases=True
+    )
+    (phase,) = phases_of_drive(observation, predicted)
+    assert phase.degrees == pytest.approx(degrees, abs=1e-6)
+    assert phase.sign == sign
+    assert phase.confidence == pytest.approx(1.0)

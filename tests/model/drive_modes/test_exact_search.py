@@ -1,15 +1,22 @@
-"""The exact search: equal to trying everything, and its bounds hold."""
+"""Searches of drives against exhaustive ones: compiled, limited in level, by dual weights."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog, minimize
 
 from drives import by_hand
+from model.drive_modes import find_drives
+from model.drive_modes.dual_weights import dual_weights
 from model.drive_modes.exact_search import groupings, pattern_count, search_exactly, sensation_found
 from model.drive_modes.forms import SILENT, Forms, Weights
+from model.drive_modes.phased import PHASED
 from model.drive_modes.switched import find_switched
 from model.errors import InputError
+from model.rig.uncertainty import Uncertainty
 from model.table.question import Question
 from paper_table import contact_sets, smooth_table
 from random_forms import random_forms
@@ -119,3 +126,119 @@ def test_search_exactly_refuses_ten_eras():
     given = Forms(field, form, form, np.ones(1, np.float32), 1e-6)
     with pytest.raises(InputError, match="at most 9, got 10"):
         search_exactly(given, eras_at_most=10)
+
+
+@pytest.mark.parametrize("wanted", [1e-6, 1.0, 1.5, 3.0, 9.0])
+@pytest.mark.parametrize("margin", [0.0, 1.0])
+@pytest.mark.parametrize(("quiet", "eras"), [(1, 3), (2, 5), (6, 4), (19, 8)])
+def test_both_ways_find_the_same(
+    quiet: int, eras: int, margin: float, wanted: float, without_kernels: Callable[[], None]
+) -> None:
+    """Scores of the best frequency, bounds, and whether a level is missed; none to all reach it."""
+    given = random_forms(3, frequencies=21, eras=eras, quiet=quiet, wanted=wanted)
+    if margin:
+        doubtful = given.target_power * np.float32(1.1)
+        given = replace(given, target_power=doubtful, level_margin=margin)
+    by_kernel = PHASED.search(given)
+    without_kernels()
+    by_numpy = PHASED.search(given)
+    best = int(by_numpy.score.argmax())
+    assert by_kernel.score[best] == pytest.approx(by_numpy.score[best], rel=1e-4)
+    assert by_kernel.weights[best] == pytest.approx(by_numpy.weights[best], abs=1e-3)
+    assert by_kernel.is_level_limited == by_numpy.is_level_limited
+    assert by_kernel.bound == pytest.approx(by_numpy.bound, rel=1e-3)
+
+
+def test_loudest_points_count_in_both_ways(without_kernels: Callable[[], None]) -> None:
+    """Of a rig that is known exactly, where few points do not show the nulls."""
+    (places,) = contact_sets(1, fingers=4, seed=8)
+    known = replace(smooth_table(), uncertainty=Uncertainty.none())
+    given = known.forms(Question((places[0],), tuple(places[1:])))
+    assert given.fine is not None
+    by_kernel = PHASED.search(given)
+    without_kernels()
+    by_numpy = PHASED.search(given)
+    assert (by_numpy.score > 0).any()
+    assert by_kernel.score == pytest.approx(by_numpy.score, rel=2e-3)
+    assert np.isfinite(by_kernel.weights).all()
+
+
+def _forms(seed: int, short: float) -> Forms:
+    """Random forms at one frequency, whose best weights miss the level by a factor."""
+    rng = np.random.default_rng(seed)
+    target = rng.normal(size=4) + 1j * rng.normal(size=4)
+    near = target + 0.2 * (rng.normal(size=4) + 1j * rng.normal(size=4))
+    form = np.outer(near.conj(), near) + 0.01 * np.diag(np.abs(near) ** 2)
+    best = np.linalg.solve(form, target.conj())
+    level = abs(target @ best) / np.abs(best).max()
+    assert short * level < np.abs(target).sum()
+    power = np.outer(target.conj(), target)
+    return Forms(
+        targets=target[None, None].astype(np.complex64),
+        target_power=power[None, None].astype(np.complex64),
+        quiet=form[None, None].astype(np.complex64),
+        threshold=np.ones(1, dtype=np.float32),
+        wanted=short * level,
+        level_margin=0.0,
+    )
+
+
+def _optimum(forms: Forms) -> float:
+    """The best score within full stroke, by sequential quadratic programming."""
+    target, form = forms.targets[0, 0].astype(complex), forms.quiet[0, 0].astype(complex)
+    n = len(target)
+
+    def weights(x):
+        return x[:n] + 1j * x[n:]
+
+    def power(x):
+        return float((weights(x).conj() @ form @ weights(x)).real)
+
+    limits = [
+        {"type": "ineq", "fun": lambda x: 1 - np.abs(weights(x)) ** 2},
+        {"type": "ineq", "fun": lambda x: (target @ weights(x)).real - forms.wanted},
+        {"type": "eq", "fun": lambda x: (target @ weights(x)).imag},
+    ]
+    loud = target.conj() / np.abs(target)
+    start = np.concatenate([loud.real, loud.imag]) * 0.99
+    found = minimize(power, start, constraints=limits, method="SLSQP", options={"maxiter": 500})
+    assert found.success
+    return float(abs(target @ weights(found.x)) / np.sqrt(power(found.x)))
+
+
+@pytest.mark.usefixtures("kernels_or_numpy")
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("short", [1.1, 1.4])
+def test_level_beyond_the_best_weights_costs_no_more_than_it_must(seed: int, short: float) -> None:
+    """The drive reaches the level within full stroke, half a decibel from the best at most."""
+    forms = _forms(seed, short)
+    (score, drive), *_ = find_drives(forms, "phased")
+    assert np.abs(drive.values).max() <= 1 + 1e-6
+    assert abs(forms.targets[0, 0] @ drive.values) >= 0.999 * forms.wanted
+    assert 20 * np.log10(_optimum(forms) / score) < 0.5
+
+
+def sources(seed):
+    """Powers of 40 sources at 80 quiet fingertips."""
+    return np.random.default_rng(seed).exponential(size=(40, 80))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_dual_weights_reach_the_primal_optimum(seed):
+    """The primal program has the same value, to a thousandth."""
+    relative = sources(seed)
+    n, points = relative.shape
+    primal = linprog(
+        np.append(np.zeros(n), 1.0),
+        A_ub=np.column_stack([relative.T, -np.ones(points)]),
+        b_ub=np.zeros(points),
+        A_eq=[np.append(np.ones(n), 0.0)],
+        b_eq=[1.0],
+        method="highs-ipm",
+    )
+    share = dual_weights(np.ones(n), relative)
+    bound = 1 / (relative @ share).min()
+    assert share.sum() == pytest.approx(1.0)
+    assert (share >= 0).all()
+    assert 1 / primal.fun <= bound * (1 + 1e-9)
+    assert bound == pytest.approx(1 / primal.fun, rel=2e-3)

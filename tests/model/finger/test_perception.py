@@ -1,17 +1,20 @@
-"""Detection thresholds and levels above them."""
+"""Thresholds, levels, the band that is felt, and the grid of fingers."""
 
 import numpy as np
 import pytest
 
 from model.errors import InputError
+from model.finger.grid import CELL_SAMPLES, Grid
 from model.finger.perception import (
     THRESHOLDS,
     check_has_threshold,
     detection_threshold,
+    felt_part,
     highest_measured,
     sensation_level,
     sensitivity_margin_db,
 )
+from model.structure.plate import Material, Plate
 from model.table.pattern import Pattern
 from model.vibration.excitation import Tone
 
@@ -115,3 +118,46 @@ def test_patterns_above_measured_thresholds_say_so():
         played = {"SW": Tone(100.0, 1e-6), "SE": Tone(frequency, 1e-6)}
         pattern = Pattern(played, 0.04, 20.0, None, None, threshold=name)
         assert pattern.is_level_extrapolated is is_extrapolated
+
+
+@pytest.mark.parametrize("rate", [8000.0, 10_000.0, 44_100.0])
+@pytest.mark.parametrize(
+    ("frequency", "passes"), [(40, 1), (300, 1), (850, 1), (1800, 0), (2500, 0), (3900, 0)]
+)
+def test_felt_part_passes_tones_up_to_a_kilohertz(
+    rate: float, frequency: float, passes: float
+) -> None:
+    """Within 1 %, in phase and sample by sample; what is far above is gone."""
+    times = np.arange(round(0.1 * rate)) / rate
+    tone = np.sin(2 * np.pi * frequency * times + 0.7)
+    found = felt_part(np.column_stack([tone, -2 * tone]), rate)
+    inner = (times > 0.003) & (times < 0.097)
+    np.testing.assert_allclose(found[inner, 0], passes * tone[inner], atol=0.01)
+    np.testing.assert_allclose(found[:, 1], -2 * found[:, 0], atol=1e-12)
+
+
+def test_felt_part_of_slow_samples_is_all_of_them() -> None:
+    """At 2 kHz nothing above 1 kHz is in them; none at all are none."""
+    samples = np.random.default_rng(0).normal(size=(50, 2))
+    np.testing.assert_array_equal(felt_part(samples, 2000.0), samples)
+    assert felt_part(np.zeros((0, 3)), 10_000.0).shape == (0, 3)
+
+
+PLATE = Plate(0.6, 0.2, 0.002, Material("steel", 210e9, 7850.0, 0.3))
+
+
+def test_grid_numbers_cells_along_x_first():
+    """Three by two cells of 200 x 100 mm."""
+    centres = [[x, y] for y in (0.05, 0.15) for x in (0.1, 0.3, 0.5)]
+    np.testing.assert_allclose(Grid(3, 2).centres(PLATE), centres)
+
+
+def test_grid_samples_cells_evenly():
+    """Each cell in its turn: five by five points a fifth of a side apart, about its centre."""
+    grid = Grid(3, 2)
+    cells = grid.samples(PLATE).reshape(grid.cell_count, -1, 2)
+    share = (np.arange(5) - 2) / 5
+    offsets = [[dx * 0.2, dy * 0.1] for dy in share for dx in share]
+    assert CELL_SAMPLES == 5
+    for samples, centre in zip(cells, grid.centres(PLATE), strict=True):
+        np.testing.assert_allclose(samples - centre, offsets, atol=1e-12)

@@ -1,14 +1,20 @@
-"""The plate in a few dozen coordinates, against the direct solve."""
+"""The plate in a few coordinates: against the full one, its slopes, modes and what was left out."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from model.arrays import FloatArray
 from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import assemble, direct_acceleration
-from model.reduction.reduced_plate import reduce_plate
-from model.structure.attachments import Era, footprints_of
+from model.reduction.place_slopes import place_slopes
+from model.reduction.reduced_plate import SupportedModes, reduce_plate, supported_modes
+from model.reduction.truncation import truncation_weights
+from model.rig.rig import Rig
+from model.structure.attachments import Era, damping_from_ratio, footprints_of
 from model.structure.plate import Plate
-from paper_plate import ALUMINIUM, LENGTH, WIDTH
+from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
 PLATE = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
 MESH = Mesh(6, 5, LENGTH, WIDTH, ELEMENTS["Q4"], 0.003)
@@ -62,3 +68,95 @@ def test_projection_carries_motion_to_another_reduction():
     through_small = other.projection_from(small) @ down
     np.testing.assert_allclose(across @ up, through_small @ up, atol=1e-9)
     assert np.linalg.norm(across - through_small) > 0.1
+
+
+SIDES = np.array([0.3, 0.2])
+WAVES = np.array([[20.0, 0.0], [35.0, -60.0], [0.0, 90.0]])  # rad/m
+
+
+def test_slopes_are_those_of_waves() -> None:
+    """Inside, beside edges and at corners, to 2e-6 of the wave number, from points on the plate."""
+    places = np.array([[0.1, 0.05], [0.0, 0.12], [0.3, 0.2], [1e-7, 0.2], [0.12, 0.2 - 1e-7]])
+    places = np.column_stack([places, np.full(len(places), 0.01)])
+
+    def field(at: FloatArray) -> FloatArray:
+        assert ((at[:, :2] >= 0) & (at[:, :2] <= SIDES)).all()
+        assert (at[:, 2] == 0.01).all()
+        return np.asarray(np.sin(at[:, :2] @ WAVES.T))
+
+    exact = np.cos(places[:, :2] @ WAVES.T)[:, None] * WAVES.T
+    np.testing.assert_allclose(place_slopes(field, places, SIDES), exact, atol=2e-6 * 90)
+
+
+LARGEST = 1 / 4.0e7  # the lowest truncated mode at about 1 kHz
+
+
+def approximation(zeta, u, terms):
+    """Sum of the weights times (u / u_c)^j."""
+    powers = (u[:, None] / LARGEST) ** np.arange(1, terms + 1)
+    return powers @ truncation_weights(np.array([zeta]), LARGEST, terms)[0]
+
+
+def error_bound(zeta, terms):
+    """1 / |T_k(t)| at t = 2 / (u_c zeta) - 1, by |T_k| = |cosh(k arccosh t)|."""
+    return 1 / abs(np.cosh(terms * np.arccosh(2 / (LARGEST * complex(zeta)) - 1)))
+
+
+@pytest.mark.parametrize("terms", [1, 3, 4, 8])
+@pytest.mark.parametrize("zeta", [1e3, 1e6, 1e7, 1e7 - 1e5j, 3e7])
+def test_truncation_weights_reach_the_error_of_a_chebyshev_polynomial(zeta, terms):
+    """Over the whole interval the relative error reaches its bound and does not exceed it."""
+    u = LARGEST * np.linspace(1e-6, 1, 2001)
+    exact = u / (1 - zeta * u)
+    error = np.abs(approximation(zeta, u, terms) / exact - 1).max()
+    bound = error_bound(zeta, terms)
+    assert error < 1.001 * bound + 1e-11
+    assert error > 0.9 * bound or bound < 1e-9
+
+
+# Founding paper, in-house column of Table 2 [Hz].
+TABLE_2 = ["31.98", "68.50", "76.62", "107.84", "160.77"]
+
+
+def modes_of(rig: Rig, *, frequency_max: float) -> SupportedModes:
+    """Those of a rig's plate on its mesh."""
+    attached = footprints_of(rig.eras)
+    reduced = reduce_plate(rig.plate, rig.mesh, attached, frequency_max=frequency_max)
+    return supported_modes(reduced, rig.eras, frequency_max=frequency_max)
+
+
+def test_supported_modes_reproduce_table_2(coarse_rig: Rig) -> None:
+    """On the paper's mesh its Table 2 comes out, every printed digit, and nothing beyond it."""
+    found = modes_of(coarse_rig, frequency_max=170.0).natural_frequencies
+    assert [f"{frequency:.2f}" for frequency in found] == TABLE_2
+
+
+def test_damping_ratio_of_a_rigid_plate_as_by_hand() -> None:
+    """Bouncing has the ratio zeta, tilting nearly sqrt(3) times that.
+
+    Mass m on four corners of k and c = 2 zeta sqrt(k m / 4): bouncing 4 c / (2 sqrt(4 k m)).
+    Tilting along a side b has the inertia m (b² + h²) / 12, and k b², c b².
+    """
+    rig = make_paper_rig(12, 9)
+    plate = replace(rig.plate, thickness=0.03, loss_factor=0.0)  # bends at a thousand hertz
+    damping = damping_from_ratio(0.05, stiffness=17000.0, plate_mass=plate.mass, era_count=4)
+    eras = tuple(replace(era, damping=damping) for era in rig.eras)
+    mesh = Mesh.accurate(plate, frequency_max=100.0)
+    found = modes_of(replace(rig, plate=plate, eras=eras, mesh=mesh), frequency_max=100.0)
+    tilting = [
+        0.05 * np.sqrt(3 / (1 + (plate.thickness / side) ** 2))
+        for side in (plate.width, plate.length)
+    ]
+    np.testing.assert_allclose(found.damping_ratios, [0.05, *tilting], rtol=2e-3)
+    bouncing = np.sqrt(4 * 17000.0 / plate.mass) / (2 * np.pi)
+    np.testing.assert_allclose(found.natural_frequencies[0], bouncing, rtol=1e-3)
+
+
+def test_supported_mode_shapes_have_unit_modal_mass() -> None:
+    """Of a rigid plate that bounces, mass 1 is a deflection of 1 / sqrt(m) everywhere."""
+    rig = make_paper_rig(12, 9)
+    plate = replace(rig.plate, thickness=0.03)
+    mesh = Mesh.accurate(plate, frequency_max=100.0)
+    found = modes_of(replace(rig, plate=plate, mesh=mesh), frequency_max=100.0)
+    bouncing = found.at(np.array([[0.0, 0.0], [0.1, 0.05], [0.3, 0.2]]))[:, 0]
+    np.testing.assert_allclose(np.abs(bouncing), 1 / np.sqrt(plate.mass), rtol=5e-3)

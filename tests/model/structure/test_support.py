@@ -1,3 +1,5 @@
+"""Supports, loads at points and under fingertips, and the areas that they have."""
+
 import math
 from dataclasses import replace
 
@@ -5,11 +7,18 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
+from model.fem.mesh import Mesh
+from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate, supported_modes
 from model.rig.file import example_rig_path, load_rig
-from model.structure.attachments import Era, PointLoad
+from model.structure.attachments import Era, Fingertip, PointLoad, footprints_of
+from model.structure.footprint import mean_over
 from model.structure.plate import Material, Plate
 from model.structure.support import check_supported, rigid_body_frequencies, support_problem
+from model.transients.base_motion import Term
+from model.vibration.natural_modes import direct_responder
+from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
+from sim.plant.plant import Plant
 
 PLATE = Plate(0.3, 0.2, 0.002, Material("aluminium", E=70e9, rho=2700.0, nu=0.33))
 
@@ -73,3 +82,142 @@ def test_plate_is_supported_by_three_eras_not_in_line(eras: list[Era]) -> None:
 def test_plate_is_supported_by_two_eras_and_a_spring() -> None:
     """Springs of loads count as those of ERAs do."""
     assert support_problem(PLATE, CORNERS[:2], loads=[PointLoad(0.15, 0.2, 17e3)]) is None
+
+
+def test_point_load_at_an_era_acts_as_bolt_mass_and_parallel_spring():
+    """A mass and a damper laid on an ERA act as its own would, but are not driven by its base."""
+    plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
+    free = solve_free_plate(plate, Mesh(12, 9, LENGTH, WIDTH))
+    places = [(0.0, 0.0), (LENGTH, 0.0), (0.1, WIDTH)]
+    eras = [Era(f"E{n}", x, y, 17000.0, 2.0, 0.0, 1e-4) for n, (x, y) in enumerate(places)]
+    heavier = [Era(e.name, e.x, e.y, 17000.0, 2.0, 0.01, 1e-4) for e in eras]
+    masses = [PointLoad(x, y, mass=0.01) for x, y in places]
+    frequencies = np.array([60.0, 110.0, 400.0])
+    np.testing.assert_allclose(
+        free.acceleration(eras, frequencies, free.mesh.nodes, loads=masses),
+        free.acceleration(heavier, frequencies, free.mesh.nodes),
+        rtol=1e-8,
+    )
+    # The base of an ERA with spring k + s and stroke a k / (k + s) pushes as one of k and a does.
+    springs = [PointLoad(x, y, stiffness=3000.0, damping=0.3) for x, y in places]
+    stiffer = [Era(e.name, e.x, e.y, 20000.0, 2.3, 0.0, 1e-4) for e in eras]
+    omega = 2 * np.pi * frequencies
+    share = (17000 + 2j * omega) / (20000 + 2.3j * omega)
+    np.testing.assert_allclose(
+        free.acceleration(eras, frequencies, free.mesh.nodes, loads=springs),
+        free.acceleration(stiffer, frequencies, free.mesh.nodes) * share[:, None, None],
+        rtol=1e-8,
+    )
+
+
+HERTZ = np.array([60.0, 100.0, 250.0])
+
+
+def test_dynamic_stiffness_of_a_phalanx_that_moves() -> None:
+    """Real parts at 60, 100 and 250 Hz as worked out from the formula by hand."""
+    found = Fingertip().dynamic_stiffness(2 * np.pi * HERTZ)
+    assert found.real == pytest.approx([69, -87, -358], abs=1)
+    assert (found.imag > 0).all()
+
+
+def test_dynamic_stiffness_of_a_phalanx_at_rest() -> None:
+    """A phalanx too heavy to move leaves spring, damper and contact mass."""
+    found = Fingertip(phalanx_mass=1e9).dynamic_stiffness(2 * np.pi * HERTZ)
+    assert found.real == pytest.approx([972, 921, 507], abs=1)
+    assert found.imag == pytest.approx(2 * 2 * np.pi * HERTZ, rel=1e-4)
+
+
+def test_scaled_contact_keeps_phalanx_and_joint() -> None:
+    """Twice the contact has twice the pulp; at rest pulp and joint are springs in series."""
+    at_rest = Fingertip().scaled(2).dynamic_stiffness(np.zeros(1))
+    assert at_rest.real == pytest.approx(2000 * 500 / 2500)
+
+
+@pytest.mark.parametrize("wrong", [{"damping": 0.0}, {"stiffness": -1.0}, {"phalanx_mass": np.nan}])
+def test_refuses_what_no_finger_has(wrong: dict[str, float]) -> None:
+    """Negative values, NaN, and a pulp without damping."""
+    with pytest.raises(InputError):
+        Fingertip(**wrong)
+
+
+LONG, WIDE, A = 0.3, 0.2, 0.01
+# Moments of a disc of radius a about its centre, of its half and quarter beyond an edge or corner:
+# mean of x - x0, and of (x - x0)². Half: 4 a / 3 pi and a² / 4.
+CASES = {
+    "inside": ((0.1, 0.08), (0.0, 0.0)),
+    "edge": ((0.0, 0.08), (4 * A / (3 * math.pi), 0.0)),
+    "corner": ((LONG, WIDE), (-4 * A / (3 * math.pi), -4 * A / (3 * math.pi))),
+}
+
+
+@pytest.mark.parametrize(("centre", "shift"), CASES.values(), ids=CASES)
+def test_means_are_those_of_a_disc_by_hand(centre, shift):
+    """Mean of x, y and of squares over what is on the plate of a disc."""
+    x, y = centre
+
+    def functions(points):
+        dx, dy = points[:, 0] - x, points[:, 1] - y
+        return np.column_stack([dx, dy, dx**2, dy**2])
+
+    found = mean_over(functions, np.array([[x, y, A]]), length=LONG, width=WIDE)
+    expected = [*shift, A**2 / 4, A**2 / 4]
+    np.testing.assert_allclose(found[0], expected, rtol=1e-4, atol=1e-9)
+
+
+def test_an_annular_wave_averages_to_the_bessel_function():
+    """The mean of cos(k x) over a whole disc is 2 J1(k a) / (k a): 0.88010117 at k a = 1."""
+    places = np.array([[0.1, 0.08, A], [0.2, 0.1, 0.0]])
+    found = mean_over(lambda at: np.cos((at[:, :1] - 0.1) / A), places, length=LONG, width=WIDE)
+    assert found[0, 0] == pytest.approx(0.88010117, rel=1e-6)
+    assert found[1, 0] == pytest.approx(math.cos(0.1 / A))
+
+
+@pytest.fixture(scope="module")
+def on_feet():
+    """The paper's rig on feet of 6 mm, with a mass on a disc."""
+    rig = make_paper_rig(24, 18)
+    eras = tuple(replace(era, foot=0.006) for era in rig.eras)
+    return replace(rig, eras=eras, masses=(PointLoad(0.1, 0.1, mass=0.02, foot=0.01),))
+
+
+def test_reduction_with_feet_equals_a_factor_for_each_frequency(on_feet):
+    """Elements: the same consistent forces as the direct solution, within 1e-4."""
+    frequencies = np.array([60.0, 150.0, 310.0])
+    points = np.array([[0.05, 0.05], [0.2, 0.15]])
+    arguments = (on_feet.eras, frequencies, points)
+    free = solve_free_plate(on_feet.plate, on_feet.mesh, frequency_max=500.0)
+    found = free.acceleration(*arguments, loads=on_feet.masses)
+    respond = direct_responder(on_feet.plate, on_feet.mesh)
+    exact = respond(*arguments, loads=on_feet.masses)
+    np.testing.assert_allclose(found, exact, rtol=1e-3, atol=1e-4 * abs(exact).max())
+
+
+def test_plate_in_time_settles_to_the_response_on_feet(on_feet):
+    """The plate in time under one ERA's tone reaches the steady response, within 1 %."""
+    frequency = 130.0
+    eras, loads = on_feet.eras, on_feet.masses
+    point = np.array([[0.2, 0.15]])
+    free = solve_free_plate(on_feet.plate, on_feet.mesh, frequency_max=500.0)
+    expected = abs(free.acceleration(eras, np.array([frequency]), point, loads=loads)[0, 0, 0])
+    reduced = reduce_plate(on_feet.plate, on_feet.mesh, footprints_of(eras, loads))
+    plant = Plant(reduced, eras, loads=loads)
+    found = _steady_amplitude(plant, reduced.at(point), eras[0], frequency)
+    assert found == pytest.approx(expected, rel=0.01)
+
+
+def _steady_amplitude(plant, shapes, era: Era, frequency: float) -> float:
+
+    omega = 2 * math.pi * frequency
+    plant.set_input(0, [Term(0.0, math.inf, omega, era.stroke)])
+    plant.skip(3.0)
+    _, values = plant.advance(3.1, sample_rate=20_000.0, shapes=shapes)
+    return float(np.sqrt(2 * np.mean(values**2)))
+
+
+@pytest.mark.parametrize("foot", [-1e-3, math.nan])
+def test_a_foot_must_be_a_length(foot):
+    """Negative and not a number are refused, of ERAs and loads."""
+    with pytest.raises(InputError):
+        PointLoad(0.1, 0.1, mass=0.1, foot=foot)
+    with pytest.raises(InputError):
+        replace(make_paper_rig(12, 9).eras[0], foot=foot)

@@ -1,16 +1,31 @@
-"""Patterns of a localization table against the direct solve of every tone."""
+"""The localization table: its fields, frequencies, raster, and the table that follows a plate."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from model.drive_modes.sources import all_combinations, magnitudes_of_sources, sums_of_sources
+from model.errors import InputError
 from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger.grid import Grid
 from model.finger.perception import detection_threshold
-from model.structure.attachments import FingertipLoad
+from model.reduction.free_plate import solve_free_plate
+from model.rig.file import example_rig_path, load_rig
+from model.rig.rig import Rig
+from model.structure.attachments import FingertipLoad, PointLoad
+from model.structure.plate import Material, Plate
+from model.table.build import build_table
+from model.table.live_table import table_following
 from model.table.question import Question
+from model.table.raster import Raster
+from model.table.table import LocalizationTable, default_drive_frequencies
+from model.table.table_parts import TableProblem
 from model.vibration.excitation import tone_amplitudes
-from paper_table import contact_sets, smooth_rig, smooth_table
+from paper_plate import make_paper_rig
+from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
+from registry.limits import GuardLimits
 
 TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)
 
@@ -72,3 +87,152 @@ def test_query_scales_the_drive_with_the_level():
     assert less.excitation.keys() == loud.excitation.keys()
     for name, tone in less.excitation.items():
         assert tone.amplitude == pytest.approx(loud.excitation[name].amplitude * 10 ** (-1 / 20))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (20.0, 700.0, range(40, 501, 10)),
+        (60.0, 300.0, range(60, 301, 10)),
+        (75.0, 85.0, [80]),
+        (400.0, 430.0, [400, 410, 420, 430]),
+        (61.0, 69.0, [61]),
+    ],
+)
+def test_default_drive_frequencies_are_within_the_limits(low, high, expected):
+    """40 to 500 Hz in steps of 10 within the limits; at least one."""
+    found = default_drive_frequencies(GuardLimits(frequency_min=low, frequency_max=high, level=1.0))
+    np.testing.assert_array_equal(found, list(expected))
+
+
+@pytest.mark.parametrize(
+    "frequencies",
+    [[], [100.0, 100.0], [200.0, 100.0], [10.0], [100.0, 900.0], [100.0, float("nan")]],
+)
+def test_build_refuses_impossible_frequencies(frequencies):
+    """None, unordered, outside the rig's limits, not a number."""
+    with pytest.raises(InputError, match="frequencies"):
+        build_table(make_paper_rig(12, 9), frequencies=np.array(frequencies))
+
+
+def test_table_problem_refuses_a_table_too_large_to_be_read():
+    """A foil of three by three metres has some ten thousand modes, refused before it is solved."""
+    rig = make_paper_rig(48, 36)
+    plate = replace(rig.plate, length=3.0, width=3.0, thickness=0.0001)
+    with pytest.raises(InputError, match="GB"):
+        TableProblem(replace(rig, plate=plate), np.array([100.0, 500.0]), Grid(4, 3))
+
+
+CROSS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+CONTACTS = [(0.15, 0.11), (0.0, 0.0), (0.3048, 0.1), (0.2, 0.225), (0.006, 0.0031)]
+
+
+def test_fingertips_reads_the_points_of_the_disc():
+    """Reading x and y themselves gives back the points, the centre and four of the rim as well."""
+    plate = smooth_rig().plate
+    raster = Raster.for_plate(plate, frequency_max=500.0)
+    places = raster.points.astype(np.float32)
+    few, fine = raster.fingertips(np.array(CONTACTS)).read(places)
+    expected = [fingertip_points(x, y, plate) for x, y in CONTACTS]
+    np.testing.assert_allclose(fine, expected, atol=1e-7)
+    assert few.shape == (5, 5, 2)
+    np.testing.assert_allclose(few[:, 0], CONTACTS, atol=1e-7)
+    np.testing.assert_allclose(few[0, 1:] - few[0, :1], 0.013 * CROSS, atol=1e-7)
+
+
+def test_fingertips_interpolates_fields_of_the_plate():
+    """At 500 Hz as well the interpolation is within 1e-4 of the field, beside an ERA as inside."""
+    rig = smooth_rig()
+    raster = Raster.for_plate(rig.plate, frequency_max=500.0)
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
+    kept = free.acceleration(rig.eras, FREQUENCIES, raster.points).transpose(2, 0, 1)
+    values = np.ascontiguousarray(kept.astype(np.complex64)).reshape(len(kept), -1)
+    _, fine = raster.fingertips(np.array(CONTACTS)).read(values.view(np.float32))
+    found = fine.reshape(-1, fine.shape[-1])
+    points = np.concatenate([fingertip_points(x, y, rig.plate) for x, y in CONTACTS])
+    solved = free.acceleration(rig.eras, FREQUENCIES, points).transpose(2, 0, 1)
+    size = np.sqrt((np.abs(kept) ** 2).mean(axis=0))
+    error = np.abs(found.view(np.complex64).reshape(solved.shape) - solved) / size
+    assert error.max() < 1e-4
+
+
+@pytest.mark.parametrize("thickness", [0.0001, 0.01])
+def test_for_plate_handles_thin_and_small_plates(thickness):
+    """A foil of short waves, and a plate barely larger than a fingertip."""
+    plate = Plate(0.02, 0.03, thickness, Material("any", E=70e9, rho=2700.0, nu=0.33))
+    raster = Raster.for_plate(plate, frequency_max=500.0)
+    heights = (3 * raster.points[:, :1] - raster.points[:, 1:]).astype(np.float32)
+    np.testing.assert_allclose(raster.at(heights, np.array([[0.011, 0.004]])), [[0.029]], rtol=1e-5)
+
+
+def test_raster_refuses_too_few_points():
+    """Five points do not carry a quintic."""
+    with pytest.raises(InputError, match="6 to"):
+        Raster(5, 9, 0.1, 0.1)
+
+
+FIVE = np.array([80.0, 145.0, 220.0, 310.0, 450.0])
+POINTS = np.array([[0.06, 0.05], [0.15, 0.11], [0.26, 0.17], [0.22, 0.04]])
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The paper's plate."""
+    return load_rig(example_rig_path())
+
+
+@pytest.fixture(scope="module")
+def table(rig: Rig) -> LocalizationTable:
+    """Its table at a few frequencies."""
+    return build_table(rig, frequencies=FIVE, drive_mode="phased")
+
+
+def changed(rig: Rig) -> Rig:
+    """The rig after it was identified and gained a sticker."""
+    material = replace(rig.plate.material, E=0.99 * rig.plate.material.E)
+    plate = replace(
+        rig.plate,
+        thickness=1.01 * rig.plate.thickness,
+        material=material,
+        loss_factor=0.013,
+        loss_exponent=0.2,
+        mode_deviations=((0.01, 0.2), (-0.01, 0.0)),
+    )
+    eras = tuple(
+        replace(era, x=era.x + dx, stiffness=factor * era.stiffness, bolt_mass=0.3e-3)
+        for era, dx, factor in zip(
+            rig.eras, (1e-3, 0.0, -2e-3, 0.0), (1.1, 0.8, 1.0, 0.95), strict=True
+        )
+    )
+    return replace(rig, plate=plate, eras=eras, masses=(PointLoad(0.1, 0.09, mass=3e-3),))
+
+
+def test_fields_are_those_of_a_table_built_anew(rig: Rig, table: LocalizationTable) -> None:
+    """Fields of the following table differ by 3 % at most where the change itself is over 20 %."""
+    after = changed(rig)
+    built = build_table(after, frequencies=FIVE).unit_fields(POINTS)
+    followed = table_following(table, after).unit_fields(POINTS)
+    size = np.linalg.norm(built, axis=(1, 2))
+    error = np.linalg.norm(followed - built, axis=(1, 2)) / size
+    moved = np.linalg.norm(table.unit_fields(POINTS) - built, axis=(1, 2)) / size
+    assert error.max() < 0.03
+    assert moved.max() > 0.2
+
+
+def test_same_rig_leaves_the_table_as_it_is(rig: Rig, table: LocalizationTable) -> None:
+    """A table that follows its own rig answers with the same pattern."""
+    question = Question(((0.08, 0.06),), ((0.2, 0.15),), level_db_sl=0.0)
+    same = table_following(table, rig)
+    assert same.query(question).excitation == table.query(question).excitation
+    assert same.fingerprint == table.fingerprint
+
+
+def test_other_plates_are_refused(rig: Rig, table: LocalizationTable) -> None:
+    """Other ERAs, sides, or a thickness 20 % larger need a build."""
+    plates = (
+        replace(rig.plate, length=0.31),
+        replace(rig.plate, thickness=1.2 * rig.plate.thickness),
+    )
+    for other in (replace(rig, eras=rig.eras[:3]), *(replace(rig, plate=each) for each in plates)):
+        with pytest.raises(InputError):
+            table_following(table, other)

@@ -1,22 +1,35 @@
-"""Which of several drives keeps quiet fingers quiet while it starts along a plain ramp."""
+"""Onsets and endings: their knots, envelopes and bounded solutions."""
 
+import cmath
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from model.drive_modes.forms import Weights
 from model.drive_modes.tones import excitation_of
+from model.errors import InputError
 from model.reduction.reduced_plate import reduce_plate
 from model.structure.attachments import footprints_of
 from model.table.pattern import ONSET_RAMP
 from model.table.question import Question
-from model.transients.base_motion import ramped_onset
+from model.transients.base_motion import BaseEnvelope, Term, ramped_ending, ramped_onset, shaped
+from model.transients.knots import (
+    ENDING_KNOTS,
+    bounded_solution,
+    mean_square,
+    solve_carrier,
+    while_ending,
+)
 from model.transients.measures import Transients
 from model.transients.onset import RampedOnsets
 from model.transients.time_response import plate_in_time
+from model.vibration.excitation import Tone
 from paper_plate import make_paper_rig
 from paper_table import FREQUENCIES, contact_sets, smooth_table
+from plate_in_time import make_plate_in_time
 
 
 @pytest.mark.parametrize(("ramp", "within"), [(0.020, 0.5), (0.040, 0.25)])
@@ -93,3 +106,127 @@ def test_ramped_onsets_of_heavily_damped_eras_do_not_overflow():
     weights = np.ones((1, 4), dtype=np.complex64)
     contrast = onsets.contrast(np.array([0]), weights, targets=[shapes[:1]], quiet=shapes[1:])
     assert np.isfinite(contrast).all()
+
+
+def test_while_ending_is_the_mean_square_of_the_response():
+    """For knots at random, the form's value is that of the sampled vibration, mean over phases."""
+    rig, plate = make_plate_in_time()
+    frequency = 217.0
+    carrier = solve_carrier(
+        plate, frequency, residual_form=mean_square(plate, 0.1), gain_variance=0.0
+    )
+    point = np.array([[0.21, 0.06]])
+    form = while_ending(carrier.hats, carrier.steady, plate.reduced.at(point))
+    transients = Transients(plate)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        shape = (ENDING_KNOTS, 4)  # the tone, then seven knots, in strokes; the eighth is silence
+        knots = 0.1 * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
+        knots += (rng.standard_normal(4) + 1j) * np.linspace(1, 0, ENDING_KNOTS)[:, None]
+        predicted = (knots.ravel().conj() @ form @ knots.ravel()).real
+        sampled = 0.0
+        for phase in (0.0, math.pi / 2):  # their squares add up to that of the complex amplitude
+            turned = knots * np.exp(1j * phase)
+            envelopes, tones = {}, {}
+            for number, era in enumerate(rig.eras):
+                start, *rest = (turned[:, number] * era.stroke).tolist()
+                envelopes[era.name] = BaseEnvelope(frequency, start, (*rest, 0j))
+                tones[era.name] = Tone(frequency, abs(start), float(np.angle(start)))
+            felt = transients.acceleration(
+                shaped(envelopes, rig.eras), point, duration=0.005 * ENDING_KNOTS, after=tones
+            )
+            sampled += (felt**2).mean()
+        np.testing.assert_allclose(predicted, sampled, rtol=0.03)
+
+
+def motion(terms: tuple[Term, ...], time: float) -> float:
+    """Displacement of a base [m] at a time [s]: the sum of the terms that hold then."""
+    return sum(
+        (
+            (term.c0 + term.c1 * (time - term.start))
+            * cmath.exp(1j * term.omega * (time - term.start))
+        ).imag
+        for term in terms
+        if term.start <= time < term.end
+    )
+
+
+def test_envelope_terms_are_linear_between_knots():
+    """Half way between knots the complex amplitude is their mean, at its carrier's phase."""
+    envelope = BaseEnvelope(100.0, 0j, (2e-5 + 1e-5j, -4e-5j), step=0.005)
+    terms = envelope.terms()
+    for time, amplitude in [
+        (0.0025, 1e-5 + 0.5e-5j),
+        (0.0075, 1e-5 - 1.5e-5j),
+        (0.02, -4e-5j),  # the last knot stays
+    ]:
+        expected = (amplitude * cmath.exp(2j * math.pi * 100.0 * time)).imag
+        assert motion(terms, time) == pytest.approx(expected, abs=1e-17)
+        assert envelope.amplitude(np.array([time]))[0] == pytest.approx(amplitude)
+
+
+def test_ramped_onset_and_ending_are_raised_cosines():
+    """Half way through a ramp, up or down, the amplitude is half, and none or all at its ends."""
+    rig = make_paper_rig(2, 2)
+    excitation = {"SE": Tone(50.0, 1e-4, 0.3)}
+    up = ramped_onset(excitation, rig.eras, ramp=0.02)
+    down = ramped_ending(excitation, rig.eras, ramp=0.02)
+    assert [len(base) > 0 for base in up] == [era.name == "SE" for era in rig.eras]
+    se = [era.name for era in rig.eras].index("SE")
+    for time, share in [(0.0, 0.0), (0.01, 0.5), (0.03, 1.0)]:
+        tone = 1e-4 * math.sin(2 * math.pi * 50.0 * time + 0.3)
+        assert motion(up[se], time) == pytest.approx(share * tone, abs=1e-17)
+        assert motion(down[se], time) == pytest.approx((1 - share) * tone, abs=1e-17)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "knots", "step", "place"),
+    [
+        (100.0, (), 0.005, "got 0"),
+        (100.0, (1e-5 + 0j,) * 33, 0.005, "got 33"),
+        (100.0, (complex("nan"),), 0.005, "knots"),
+        (100.0, (1e-5 + 0j,), 0.0, "above"),
+        (0.0, (1e-5 + 0j,), 0.005, "above"),
+    ],
+)
+def test_envelope_refuses_values_no_amplifier_plays(frequency, knots, step, place):
+    """No knots, too many, not finite ones, no frequency and no step."""
+    with pytest.raises(InputError, match=place):
+        BaseEnvelope(frequency, 0j, knots, step)
+
+
+def random_form(seed: int, n: int):
+    """A (n, n) Hermitian positive definite and b (n,) for which bounds of 1 matter."""
+    rng = np.random.default_rng(seed)
+    rows = rng.standard_normal((2 * n, n)) + 1j * rng.standard_normal((2 * n, n))
+    A = rows.conj().T @ rows
+    return A, 3 * A @ (rng.standard_normal(n) + 1j * rng.standard_normal(n)) / np.sqrt(n)
+
+
+def value(A, b, x):
+    """What is minimised."""
+    return float((x.conj() @ A @ x - 2 * b.conj() @ x).real)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_bounded_solution_equals_a_general_optimiser(seed):
+    """No bound is exceeded, and the value is that of SLSQP within 1 % of what is to be gained."""
+    A, b = random_form(seed, 6)
+    found = bounded_solution(A, b, np.ones(6))
+    general = minimize(
+        lambda z: value(A, b, z[:6] + 1j * z[6:]),
+        np.zeros(12),
+        method="SLSQP",
+        constraints={"type": "ineq", "fun": lambda z: 1 - z[:6] ** 2 - z[6:] ** 2},
+        options={"maxiter": 500, "ftol": 1e-12},
+    )
+    assert np.abs(np.linalg.solve(A, b)).max() > 1  # the bounds are in the way
+    assert np.abs(found).max() <= 1
+    assert value(A, b, found) <= 0.99 * general.fun
+
+
+def test_bounded_solution_is_unbounded_when_bounds_are_inactive():
+    """Where the free solution keeps the bounds, it is the answer."""
+    A, b = random_form(9, 7)
+    free = np.linalg.solve(A, b)
+    np.testing.assert_allclose(bounded_solution(A, b, 1.01 * np.abs(free)), free, rtol=1e-9)

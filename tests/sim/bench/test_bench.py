@@ -11,49 +11,13 @@ from model.arrays import FloatArray
 from model.fem.plate import assemble, direct_acceleration
 from model.finger.fingertip import fingertip_points
 from model.rig.rig import Rig
-from model.structure.attachments import Fingertip, FingertipLoad, PointLoad
+from model.structure.attachments import Fingertip, FingertipLoad
 from plate_in_time import apart, lock_in
 from sim.bench.bench import Bench
 from sim.plant.accelerometer import Accelerometer
 from sim.sensors.recorder import Accelerometers
 
 START = 98765.4321  # as large as a clock may be
-
-
-@pytest.mark.parametrize("is_heavy", [False, True])
-def test_bench_felt_vibration_agrees_with_the_model(coarse_rig: Rig, is_heavy: bool) -> None:
-    """Steady state of three ERAs at two frequencies, with 80 g on the plate or without.
-
-    Against the sparse direct solve, within 1 %; the masses make a difference of 30 %.
-    """
-    masses = (PointLoad(0.1, 0.15, mass=0.05), PointLoad(0.3048, 0.1, mass=0.03))
-    rig = replace(coarse_rig, masses=masses if is_heavy else ())
-    fingers = {"a": (0.08, 0.06), "b": (0.25, 0.2)}
-    bench = Bench(rig, now=START)
-    bench.place_fingers(fingers, now=START)
-    commands = (
-        Tone(0, 110.0, 1.0),
-        Tone(2, 110.0, 0.5, phase=180.0),
-        Tone(3, 230.0, 0.7),
-    )
-    play(bench, *commands, now=START + 0.01, ramp=0.02, watchdog=0.25)
-    keep_alive(bench, START + 4.0, every=0.05)
-    felt = bench.felt(START + 3.5, START + 4.0)
-    matrices = assemble(rig.plate, rig.mesh)
-    tips = [FingertipLoad(*at, Fingertip()) for at in fingers.values()]
-    heavy = [PointLoad(0.1, 0.15, mass=0.05), PointLoad(0.3048, 0.1, mass=0.03)]
-    for name, at in fingers.items():
-        points = fingertip_points(*at, rig.plate)
-        expected = {}
-        for loads in ((), heavy):
-            unit = direct_acceleration(
-                matrices, rig.eras, np.array([110.0, 230.0]), points, loads=[*loads, *tips]
-            )
-            expected[bool(loads)] = np.abs([unit[0, 0] - 0.5 * unit[0, 2], 0.7 * unit[1, 3]])
-        assert felt[name].frequencies == (110.0, 230.0)
-        assert apart(felt[name].amplitude, expected[is_heavy]) < 0.01
-        assert apart(felt[name].amplitude, expected[not is_heavy]) > 0.3
-        np.testing.assert_array_equal(felt[name].points, points)
 
 
 def test_bench_watchdog_silences_at_its_time(coarse_rig: Rig) -> None:
@@ -164,6 +128,7 @@ def test_bench_ignores_an_earlier_time(coarse_rig: Rig) -> None:
 
 
 A, B = (0.1, 0.07), (0.29, 0.2)
+PLACES = {"a": A, "b": B}
 FREQUENCY = 210.0
 FULL_STROKE = Tone(1, FREQUENCY, 1.0)
 
@@ -177,38 +142,24 @@ def expected(rig: Rig, loads: tuple[FingertipLoad, ...]) -> FloatArray:
 
 
 def test_bench_fingers_load_the_plate(coarse_rig: Rig) -> None:
-    """What A feels alone, after B came, and after B went, each once the plate has settled."""
+    """What A feels alone, after B came and pressed twice as hard, and pressing half itself.
+
+    Each once the plate has settled.
+    """
     tip = Fingertip(2000.0, 3.0, 0.005)
     bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
     bench.place_fingers({"a": A}, now=0.0)
     play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
-    for positions in ({"a": A}, {"a": A, "b": B}, {"a": A}):
-        bench.place_fingers(positions, now=bench.time)
-        keep_alive(bench, bench.time + 4)
-        truth = expected(coarse_rig, tuple(FingertipLoad(*at, tip) for at in positions.values()))
-        (amplitude,) = bench.felt(bench.time - 0.5, bench.time)["a"].amplitude
-        assert apart(amplitude, truth) < 0.005
-    assert (
-        apart(truth, expected(coarse_rig, (FingertipLoad(*A, tip), FingertipLoad(*B, tip)))) > 0.02
-    )
-
-
-def test_bench_fingers_press_harder_where_they_are(coarse_rig: Rig) -> None:
-    """A finger with twice the load and one with half of it, each once the plate has settled."""
-    tip = Fingertip(2000.0, 3.0, 0.005)
-    bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
-    bench.place_fingers({"a": A, "b": B}, now=0.0)
-    play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
     truths = []
-    for loads in ({"b": 2.0}, {"a": 0.5}):
-        bench.place_fingers({"a": A, "b": B}, now=bench.time, loads=loads)
+    for loads in ({"a": 1.0}, {"a": 1.0, "b": 2.0}, {"a": 0.5}):
+        placed = {name: PLACES[name] for name in loads}
+        bench.place_fingers(placed, now=bench.time, loads=loads)
         keep_alive(bench, bench.time + 4)
-        tips = [tip.scaled(loads.get(name, 1.0)) for name in "ab"]
-        fingers = [FingertipLoad(*at, each) for at, each in zip((A, B), tips, strict=True)]
+        fingers = [FingertipLoad(*PLACES[name], tip.scaled(loads[name])) for name in loads]
         truths.append(expected(coarse_rig, tuple(fingers)))
         (amplitude,) = bench.felt(bench.time - 0.5, bench.time)["a"].amplitude
         assert apart(amplitude, truths[-1]) < 0.005
-    assert apart(*truths) > 0.02
+    assert apart(truths[0], truths[1]) > 0.02
 
 
 def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:

@@ -1,13 +1,12 @@
-"""The plate on a desk against closed forms, a direct solution, and SciPy's sampling."""
+"""The plate on a desk against a direct solution, and identified behind its sound card."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import signal
 
 from benchmarks.desk_plate.desk_plate import DeskPlate
-from benchmarks.desk_plate.lifted_blocks import LiftedBlocks, sampled
+from benchmarks.desk_plate.lifted_blocks import sampled
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
@@ -17,7 +16,6 @@ from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.errors import InputError
 from model.identification.identify import identify
 from model.identification.measured_plate import MeasuredPlate
-from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import fingertip_loads
 from model.vibration.natural_modes import direct_responder
@@ -55,40 +53,6 @@ def test_model_agrees_with_the_direct_solution(
         exact[:, number] *= moved[:, None]
     wrong = np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
     assert wrong.max() < 0.005
-
-
-def test_blocks_are_scipys_samples_of_a_first_order_hold(model: DeskModel) -> None:
-    """Any input, by `cont2discrete` of the same matrices and its recursion, sample by sample."""
-    plate = model.under(fingertip_loads(load_rig(example_rig_path()).fingertip, FINGERS))
-    played = np.random.default_rng(0).standard_normal((64, 4))
-    nothing = np.zeros((len(plate.C), 4))
-    A, B, C, D, _ = signal.cont2discrete(
-        (plate.A, plate.B, plate.C, nothing), 1 / RATE, method="foh"
-    )
-    state, exact = np.zeros(len(A)), []
-    for sample in played:
-        exact.append(C @ state + D @ sample)
-        state = A @ state + B @ sample
-    found = LiftedBlocks(sampled(plate, rate=RATE)).advance(played)
-    np.testing.assert_allclose(found, exact, atol=1e-9 * np.abs(exact).max())
-
-
-def test_samples_in_steady_state_are_the_closed_form(truth: Truth, model: DeskModel) -> None:
-    """Plate, sensitivity, filter and delay, block after block; C (z - E)^-1 B + D by hand."""
-    sensors = [WiredSensor(f"P{n}", x, y, n + 1, 2e-3) for n, (x, y) in enumerate(POINTS)]
-    converters = Converters(delay=73, noise=0.0)
-    desk = DeskPlate(truth, sensors, rate=RATE, converters=converters, seed=1)
-    assert (desk.outputs, desk.inputs) == (5, 4)
-    played = np.zeros((48_000, 5))
-    times = np.arange(len(played)) / RATE
-    played[:, 2] = np.sin(2 * np.pi * 150 * times)
-    played[:, 4] = played[:, 2]
-    heard = np.concatenate([desk.advance(block) for block in np.split(played, 375)])
-    found = phasors(heard[-9600:], times[-9600:], 150.0)
-    (exact,) = sampled(model.under(), rate=RATE).response(np.array([150.0]))
-    late = converters.response(np.array([150.0]), rate=RATE)[0]
-    np.testing.assert_allclose(found[:3] / (2e-3 * late), exact[:, 2], rtol=0.01)
-    assert found[3] == pytest.approx(0.9 * late, rel=1e-6)
 
 
 def test_fingers_are_swapped_without_a_jump(truth: Truth, model: DeskModel) -> None:

@@ -1,4 +1,4 @@
-"""Fingertips on the plate in time: against SciPy's matrix exponential and the closed formula."""
+"""Fingertips on the plate in time, against SciPy's matrix exponential."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,7 +12,6 @@ from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, footprints_of
 from model.transients.base_motion import Term
-from plate_in_time import apart, lock_in
 from resting_fingers import FINGERTIP, resting
 from sim.plant.plant import Plant
 
@@ -94,30 +93,3 @@ def test_plant_under_fingertips_agrees_with_a_matrix_exponential(
     expected = by_hand(lossless, reduced, fingers, 0.1)
     # A jump of the base's velocity at time 0 passes an impulse through the damper; not modelled.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("frequency", [60.0, 100.0, 250.0])
-def test_plant_steady_state_is_that_of_the_closed_formula(
-    lossless: Rig, reduced: ReducedPlate, frequency: float
-) -> None:
-    """Steady accelerations under D = -w² m + Zp Zb / (Zp + Zb), written out here, within 1e-6."""
-    w = 2 * np.pi * frequency
-    fingers = resting(*PLACES)
-    plant = Plant(reduced, lossless.eras)
-    plant.set_contacts(fingers)
-    plant.set_input(0, [Term(0.0, np.inf, w, STROKE)])
-    plant.skip(20.0)
-    times, samples = plant.advance(20.2, sample_rate=RATE, shapes=plant.reduced.at(POINTS))
-    pulp, bone = 1000 + 2j * w, 500 + 2j * w - 0.005 * w**2
-    tip = pulp * bone / (pulp + bone) - 0.0002 * w**2
-    dynamic = np.diag(reduced.omega**2 - w**2).astype(complex)
-    for era in lossless.eras:
-        phi = reduced.at(np.array([[era.x, era.y]]))[0]
-        dynamic += (era.stiffness + 1j * w * era.damping) * np.outer(phi, phi)
-    for place in PLACES:
-        phi = reduced.at(np.array([place]))[0]
-        dynamic += tip * np.outer(phi, phi)
-    era = lossless.eras[0]
-    force = (era.stiffness + 1j * w * era.damping) * reduced.at(np.array([[era.x, era.y]]))[0]
-    expected = -(w**2) * STROKE * reduced.at(POINTS) @ linalg.solve(dynamic, force)
-    assert apart(lock_in(times, samples, frequency), expected) < 1e-6

@@ -58,7 +58,7 @@ def expect_one_of(seen: object, known: Collection[object], what: str) -> None:
 
 
 REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
-QUIET = 0.03  # s; in which something that must not be replied to would be
+QUIET = 0.03  # s; beyond the time of an exchange, in which what is replied to has its reply
 _T = TypeVar("_T")
 _CODES = {number: name for name, number in REFUSALS.items()}
 
@@ -114,8 +114,8 @@ class Client(ABC):
 
     heard: messages that no request was waiting for; events: those of type Event; order: types of
     all, as they came. reply_words: the longest reply to each message by its number, where it is
-    known. transit: time on the wire [s] of a request and the longest reply. session: that was begun
-    last. loss: why the line was lost.
+    known. quiet: time [s] in which a reply comes. transit: time on the wire [s] of a request and
+    the longest reply. session: that was begun last. loss: why the line was lost.
     """
 
     kind: ClassVar[str]
@@ -135,6 +135,7 @@ class Client(ABC):
         self.order: list[int] = []
         self.reply_words: dict[int, int] = {}
         self.transit = 0.0
+        self.quiet = QUIET
         self.session = 0
         self.loss: str | None = None
         self._news = asyncio.Event()
@@ -168,11 +169,11 @@ class Client(ABC):
         heard = await self.send(data)
         expect(not heard, f"replies to {what}", expected="none", seen=len(heard))
 
-    async def send(self, data: bytes, quiet: float = QUIET) -> list[Heard]:
-        """Send bytes; return what is heard until a time [s] has passed."""
+    async def send(self, data: bytes) -> list[Heard]:
+        """Send bytes; return what is heard until a reply must have come."""
         self.heard.clear()
         self.port.write(data)
-        await asyncio.sleep(quiet)
+        await asyncio.sleep(self.quiet)
         heard, self.heard = self.heard, []
         return heard
 

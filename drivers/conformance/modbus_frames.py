@@ -150,10 +150,10 @@ class ModbusClient(Client):
             for at in (-2, -1, -4):
                 yield f"a wrong byte {at}", altered(frame, at)
 
-    async def send(self, data: bytes, quiet: float = QUIET) -> list[Heard]:
-        """Send bytes; return what is heard until a time [s] has passed."""
+    async def send(self, data: bytes) -> list[Heard]:
+        """Send bytes; return what is heard until a reply must have come."""
         self._buffer = b""
-        heard = await super().send(data, quiet)
+        heard = await super().send(data)
         if self.is_rtu:
             await asyncio.sleep(QUIET)  # ends a frame that is not whole
         return heard

@@ -39,14 +39,15 @@ def layers_play_on(subject: Subject) -> Rows:
 @driving(_SETS)
 def valid_for(subject: Subject) -> Rows:
     """It ends a layer after its valid_for, along its ramp, and stays armed; 0 and 60 s last."""
-    ramp, half = min(100, subject.can["ramp_max"]), subject.one(level=0.5, valid_for=100)
+    ramp, short = min(100, subject.can["ramp_max"]), subject.lasting(100)
+    half, pause = subject.one(level=0.5, valid_for=short), 0.15 * subject.slowness
     lasting = layer(1, subject.beside(1, 0.25), valid_for=60_000)
     several = play(half, lasting, layer(2, subject.beside(2, 0.25)))
     return [
         [subject.one(valid_for=1)],
-        [subject.one(valid_for=100)],
-        [subject.one(ramp=ramp, valid_for=150)],
-        [several, partial(subject.follow, 0.3), half, subject.one(level=0.5), 0.15],
+        [subject.one(valid_for=short)],
+        [subject.one(ramp=ramp, valid_for=subject.lasting(150))],
+        [several, partial(subject.follow, 2 * pause), half, subject.one(level=0.5), pause],
     ]
 
 
@@ -54,14 +55,14 @@ def valid_for(subject: Subject) -> Rows:
 def renew(subject: Subject) -> Rows:
     """It starts valid_for anew by a renewal, and changes nothing else."""
     first, second = (
-        subject.one(level=0.5, ramp=40, valid_for=200),
+        subject.one(level=0.5, ramp=40, valid_for=subject.lasting(200)),
         layer(1, subject.beside(1, 0.25)),
     )
-    third = layer(3, subject.beside(3, 0.25), valid_for=60)
+    third = layer(3, subject.beside(3, 0.25), valid_for=subject.lasting(60))
     return [
-        (first, second, 0.1, layer(0, renew=True, valid_for=250)),
-        (layer(2, renew=True, valid_for=100), second),
-        (third, layer(3, renew=True), 0.12),
+        (first, second, 0.1, layer(0, renew=True, valid_for=subject.lasting(250))),
+        (layer(2, renew=True, valid_for=subject.lasting(100)), second),
+        (third, layer(3, renew=True), 0.12 * subject.slowness),
     ]
 
 
@@ -164,8 +165,9 @@ def endings(subject: Subject) -> Rows:
 def endings_amid(subject: Subject) -> Rows:
     """It begins an ending at the present amplitude, plays it once, and lets nothing prolong it."""
     _require_knots(subject)
-    onset, ending = subject.envelope(0.1, 1), subject.envelope(0.05, 0.25)
-    half, part = onset.step / 20_000, ending.step / 20_000
+    knots = math.ceil(subject.slowness)
+    onset, ending = subject.envelope(0.1, *[1.0] * knots), subject.envelope(0.05, *[0.25] * knots)
+    half, part = knots * onset.step / 20_000, knots * ending.step / 20_000
     towards_0 = subject.tone(0, 0.0, onset=onset)  # a voice counts until its onset has ended
     long = min(500, subject.can["ramp_max"])
     return [
@@ -211,6 +213,8 @@ async def _expect_turned(
 ) -> None:
     """Play two tones some periods apart; keep: both at once, one of them again with that flag."""
     slow = max(subject.lowest, _SLOW)
+    if subject.exchange_time > 0.25 * 20 / slow:
+        raise Optional("the line is too slow to see phases of tones that began apart")
     tone = subject.tone(channel, 0.5, frequency=slow)
     again = replace(subject.tone(channel, 0.5, phase, keep=bool(keep)), frequency=slow)
     time = periods * 20 / slow

@@ -40,15 +40,19 @@ def set_of(material: Material, room: int) -> list[LayerSet]:
 
 def long_set(subject: Subject) -> list[LayerSet]:
     """Make a set of several parts, a short one on a slow line, lest it expires on its way."""
-    words = _LONG if subject.client.transit < _SLOW else _SHORT
-    return set_of(subject, min(subject.can["set_words"], words))
+    is_quick = max(subject.client.transit, subject.exchange_time) < _SLOW
+    return set_of(subject, min(subject.can["set_words"], _LONG if is_quick else _SHORT))
+
+
+def _require_quick(subject: Subject) -> None:
+    if 16 * subject.exchange_time > STAGED_LIFE:
+        raise Optional("the line is too slow for a set in several parts")
 
 
 @driving(_PLACE)
 def parts_of_sets(subject: Subject) -> Rows:
     """It takes parts in any order and again, says which is missing, and plays a whole set alone."""
-    if 12 * subject.exchange_time > STAGED_LIFE:
-        raise Optional("the line is too slow for a set in several parts")
+    _require_quick(subject)
     made = long_set(subject)
 
     def cut(token: int, now: int = 0) -> list[Values]:
@@ -93,6 +97,7 @@ def max_set(subject: Subject) -> Rows:
 @driving(_PLACE)
 def sets_expire(subject: Subject) -> Rows:
     """It discards a set that is not committed, or not complete, 1 s after its first part."""
+    _require_quick(subject)
     parts = subject.parts(*long_set(subject), token=3, now=0, count=3)
     first, *others, last = (send("Set", **each) for each in parts)
     shorter = 0.9 * STAGED_LIFE - 4 * min(subject.exchange_time, 0.1)

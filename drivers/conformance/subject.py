@@ -9,6 +9,8 @@ from typing import Any
 
 from drivers import clock
 from drivers.conformance.client import (
+    QUIET,
+    REPLY_TIMEOUT,
     Answer,
     Client,
     Late,
@@ -29,11 +31,13 @@ LEVEL = 0.2
 MAX_ATTEMPTS = 10
 """Of a check, or a case of one, for which this machine was late."""
 _SAMPLES, _EACH = 12, 0.02  # of a transition; s for which one must be in time
+_PROMPT, _SLOWEST = 0.01, 0.1  # s; exchanges of a quick line, and the longest that count
 _NARROW = 0.006  # s; of the uncertainty of a sample, beyond two exchanges
 _SETTLED = 3.2  # s; the longest watchdog and ramp, and what a state may take
 _MAX_WATCHDOG_USE = 0.8
 _DONE = "carried out"
 _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
+_READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
 _BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
 _MOVING = STATES["SWITCHED_ON"], STATES["FAULT_REACTION_ACTIVE"]
 _STATUSES = [name for name, each in MESSAGES.items() if "levels" in each.reply.names]
@@ -52,6 +56,7 @@ class Subject(Material):
         self.expected: Expected | None = None
         self.is_starving = True
         self.exchange_time = math.inf
+        client.quiet = REPLY_TIMEOUT
         self.heard_at = clock.now()
         channels, layers = can["channels"], can["layers"]
         rows = dict.fromkeys(_STATUSES, 9 + channels + layers)
@@ -109,10 +114,13 @@ class Subject(Material):
                 raw = message.request.pack(values)
             except ValueError:  # beyond the table
                 raw = [values[each] for each in message.request.names]
+        sent = clock.now()
         answer = await self.client.exchange(message.number, raw)
         self._check_fed()  # or it may have been carried out after the watchdog
-        took = answer.when.latest - answer.when.earliest
-        self.exchange_time = min(self.exchange_time, took)
+        took = clock.now() - sent
+        self.client.quiet = min(self.client.quiet, QUIET + took)
+        if name not in _READ_ALONE:
+            self.exchange_time = min(self.exchange_time, took)
         self.heard_at = answer.when.latest
         return answer
 
@@ -167,9 +175,9 @@ class Subject(Material):
     async def arm(self, watchdog: float = 2.0) -> Answer:
         """Arm under a new session with a watchdog [s], or the nearest that is possible."""
         self.session = self.client.session = self.next_session
-        low, high = self.can["watchdog_min"], self.can["watchdog_max"]
         self.token, self.is_starving = 0, False
-        milliseconds = min(max(round(1000 * watchdog), low), high)
+        milliseconds = max(round(1000 * watchdog), self.shortest_watchdog)
+        milliseconds = min(milliseconds, self.can["watchdog_max"])
         return await self.request("Arm", session=self.session, watchdog=milliseconds)
 
     @property
@@ -234,6 +242,21 @@ class Subject(Material):
         return await self.send(play(*layers))
 
     # In time
+
+    @property
+    def slowness(self) -> float:
+        """By what times must be longer than those for a line with exchanges of 10 ms or less."""
+        return max(min(self.exchange_time, _SLOWEST) / _PROMPT, 1.0)
+
+    def lasting(self, milliseconds: int) -> int:
+        """Return a time [ms] that is long against an exchange, as this one is on a quick line."""
+        return math.ceil(milliseconds * self.slowness)
+
+    @property
+    def shortest_watchdog(self) -> int:
+        """The shortest watchdog time [ms], or that in which it can be fed on a slow line."""
+        fed = math.ceil(10_000 * min(self.exchange_time, _SLOWEST))
+        return int(min(max(self.can["watchdog_min"], fed), self.can["watchdog_max"]))
 
     @property
     def ramp(self) -> int:

@@ -217,11 +217,21 @@ async def test_machine_that_is_always_late_has_no_verdict() -> None:
     assert Report("x", 0.2, (late, good), 0).overall == "incomplete"
 
 
-def test_set_that_waits_is_judged_on_a_slow_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At 40 ms for an exchange: the onset that it waits for lasts until all has been sent."""
+SLOW = {
+    "serial": [
+        *("lengths", "trips_amid_other_requests", "parts_of_sets", "sets_expire", "valid_for"),
+        *("renew", "after", "endings_amid", "doubled_frames", "tolerated_frames"),
+    ],
+    "tcp": ["pieces", "lengths", "watchdog_ranges", "arms_again", "watchdog_unread", "renew"],
+}
+
+
+@pytest.mark.parametrize("kind", SLOW)
+def test_slow_line_has_its_verdicts(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 40 ms each way and back: times are long against it, and what comes late is heard."""
     monkeypatch.setattr("judged_line.DELAY", 0.02)
-    (result,) = judged("serial", ["after"])
-    assert (result.result, result.attempts) == (Result.PASSED, 1), result.reason
+    for found in judged(kind, SLOW[kind]):
+        assert (found.result, found.attempts) == (Result.PASSED, 1), found
 
 
 def test_request_that_comes_after_an_onset_is_no_violation(

@@ -27,12 +27,11 @@ from model.structure.attachments import Era, FingertipLoad, PointLoad, check_loa
 from model.structure.plate import Plate
 from model.transients.base_motion import Motion
 from sim.amplifier.contract import Amplifier
-from sim.bench.placement import Placement
 from sim.bench.sensing import REACH, Sensing, ToneReader
 from sim.plant.accelerometer import Accelerometer
 from sim.plant.fingers import KEPT, Felt, Fingers, Position, Record, measure_vibration
 from sim.plant.imperfections import Imperfections, PlateErrors, realised
-from sim.plant.loaded_plates import LoadedPlate
+from sim.plant.loaded_plates import LoadedPlate, Placement
 from sim.plant.plant import SAMPLE_RATE, Plant
 from sim.plant.voiced_base import delayed, motion_of
 

@@ -19,9 +19,8 @@ from drivers.codec.can_bus.canopen import BITRATE
 from drivers.urls import ADDRESS, BAUD, RTU_BAUD
 from model.errors import InputError
 from sim.bench.amplifier_device import AmplifierDevice
+from sim.far_ends.can_bus.adapters import BUS_NAME, SlcanAdapter, SocketcandClient
 from sim.far_ends.can_bus.bus import BusNodes, CanBus
-from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter
-from sim.far_ends.can_bus.socketcand import BUS_NAME, SocketcandClient
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.faults.fault_window import Faults

@@ -11,9 +11,16 @@ from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.rig.rig import Rig
-from sim.measuring.checks import check_clocks, check_coherence, check_levels, check_wiring
 from sim.measuring.desk import Desk
-from sim.measuring.loopback import is_as_late, is_whole, latency
+from sim.measuring.loopback import (
+    check_clocks,
+    check_coherence,
+    check_levels,
+    check_wiring,
+    is_as_late,
+    is_whole,
+    latency,
+)
 from sim.measuring.multisine import PERIOD, Multisine, default_frequencies, estimate
 from sim.measuring.sound_card import SoundCard, open_card
 from sim.sensors.sensor_file import read_sensors

@@ -21,9 +21,8 @@ from model.table.promise_at_sensors import (
 from model.table.table import LocalizationTable
 from model.table.table_check import CheckSettings
 from model.vibration.excitation import Excitation
-from sim.measuring.checks import check_levels
 from sim.measuring.desk import Desk
-from sim.measuring.loopback import is_whole
+from sim.measuring.loopback import check_levels, is_whole
 from sim.measuring.multisine import ramped
 from sim.measuring.sound_card import SoundCard, open_card
 from sim.plant.fingers import fit_tones

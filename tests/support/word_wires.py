@@ -14,10 +14,9 @@ import can
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from sim.amplifier.contract import Amplifier
+from sim.far_ends.can_bus.adapters import SlcanAdapter, SocketcandClient
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from sim.far_ends.can_bus.bus import CanBus
-from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter
-from sim.far_ends.can_bus.socketcand import SocketcandClient
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.far_end import FarEnd

@@ -13,8 +13,8 @@ from drivers.by_hand.cli import app
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.discovery import places
 from drivers.discovery.places import SlcanAdapter, detect_slcan
+from sim.far_ends.can_bus.adapters import SlcanAdapter as FarAdapter
 from sim.far_ends.can_bus.bus import CanBus
-from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter as FarAdapter
 from sim.transport.pseudo_terminal import make_terminal
 
 SPOKEN = b"V\rC\rS6\rL\rC\r"

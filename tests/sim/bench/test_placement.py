@@ -14,10 +14,9 @@ from drivers.contents import Tone
 from model.rig.rig import Rig
 from model.structure.attachments import Fingertip
 from sim.bench.bench import Bench
-from sim.bench.placement import Placement
 from sim.control.context import SimulationContext
 from sim.control.operations import carry_out
-from sim.plant.loaded_plates import LoadedPlate
+from sim.plant.loaded_plates import LoadedPlate, Placement
 
 A, B, C = (0.1, 0.07), (0.29, 0.2), (0.2, 0.1)
 

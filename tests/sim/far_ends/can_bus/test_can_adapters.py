@@ -9,9 +9,8 @@ import pytest
 
 from drivers.codec.can_bus.canopen import CanFrame
 from model.rig.rig import Rig
+from sim.far_ends.can_bus.adapters import SlcanAdapter, SocketcandClient
 from sim.far_ends.can_bus.bus import CanBus
-from sim.far_ends.can_bus.slcan_adapter import SlcanAdapter
-from sim.far_ends.can_bus.socketcand import SocketcandClient
 from sim.faults.fault_window import Faults
 from sim.transport.far_end import TcpEnd, TerminalEnd
 from words_bench import make_bench

@@ -1,11 +1,13 @@
-"""A simulated serial CAN adapter: LAWICEL's ASCII commands.
+"""Simulated CAN adapters: LAWICEL's serial ASCII commands (slcan), and socketcand over TCP.
 
-Commands end with CR; replies are CR, or BELL for errors. Not modelled: acceptance masks, time
-stamps and polling, which are accepted without effect.
+Commands of slcan end with CR; replies are CR, or BELL for errors; elements of socketcand are
+`< ... >`. Not modelled: acceptance masks, time stamps and polling, which are accepted without
+effect; modes other than raw mode, extended identifiers, discovery by broadcast.
 """
 
 import re
 
+from drivers import clock
 from drivers.codec.can_bus.canopen import CanFrame
 from sim.far_ends.can_bus.bus import CanBus
 from sim.transport.far_end import FarEnd, Send
@@ -78,3 +80,65 @@ def _parse(line: bytes) -> CanFrame | None:
     if found is None or len(found[3]) != 2 * int(found[2]):
         return None
     return CanFrame(int(found[1], 16), bytes.fromhex(found[3].decode()))
+
+
+BUS_NAME = "can0"
+_MAX_ELEMENT = 512  # characters of an element
+_ELEMENT = re.compile(r"send ([0-7]?[0-9A-Fa-f]{1,2}) ([0-8])((?: [0-9A-Fa-f]{1,2})*)")
+
+
+class SocketcandClient(FarEnd):
+    """One connection, through the states new, open and raw."""
+
+    def __init__(self, bus: CanBus, send: Send) -> None:
+        self._bus = bus
+        self._send = send
+        self._rest = ""
+        self._is_open = self._is_raw = False
+        self._listener = self._hear  # one object, by which the bus knows it
+        send(b"< hi >")
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.leave(self._listener)
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Process complete elements; text between them is skipped."""
+        *elements, rest = (self._rest + data.decode("ascii", errors="replace")).split(">")
+        self._rest = rest if len(rest) <= _MAX_ELEMENT else ""
+        for element in elements:
+            _, bracket, content = element.partition("<")
+            if bracket:
+                self._element(content.strip())
+
+    def _element(self, element: str) -> None:
+        name = element.partition(" ")[0]
+        if not self._is_open:
+            self._is_open = element == f"open {BUS_NAME}"
+            self._send(b"< ok >" if self._is_open else b"< error could not open bus >")
+            if not self._is_open:
+                self._send(b"")
+        elif element == "rawmode":
+            self._send(b"< ok >")
+            if not self._is_raw:
+                self._is_raw = True
+                self._bus.join(self._listener)
+        elif element == "echo":
+            self._send(b"< echo >")
+        elif name == "send":
+            if frame := _frame_of(element):  # socketcand sends no error either
+                self._bus.send(frame, sender=self._listener)
+        else:
+            self._send(b"< error unknown command >")
+
+    def _hear(self, frame: CanFrame) -> None:
+        stamp = f"{clock.now():.6f}"  # only differences are meaningful
+        self._send(f"< frame {frame.id:03X} {stamp} {frame.data.hex().upper()} >".encode())
+
+
+def _frame_of(element: str) -> CanFrame | None:
+    """The frame of an element send, else None."""
+    found = _ELEMENT.fullmatch(element)
+    if found is None or len(found[3].split()) != int(found[2]):
+        return None
+    return CanFrame(int(found[1], 16), bytes(int(byte, 16) for byte in found[3].split()))

@@ -2,126 +2,25 @@
 
 import asyncio
 import itertools
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
 
 import pytest
 
 from controller.daemon.lease import Lease
 from controller.daemon.states import DaemonEvent, DaemonState, Trigger
-from controller.daemon.supervisor import Supervisor
 from controller.loop.loop import Controller
-from controller.loop.observer import Observer
-from controller.sources.touch import Touch, TouchFrame
-from controller_bench import DISARMED, STOPPED, BenchLines, FarEnd, make_bench
+from controller_bench import DISARMED, STOPPED
 from controller_bench import ENABLED as ARMED
 from drivers.errors import CommandRefused, LinkError
 from drivers.host.line import GRACE
 from drivers.host.timing import HEARTBEAT
-from drivers.protocol.records import Refusal, Values
+from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_after
 from drivers.protocol.table import FAULTS, STATES
-from newest_contact import BuzzNewestContact
 from virtual_loop import in_virtual_time
+from watched_supervisor import Watched, watched
 
 ENABLED = DaemonState.OPERATION_ENABLED
 ARM, STOP, CLEAR = (DaemonEvent(each) for each in (Trigger.ARM, Trigger.STOP, Trigger.CLEAR))
-
-
-@dataclass
-class Watched:
-    """A running supervisor, the far end of its amplifier, and what it has reported."""
-
-    supervisor: Supervisor
-    controller: Controller
-    far_end: FarEnd
-    states: list[DaemonState] = field(default_factory=list)
-    links: list[str] = field(default_factory=list)
-    refusals: list[str] = field(default_factory=list)
-    alive: list[float] = field(default_factory=list)
-
-    @property
-    def state(self) -> DaemonState:
-        """The state of the daemon."""
-        return self.supervisor.machine.state
-
-    async def handle(self, event: DaemonEvent) -> None:
-        """Let the supervisor handle an event."""
-        await self.supervisor.handle(event)
-
-    def touch(self) -> None:
-        """Put a finger on the middle of the plate."""
-        now = asyncio.get_running_loop().time()
-        self.controller.deliver(TouchFrame("test", now, (Touch(1, 0.5, 0.5),)))
-
-    def touch_elsewhere(self) -> None:
-        """Move the finger far enough for another pattern."""
-        now = asyncio.get_running_loop().time()
-        self.controller.deliver(TouchFrame("test", now, (Touch(1, 0.9, 0.9),)))
-
-    def cut(self) -> None:
-        """Let no request reach the amplifier any more."""
-        self.far_end.cut()
-
-    def obey(self) -> None:
-        """Let the amplifier obey again, and forget the requests so far."""
-        self.far_end.asked.clear()
-        self.far_end.mend()
-        self.far_end.answer = lambda name, values: None
-
-    def answer(self, *names: str, **changed: object) -> None:
-        """Let the amplifier report something else in replies of some names."""
-        self.far_end.answer = lambda name, values: (
-            {**self.far_end.status(), **changed} if name in names else None
-        )
-
-    def refuse(self, *names: str) -> None:
-        """Let the amplifier refuse requests of some names."""
-
-        def answer(name: str, values: Values) -> None:
-            if name in names:
-                raise Refusal("as told", "WRONG_STATE")
-
-        self.far_end.answer = answer
-
-
-@asynccontextmanager
-async def watched(*, refuses: bool = False) -> AsyncIterator[Watched]:
-    """A supervisor with a running control loop, which must end when it is closed.
-
-    refuses: whether the amplifier refuses all requests at first.
-    """
-    bench = make_bench()
-    loop = asyncio.get_running_loop()
-
-    supervisor = Supervisor(
-        state_changed=[lambda old, new: daemon.states.append(new.state)],
-        link_changed=lambda event, lost, message: daemon.links.append(event),
-        alive=lambda: daemon.alive.append(loop.time()),
-    )
-    controller = Controller(
-        bench.rig,
-        bench.table,
-        lines=lambda: BenchLines({"main": bench.far_end}),
-        intent_source=BuzzNewestContact(),
-        connected=supervisor.connected,
-        observer=supervisor.observe(
-            Observer(refused=lambda reason: daemon.refusals.append(reason))
-        ),
-    )
-    daemon = Watched(supervisor, controller, bench.far_end)
-    if refuses:
-        daemon.refuse("GetCaps")
-    running = asyncio.create_task(supervisor.run(controller))
-    await supervisor.started.wait()
-    await asyncio.sleep(0.005)
-    try:
-        yield daemon
-    finally:
-        await supervisor.close("end of the test")
-        await running
-        assert not bench.far_end.is_open
 
 
 def slow_down(controller: Controller, *, stop: float) -> None:

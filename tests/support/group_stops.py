@@ -27,14 +27,13 @@ import pytest
 import drivers
 import sim
 from drivers.by_hand import actions
-from drivers.contents import Layer, Shape, Tone
 from drivers.errors import DriverError
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.dialogue import SILENCING
-from drivers.host.group import Group
 from drivers.host.stop import Stopped
 from drivers.protocol.records import Values
+from random_group import RandomGroup
 from virtual_loop import Stuck, run_virtual
 from words_line import Alter, MemoryLine, unaltered
 
@@ -84,21 +83,18 @@ class Tally:
         return "\n".join(rows)
 
 
-class Chain:
+class Chain(RandomGroup):
     """A group on its lines, beaten as by a control loop; found: what was wrong."""
 
     def __init__(self, wire: str, rng: random.Random) -> None:
         kind, lines = LINES[wire]
-        self.rng = rng
-        self.ends = [MemoryLine(kind, *names) for names in lines]
-        hosts = {name: host for end in self.ends for name, host in end.hosts.items()}
-        self.group = Group(hosts, draw=rng.randint)
+        super().__init__([MemoryLine(kind, *names) for names in lines], rng)
         self.found: list[str] = []
         self._granted: list[str] = []
-        for end in self.ends:
+        for end in self.lines:
             for name, far in end.far.items():
                 far.handle = self._noting(name, far.handle)  # type: ignore[method-assign]
-        self._beating = asyncio.create_task(self._beat())
+        self._background = asyncio.create_task(self.keep_beating())
 
     def _noting(
         self, name: str, handle: Callable[[str, Values, float], Values]
@@ -111,44 +107,17 @@ class Chain:
 
         return noting
 
-    async def _beat(self) -> None:
-        while True:
-            await asyncio.sleep(_HEARTBEAT)
-            with suppress(DriverError):
-                await self.group.beat()
-
-    def disturb(self) -> None:
-        """Lose, delay and double frames from now on, in one direction or both."""
-        for end in self.ends:
-            end.inward, end.outward = _faulty(self.rng), _faulty(self.rng)
-
-    def recover(self) -> None:
-        """End all faults of frames."""
-        for end in self.ends:
-            end.inward = end.outward = unaltered
+    def disturb(self, *, is_on: bool = True) -> None:
+        """Lose, delay and double frames from now on, in one direction or both, or no longer."""
+        for end in self.lines:
+            end.inward, end.outward = (
+                _faulty(self.rng) if is_on else unaltered for _ in ("inward", "outward")
+            )
 
     async def apply(self) -> None:
         """Play some layers on all amplifiers."""
-        chosen = self.rng.sample(range(4), self.rng.randint(1, 3))
-        layers = [self._layer(number) for number in chosen]
         with suppress(DriverError):
-            await self.group.apply(dict.fromkeys(self.group.amplifiers, layers))
-
-    def _layer(self, number: int) -> Layer:
-        """Draw what a layer plays: with and without shapes and ends."""
-        rng = self.rng
-        tones = tuple(
-            Tone(
-                channel,
-                rng.choice((80.0, 150.0)),
-                rng.uniform(0.05, 0.25),
-                onset=_shape(rng),
-                ending=_shape(rng),
-            )
-            for channel in range(2)
-            if rng.random() < 0.8
-        )
-        return Layer(number, tones, rng.choice((0.001, 0.02)), rng.choice((0.0, 0.0, 0.2)))
+            await self.group.apply(dict.fromkeys(self.group.amplifiers, self.layers()))
 
     async def play(self) -> None:
         """Clear and arm if need be, and play; gives up after a DriverError."""
@@ -162,7 +131,7 @@ class Chain:
     def _loud(self, name: str) -> str:
         """Describe what an amplifier plays, or will without a request; empty if nothing."""
         now = asyncio.get_running_loop().time()
-        far = next(end.far[name] for end in self.ends if name in end.far)
+        far = next(end.far[name] for end in self.lines if name in end.far)
         far.tick(now)
         channels = range(far.playback.channels)
         level = max(
@@ -197,14 +166,7 @@ class Chain:
 
     def close(self) -> None:
         """End the heartbeats."""
-        self._beating.cancel()
-
-
-def _shape(rng: random.Random) -> Shape | None:
-    if rng.random() < 0.6:
-        return None
-    knots = tuple(complex(rng.uniform(0, 0.25)) for _ in range(rng.randint(1, 8)))
-    return Shape(0.004, knots)
+        self._background.cancel()
 
 
 def _faulty(rng: random.Random) -> Alter:
@@ -310,7 +272,7 @@ async def _disturbed_stops(wire: str, rng: random.Random, tally: Tally) -> list[
             chain.disturb()
         await asyncio.sleep(rng.choice((0.0, 0.07, 0.12, 0.5)) * rng.random())
         await _stop(chain, wire, scene, tally)
-        chain.recover()
+        chain.disturb(is_on=False)
         await asyncio.sleep(0.3)
     chain.close()
     return chain.found
@@ -340,12 +302,12 @@ async def _stop_by_command(wire: str, rng: random.Random, tally: Tally) -> list[
         chain.disturb()
     await asyncio.sleep(rng.uniform(0.0, 0.02))
     chain.close()
-    for end in chain.ends:
+    for end in chain.lines:
         end.kill_host()
     silent_from = asyncio.get_running_loop().time() + WATCHDOG + SILENCING
     if not is_early:
         chain.disturb()
-    end = rng.choice(chain.ends)
+    end = rng.choice(chain.lines)
     name = rng.choice(tuple(end.hosts))
 
     @asynccontextmanager

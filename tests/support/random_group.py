@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import random
 from collections.abc import Sequence
+from typing import Any
 
 from drivers.contents import Layer, Shape, Tone
 from drivers.errors import CommandRefused, LinkError, Preempted
@@ -11,7 +12,6 @@ from drivers.host.group import Group
 from drivers.host.jobs import Priority
 from drivers.host.members import GroupState
 from drivers.protocol.table import STATES
-from listened_line import ListenedLine
 from words_line import unaltered
 
 _CHANNELS, _LAYERS = 2, 4
@@ -22,8 +22,8 @@ _FAILURES = (CommandRefused, LinkError, Preempted)
 class RandomGroup:
     """A group on lines, and a random generator of what is done with it."""
 
-    def __init__(self, lines: Sequence[ListenedLine], seed: int) -> None:
-        self.rng = random.Random(seed)
+    def __init__(self, lines: Sequence[Any], rng: random.Random) -> None:
+        self.rng = rng
         self.lines = lines
         hosts = {name: host for line in lines for name, host in line.hosts.items()}
         self.group = Group(hosts, watchdog=self.rng.choice((0.25, 0.5)), draw=self.rng.randint)
@@ -38,7 +38,7 @@ class RandomGroup:
     async def run(self, steps: int, *, lossy_steps: int = 0) -> None:
         """Open and arm the group, take so many steps, the first lossy, and disarm."""
         background = [asyncio.ensure_future(line.keep_sensing()) for line in self.lines]
-        background.append(asyncio.ensure_future(self._keep_beating()))
+        background.append(asyncio.ensure_future(self.keep_beating()))
         try:
             await self._opened()
             for step in range(steps):
@@ -76,7 +76,7 @@ class RandomGroup:
         names = [*self.group.amplifiers]
         host = self.group.amplifiers[self.rng.choice(names)]
         if chosen < 0.6:
-            layers = {name: self._layers() for name in names}
+            layers = {name: self.layers() for name in names}
             await self.group.apply(layers)
         elif chosen < 0.7:
             await host.request("GetAchieved", {"layer": self._number()}, Priority.OTHER)
@@ -113,7 +113,8 @@ class RandomGroup:
     def _ramp(self) -> float:
         return self.rng.choice((0.0, 0.005, 0.01, 0.03))
 
-    def _layers(self) -> list[Layer]:
+    def layers(self) -> list[Layer]:
+        """Draw layers to play."""
         numbers = self.rng.sample(range(_LAYERS), self.rng.choice((1, 1, 1, 2)))
         return [self._layer(number) for number in numbers]
 
@@ -145,7 +146,8 @@ class RandomGroup:
         step = self.rng.choice((0.001, 0.004, 0.02))
         return Shape(step, tuple(0.2 * self.rng.random() + 0j for _ in range(count)))
 
-    async def _keep_beating(self) -> None:
+    async def keep_beating(self) -> None:
+        """Beat as a control loop does while it is armed."""
         while True:
             await asyncio.sleep(_BEAT)
             async with self._beating:

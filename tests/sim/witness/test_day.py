@@ -150,7 +150,7 @@ def play_group(
             ListenedLine(witness, name, kind, *names, at_host=at_host)
             for name, (_, names) in named.items()
         ]
-        await RandomGroup(ends, seed).run(40, lossy_steps=lossy_steps)
+        await RandomGroup(ends, random.Random(seed)).run(40, lossy_steps=lossy_steps)
 
     run_virtual(run())
     return witness.finish(), witness.frames

@@ -2,7 +2,14 @@
 
 from typing import Annotated, ClassVar
 
-from controller.effects.effect import MAX_DURATION, MIN_DURATION, Effect, EffectRun, SteadyRun
+from controller.effects.effect import (
+    MAX_DURATION,
+    MIN_DURATION,
+    Effect,
+    EffectRun,
+    Modulation,
+    SteadyRun,
+)
 from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
@@ -18,11 +25,12 @@ class Buzz(Effect):
     duration: (
         Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=MAX_DURATION)] | None
     ) = None
+    modulation: Modulation = None
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start a steady vibration."""
         pulse = None if self.duration is None else Pulse(self.duration, now)
-        return SteadyRun(level_db_sl, pulse)
+        return SteadyRun(level_db_sl, pulse, self.modulation)
 
     @property
     def has_end(self) -> bool:

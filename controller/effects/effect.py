@@ -12,8 +12,9 @@ from controller.effects.region import Region
 from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
-from model.config.units import RATIO
+from model.config.units import FREQUENCY, RATIO
 from model.finger.perception import STRONG_DB_SL
+from model.table.modulation import MAX_MODULATION, MIN_MODULATION
 
 NEIGHBOURS: Literal["neighbours"] = "neighbours"
 """The level `as strong as the neighbours allow`."""
@@ -36,6 +37,11 @@ def _level(value: object) -> object:
     return _DB_SL.read(value)
 
 
+Modulation: TypeAlias = (
+    Annotated[float, Quantity(FREQUENCY, at_least=MIN_MODULATION, at_most=MAX_MODULATION)] | None
+)
+"""How often a second a vibration comes and goes [Hz]; None for a steady one."""
+
 Level: TypeAlias = Annotated[float | Literal["neighbours"], BeforeValidator(_level)]
 """dB above the detection threshold, or `neighbours`."""
 
@@ -47,13 +53,15 @@ class Sensation:
     level_db_sl: None for as strong as the neighbours allow. until: when [s] that may change though
     the finger does nothing; None for never. allow_weaker: where the plate cannot reach the level,
     play as strong as the neighbours allow instead of nothing. pulse: for a vibration of limited
-    duration, which the amplifiers end by themselves.
+    duration, which the amplifiers end by themselves. modulation_hz: how often a second its strength
+    comes and goes, 10 to 30; None for a steady one, as are pulses below 0.2 s.
     """
 
     level_db_sl: float | None
     until: float | None = None
     allow_weaker: bool = False
     pulse: Pulse | None = None
+    modulation_hz: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +88,20 @@ class SteadyRun(EffectRun):
 
     level_db_sl: float | None
     pulse: Pulse | None
+    modulation_hz: float | None = None
 
     def feel(self, contact: Contact, now: float) -> Sensation | NoSensation | None:
         """Return the level until the end of the pulse."""
         if self.pulse is None:
-            return Sensation(self.level_db_sl)
+            return Sensation(self.level_db_sl, modulation_hz=self.modulation_hz)
         if now >= self.pulse.end:
             return None
-        return Sensation(self.level_db_sl, until=self.pulse.end, pulse=self.pulse)
+        return Sensation(
+            self.level_db_sl,
+            until=self.pulse.end,
+            pulse=self.pulse,
+            modulation_hz=self.modulation_hz,
+        )
 
 
 class Effect(TunedSection, ABC):

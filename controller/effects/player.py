@@ -92,6 +92,7 @@ class EffectPlayer:
                 content=play.name,
                 is_own=play.region is not None and play.region.is_own,
                 may_share=play.region is not None and play.region.may_share,
+                modulation_hz=sensation.modulation_hz,
             )
             for play, contact, sensation in felt
             if not play.is_elsewhere or play.number == newest

@@ -7,7 +7,13 @@ from typing import Annotated, ClassVar, Self
 
 from pydantic import model_validator
 
-from controller.effects.effect import Effect, EffectRun, NoSensation, Sensation
+from controller.effects.effect import (
+    Effect,
+    EffectRun,
+    Modulation,
+    NoSensation,
+    Sensation,
+)
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import RATIO, SPEED
@@ -38,6 +44,7 @@ class Texture(Effect):
     slow: Annotated[float, Quantity(SPEED, above=0, at_most=1)] = 0.01
     fast: Annotated[float, Quantity(SPEED, above=0, at_most=5)] = 0.20
     range: Annotated[float, Quantity(RATIO, at_least=0, at_most=40)] = 14.0
+    modulation: Modulation = None
 
     @model_validator(mode="after")
     def _check_speeds(self) -> Self:
@@ -78,7 +85,12 @@ class _TextureRun(EffectRun):
         speed = self._speed(contact, now)
         if speed < self._texture.slow:
             return NoSensation(until=rests_from)
-        return Sensation(self._level_at(speed), until=rests_from, allow_weaker=True)
+        return Sensation(
+            self._level_at(speed),
+            until=rests_from,
+            allow_weaker=True,
+            modulation_hz=self._texture.modulation,
+        )
 
     def _speed(self, contact: Contact, now: float) -> float:
         """Return the mean speed [m/s] along the stored path up to the finger."""

@@ -7,9 +7,8 @@ from controller.loop.intent import Target
 from controller.sources.contacts import Contact, ContactKey
 from model.table.pattern import Pattern
 from model.table.question import Question
-from model.table.request import OWN_CONTRAST_DB
 
-OWN, MIXED, SHARED, HELD_BACK = "own", "mixed", "shared", "held back"
+OWN, SHARED, HELD_BACK = "own", "shared", "held back"
 
 
 @dataclass(frozen=True)
@@ -42,13 +41,20 @@ class Content:
     """The pattern of one layer, with the contacts as they were when it was chosen.
 
     targets: the finger whose content it is, then those that share it; question: by which its onset
-    and ending are shaped; predictions: one per target.
+    and ending are shaped; predictions: one per target; voice: 0, or the number of a side band of
+    the finger's content, which has no predictions.
     """
 
     targets: tuple[tuple[Contact, Target], ...]
     question: Question
     pattern: Pattern
     predictions: tuple[Prediction, ...]
+    voice: int = 0
+
+    @property
+    def key(self) -> tuple[ContactKey, int]:
+        """The finger whose content it is, and the voice."""
+        return self.targets[0][0].key, self.voice
 
     @property
     def frequency(self) -> float | None:
@@ -97,9 +103,3 @@ class Selection:
 def not_served(contact: Contact, reason: str) -> Prediction:
     """Return the prediction for a target that feels nothing of its own."""
     return Prediction(contact, None, verdict=HELD_BACK, held_back=reason)
-
-
-def verdict_of(promised_contrast_db: float | None) -> str:
-    """Return whether a content with a contrast is a finger's own or mixed with others."""
-    is_own = promised_contrast_db is None or promised_contrast_db >= OWN_CONTRAST_DB
-    return OWN if is_own else MIXED

@@ -119,7 +119,8 @@ class Decider:
         self._selected: Selection | None = None
         self._decided: Decision | None = None  # the last one with something to send
         self._playing: Mapping[int, PlayedContent] = {}
-        self._layer_of: Mapping[ContactKey, int] = {}  # also where what plays is unknown
+        # By finger and voice, also where what plays is unknown.
+        self._layer_of: Mapping[tuple[ContactKey, int], int] = {}
         self._may_play: frozenset[int] = frozenset()  # layers, since all were silent
         self._is_silent = False  # for certain
         self._retry_at: float | None = None
@@ -258,8 +259,10 @@ class Decider:
         """
         self._retry_at = error.until
         newest = max(decision.started, key=self._requested_at, default=None)
-        if newest is not None and len(self._playing) > 1:
-            return self._without(newest, decision, str(error))
+        if newest is not None:
+            ends = self._voices_beside(newest)
+            if len(ends) < len(self._playing):
+                return self._without(ends, decision, str(error))
         self._playing, self._is_silent = {}, True
         self._decided = replace(
             decision,
@@ -275,15 +278,21 @@ class Decider:
         contact, target = self._playing[number].content.targets[0]
         return contact.since if target.pulse is None else target.pulse.requested_at
 
-    def _without(self, number: int, decision: Decision, reason: str) -> Decision:
-        """Return the last decision with a layer that ends instead of what it starts there."""
-        content = self._playing[number].content
-        self._playing = {n: one for n, one in self._playing.items() if n != number}
+    def _voices_beside(self, number: int) -> frozenset[int]:
+        """Return the layers that play for the same finger as one, itself included."""
+        key, _ = self._playing[number].content.key
+        return frozenset(n for n, one in self._playing.items() if one.content.key[0] == key)
+
+    def _without(self, numbers: frozenset[int], decision: Decision, reason: str) -> Decision:
+        """Return the last decision with layers that end instead of what it starts there."""
+        contents = [self._playing[number].content for number in numbers]
+        self._playing = {n: one for n, one in self._playing.items() if n not in numbers}
+        ends = {number: self._builder.build_end(number, has_endings=False) for number in numbers}
         self._decided = replace(
             decision,
-            selection=_held_back(decision.selection, [content], reason),
-            sets={**decision.sets, number: self._builder.build_end(number, has_endings=False)},
-            started=decision.started - {number},
+            selection=_held_back(decision.selection, contents, reason),
+            sets={**decision.sets, **ends},
+            started=decision.started - numbers,
             refusal=reason,
         )
         return self._decided
@@ -415,7 +424,7 @@ class Decider:
         if not sets:
             return None
         self._playing, self._is_silent = playing, False
-        self._layer_of = {each.targets[0][0].key: number for number, each in numbers.items()}
+        self._layer_of = {each.key: number for number, each in numbers.items()}
         self._may_play |= started
         return replace(draft, sets=sets, started=started)
 
@@ -424,7 +433,7 @@ class Decider:
         numbers = {}
         new = []
         for content in contents:
-            number = self._layer_of.get(content.targets[0][0].key)
+            number = self._layer_of.get(content.key)
             if number is None:
                 new.append(content)
             else:
@@ -487,7 +496,8 @@ def _shortest(played: Mapping[str, Sequence[LayerSet]], number: int) -> float:
 
 def _held_back(selection: Selection, contents: Sequence[Content], reason: str) -> Selection:
     """Return a selection without some of its contents, whose targets feel nothing for a reason."""
-    skipped = [not_served(contact, reason) for each in contents for contact, _ in each.targets]
+    held_back = dict.fromkeys(contact for each in contents for contact, _ in each.targets)
+    skipped = [not_served(contact, reason) for contact in held_back]
     return replace(
         selection,
         contents=tuple(each for each in selection.contents if each not in contents),

@@ -61,7 +61,8 @@ class Target:
     the nearest of the table. priority: lower ones give way first. content: a name; fingers of one
     name may share one vibration where the plate cannot give each its own. None: of this one alone.
     is_own: whether it feels its own content or none; may_share: whether it may also feel that of
-    any finger that may share.
+    any finger that may share. modulation_hz: how often a second the strength of what lasts comes
+    and goes.
     """
 
     key: ContactKey
@@ -73,6 +74,7 @@ class Target:
     content: str | None = None
     is_own: bool = False
     may_share: bool = False
+    modulation_hz: float | None = None
 
     @property
     def is_short(self) -> bool:

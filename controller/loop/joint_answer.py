@@ -21,6 +21,7 @@ from model.arrays import Complex64Array
 from model.finger.perception import FELT_DB_SL, decibels
 from model.table import request
 from model.table.answer import answer
+from model.table.modulation import with_modulation
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, ONSET_RAMP, Pattern
 from model.table.question import Question
 from model.table.request import OWN_CONTRAST_DB, Answer, Finger, Layer, Request
@@ -29,6 +30,8 @@ from model.vibration.excitation import Excitation, base_amplitudes
 
 KEPT_WITHIN = 3.0
 """How much more [dB] another frequency must promise to take the place of one that is felt."""
+
+_SIDE_BANDS = 2
 
 Shape = Callable[[Question, Pattern, bool], Pattern]
 """Adds the envelopes of a pattern; whether it continues what its layer plays, without an onset."""
@@ -40,7 +43,7 @@ def query_jointly(
     quiet: Sequence[Contact],
     capabilities: PlaybackCapabilities,
     *,
-    before: Mapping[ContactKey, Content],
+    before: Mapping[tuple[ContactKey, int], Content],
     shape: Shape,
     protected: frozenset[ContactKey] = frozenset(),
 ) -> Selection:
@@ -52,6 +55,8 @@ def query_jointly(
     requests = requests_of(table, targets, capabilities.frequencies, protected)
     fingers = [Finger((each.x, each.y), each.load, _bound(each, protected)) for each in quiet]
     found = _answer(table, requests, fingers, _kept(requests, targets, before))
+    modulations = _modulations(targets, capabilities.layers)
+    found = with_modulation(table, requests, fingers, found, modulations)
     places = [each.at for each in requests]
     fields = table.unit_fields(np.array(places), contacts=places)
     factor = _factor_within(found, capabilities)
@@ -66,15 +71,16 @@ def query_jointly(
                 for other, one in enumerate(found.layers)
                 if one.verdict == SHARED and one.excitation == layer.excitation
             ]
-            then = before.get(contact.key)
-            pattern = _pattern(table, layer, capabilities)
-            pattern = pattern.scaled(float(decibels(factor)))
-            if then is not None:
-                pattern = _in_phase(pattern, then.pattern, fields[:, :, number], table)
             served = [(contact, target, layer), *sharing]
-            contents.append(
-                _content(served, targets, quiet, pattern, then, factor=factor, shape=shape)
-            )
+            for voice, tones in enumerate((layer.excitation, *layer.side_bands)):
+                then = before.get((contact.key, voice))
+                pattern = _pattern(table, replace(layer, excitation=tones), capabilities)
+                pattern = pattern.scaled(float(decibels(factor)))
+                if then is not None or layer.side_bands:
+                    pattern = _in_phase(pattern, then, fields[:, :, number], table)
+                contents.append(
+                    _content(served, targets, quiet, pattern, then, factor, shape, voice)
+                )
     change = float(decibels(factor))
     return Selection(
         tuple(targets),
@@ -88,6 +94,19 @@ def query_jointly(
         },
         protected=protected,
     )
+
+
+def _modulations(targets: Sequence[tuple[Contact, Target]], layers: int) -> list[float | None]:
+    """Return how each target is modulated [Hz], by priority as far as there are layers.
+
+    A layer is left to a click.
+    """
+    found: list[float | None] = [None] * len(targets)
+    spare = layers - len(targets) - 1
+    for number in sorted(range(len(targets)), key=lambda each: -targets[each][1].priority):
+        if targets[number][1].modulation_hz is not None and spare >= _SIDE_BANDS:
+            found[number], spare = targets[number][1].modulation_hz, spare - _SIDE_BANDS
+    return found
 
 
 def requests_of(
@@ -121,13 +140,13 @@ def _bound(contact: Contact, protected: frozenset[ContactKey]) -> float:
 def _kept(
     requests: Sequence[Request],
     targets: Sequence[tuple[Contact, Target]],
-    before: Mapping[ContactKey, Content],
+    before: Mapping[tuple[ContactKey, int], Content],
 ) -> list[Request]:
     """The requests with the frequencies that fingers feel now, where their bands allow it."""
     kept = []
     for requested, (contact, _) in zip(requests, targets, strict=True):
         each = requested
-        then = before.get(contact.key)
+        then = before.get((contact.key, 0))
         frequency = None if then is None else then.frequency
         low, high = each.band_hz
         if frequency is not None and low <= frequency <= high:
@@ -167,8 +186,9 @@ def _factor_within(found: Answer, capabilities: PlaybackCapabilities) -> float:
     full: dict[str, float] = defaultdict(float)
     for layer in found.layers:
         if layer.verdict not in (HELD_BACK, SHARED):
-            for name, tone in layer.excitation.items():
-                full[name] += tone.amplitude / capabilities.max_amplitudes[name]
+            for tones in (layer.excitation, *layer.side_bands):
+                for name, tone in tones.items():
+                    full[name] += tone.amplitude / capabilities.max_amplitudes[name]
     power = sum(level**2 for level in full.values())
     highest = max(1.0, *full.values(), math.sqrt(power / capabilities.max_power))
     return 1.0 / highest
@@ -199,11 +219,11 @@ def _content(
     quiet: Sequence[Contact],
     pattern: Pattern,
     then: Content | None,
-    *,
     factor: float,
     shape: Shape,
+    voice: int,
 ) -> Content:
-    """The content of one finger and those that share it."""
+    """A voice of the content of one finger and those that share it."""
     own = {contact.key for contact, _, _ in served}
     others = [contact for contact, _ in targets if contact.key not in own]
     first = served[0][0]
@@ -231,7 +251,8 @@ def _content(
         tuple((contact, target) for contact, target, _ in served),
         question,
         shape(question, pattern, is_continued),
-        predictions,
+        () if voice else predictions,
+        voice,
     )
 
 
@@ -258,17 +279,19 @@ def _held_back(contact: Contact, layer: Layer) -> Prediction:
 
 
 def _in_phase(
-    pattern: Pattern, before: Pattern, fields: Complex64Array, table: LocalizationTable
+    pattern: Pattern, before: Content | None, fields: Complex64Array, table: LocalizationTable
 ) -> Pattern:
-    """Turn a pattern so that its finger feels it in the phase of the one before.
+    """Turn a pattern so that its finger feels it in the phase of the one before, 0 without any.
 
-    fields (f, eras): at the finger, of each ERA at full stroke.
+    Side bands in phase with their carrier modulate its amplitude, not its frequency. fields (f,
+    eras): at the finger, of each ERA at full stroke.
     """
     felt = _felt(pattern.excitation, fields, table)
-    felt_before = _felt(before.excitation, fields, table)
+    felt_before = {} if before is None else _felt(before.pattern.excitation, fields, table)
     turned = {}
     for name, tone in pattern.excitation.items():
-        now, then = felt[tone.frequency], felt_before.get(tone.frequency)
+        now = felt[tone.frequency]
+        then = 1.0 if before is None else felt_before.get(tone.frequency)
         change = cmath.phase(then / now) if now and then else 0.0
         turned[name] = replace(tone, phase=tone.phase + change)
     return replace(pattern, excitation=turned)

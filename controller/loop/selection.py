@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from controller.loop.answer_thread import AnswerThread
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.content import Content, Prediction, Selection, not_served, verdict_of
+from controller.loop.content import Content, Prediction, Selection, not_served
 from controller.loop.intent import HapticIntent, Target
 from controller.loop.joint_answer import Shape, query_jointly
 from controller.loop.table_query import TableAnswer, query_table
@@ -19,6 +19,7 @@ from model.finger.perception import decibels
 from model.table.effect_level import EffectLevels
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, Pattern
 from model.table.question import Question
+from model.table.request import verdict_of
 from model.table.table import LocalizationTable
 from registry.plugins import failure_text
 
@@ -203,7 +204,7 @@ class Selector:
             }
             return _Chosen(found, new, triggered_at)
 
-        takes_long = lasting is not None and (len(lasting) > 1 or bool(protected))
+        takes_long = lasting is not None and not _is_quick(lasting, protected)
         if self._thread.is_busy or takes_long:
             self._requested = Selection(lasting or (), contacts, protected=protected), short
             self._thread.compute(chosen)
@@ -270,6 +271,12 @@ def _sum_db(levels: Iterable[float]) -> float:
     """Return the level of powers that add up [dB]."""
     power = sum(10 ** (level / 10) for level in levels)
     return 10 * math.log10(power) if power else -math.inf
+
+
+def _is_quick(lasting: Targets, protected: frozenset[ContactKey]) -> bool:
+    """Whether it is one steady content that no finger must not notice."""
+    keys = {contact.key for contact, _ in lasting}
+    return len(lasting) == 1 and protected <= keys and lasting[0][1].modulation_hz is None
 
 
 def _intents(targets: Targets) -> set[Target]:
@@ -347,10 +354,10 @@ def _lasting_of(
 ) -> Selection:
     """Choose for all targets that last; any failure is their reason for silence."""
     keys = {contact.key for contact, _ in lasting}
-    if len(lasting) == 1 and protected <= keys:
+    if _is_quick(lasting, protected):
         return _alone(table, levels, *lasting[0], contacts, capabilities, before, protected)
     quiet = tuple(each for each in contacts if each.key not in keys)
-    felt = {content.targets[0][0].key: content for content in before.contents}
+    felt = {content.key: content for content in before.contents}
     try:
         return query_jointly(
             table, lasting, quiet, capabilities, before=felt, shape=shape, protected=protected

@@ -27,13 +27,13 @@ from model.table.contents_kernel import choose_tones
 from model.table.request import (
     APART_HZ,
     MIN_CONTRAST_DB,
-    OWN_CONTRAST_DB,
     Answer,
     Finger,
     Layer,
     QuietFinger,
     Request,
     check_requests,
+    verdict_of,
 )
 from model.table.table import LocalizationTable
 
@@ -281,7 +281,7 @@ class _Answering:
                 layers[finger] = Layer(
                     self.requests[finger],
                     excitation,
-                    "shared" if is_shared else _verdict(promised),
+                    "shared" if is_shared else verdict_of(promised),
                     level_db_sl=level[finger][0],
                     promised_level_db_sl=level[finger][1],
                     felt_contrast_db=nominal,
@@ -319,8 +319,3 @@ def _at(request: Request) -> str:
 def _known(values: FloatArray) -> list[Any]:
     """Values as lists, None for those that are not known."""
     return list(np.where(np.isnan(values), None, values).tolist())  # type: ignore[call-overload]
-
-
-def _verdict(contrast_db: float | None) -> str:
-    is_own = contrast_db is None or contrast_db >= OWN_CONTRAST_DB
-    return "own" if is_own else "mixed"

@@ -125,7 +125,7 @@ class Layer:
     all other contents at this finger, which nine of ten plates do not exceed; verdict: `own`,
     `mixed` (below OWN_CONTRAST_DB), `shared` (the content of another finger) or `held back`, which
     has the contrast that it would have had; is_disturbing: whether that is because of a finger's
-    max_foreign_db_sl.
+    max_foreign_db_sl; side_bands: excitations beside it of a content that is modulated.
     """
 
     request: Request
@@ -138,6 +138,7 @@ class Layer:
     promised_contrast_db: float | None = None
     foreign_level_db_sl: float | None = None
     is_disturbing: bool = False
+    side_bands: tuple[Excitation, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -168,6 +169,12 @@ class Answer:
     promised_worst_db: float | None
     stroke_factor: float
     applied: tuple[str, ...] = field(default=())
+
+
+def verdict_of(promised_contrast_db: float | None) -> str:
+    """Return whether a content of a contrast is a finger's own or mixed with others."""
+    is_own = promised_contrast_db is None or promised_contrast_db >= OWN_CONTRAST_DB
+    return "own" if is_own else "mixed"
 
 
 def check_requests(requests: Sequence[Request], fingers: Sequence[Finger], plate: Plate) -> None:

@@ -516,7 +516,7 @@ def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
         layers=4,
     )
     first = query_jointly(table(), targets, (), capabilities, before={}, shape=unshaped)
-    before = {each.targets[0][0].key: each for each in first.contents}
+    before = {each.key: each for each in first.contents}
     moved = replace(contacts[0], x=contacts[0].x + 0.01)
     third = Contact(ContactKey("a", 2), *ABOVE, since=0.0)
     joined = [(moved, targets[0][1]), targets[1], (third, Target(third.key, 14.0))]
@@ -525,7 +525,7 @@ def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
     fields = table().unit_fields(np.array(places), contacts=places)
     kept = 0
     for content in second.contents:
-        then = before.get(content.targets[0][0].key)
+        then = before.get(content.key)
         if then is not None and then.frequency == content.frequency:
             at = places.index((content.targets[0][0].x, content.targets[0][0].y))
             now, old = (_felt(each.pattern, fields[:, :, at]) for each in (content, then))

@@ -1,0 +1,257 @@
+"""Contents whose strength beats 10 to 30 times a second: a carrier and two side bands.
+
+Of a full modulation each side band has half the amplitude of the carrier. At the carrier's weights
+side bands leak 3 to 12 dB more: each has weights of its own, found like those of a content of its
+frequency. The carrier is chosen for all three together, near the best steady one.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.choice import best_of
+from model.ensemble.measures import percentile
+from model.ensemble.touched_by_kernel import touch
+from model.finger.perception import decibels
+from model.table.answer import answer
+from model.table.contents import PROMISED_DRAWS, PROMISED_PERCENTILE
+from model.table.request import (
+    APART_HZ,
+    MIN_CONTRAST_DB,
+    Answer,
+    Finger,
+    Layer,
+    Request,
+    verdict_of,
+)
+from model.table.table import LocalizationTable
+from model.vibration.excitation import Excitation, base_amplitudes
+
+MIN_MODULATION, MAX_MODULATION = 10.0, 30.0
+"""Modulations that side bands play [Hz]; slower ones are changes of level."""
+
+_SIDE = 0.5  # amplitude of a side band to the carrier's
+_ALL_DB = 10 * math.log10(1 + 2 * _SIDE**2)  # of all three above the carrier
+_NEAR = 2  # carriers tried on each side of the steady one, by frequencies of the table
+_SAME = 0.5  # Hz; by which both side bands may differ in distance from the carrier
+
+
+@dataclass(frozen=True)
+class _Modulated:
+    """A carrier and two side bands [dB of contrast on their own], all at their levels."""
+
+    tones: tuple[Layer, Layer, Layer]
+
+    @property
+    def contrast_db(self) -> float:
+        """Promised contrast of all three: what leaks adds up."""
+        leaks = [
+            share**2 * 10 ** (-each.promised_contrast_db / 10)
+            for share, each in zip((1.0, _SIDE, _SIDE), self.tones, strict=True)
+            if each.promised_contrast_db is not None
+        ]
+        return math.inf if not leaks else _ALL_DB - 10 * math.log10(sum(leaks))
+
+
+def with_modulation(
+    table: LocalizationTable,
+    requests: Sequence[Request],
+    fingers: Sequence[Finger],
+    found: Answer,
+    modulations: Sequence[float | None],
+) -> Answer:
+    """Return an answer whose contents are modulated [Hz] where that leaves all fingers served.
+
+    modulations: of each request, None for none. Side bands are at the nearest frequencies of the
+    table that are as far above as below the carrier.
+    """
+    layers = [*found.layers]
+    every: list[Request | Finger] = [*requests, *fingers]
+    for number, modulation in enumerate(modulations):
+        if modulation is None or layers[number].verdict not in ("own", "mixed"):
+            continue
+        if any(each.verdict == "shared" and each.excitation == layers[number].excitation
+               for each in layers):  # fmt: skip
+            continue
+        taken = [frequency_of(each) for n, each in enumerate(layers) if n != number]
+        best = _modulated(table, every, number, layers[number], modulation, taken)
+        if best is None:
+            continue
+        carrier, *sides = best.tones
+        tried = [*layers]
+        tried[number] = replace(
+            layers[number],
+            excitation=_scaled(carrier.excitation, -_ALL_DB),
+            side_bands=tuple(
+                _scaled(each.excitation, -_ALL_DB + float(decibels(_SIDE))) for each in sides
+            ),
+        )
+        promised = _promised(table, every, tried, found)
+        if _is_served(promised, fingers, found.promised_worst_db):
+            layers, found = [*promised.layers], promised
+    return found
+
+
+def _is_served(found: Answer, fingers: Sequence[Finger], steady_db: float | None) -> bool:
+    """Whether all fingers have what they require, and no less than 6 dB unless they had less."""
+    worst = found.promised_worst_db
+    if worst is not None and steady_db is not None and worst < min(MIN_CONTRAST_DB, steady_db):
+        return False
+    bounds = [each.request.max_foreign_db_sl for each in found.layers]
+    levels = [each.foreign_level_db_sl for each in found.layers]
+    bounds += [each.max_foreign_db_sl for each in fingers]
+    levels += [each.level_db_sl for each in found.quiet]
+    return all(
+        level is None or level <= bound for level, bound in zip(levels, bounds, strict=True)
+    ) and all(
+        each.promised_contrast_db is None
+        or each.verdict not in ("own", "mixed")
+        or each.promised_contrast_db >= each.request.min_contrast_db
+        for each in found.layers
+    )
+
+
+def frequency_of(layer: Layer) -> float:
+    """Return the frequency of a layer's carrier [Hz]; infinite for none."""
+    return next((tone.frequency for tone in layer.excitation.values()), math.inf)
+
+
+def _modulated(
+    table: LocalizationTable,
+    every: Sequence[Request | Finger],
+    number: int,
+    layer: Layer,
+    modulation: float,
+    taken: Sequence[float],
+) -> _Modulated | None:
+    """The best carrier with its side bands; None where the table has none."""
+    frequencies = table.frequencies
+    low, high = layer.request.band_hz
+    row = int(np.argmin(np.abs(frequencies - frequency_of(layer))))
+    around = range(max(row - _NEAR, 0), min(row + _NEAR + 1, len(frequencies)))
+    alone: dict[int, Layer] = {}
+    tried: list[_Modulated] = []
+    for carrier in around:
+        f = float(frequencies[carrier])
+        sides = [int(np.argmin(np.abs(frequencies - f - sign * modulation))) for sign in (-1, 1)]
+        gaps = np.abs(frequencies[sides] - f)
+        is_even = gaps.min() > 0 and abs(gaps[0] - gaps[1]) <= _SAME
+        is_apart = all(abs(f - other) >= APART_HZ for other in taken)
+        if not (is_even and low <= f <= high and (is_apart or carrier == row)):
+            continue
+        for each in (carrier, *sides):
+            if each not in alone:
+                alone[each] = _alone(table, every, number, float(frequencies[each]))
+        tried.append(_Modulated((alone[carrier], alone[sides[0]], alone[sides[1]])))
+    return tried[best_of([each.contrast_db for each in tried])] if tried else None
+
+
+def _alone(
+    table: LocalizationTable, every: Sequence[Request | Finger], number: int, frequency: float
+) -> Layer:
+    """The only content at a finger, at a frequency, all others quiet."""
+    own = every[number]
+    if not isinstance(own, Request):
+        raise TypeError("a content must be that of a request")
+    others = [Finger(each.at, each.load) for n, each in enumerate(every) if n != number]
+    request = replace(own, band_hz=(frequency, frequency), min_contrast_db=-math.inf)
+    (layer,) = answer(table, [request], others, min_contrast_db=-math.inf).layers
+    return layer
+
+
+def _promised(
+    table: LocalizationTable,
+    every: Sequence[Request | Finger],
+    layers: Sequence[Layer],
+    found: Answer,
+) -> Answer:
+    """The answer with what all tones of layers promise together, on the same plates."""
+    tips = table.read_fingertips([each.at for each in every])
+    loads = tuple(each.load for each in every)
+    owners, rows, weights = [], [], []
+    strokes = np.array([era.stroke for era in table.eras])
+    for number, layer in enumerate(layers):
+        for tones in (layer.excitation, *layer.side_bands):
+            if tones and layer.verdict != "shared":
+                frequencies, bases = base_amplitudes(tones, table.eras)
+                owners.append(number)
+                rows.append(int(np.searchsorted(table.frequencies, frequencies[0])))
+                weights.append(bases[0] / strokes)
+    shares, owner = tips.fine_weights, np.array(owners)
+    powers = touch(table.on_eras, tips.few[:, 0], loads).drawn(
+        *(PROMISED_DRAWS, np.array(rows), np.array(weights, dtype=np.complex64)),
+        *(tips.fine.reshape(-1, tips.fine.shape[2]), shares, table.error_power, table.thresholds),
+        with_powers=True,
+    ).powers  # fmt: skip
+    power = np.asarray(powers, dtype=float).reshape(len(rows), *shares.shape, -1)
+    felt = {
+        number: np.sqrt(
+            sum((shares[number] @ np.sqrt(each[number])) ** 2 for each in power[owner == number])
+        )
+        for number in {*owners}
+    }
+    ratios, new, quiet = [], [*layers], [*found.quiet]
+    for finger in range(len(every)):
+        is_target = finger in felt
+        if finger < len(layers) and not is_target:  # shared or held back
+            continue
+        others = power[owner != finger][:, finger]
+        own = felt[finger] if is_target else np.min([*felt.values()], axis=0)
+        heard = np.sqrt(np.maximum(others.sum(axis=0).max(axis=0), 1e-20)) if len(others) else None
+        ratio = None if heard is None else own / heard
+        if ratio is not None:
+            ratios.append(ratio)
+        if not is_target and ratio is not None and heard is not None:
+            at = finger - len(layers)
+            quiet[at] = replace(
+                quiet[at],
+                felt_contrast_db=float(decibels(ratio[0])),
+                promised_contrast_db=_promise(ratio),
+                level_db_sl=_promise(heard, 100 - PROMISED_PERCENTILE),
+            )
+        if not is_target:
+            continue
+        new[finger] = replace(
+            new[finger], level_db_sl=float(decibels(own[0])), promised_level_db_sl=_promise(own)
+        )
+        if ratio is not None and heard is not None:
+            new[finger] = _compared(new[finger], ratio)
+            level = _promise(heard, 100 - PROMISED_PERCENTILE)
+            new[finger] = replace(new[finger], foreign_level_db_sl=level)
+    worst = np.min(ratios, axis=0) if ratios else None
+    if len(felt) == 1 and worst is not None:
+        (only,) = felt
+        new[only] = _compared(new[only], worst)
+    return replace(
+        found,
+        layers=tuple(new),
+        quiet=tuple(quiet),
+        promised_worst_db=None if worst is None else _promise(worst),
+    )
+
+
+def _compared(layer: Layer, ratio: FloatArray) -> Layer:
+    """A layer with contrasts from ratios on plates (1 + d,), that as modelled first."""
+    promised = _promise(ratio)
+    return replace(
+        layer,
+        felt_contrast_db=float(decibels(ratio[0])),
+        median_felt_contrast_db=_promise(ratio, 50),
+        promised_contrast_db=promised,
+        verdict=verdict_of(promised),
+    )
+
+
+def _promise(values: FloatArray, percent: float = PROMISED_PERCENTILE) -> float:
+    """Percentile of the drawn plates, without the first, that as modelled [dB]."""
+    return float(decibels(percentile(values[1:], percent)))
+
+
+def _scaled(excitation: Excitation, gain_db: float) -> Excitation:
+    factor = 10 ** (gain_db / 20)
+    return {
+        name: replace(tone, amplitude=factor * tone.amplitude) for name, tone in excitation.items()
+    }

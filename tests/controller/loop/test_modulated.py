@@ -1,0 +1,108 @@
+"""A modulated content beside a steady one, over the wire at the fingertips."""
+
+import asyncio
+
+import numpy as np
+from scipy.signal import hilbert
+
+from controller.effects.buzz import Buzz
+from controller.effects.layout import SurfaceLayout
+from controller.effects.region import Region
+from controller.effects.shapes import Rectangle
+from drivers.errors import CommandRefused
+from several_fingers import LEFT, RIGHT, fingers_on, table
+from virtual_loop import in_virtual_time
+
+LAYOUT = SurfaceLayout(
+    (
+        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="rough"),
+        Region("right", Rectangle(0.16, 0.0, 0.14, 0.12), on_press="smooth"),
+    ),
+    {"rough": Buzz(level=14.0, modulation=20.0), "smooth": Buzz(level=14.0)},
+    elsewhere=None,
+)
+
+
+@in_virtual_time
+async def test_a_modulated_content_beats_at_its_own_finger_and_at_no_other() -> None:
+    """Of its envelope all comes and goes 20 times a second; that of the other hardly does."""
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(1.5)
+        applied = fingers.applied[-1]
+        assert len(applied.contents) == 4
+        first, second = applied.targets
+        voices = [one.content for one in applied.contents.values()]
+        of_first = sorted(each.frequency or 0.0 for each in voices if each.key[0].id == 1)
+        assert first.frequency == of_first[1]
+        assert np.diff(of_first).tolist() == [20.0, 20.0]
+        now, bench = asyncio.get_running_loop().time(), fingers.far.bench
+        bench.advance(now)
+        record = bench.fingers.felt(now - 0.5, now)
+        for id, least, most in (("1", 0.8, 1.3), ("2", 0.0, 0.35)):
+            motion = record[id].accelerations @ record[id].weights
+            envelope = np.abs(hilbert(motion))[200:-200]
+            times = np.arange(len(envelope)) / bench.sample_rate
+            part = envelope * np.hanning(len(envelope))
+            depth = 2 * abs((part * np.exp(-2j * np.pi * 20.0 * times)).sum()) / part.sum()
+            assert least < depth < most
+        assert second.verdict == "own"
+
+
+@in_virtual_time
+async def test_a_modulated_content_is_steady_where_layers_are_few() -> None:
+    """Two contents of four layers leave one for a click; a lone one takes three."""
+    async with fingers_on(table(), LAYOUT, layers=4) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(1.0)
+        assert len(fingers.applied[-1].contents) == 2
+        del fingers.at[2]
+        await fingers.hold(0.3)
+        fingers.at[1] = (LEFT[0] - 0.02, LEFT[1])
+        await fingers.hold(1.0)
+        assert len(fingers.applied[-1].contents) == 3
+
+
+@in_virtual_time
+async def test_voices_of_one_finger_end_together() -> None:
+    """When it lifts, all its layers fall silent, and the other's is not touched."""
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(1.0)
+        contents = fingers.applied[-1].contents
+        (own,) = (number for number, one in contents.items() if one.content.key[0].id == 2)
+        before = len(fingers.committed)
+        del fingers.at[1]
+        await fingers.hold(0.3)
+        sets = [layer for _, _, layers in fingers.committed[before:] for layer in layers]
+        ended = {layer.layer for layer in sets if not layer.renew}
+        assert len(ended) == 3
+        assert own not in ended
+        assert [*fingers.applied[-1].contents] == [own]
+
+
+@in_virtual_time
+async def test_a_refused_voice_takes_the_others_of_its_finger_along() -> None:
+    """A carrier without one side band would be another content: the finger feels none."""
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {2: RIGHT}
+        await fingers.hold(0.5)
+        group = fingers.controller.group
+        apply, refusals = group.apply, []
+
+        async def refusing(layers):  # type: ignore[no-untyped-def]
+            (played,) = layers.values()
+            if sum(any(tone.level for tone in each.tones) for each in played) >= 3:
+                refusals.append(layers)
+                raise CommandRefused("no more")
+            return await apply(layers)
+
+        group.apply = refusing  # type: ignore[method-assign]
+        fingers.at[1] = LEFT
+        await fingers.hold(0.5)
+        assert refusals
+        targets = {each.contact.key.id: each for each in fingers.applied[-1].targets}
+        assert targets[1].held_back == "no more"
+        assert len([each for each in fingers.applied[-1].targets if each.contact.key.id == 1]) == 1
+        assert {one.content.key[0].id for one in fingers.applied[-1].contents.values()} == {2}
+        group.apply = apply  # type: ignore[method-assign]

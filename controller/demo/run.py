@@ -23,13 +23,14 @@ from controller.demo.contents_picture import contents_figure
 from controller.demo.far_end import SIM_OPTIONS, WATCHDOG, SimulatedPlate, simulated_plate
 from controller.demo.picture import choose_rows, touches_figure
 from controller.demo.recorder import TouchRecorder
-from controller.demo.scene import Scene
+from controller.demo.scene import Scene, example_layout
 from controller.demo.touch_row import TouchRow
 from controller.gateway.installed import require_gateway
 from controller.sources.capture import replay_capture
 from drivers import clock
 from drivers.errors import LinkError
 from model.figures import save_figure
+from model.rig.file import load_rig
 from model.table.table import LocalizationTable
 
 WIRES = (*SIM_OPTIONS, "sim")
@@ -111,6 +112,7 @@ async def run_live(
 ) -> None:
     """Serve the dashboard of a rig over a wire until Ctrl-C; starts disarmed.
 
+    Fingers in each strip of the plate feel a vibration of their own, those between them nothing.
     rig_file, wire, seed: as for `run_demo`; dashboard: HOST:PORT of the loopback. The daemon uses
     the default socket, so that `era status` and others reach it. Raises InputError if one runs
     already or the gateway is not installed, and LinkError.
@@ -118,9 +120,12 @@ async def run_live(
     require_gateway()
     log = start_log(None, level="warning")
     try:
-        async with _on_simulated_plate(
-            rig_file, {}, layout=Scene(()).layout, wire=wire, seed=seed
-        ) as (config, lock, _):
+        layout = example_layout(load_rig(rig_file))
+        async with _on_simulated_plate(rig_file, {}, layout=layout, wire=wire, seed=seed) as (
+            config,
+            lock,
+            _,
+        ):
             daemon = Daemon(
                 config,
                 table,

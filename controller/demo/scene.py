@@ -13,6 +13,9 @@ from model.structure.plate import Plate
 MIN_ERAS_FOR_THREE = 8
 """Number of ERAs from which three people have contents of their own, else two."""
 
+SILENT_SHARE = 0.2
+"""Share of the plate's length between the strips of several people."""
+
 _TWO = {"left": None, "right": None}
 _THREE = {"left": (60, 110), "middle": (130, 180), "right": (220, 280)}  # Hz
 
@@ -30,12 +33,20 @@ class Scene:
 
 def example_scenes(rig: Rig) -> list[Scene]:
     """The recorded touches of the demonstration of a rig: one person, then two or three."""
-    is_for_three = len(rig.eras) >= MIN_ERAS_FOR_THREE
-    name, bands = ("three_people", _THREE) if is_for_three else ("two_people", _TWO)
+    name = "three_people" if _is_for_three(rig) else "two_people"
     return [
         Scene(read_capture(example_touches_path("touches"))),
-        Scene(read_capture(example_touches_path(name)), layout_of_people(rig.plate, bands)),
+        Scene(read_capture(example_touches_path(name)), example_layout(rig)),
     ]
+
+
+def example_layout(rig: Rig) -> dict[str, Any]:
+    """The layout for two or three people at a rig's plate."""
+    return layout_of_people(rig.plate, _THREE if _is_for_three(rig) else _TWO)
+
+
+def _is_for_three(rig: Rig) -> bool:
+    return len(rig.eras) >= MIN_ERAS_FOR_THREE
 
 
 def layout_of_people(
@@ -43,24 +54,21 @@ def layout_of_people(
 ) -> dict[str, Any]:
     """Return a layout of upright strips, from west to east, each with a vibration of its own.
 
-    bands: lowest and highest frequency [Hz] by name, None for any.
+    bands: lowest and highest frequency [Hz] by name, None for any. Between the strips, on a fifth
+    of the plate, a finger feels nothing.
     """
-    width = plate.length / len(bands)
-    return {
-        "effects": {name: {"kind": "buzz"} for name in bands},
-        "regions": {
-            name: {
-                "rectangle": {
-                    "start": [number * width, 0],
-                    "end": [(number + 1) * width, plate.width],
-                },
-                "on_press": name,
-                **({} if band is None else {"band": [*band]}),
-            }
-            for number, (name, band) in enumerate(bands.items())
-        },
-        "elsewhere": None,
-    }
+    width = (1 - SILENT_SHARE) / len(bands)
+    pitch = width + SILENT_SHARE / (len(bands) - 1)
+    regions = {}
+    for number, (name, band) in enumerate(bands.items()):
+        west, east = (plate.length * (number * pitch + side) for side in (0, width))
+        regions[name] = {
+            "rectangle": {"start": [west, 0], "end": [east, plate.width]},
+            "on_press": name,
+            **({} if band is None else {"band": [*band]}),
+        }
+    effects = {name: {"kind": "buzz"} for name in bands}
+    return {"effects": effects, "regions": regions, "elsewhere": None}
 
 
 def example_touches_path(name: str) -> Path:

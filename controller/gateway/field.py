@@ -17,6 +17,7 @@ from controller.api.client_protocol import Notification, read_line, result_of
 from controller.api.schema import PlayedTone
 from controller.gateway.link import DaemonLink, request_of
 from model.arrays import ComplexArray, lattice
+from model.finger.perception import detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import parse_rig
 from model.rig.rig import Rig
@@ -24,7 +25,7 @@ from model.rig.rig import Rig
 _COLUMNS = 64  # grid points along the longer side; several per bending wavelength
 _MAX_FREQUENCIES = 64  # in the cache
 _FULL_SCALE = 32767
-_NO_FIELD = bytes(8 + 4)  # no columns, no rows, no frequencies, scale 0
+_NO_FIELD = bytes(8 + 4)  # no columns, no rows, no fields, scale 0
 _RETRY_INTERVAL = 0.5  # s; of connecting to the daemon
 _TOPICS = b'{"topics":["pattern","silence"]}'
 
@@ -48,26 +49,33 @@ class FieldSolver:
         )
         self._response = lru_cache(_MAX_FREQUENCIES)(self._solve)
 
-    def frame(self, drive: Mapping[str, PlayedTone]) -> bytes:
-        """The complex acceleration under a drive by ERA, as a frame; raises InputError.
+    def frame(self, layers: Mapping[int, Mapping[str, PlayedTone]]) -> bytes:
+        """The complex acceleration of each layer under its drive by ERA, as a frame.
 
-        Little-endian: u16 columns, u16 rows, u16 frequencies, u16 zero; f32 scale [m/s²]; f32 per
-        frequency [Hz]; then i16 per frequency, row from the south and column from the west: real
-        and imaginary part, of 32767 as the scale.
+        A field is what one layer moves at one frequency. Little-endian: u16 columns, u16 rows, u16
+        fields, u16 zero; f32 scale [m/s²]; f32 per field, its frequency [Hz]; f32 per field, the
+        threshold of feeling there [m/s²]; u16 per field, its layer; then i16 per field, row from
+        the south and column from the west: real and imaginary part, of 32767 as the scale. Raises
+        InputError.
         """
-        frequencies = sorted({tone.frequency_hz for tone in drive.values()})
         names = [era.name for era in self._rig.eras]
-        amplitude = np.zeros((len(frequencies), self.rows * self.columns), dtype=complex)
-        for name, tone in drive.items():
-            weight = cmath.rect(tone.level, math.radians(tone.phase_deg))
-            response = self._response(tone.frequency_hz)
-            amplitude[frequencies.index(tone.frequency_hz)] += weight * response[names.index(name)]
+        fields: dict[tuple[int, float], ComplexArray] = {}
+        for number, drive in sorted(layers.items()):
+            for name, tone in drive.items():
+                weight = cmath.rect(tone.level, math.radians(tone.phase_deg))
+                moved = weight * self._response(tone.frequency_hz)[names.index(name)]
+                place = number, tone.frequency_hz
+                fields[place] = fields[place] + moved if place in fields else moved
+        amplitude = np.array([*fields.values()]).reshape(len(fields), self.rows * self.columns)
         parts = np.stack([amplitude.real, amplitude.imag], axis=-1)
         scale = float(np.abs(parts).max(initial=0.0))
         whole = np.rint(parts / (scale or 1.0) * _FULL_SCALE).astype("<i2")
-        sizes = np.array([self.columns, self.rows, len(frequencies), 0], dtype="<u2")
-        numbers = np.array([scale, *frequencies], dtype="<f4")
-        return sizes.tobytes() + numbers.tobytes() + whole.tobytes()
+        frequencies = np.array([frequency for _, frequency in fields])
+        thresholds = detection_threshold(frequencies, self._rig.threshold)
+        sizes = np.array([self.columns, self.rows, len(fields), 0], dtype="<u2")
+        numbers = np.array([scale, *frequencies, *thresholds], dtype="<f4")
+        of_layer = np.array([number for number, _ in fields], dtype="<u2")
+        return b"".join(each.tobytes() for each in (sizes, numbers, of_layer, whole))
 
     def _solve(self, frequency: float) -> ComplexArray:
         """Acceleration [m/s²] (eras, points) per ERA at full stroke."""
@@ -88,7 +96,7 @@ class DrawnField:
         self._frame = _NO_FIELD
         self._changed = asyncio.Event()
         self._due = threading.Event()
-        self._plays: tuple[str, Mapping[str, Any]] | None = None  # a rig file, and tones by ERA
+        self._plays: tuple[str, Mapping[str, Any]] | None = None  # a rig file, and drives by layer
         self._problem = ""
 
     async def newer_than(self, frame: bytes | None) -> bytes:
@@ -118,7 +126,7 @@ class DrawnField:
             while True:
                 received = read_line(await link.next_line())
                 if isinstance(received, Notification):
-                    self._show((rig_text, received.data.get("drive", {})))
+                    self._show((rig_text, received.data.get("layers", {})))
                 else:
                     result_of(received)  # raises if the daemon has too many clients
                     self._problem = ""
@@ -138,7 +146,7 @@ class DrawnField:
             frame, plays = _NO_FIELD, self._plays
             try:
                 if plays is not None:
-                    frame = solvers(plays[0]).frame(_tones(plays[1]))
+                    frame = solvers(plays[0]).frame(_drives(plays[1]))
             except Exception as error:
                 self._note("field of the plate not drawn", error)
             if not (self._due.is_set() or loop.is_closed()):
@@ -158,6 +166,11 @@ class DrawnField:
             _logger.warning("%s", problem)
 
 
-def _tones(drive: Mapping[str, Any]) -> dict[str, PlayedTone]:
-    """Tones by ERA, without what a later daemon may add to them."""
-    return {era: PlayedTone.model_validate(tone, extra="ignore") for era, tone in drive.items()}
+def _drives(layers: Mapping[str, Mapping[str, Any]]) -> dict[int, dict[str, PlayedTone]]:
+    """Tones by layer and ERA, without what a later daemon may add to them."""
+    return {
+        int(number): {
+            era: PlayedTone.model_validate(tone, extra="ignore") for era, tone in drive.items()
+        }
+        for number, drive in layers.items()
+    }

@@ -8,8 +8,10 @@ import logging
 import re
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import pytest_asyncio
 
@@ -25,10 +27,12 @@ from dashboard_pictures import (
     REASON,
     SCREENS,
     STATE,
+    TWO_PEOPLE,
     Screen,
     fingers_down,
     on_plate,
     open_dashboard,
+    two_people,
 )
 from gateway_bench import (
     TOKEN,
@@ -211,6 +215,87 @@ async def test_field_is_drawn_at_the_frame_rate(page: Page, era: Client) -> None
         await page.click("#motion")
         assert await page.evaluate("document.querySelector('#scale-low').textContent") == "0"
     assert await page.until(colours, lambda count: count == 1)  # still again
+
+
+async def test_each_finger_has_its_content_in_a_colour_of_its_own(
+    tab: Page, tmp_path: Path
+) -> None:
+    """Two touches: two rings, around each the field of its colour, and one content if chosen.
+
+    Where a content is drawn alone, its own finger is on a brighter place than the other.
+    """
+    fingers = f"({PROBES}).fingersOn('#field')"
+    choices = "[...document.querySelectorAll('#layers button')].map(e => e.textContent)"
+    with (
+        two_people(tmp_path) as socket,
+        gateway_process(tmp_path, socket) as gateway,
+        Client.connect(socket, name="test") as era,
+    ):
+        await open_dashboard(tab, gateway, DESKTOP)
+        await settled(tab, era)
+        await arm(tab, era)
+        async with fingers_down(tab, *TWO_PEOPLE):
+            await tab.until(choices, lambda texts: len(texts) == 3)
+            frequencies = sorted(contact.frequency_hz or 0.0 for contact in era.status().contacts)
+            assert sorted(await tab.evaluate(choices)) == sorted(
+                ["all", *(f"{frequency:.0f} Hz" for frequency in frequencies)]
+            )
+            summary = await tab.evaluate("document.querySelector('#summary').textContent")
+            for frequency in frequencies:
+                assert re.search(f"{frequency:.0f} Hz (own|mixed), ", summary)
+            (first, _), (second, _) = await tab.until(fingers, is_in_own_colours)
+            assert first != second
+            for number in (2, 3):
+                button = f"#layers button:nth-child({number})"
+                name = await tab.evaluate(f"document.querySelector('{button}').textContent")
+                own = f"{frequency_at(era, TWO_PEOPLE[0]):.0f} Hz" != name
+                await tab.click(button)
+                await tab.until(fingers, partial(is_brighter_at, own))
+            await tab.click("#layers button")
+            await tab.until(fingers, is_in_own_colours)
+        assert await contacts(era, 0) == []
+        await tab.until(choices, lambda texts: not texts)
+    assert tab.complaints == []
+
+
+def is_in_own_colours(fingers: list[list[list[int]]]) -> bool:
+    """Whether the ground of both fingers is a shade of the colour of their rings, no grey."""
+    return len(fingers) == 2 and all(
+        np.argsort(ring).tolist() == np.argsort(ground).tolist()
+        and max(ground) > 1.3 * min(ground) + 10
+        for ring, ground in fingers
+    )
+
+
+def is_brighter_at(own: int, fingers: list[list[list[int]]]) -> bool:
+    """Whether the ground of one of two fingers is brighter than that of the other."""
+    brightness = [sum(ground) for _, ground in fingers]
+    return len(brightness) == 2 and brightness[own] > brightness[1 - own]
+
+
+def frequency_at(era: Client, share: tuple[float, float]) -> float | None:
+    """The frequency [Hz] that the finger at a place feels."""
+    contact = min(era.status().contacts, key=lambda each: abs(each.x_m - share[0] * LENGTH))
+    return contact.frequency_hz
+
+
+async def test_shift_and_click_leaves_fingers_resting(page: Page, era: Client) -> None:
+    """Beside a pointer that presses; each until it is clicked so again, or Escape lifts all."""
+    (one, other, third) = await on_plate(page, (0.3, 0.4), (0.7, 0.6), (0.5, 0.8))
+    for place in (one, other):
+        for kind in ("mousePressed", "mouseReleased"):
+            await page.mouse(kind, *place, shift=True)
+    await contacts(era, 2)
+    await page.mouse("mousePressed", *third)
+    seen = await contacts(era, 3)
+    assert seen[-1] == pytest.approx((0.5 * LENGTH, 0.2 * WIDTH), abs=1e-3)
+    await page.mouse("mouseReleased", *third)
+    await contacts(era, 2)
+    await page.mouse("mousePressed", *one, shift=True)
+    await page.mouse("mouseReleased", *one, shift=True)
+    assert await contacts(era, 1) == [pytest.approx((0.7 * LENGTH, 0.4 * WIDTH), abs=1e-3)]
+    await page.press("Escape")
+    assert await contacts(era, 0) == []
 
 
 async def test_summary_explains_silence_while_disarmed(page: Page, era: Client) -> None:

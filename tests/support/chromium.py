@@ -120,11 +120,12 @@ class Page:
         fingers = [{"x": x, "y": y, "id": id} for id, (x, y) in enumerate(points)]
         await self.call("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
 
-    async def mouse(self, kind: str, x: float, y: float, *, button: str = "left") -> None:
-        """Real mouse events: mousePressed, mouseMoved, mouseReleased."""
-        await self.call(
-            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, clickCount=1
-        )
+    async def mouse(
+        self, kind: str, x: float, y: float, *, button: str = "left", shift: bool = False
+    ) -> None:
+        """Real mouse events: mousePressed, mouseMoved, mouseReleased; shift: with that key."""
+        place = {"x": x, "y": y, "button": button, "clickCount": 1}
+        await self.call("Input.dispatchMouseEvent", type=kind, modifiers=8 * shift, **place)
 
     async def press(self, key: str, code: str | None = None) -> None:
         """A key, down and up."""

@@ -1,21 +1,27 @@
 """`python tests/support/dashboard_pictures.py FOLDER`: the dashboard as it looks, on every screen.
 
-A daemon over a simulated amplifier with the example's surface layout, armed, two fingers on the
-plate: on a desktop, a tablet and a phone, in light and dark. docs/pictures/dashboard.png is
-dashboard_desktop_light.png of these.
+A daemon over a simulated amplifier, armed, two people with a finger each on the plate: on a
+desktop, a tablet and a phone, in light and dark; with `_one` in its name only the field of one
+content. docs/pictures/dashboard.png is dashboard_desktop_light.png of these.
 """
 
 import asyncio
+import json
 import sys
 import tempfile
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+import patient_daemon
 from chromium import Page, open_browser
-from controller.effects.layout_kind import LAYOUT
+from controller.demo.scene import layout_of_people
 from gateway_bench import GatewayProcess, gateway_process, real_daemon
+from model.table.build import build_table
+from paper_plate import make_paper_rig
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,8 @@ SCREENS = (
 STATE = "document.querySelector('#state')?.dataset.state"
 REASON = "document.querySelector('#banner')?.dataset.reason"
 """Why the banner is shown."""
+TWO_PEOPLE = ((0.1, 0.5), (0.72, 0.74))
+"""One in each strip of the demonstration's layout."""
 PLACES = ((0.2, 0.7), (0.72, 0.74))
 """On the keypad and on the knob of the example's layout, as `on_plate` has it."""
 
@@ -75,12 +83,23 @@ async def fingers_down(page: Page, *shares: tuple[float, float]) -> AsyncIterato
         await page.touch("touchEnd", [])
 
 
+@contextmanager
+def two_people(folder: Path) -> Iterator[Path]:
+    """The socket of a daemon in which two people each feel a content of their own."""
+    rig = make_paper_rig(12, 9)
+    table = build_table(rig, frequencies=np.arange(60.0, 301.0, 20.0), drive_mode="phased")
+    layout = layout_of_people(rig.plate, {"left": None, "right": None})
+    (folder / "layout.yaml").write_text(json.dumps(layout), encoding="utf-8")
+    program = patient_daemon.RESTING
+    with real_daemon(folder, "layout: layout.yaml\n", program=program, table=table) as socket:
+        yield socket
+
+
 async def _take(folder: Path) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         work = Path(scratch)
-        (work / "layout.yaml").write_text(LAYOUT.example(), encoding="utf-8")
         with (
-            real_daemon(work, "layout: layout.yaml\n") as daemon,
+            two_people(work) as daemon,
             gateway_process(work, daemon) as gateway,
         ):
             async with open_browser(work / "profile") as browser:
@@ -98,10 +117,9 @@ async def _take_one(
     await page.until("!document.querySelector('#arm').disabled")
     await page.click("#arm")
     await page.until(f"{STATE} === 'OPERATION_ENABLED'")
-    async with fingers_down(page, *PLACES):
+    async with fingers_down(page, *TWO_PEOPLE):
         await page.until("document.querySelectorAll('.contact').length === 2")
-        await page.until("document.querySelectorAll('.contact.target').length")
-        await page.until("document.querySelector('#summary').textContent.includes(' dB SL')")
+        await page.until("document.querySelectorAll('#layers button').length === 3")
         await asyncio.sleep(0.3)  # the field is solved after the event
         name = f"dashboard_{screen.name}_{'dark' if is_dark else 'light'}"
         await page.screenshot(folder / f"{name}.png")
@@ -109,6 +127,10 @@ async def _take_one(
             await page.evaluate("window.scrollTo(0, document.body.scrollHeight)")
             await asyncio.sleep(0.3)
             await page.screenshot(folder / f"{name}_below.png")
+        await page.evaluate("window.scrollTo(0, 0)")
+        await page.click("#layers button:nth-child(2)")
+        await asyncio.sleep(0.3)
+        await page.screenshot(folder / f"{name}_one.png")
     await page.click("#disarm")
     await page.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
 

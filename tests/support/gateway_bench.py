@@ -50,6 +50,7 @@ from controller.api.topics import StateEvent
 from daemon_bench import PATIENCE, daemon_table, write_daemon
 from model.rig.file import parse_rig
 from model.table.file import save_table
+from model.table.table import LocalizationTable
 from rig_files import write_rig
 
 ERA = Path(sys.executable).with_name("era")
@@ -300,13 +301,17 @@ def wait_for_daemon(gateway: GatewayProcess) -> None:
 
 @contextmanager
 def real_daemon(
-    folder: Path, more: str = "", *, program: Sequence[str | Path] = (ERA,)
+    folder: Path,
+    more: str = "",
+    *,
+    program: Sequence[str | Path] = (ERA,),
+    table: LocalizationTable | None = None,
 ) -> Iterator[Path]:
     """The socket of `era daemon` with a simulated amplifier.
 
-    more: further lines of its file; program: the command before `daemon`.
+    more: further lines of its file; program: the command before `daemon`; table: by default small.
     """
-    save_table(daemon_table(), folder / "table.npz")
+    save_table(table or daemon_table(), folder / "table.npz")
     config = write_daemon(folder, {}, f"table: table.npz\n{more}")
     daemon_socket = folder / "era.sock"
     with (

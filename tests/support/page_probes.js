@@ -50,6 +50,21 @@
     });
   },
 
+  // Colours [r, g, b] of the rings of fingers that feel something, and of the canvas there.
+  fingersOn(selector) {
+    const canvas = document.querySelector(selector);
+    const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
+    copy.drawImage(canvas, 0, 0);
+    const box = canvas.getBoundingClientRect();
+    return [...document.querySelectorAll(".contact.target")].map((ring) => {
+      const { x, y, width, height } = ring.getBoundingClientRect();
+      const column = ((x + width / 2 - box.x) / box.width) * canvas.width;
+      const row = ((y + height / 2 - box.y) / box.height) * canvas.height;
+      const { data } = copy.getImageData(Math.floor(column), Math.floor(row), 1, 1);
+      return [getComputedStyle(ring).stroke.match(/\d+/g).map(Number), [...data.slice(0, 3)]];
+    });
+  },
+
   // How many colours a canvas shows.
   colours(selector) {
     const { width, height } = document.querySelector(selector);

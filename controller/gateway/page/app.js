@@ -1,7 +1,7 @@
 // The dashboard: shows the daemon's events, and sends fingers and buttons to the daemon.
 
 import { Connection } from "./connection.js";
-import { decodeField, FieldView } from "./field.js";
+import { colourOf, decodeField, FieldView } from "./field.js";
 import { Fingers } from "./fingers.js";
 import { fixed, PlateOverlay } from "./plate.js";
 import { addEvent, annotate, showAmplifiers, showEffects, showLatency, timeOfDay } from "./side.js";
@@ -37,7 +37,7 @@ let linkLoss = null;  // the event of a lost link, and the number of retries
 const overlay = new PlateOverlay(at("plate"), at("overlay"));
 const fieldView = new FieldView(at("field"), at("scale"), (low, high) => {
   at("scale-low").textContent = `${low}`;
-  at("scale-high").textContent = `${high} m/s²`;
+  at("scale-high").textContent = high;
 });
 const fingers = new Fingers(at("plate"), overlay, (touches) => connection?.touch(touches));
 window.eraHaptics = { get frames() { return fieldView.frames; } };  // for measuring the frame rate
@@ -134,7 +134,8 @@ function showOutage(message) {
 // Without events the state of plate and amplifiers is unknown.
 function showUnknown(cause) {
   showState(null, null, cause);
-  overlay.show({ contacts: [], drive: {} });
+  overlay.show({ contacts: [], layers: {} });
+  showLayers();
   fieldView.clear();
   at("summary").textContent = "";
   showAmplifiers(at("amplifiers"), null, []);
@@ -145,7 +146,42 @@ function showLinkLoss(cause, remedy) {
   linkLoss ??= { item: addEvent(log, "error", `link lost: ${cause}`, remedy), remedy, retries: 0 };
 }
 
+// Buttons for the field of one content or of all, where there are several.
+function showLayers() {
+  const { contents } = overlay;
+  if (!contents.some(({ layer }) => layer === fieldView.layer)) fieldView.select(null);
+  const choices = contents.length < 2 ? [] : [{ layer: null, frequencies: [] }, ...contents];
+  at("layers").hidden = !choices.length;
+  at("layers").replaceChildren(...choices.map(({ layer, frequencies }) => {
+    const button = document.createElement("button");
+    button.type = "button";
+    button.textContent = layer === null ? "all" : `${frequencies.map((each) => fixed(each)).join(", ")} Hz`;
+    button.ariaPressed = `${layer === fieldView.layer}`;
+    if (layer !== null) button.style.setProperty("--content", colourOf(layer));
+    button.addEventListener("click", () => {
+      fieldView.select(layer);
+      showLayers();
+    });
+    return button;
+  }));
+}
+
+// What every finger feels of its own content, where there are several.
+function summariseContents({ contacts, latency_ms }) {
+  const targets = contacts.filter(({ role }) => role === "target").map((contact) => {
+    const { verdict, frequency_hz, level_db_sl, robust_felt_contrast_db: promised } = contact;
+    if (frequency_hz === null) return verdict;
+    return `${fixed(frequency_hz)} Hz ${verdict}, ${fixed(level_db_sl)} dB SL, at least ${fixed(promised)} dB over others`;
+  });
+  const text = `${contacts.length} fingers, ${overlay.drives.size} contents: ${targets.join("; ")}`;
+  at("summary").textContent = `${text}; ${fixed(latency_ms, 1)} ms from touch to wire`;
+}
+
 function summarise(pattern) {
+  if (overlay.drives.size > 1) {
+    summariseContents(pattern);
+    return;
+  }
   const { contacts, predicted_level_db_sl, latency_ms } = pattern;
   const { robust_felt_contrast_db: promised, predicted_felt_contrast_db: modelled } = pattern;
   const parts = [];
@@ -184,10 +220,12 @@ const HANDLERS = {
   },
   pattern(pattern) {
     overlay.show(pattern);
+    showLayers();
     summarise(pattern);
   },
   silence({ contacts, reason }) {
-    overlay.show({ contacts, drive: {} });
+    overlay.show({ contacts, layers: {} });
+    showLayers();
     at("summary").textContent = `silent: ${reason}`;
     summariseSilence();
   },

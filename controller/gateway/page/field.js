@@ -1,7 +1,11 @@
-// Draws the plate's vibration: amplitude, or motion slowed down.
+// Draws the plate's vibration: amplitude, which content is felt where, or motion slowed down.
 
 const AMPLITUDE = ["#0b1026", "#27306b", "#4b3f8f", "#8a4f8d", "#c8637a", "#f08c5a", "#fbc557", "#fdf3a7"];
 const MOTION = ["#053061", "#2f79b5", "#a7cfe4", "#f4f4f4", "#f9b98e", "#c8493a", "#67001f"];
+const CONTENTS = ["#35e07a", "#4f9dff", "#ffa62b", "#ff5fa2", "#c58bff", "#e8e34f", "#59e0e8", "#ff7d66"];
+const GREY = 0.62;  // where contents mix
+const OWN_DB = 12;  // above all others a content is felt as a finger's own
+const BRIGHTEST_DB = 30;  // above the threshold of feeling
 const SLOW_DOWN = 100;  // factor
 const SCALE_DECAY = 0.85;  // per frame, towards a lower scale
 
@@ -20,21 +24,25 @@ function ramp(stops) {
   return table;
 }
 
-const RAMPS = { amplitude: ramp(AMPLITUDE), motion: ramp(MOTION) };
+const RAMPS = { amplitude: ramp(AMPLITUDE), motion: ramp(MOTION), felt: ramp(["#000000", "#9e9e9e"]) };
 
-// Decode what controller/gateway/fields.py encodes.
+// The colour of a layer's content, of its finger and of its field.
+export const colourOf = (layer) => CONTENTS[layer % CONTENTS.length];
+
+// Decode what controller/gateway/field.py encodes.
 export function decodeField(buffer) {
   const view = new DataView(buffer);
   const [columns, rows, count] = [0, 2, 4].map((at) => view.getUint16(at, true));
   const scale = view.getFloat32(8, true);
-  const frequencies = [];
-  for (let k = 0; k < count; k++) frequencies.push(view.getFloat32(12 + 4 * k, true));
-  const start = 12 + 4 * count;
+  const numbers = (start) => Array.from({ length: count }, (_, k) => view.getFloat32(start + 4 * k, true));
+  const [frequencies, thresholds] = [numbers(12), numbers(12 + 4 * count)];
+  const layers = Array.from({ length: count }, (_, k) => view.getUint16(12 + 8 * count + 2 * k, true));
+  const start = 12 + 10 * count;
   const parts = new Float32Array(2 * count * rows * columns);
   for (let i = 0; i < parts.length; i++) {
     parts[i] = (view.getInt16(start + 2 * i, true) / 32767) * scale;
   }
-  return { columns, rows, frequencies, parts };
+  return { columns, rows, frequencies, thresholds, layers, parts };
 }
 
 export class FieldView {
@@ -43,6 +51,7 @@ export class FieldView {
     this.scaleCanvas = scaleCanvas;
     this.onScale = onScale;
     this.inMotion = false;
+    this.layer = null;  // the only one that is drawn; null for all
     this.scale = 0;
     this.frames = 0;
     this.clear();
@@ -50,20 +59,37 @@ export class FieldView {
   }
 
   clear() {
-    this.show({ columns: 2, rows: 2, frequencies: [], parts: new Float32Array(0) });
+    this.show({ columns: 2, rows: 2, frequencies: [], thresholds: [], layers: [], parts: new Float32Array(0) });
+  }
+
+  // Draw only one layer, or all for null.
+  select(layer) {
+    this.layer = layer;
+    this.show(this.field);
+    this.drawScale();
+  }
+
+  // The drawn fields, by number.
+  get drawn() {
+    return this.field.layers.flatMap((layer, k) => (this.layer === null || layer === this.layer ? [k] : []));
+  }
+
+  get isOfContents() {
+    return !this.inMotion && new Set(this.drawn.map((k) => this.field.layers[k])).size > 1;
   }
 
   show(field) {
-    const { columns, rows, frequencies, parts } = field;
+    const { columns, rows, parts } = field;
+    const wasOfContents = this.field && this.isOfContents;
     const points = Math.max(columns, 2) * Math.max(rows, 2);
     const amplitude = new Float32Array(points);
-    for (let k = 0; k < frequencies.length; k++) {
+    this.field = field;
+    for (const k of this.drawn) {
       for (let p = 0; p < points; p++) {
         const at = 2 * (k * points + p);
         amplitude[p] += Math.hypot(parts[at], parts[at + 1]);
       }
     }
-    this.field = field;
     this.amplitude = amplitude;
     this.peak = amplitude.reduce((max, value) => Math.max(max, value), 0);
     this.canvas.width = Math.max(columns, 2);
@@ -72,6 +98,7 @@ export class FieldView {
     this.image = this.context.createImageData(this.canvas.width, this.canvas.height);
     this.pixels = new Uint32Array(this.image.data.buffer);
     this.isStale = true;
+    if (this.isOfContents !== wasOfContents) this.drawScale();
   }
 
   setMotion(inMotion) {
@@ -93,6 +120,7 @@ export class FieldView {
     if (!this.isStale && !(this.inMotion && this.peak > 0)) return;
     this.isStale = false;
     if (this.inMotion) this.paintMotion(now / 1000);
+    else if (this.isOfContents) this.paintContents();
     else this.paintStrength();
     this.context.putImageData(this.image, 0, 0);
   }
@@ -108,21 +136,51 @@ export class FieldView {
     }
   }
 
+  // The strongest content in its colour, above the threshold of feeling; paler, up to grey, the less it
+  // is above all others.
+  paintContents() {
+    const { width, height } = this.canvas;
+    const { layers, thresholds, parts } = this.field;
+    const points = width * height;
+    const numbers = [...new Set(layers)];
+    const colours = numbers.map((layer) => rgb(colourOf(layer)));
+    const fields = layers.map((layer, k) => [numbers.indexOf(layer), k * points, thresholds[k]]);
+    const powers = new Float32Array(numbers.length);
+    const share = (value) => Math.min(1, Math.max(0, value));
+    for (let row = 0; row < height; row++) {
+      const offset = (height - 1 - row) * width;
+      for (let column = 0; column < width; column++) {
+        powers.fill(0);
+        for (const [number, start, threshold] of fields) {
+          const at = 2 * (start + offset + column);
+          powers[number] += (parts[at] ** 2 + parts[at + 1] ** 2) / threshold ** 2;
+        }
+        const own = Math.max(...powers);
+        const others = powers.reduce((sum, power) => sum + power, 0) - own;
+        const purity = share((10 * Math.log10(own / others)) / OWN_DB);
+        const light = share((10 * Math.log10(own)) / BRIGHTEST_DB);
+        const [r, g, b] = colours[powers.indexOf(own)].map((value) =>
+          Math.round(light * (purity * value + (1 - purity) * 255 * GREY)));
+        this.pixels[row * width + column] = (255 << 24) | (b << 16) | (g << 8) | r;
+      }
+    }
+  }
+
   paintMotion(time) {
     const { width, height } = this.canvas;
     const { frequencies, parts } = this.field;
     const points = width * height;
-    const phaseFactors = frequencies.map((f) => {
-      const angle = (2 * Math.PI * f * time) / SLOW_DOWN;
-      return [Math.cos(angle), Math.sin(angle)];
+    const drawn = this.drawn.map((k) => {
+      const angle = (2 * Math.PI * frequencies[k] * time) / SLOW_DOWN;
+      return [k * points, Math.cos(angle), Math.sin(angle)];
     });
     for (let row = 0; row < height; row++) {
       const offset = (height - 1 - row) * width;
       for (let column = 0; column < width; column++) {
         let value = 0;
-        for (let k = 0; k < frequencies.length; k++) {
-          const at = 2 * (k * points + offset + column);
-          value += parts[at] * phaseFactors[k][0] - parts[at + 1] * phaseFactors[k][1];
+        for (const [start, cosine, sine] of drawn) {
+          const at = 2 * (start + offset + column);
+          value += parts[at] * cosine - parts[at + 1] * sine;
         }
         const index = Math.round(127.5 * (1 + value / this.scale));
         this.pixels[row * width + column] = RAMPS.motion[Math.max(0, Math.min(255, index))];
@@ -133,9 +191,11 @@ export class FieldView {
   drawScale() {
     const context = this.scaleCanvas.getContext("2d");
     const image = context.createImageData(256, 1);
-    new Uint32Array(image.data.buffer).set(this.inMotion ? RAMPS.motion : RAMPS.amplitude);
+    const name = this.inMotion ? "motion" : this.isOfContents ? "felt" : "amplitude";
+    new Uint32Array(image.data.buffer).set(RAMPS[name]);
     context.putImageData(image, 0, 0);
-    this.onScale(this.inMotion ? -this.scale : 0, this.scale);
+    if (name === "felt") this.onScale(0, `${BRIGHTEST_DB} dB above threshold`);
+    else this.onScale(this.inMotion ? -this.scale : 0, `${this.scale} m/s²`);
   }
 }
 

@@ -1,7 +1,10 @@
-// Fingers on the plate's picture: pointers of every kind, and one moved by the keyboard.
+// Fingers on the plate's picture: pointers of every kind, one moved by the keyboard, and those that rest
+// where a pointer was pressed with the shift key, until they are pressed so again or Escape lifts all.
 
 const STEP_M = 0.005;
-const KEYBOARD = -1;   // an id that no pointer has
+const KEYBOARD = -1;  // an id that no pointer has
+const RESTING = -2;  // the first of those that rest; the next ones are lower
+const NEAR_PX = 24;  // of a resting finger
 
 export class Fingers {
   // send(touches) is called with all fingers at every change.
@@ -24,6 +27,10 @@ export class Fingers {
     if (!this.overlay.rig || (event.pointerType === "mouse" && event.button !== 0)) return;
     event.preventDefault();
     plate.focus({ preventScroll: true });
+    if (event.shiftKey) {
+      this.rest(this.overlay.position(event));
+      return;
+    }
     plate.setPointerCapture(event.pointerId);
     this.put(event.pointerId, this.overlay.position(event));
   }
@@ -37,6 +44,16 @@ export class Fingers {
       this.isMoveScheduled = false;
       if (this.positions.size) this.report();
     });
+  }
+
+  // Lift the resting finger here, or let one rest here.
+  rest(position) {
+    const ids = [...this.positions.keys()].filter((id) => id <= RESTING);
+    const isNear = ({ x_m, y_m }) =>
+      Math.hypot(x_m - position.x_m, y_m - position.y_m) < NEAR_PX * this.overlay.px;
+    const there = ids.find((id) => isNear(this.positions.get(id)));
+    if (there !== undefined) this.lift(there);
+    else this.put(Math.min(RESTING + 1, ...ids) - 1, position);
   }
 
   put(id, position) {
@@ -59,6 +76,9 @@ export class Fingers {
     const step = steps[event.key];
     if (!rig || (!step && event.key !== "Enter" && event.key !== "Escape")) return;
     event.preventDefault();
+    if (event.key === "Escape") {
+      for (const id of [...this.positions.keys()]) if (id <= RESTING) this.lift(id);
+    }
     this.cursor ??= { x_m: rig.length_m / 2, y_m: rig.width_m / 2 };
     if (step) {
       const clamp = (value, max) => Math.min(max, Math.max(0, value));

@@ -1,5 +1,7 @@
 // Drawn over the plate: ERAs, regions, and fingers with their predicted sensations.
 
+import { colourOf } from "./field.js";
+
 const SVG = "http://www.w3.org/2000/svg";
 const FINGERTIP_M = 0.0065;  // radius
 const SMALL_PX = 480;  // below it labels are shorter
@@ -24,7 +26,7 @@ export class PlateOverlay {
     this.layers = ["regions", "eras", "contacts", "cursor"].map((name) => element("g", { id: `layer-${name}` }));
     svg.replaceChildren(...this.layers);
     this.contacts = [];
-    this.drive = {};
+    this.drives = new Map();  // by layer, by ERA
     new ResizeObserver(() => this.redraw()).observe(plate);
   }
 
@@ -37,10 +39,22 @@ export class PlateOverlay {
     this.redraw();
   }
 
-  show({ contacts, drive }) {
+  show({ contacts, layers }) {
     if (contacts) this.contacts = contacts;
-    if (drive) this.drive = drive;
+    if (layers) this.drives = new Map(Object.entries(layers).map(([layer, drive]) => [Number(layer), drive]));
     this.redraw();
+  }
+
+  // The frequencies of each layer [Hz].
+  get contents() {
+    return [...this.drives].map(([layer, drive]) =>
+      ({ layer, frequencies: [...new Set(Object.values(drive).map((tone) => tone.frequency_hz))] }));
+  }
+
+  // The layer of a contact's content; undefined where there is only one content or none of its own.
+  layerOf({ role, frequency_hz }) {
+    if (role !== "target" || this.drives.size < 2) return undefined;
+    return this.contents.find(({ frequencies }) => frequencies.includes(frequency_hz))?.layer;
   }
 
   showCursor(cursor) {
@@ -143,7 +157,8 @@ export class PlateOverlay {
 
   era(era) {
     const { name } = era;
-    const tone = this.drive[name];
+    const tones = [...this.drives.values()].flatMap((drive) => drive[name] ?? []);
+    const [tone] = tones;
     const side = ERA_PX * this.px;
     const [x, y] = this.eraCentre(era);
     const square = element("rect", {
@@ -152,8 +167,8 @@ export class PlateOverlay {
     const gap = 4 * this.px;
     this.occupied.push([x - side / 2 - gap, y - side / 2 - gap, x + side / 2 + gap, y + side / 2 + gap]);
     const parts = [name];
-    if (tone && !this.isSmall) parts.push(`${tone.frequency_hz.toFixed(0)} Hz`);
-    if (tone) parts.push(`${(100 * tone.level).toFixed(0)} %`);
+    if (tones.length === 1 && !this.isSmall) parts.push(`${tone.frequency_hz.toFixed(0)} Hz`);
+    if (tone) parts.push(`${(100 * tones.reduce((sum, { level }) => sum + level, 0)).toFixed(0)} %`);
     const below = y < this.rig.width_m / 2;
     return [square, this.label([x, below ? y + 2 * side : y - side], parts.join(" "))];
   }
@@ -168,13 +183,18 @@ export class PlateOverlay {
   }
 
   contact(contact) {
-    const { x_m, y_m, role, level_db_sl, held_back, verdict, robust_felt_contrast_db: promised } = contact;
+    const { role, level_db_sl, frequency_hz, held_back, verdict, robust_felt_contrast_db: promised } = contact;
     const ring = this.circle(contact, `contact ${role ?? ""}`, this.ringRadius);
     ring.setAttribute("data-role", role ?? "");
     const isKnown = (value) => value !== null && value !== undefined;
+    const layer = this.layerOf(contact);
+    const rings = layer === undefined ? [ring] : [this.circle(contact, "halo", this.ringRadius), ring];
+    if (layer !== undefined) ring.style.stroke = colourOf(layer);
     const above = isKnown(level_db_sl) ? `${fixed(level_db_sl)} dB SL` : role === "quiet" ? "quiet" : "";
-    const below = held_back ? verdict ?? "held back" : role === "target" && isKnown(promised) ? `≥ ${fixed(promised)} dB over others` : "";
-    return [ring, this.besideRing(contact, above, 0), this.besideRing(contact, below, 1)];
+    let below = role === "target" && isKnown(promised) ? `≥ ${fixed(promised)} dB over others` : "";
+    if (layer !== undefined) below = `${fixed(frequency_hz)} Hz, ${verdict}${isKnown(promised) ? `, ≥ ${fixed(promised)} dB` : ""}`;
+    if (held_back) below = verdict ?? "held back";
+    return [...rings, this.besideRing(contact, above, 0), this.besideRing(contact, below, 1)];
   }
 
   // A text above (0) or below (1) a finger, or if occupied on the other side, left or right.

@@ -296,7 +296,8 @@ def test_websocket_receives_the_field_of_the_drive(
             "pattern",
             PatternEvent(
                 contacts=[],
-                drive={"SW": PlayedTone(frequency_hz=5.0, level=0.5, phase_deg=0.0)},
+                drive={},
+                layers={"2": {"SW": PlayedTone(frequency_hz=10.0, level=0.5, phase_deg=0.0)}},
                 predicted_contrast_db=None,
                 predicted_level_db_sl=None,
                 latency_ms=1.0,
@@ -307,11 +308,12 @@ def test_websocket_receives_the_field_of_the_drive(
             if opcode == 2 and struct.unpack_from("<H", payload, 4) == (1,):
                 break
     columns, rows, count, zero = struct.unpack_from("<4H", payload)
-    scale, frequency = struct.unpack_from("<2f", payload, 8)
-    assert (count, zero, frequency) == (1, 0, 5.0)
+    scale, frequency, threshold, layer = struct.unpack_from("<3fH", payload, 8)
+    assert (count, zero, frequency, layer) == (1, 0, 10.0, 2)
+    assert threshold == pytest.approx(0.0788)  # by the set's file
     assert columns > rows > 2
-    parts = struct.unpack_from(f"<{2 * rows * columns}h", payload, 16)
-    assert len(payload) == 16 + 4 * rows * columns
+    parts = struct.unpack_from(f"<{2 * rows * columns}h", payload, 22)
+    assert len(payload) == 22 + 4 * rows * columns
     assert max(map(abs, parts)) == 32767
     strength = [abs(complex(*parts[at : at + 2])) for at in range(0, len(parts), 2)]
     assert scale > 0

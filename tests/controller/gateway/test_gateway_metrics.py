@@ -114,7 +114,9 @@ TONE = PlayedTone(frequency_hz=110.0, level=0.5, phase_deg=0.0)
 class UnknownPattern(Message):
     """A pattern of an incompatible daemon."""
 
-    drive: dict[str, dict[str, str]] = {"SW": {"tone": "110 Hz"}}  # noqa: RUF012  pydantic copies it
+    layers: dict[str, dict[str, dict[str, str]]] = {  # noqa: RUF012  pydantic copies it
+        "0": {"SW": {"tone": "110 Hz"}}
+    }
 
 
 async def test_field_is_drawn_after_what_cannot_be_drawn(
@@ -124,6 +126,7 @@ async def test_field_is_drawn_after_what_cannot_be_drawn(
     pattern = PatternEvent(
         contacts=[],
         drive={"SW": TONE},
+        layers={"0": {"SW": TONE}},
         predicted_contrast_db=None,
         predicted_level_db_sl=None,
         latency_ms=1.0,

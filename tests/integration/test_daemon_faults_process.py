@@ -53,12 +53,11 @@ async def held(
     more: str = "",
     *,
     program: Sequence[str] = patient_daemon.PROGRAM,
-    environment: dict[str, str] | None = None,
 ) -> AsyncIterator["Held"]:
     """A daemon that plays for a finger, and a journal of its amplifier's requests."""
     async with (
         far_end(folder) as far,
-        daemon_process(folder, far, more, program=program, environment=environment) as daemon,
+        daemon_process(folder, far, more, program=program) as daemon,
     ):
         journal = Journal(far)
         async with await daemon.client() as era, holding(era):
@@ -275,46 +274,6 @@ async def test_daemon_plays_on_and_stops_without_descriptors(tmp_path: Path) -> 
         await test.plays_on("descriptors again")
         async with await test.daemon.client() as other:
             await other.stop()
-
-
-@pytest.mark.long
-async def test_daemon_combines_reloads_when_many_are_requested(tmp_path: Path) -> None:
-    """During 20 SIGHUPs it plays on and leaks no descriptor; the last change is applied."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        manager.bind(str(tmp_path / "notify"))
-        environment = {"NOTIFY_SOCKET": str(tmp_path / "notify")}
-        notices: list[bytes] = []
-
-        def receive() -> None:
-            notice = manager.recv(4096)
-            if notice.startswith((b"READY", b"RELOADING")):
-                notices.append(notice)
-
-        asyncio.get_running_loop().add_reader(manager, receive)
-        async with held(tmp_path, environment=environment) as test:
-            before = len(descriptors(test.pid))
-
-            async def hang_up() -> None:
-                for number in range(20):
-                    if number == 19:
-                        with (tmp_path / "daemon.yaml").open("a", encoding="utf-8") as file:
-                            file.write("level_db_sl: 10\n")
-                    os.kill(test.pid, signal.SIGHUP)
-                    await asyncio.sleep(0.001)
-
-            hanging_up = asyncio.create_task(hang_up())
-            await test.plays_on("20 SIGHUPs")
-            await hanging_up
-            await until(lambda: len(descriptors(test.pid)) <= before)
-            quiet = False
-            while not quiet:  # the last reload has ended
-                count = len(notices)
-                await asyncio.sleep(0.5)
-                quiet = count == len(notices) and notices[-1].startswith(b"READY")
-            effects = (await test.era.effects()).effects
-            assert {each.parameters["level"] for each in effects} == {10}
-        asyncio.get_running_loop().remove_reader(manager)
-    assert 1 <= sum(b"RELOADING=1" in each for each in notices) <= 10
 
 
 @pytest.mark.parametrize(

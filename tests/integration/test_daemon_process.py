@@ -11,15 +11,13 @@ from pathlib import Path
 import pytest
 
 from controller.api.async_client import AsyncClient
-from controller.cli.main import run
-from daemon_bench import PATIENCE, daemon_table, far_end, until, until_state, write_daemon
+from daemon_bench import PATIENCE, far_end, until, until_state
 from daemon_process import (
     ERA,
     daemon_process,
     playing,
     run_era,
 )
-from model.table.file import save_table
 from patient_daemon import PROGRAM
 
 pytestmark = pytest.mark.real_time
@@ -173,22 +171,3 @@ async def _serves(port: int) -> bool:
         return False
     writer.close()
     return True
-
-
-async def test_check_reads_files_without_amplifier(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Exit status 0, or 2 with the invalid file."""
-
-    async def check(path: Path) -> int:
-        # In a thread, for the command has an event loop of its own.
-        return await asyncio.to_thread(run, ["daemon", str(path), "--check"])
-
-    async with far_end(tmp_path) as far:
-        save_table(daemon_table(), tmp_path / "table.npz")
-        path = write_daemon(tmp_path, {"main": far.url}, "table: table.npz\n")
-        assert (await check(path), far.summary().token) == (0, 0)
-        assert str(path) in capsys.readouterr().out
-        (tmp_path / "table.npz").write_bytes(b"no table")
-        assert await check(path) == 2
-        assert "table.npz" in capsys.readouterr().err

@@ -16,7 +16,6 @@ from benchmarks.plate.measure import Measured
 from benchmarks.plate.problem import DAMPING, PAPER, STIFFNESS, STROKE, accelerations
 from benchmarks.plate.programs import Setting, installed_peers, settings
 from benchmarks.plate.report import best
-from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import LatencySummary
 from drivers.codec.serial_line.frame import pack_words
 from drivers.protocol.sets import Command as ToneOnWire
@@ -56,20 +55,6 @@ def test_attempt_repeats_a_disturbed_case_once() -> None:
     failed = attempt(case, measuring(Disturbed("FAULT"), Ended("the panel")))
     assert isinstance(failed, Failed)
     assert [why.partition(" (load average")[0] for why in failed.why] == ["FAULT", "the panel"]
-
-
-def test_report_names_first_cause_only() -> None:
-    """An error while disarming after a lost amplifier does not replace the first."""
-
-    def measured() -> Found:
-        try:
-            raise Disturbed("COMM_LOST")
-        finally:
-            raise RpcError(ErrorCode.LINK, "the link is lost")
-
-    failed = attempt(CASES[0], measured)
-    assert isinstance(failed, Failed)
-    assert all(why.startswith("COMM_LOST (load average") for why in failed.why)
 
 
 def test_report_compares_each_quantile_with_its_target() -> None:

@@ -11,7 +11,6 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from controller.cli.demo import app
-from controller.daemon.socket_lock import SocketLock
 from memory_machine import live_in_memory
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
@@ -112,17 +111,3 @@ def test_bad_input_is_refused_before_anything_plays(tmp_path: Path, identify: Id
         with pytest.raises(InputError, match=words):
             identify(file, *options)
     assert not Path(new).exists()
-
-
-def test_daemon_that_runs_keeps_its_amplifiers(tmp_path: Path, identify: Identify) -> None:
-    """A daemon's file names the rig; refused with its process while that holds the socket."""
-    write_rig(tmp_path / "rig.yaml", mesh="auto")
-    daemon, new = tmp_path / "daemon.yaml", tmp_path / "rig2.yaml"
-    daemon.write_text("rig: rig.yaml\nsocket: d.sock\n")
-    lock = SocketLock(tmp_path / "d.sock")
-    try:
-        with pytest.raises(InputError, match="daemon is running"):
-            identify(daemon, "--url", PORT, "-o", str(new), "--yes")
-    finally:
-        lock.release()
-    assert not new.exists()

@@ -9,15 +9,12 @@ import numpy as np
 import pytest
 
 from drivers import clock
-from drivers.errors import CommandRefused
 from drivers.host.amplifier import Amplifier
-from drivers.host.sensors import Reading, finish_reading, measure_tones, read_sensors, start_reading
-from drivers.protocol.table import FEATURES
+from drivers.host.sensors import Reading, measure_tones, read_sensors
 from long_form import shortly
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from model.vibration.natural_modes import direct_responder
-from sim.amplifier.contract import Amplifier as SimulatedAmplifier
 from sim.plant.accelerometer import Accelerometer
 from sim.sensors.recorder import Accelerometers
 from virtual_loop import in_virtual_time
@@ -94,20 +91,6 @@ async def test_tones_are_those_of_a_direct_solution(wire: str, coarse_rig: Rig) 
         assert abs(np.angle(seen / expected, deg=True)[large]).max() < 1.0
 
 
-@in_virtual_time
-async def test_phases_count_from_the_commit(coarse_rig: Rig) -> None:
-    """The phase of a later window is the same."""
-    async with on_wire("serial", coarse_rig) as hosted:
-        await settled(hosted, PLAYED[0])
-        found = []
-        for _ in range(3):
-            reading = await measured(hosted, [PLAYED[0][1]], 0.1)
-            found.append(phasor(reading.sensors[1].tones[0]))
-            await asyncio.sleep(0.0137)
-    first, *others = found
-    assert all(abs(other / first - 1) < 0.01 for other in others)
-
-
 @EVERY_WIRE
 @in_virtual_time
 async def test_sensors_are_described_and_many_tones_read(wire: str, coarse_rig: Rig) -> None:
@@ -130,34 +113,3 @@ async def test_sensors_are_described_and_many_tones_read(wire: str, coarse_rig: 
     amplitude = reading.sensors[0].tones[2][0]
     others = [size for one in reading.sensors[:4] for size, _ in one.tones]
     assert max(size for n, size in enumerate(others) if n % 16 != 2) < 0.01 * amplitude
-
-
-@EVERY_WIRE
-@in_virtual_time
-async def test_measuring_is_refused_without_sensors(wire: str, coarse_rig: Rig) -> None:
-    """The feature says so before; a host that asks all the same is refused."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SimulatedAmplifier, "attach", lambda amplifier, sensing: None)
-        async with on_wire(wire, coarse_rig) as hosted:
-            host = host_of(hosted)
-            assert not host.capabilities["features"] >> FEATURES["sensors"] & 1
-            assert await read_sensors(host) == ()
-            with pytest.raises(CommandRefused):
-                await measure_tones(host, [110.0], 0.1)
-
-
-@pytest.mark.parametrize("is_restarted", [False, True])
-@in_virtual_time
-async def test_reading_of_another_is_not_taken_for_its_own(
-    is_restarted: bool, coarse_rig: Rig
-) -> None:
-    """That of another host, or none after a loss of supply."""
-    async with on_wire("serial", coarse_rig) as hosted:
-        host = host_of(hosted)
-        started = await start_reading(host, [110.0], 0.05)
-        if is_restarted:
-            hosted.devices["main"].restart(clock.now())
-        else:
-            await start_reading(host, [90.0], 0.05)
-        with pytest.raises(CommandRefused, match="replaced"):
-            await finish_reading(host, started)

@@ -147,19 +147,6 @@ async def test_client_that_closed_its_side_gets_pending_responses() -> None:
     assert (client.is_open, served.names) == (False, ["stop"])
 
 
-async def test_flood_leaves_the_event_loop_to_others() -> None:
-    """A turn serves little of 5000 lines: others run many times meanwhile."""
-    served = ServedApi()
-    client, _ = served.client()
-    client.data_received(request("touch", '{"source":"a","touches":[]}') * 5_000)
-    client.data_received(request("renew", '{"lease":"a"}'))
-    iterations = 0
-    while "renew" not in served.names:
-        await asyncio.sleep(0)
-        iterations += 1
-    assert iterations > 50
-
-
 def touch(source: str, *ids: int, x: float = 0.1, id: int | None = None) -> bytes:
     """A touch frame with these fingers."""
     touches = ",".join(f'{{"id":{each},"x_m":{x},"y_m":0.1}}' for each in ids)

@@ -2,7 +2,6 @@
 
 import asyncio
 import os
-import re
 import socket
 import subprocess
 import sys
@@ -13,15 +12,13 @@ import pytest
 from typer.testing import CliRunner
 
 from controller.api.client_protocol import Notification
-from controller.api.jsonrpc import RpcError
-from controller.cli.daemon import app, show_event, show_status, status, touch
+from controller.cli.daemon import app, show_event, touch
 from controller.cli.main import run
 from controller.daemon.run import run_daemon
-from daemon_bench import ready_daemon, until_state, write_daemon
+from daemon_bench import ready_daemon, write_daemon
 from drivers.errors import CommandError
 from gateway_bench import UNCONFIRMED, ScriptedDaemon
 from model.errors import InputError
-from sim.faults.fault_window import FaultWindow
 
 
 def test_event_is_shown_by_wall_clock_without_unknown_values() -> None:
@@ -51,29 +48,6 @@ async def test_touch_command_refuses_places_off_the_plate(tmp_path: Path) -> Non
         await asyncio.to_thread(put, "0.3048,0")
         with pytest.raises(InputError, match="X,Y"):
             put("a")
-
-
-async def test_status_of_lost_amplifier(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Age of the last reply and watchdog time, but no old state; exit status 0 in any state."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        assert "unreachable" not in show_status(await era.status())
-        bench.far.device.inject_fault(FaultWindow("hang"))
-        await until_state(era, "COMM_LOST")
-        lost = await era.status()
-        await asyncio.to_thread(status, socket=bench.socket)  # another status is an exception
-        with pytest.raises(RpcError):  # latches: without it the link would come back to no fault
-            await era.stop()
-        bench.far.device.recover()
-        await until_state(era, "FAULT")
-        await asyncio.to_thread(status, socket=bench.socket)
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.partition(":")[0] for line in lines if line[0] != " "] == ["lost", "fault"]
-    (line,) = [line for line in show_status(lost).splitlines() if "serial://" in line]
-    assert re.search(r"\): LOST, last reply [\d.]+ s ago$", line)
-    for assume_energised, shown in ((True, "ASSUME ENERGISED"), (False, "unreachable for 12.0 s")):
-        update = {"lost_for_s": 12.0, "assume_energised": assume_energised}
-        (line,) = re.findall(f"{shown}.*", show_status(lost.model_copy(update=update)))
-        assert " 2 s" in line  # of the bench
 
 
 @pytest.mark.parametrize(

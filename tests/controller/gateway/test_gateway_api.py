@@ -16,7 +16,6 @@ from controller.api.methods import METHODS, RequestedBy
 from controller.api.schema import PlayedTone
 from controller.api.topics import LogEvent, PatternEvent
 from gateway_bench import (
-    ARM,
     TOKEN,
     UNCONFIRMED,
     GatewayProcess,
@@ -340,20 +339,6 @@ def test_websocket_is_a_client_of_its_own(gateway: GatewayProcess, daemon: Scrip
         assert staying.is_open
         other.call("effects", {}, id=2)
         assert other.response(2)["result"]
-
-
-def test_websocket_request_without_id_gets_no_response(
-    gateway: GatewayProcess, daemon: ScriptedDaemon
-) -> None:
-    """Not even an error; nor does such a request arm anything."""
-    with RawWebSocket(gateway) as ws:
-        ws.send(b'{"jsonrpc": "2.0", "method": "stop"}')
-        ws.send(b'{"jsonrpc": "2.0", "method": "arm", "params": ' + ARM + b"}")
-        ws.send(b'{"jsonrpc": "2.0", "method": "arm", "params": {}}')
-        ws.call("effects", {}, id=5)
-        opcode, payload = ws.next()
-        assert (opcode, json.loads(payload)["id"]) == (1, 5)
-    assert sorted(daemon.methods) == ["effects", "stop"]
 
 
 def test_websocket_message_in_two_fragments_is_one(gateway: GatewayProcess) -> None:

@@ -4,7 +4,6 @@ An attack is a request to arm that would be granted but for one thing, or an inv
 gateway is a process connected to a daemon that records its calls.
 """
 
-import json
 from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias
 
@@ -287,39 +286,6 @@ def test_websocket_closes_after_an_invalid_frame(gateway: GatewayProcess, name: 
     with RawWebSocket(gateway) as ws:
         misuse(ws)
         assert ws.close_code() == code
-
-
-@pytest.mark.parametrize(
-    ("text", "code"),
-    [
-        (b"arm", -32700),
-        (b'[{"jsonrpc": "2.0", "id": 1, "method": "stop"}]', -32600),
-        (b'{"jsonrpc": "2.0", "id": 1, "method": "\\u001b[2J"}', -32601),
-        (
-            b'{"jsonrpc": "2.0", "id": 1, "method": "arm", '
-            b'"params": {"owner": "me", "lease_s": 5, "level_max": 9}}',
-            -32602,
-        ),
-        (
-            b'{"jsonrpc": "2.0", "id": 1, "method": "subscribe", '
-            b'"params": {"topics": ["__proto__"]}}',
-            -32602,
-        ),
-    ],
-)
-def test_websocket_continues_after_an_invalid_request(
-    gateway: GatewayProcess, text: bytes, code: int
-) -> None:
-    """The error has its code and no control characters, and the next request is served."""
-    with RawWebSocket(gateway) as ws:
-        ws.send(text)
-        opcode, payload = ws.next()
-        assert opcode == 1
-        error = json.loads(payload)["error"]
-        assert error["code"] == code
-        assert error["message"].isprintable()
-        ws.call("no_such", {}, id=2)
-        assert ws.response(2)["error"]
 
 
 def test_websocket_has_no_compression(gateway: GatewayProcess) -> None:

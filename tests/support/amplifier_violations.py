@@ -8,18 +8,66 @@ from typing import Any
 import hand_written as hand
 from hand_written_talk import HALF, Broken, Talk, breaking
 
-BROKEN: Broken = {}
+BROKEN: Broken = {
+    "state_that_is_none": ("garbage", lambda: Talk().armed().says(9)),
+    "set_accepted_before_arm": ("enabled", lambda: Talk().identified().staged(5, hand.layer(0))),
+    "refused_though_staged": (
+        "commit",
+        lambda: Talk().armed().staged(5, hand.layer(0)).refused(hand.COMMIT, (9, 5), 6),
+    ),
+    "another_session_feeds": (
+        "session",
+        lambda: Talk().armed().exchange(hand.PING, (8,), hand.status()),
+    ),
+    "reports_another_set": ("token", lambda: Talk().armed().playing().says(**HALF | {"token": 4})),
+    "reports_another_set_of_a_layer": (
+        "token",
+        lambda: Talk().armed().playing().says(**HALF | {"tokens": (0, 5, 0, 0)}),
+    ),
+    "stop_refused": ("stop", lambda: Talk().armed().refused(hand.STOP, (5,), 7)),
+    "arms_itself": ("armed", lambda: Talk().identified().rest(0.1).says(kind=hand.GET_STATUS)),
+    "reply_of_another_set": (
+        "credit",
+        lambda: Talk().armed().exchange(hand.SET, hand.part(5, hand.layer(0)), hand.taken(4)),
+    ),
+    "no_watchdog": (
+        "watchdog",
+        lambda: Talk().armed().rest(0.3).says(kind=hand.GET_STATUS, left=0),
+    ),
+    "watchdog_left_of_before": (
+        "watchdog",
+        lambda: Talk().armed().rest(0.05).says(kind=hand.GET_STATUS, left=250),
+    ),
+    "stop_without_a_latch": (
+        "latched",
+        lambda: Talk().armed().exchange(hand.STOP, (5,), hand.status(hand.STOPPED)),
+    ),
+    "latch_that_changes_by_itself": ("latched", lambda: Talk().armed().says(latch=1)),
+    "switched_on_by_itself": ("state", lambda: Talk().armed().says(hand.SWITCHED_ON)),
+    "fault_without_a_cause": ("state", lambda: Talk().armed().says(hand.FAULT, latch=1)),
+    "address_set_while_armed": (
+        "state",
+        lambda: Talk().armed().exchange(hand.SET_ADDRESS, (2, 1, 0x3700), hand.status()),
+    ),
+    "another_level": (
+        "plays",
+        lambda: Talk().armed().playing().says(**HALF | {"levels": (4000, 0)}),
+    ),
+    "limited_below_full_level": (
+        "plays",
+        lambda: Talk().armed().playing().says(**HALF, limited=True),
+    ),
+    "other_capabilities": (
+        "constant",
+        lambda: Talk().armed().exchange(hand.GET_CAPS, (), hand.capabilities(layers=5)),
+    ),
+    "high_voltage_in_a_fault": (
+        "high_voltage",
+        lambda: Talk().armed().says(hand.FAULT, fault=hand.ARC, latch=1, high_voltage=True),
+    ),
+}
+"""Conversations by what is wrong, each with the rule that it breaks; more are below."""
 breaks = breaking(BROKEN)
-
-
-@breaks("garbage")
-def _state_that_is_none() -> Talk:
-    return Talk().armed().says(9)
-
-
-@breaks("enabled")
-def _set_accepted_before_arm() -> Talk:
-    return Talk().identified().staged(5, hand.layer(0))
 
 
 @breaks("commit")
@@ -42,11 +90,6 @@ def _whole_and_not_staged() -> Talk:
 
 
 @breaks("commit")
-def _refused_though_staged() -> Talk:
-    return Talk().armed().staged(5, hand.layer(0)).refused(hand.COMMIT, (9, 5), 6)
-
-
-@breaks("commit")
 def _broadcast_commit_ignored() -> Talk:
     talk = Talk().armed().staged(5, hand.layer(0, hand.tone(0, 100, 0.5)))
     talk.sends(hand.COMMIT, (9, 5), address=0)
@@ -58,21 +101,6 @@ def _plays_as_before() -> Talk:
     talk = Talk().armed().playing().staged(6, hand.layer(0, hand.tone(0, 100, 0.3)))
     talk.committed(6, levels=(5000, 0), tokens=(6, 0, 0, 0)).rest(0.03)
     return talk.says(**HALF | {"token": 6, "tokens": (6, 0, 0, 0)})
-
-
-@breaks("session")
-def _another_session_feeds() -> Talk:
-    return Talk().armed().exchange(hand.PING, (8,), hand.status())
-
-
-@breaks("token")
-def _reports_another_set() -> Talk:
-    return Talk().armed().playing().says(**HALF | {"token": 4})
-
-
-@breaks("token")
-def _reports_another_set_of_a_layer() -> Talk:
-    return Talk().armed().playing().says(**HALF | {"tokens": (0, 5, 0, 0)})
 
 
 @breaks("token")
@@ -91,20 +119,10 @@ def _commit_of_a_set_of_long_ago() -> Talk:
 
 
 @breaks("stop")
-def _stop_refused() -> Talk:
-    return Talk().armed().refused(hand.STOP, (5,), 7)
-
-
-@breaks("stop")
 def _broadcast_stop_ignored() -> Talk:
     talk = Talk().armed()
     talk.sends(hand.STOP, (5,), address=0)
     return talk.says(kind=hand.GET_STATUS)
-
-
-@breaks("armed")
-def _arms_itself() -> Talk:
-    return Talk().identified().rest(0.1).says(kind=hand.GET_STATUS)
 
 
 @breaks("credit")
@@ -112,11 +130,6 @@ def _reply_twice() -> Talk:
     talk = Talk().armed().says()
     talk.replies(hand.PING, hand.status())
     return talk
-
-
-@breaks("credit")
-def _reply_of_another_set() -> Talk:
-    return Talk().armed().exchange(hand.SET, hand.part(5, hand.layer(0)), hand.taken(4))
 
 
 @breaks("answer")
@@ -130,26 +143,6 @@ def _no_reply() -> Talk:
 def _watchdog_too_early() -> Talk:
     talk = Talk().armed().rest(0.2)
     return talk.says(hand.FAULT, kind=hand.GET_STATUS, fault=hand.WATCHDOG, latch=1)
-
-
-@breaks("watchdog")
-def _no_watchdog() -> Talk:
-    return Talk().armed().rest(0.3).says(kind=hand.GET_STATUS, left=0)
-
-
-@breaks("watchdog")
-def _watchdog_left_of_before() -> Talk:
-    return Talk().armed().rest(0.05).says(kind=hand.GET_STATUS, left=250)
-
-
-@breaks("latched")
-def _stop_without_a_latch() -> Talk:
-    return Talk().armed().exchange(hand.STOP, (5,), hand.status(hand.STOPPED))
-
-
-@breaks("latched")
-def _latch_that_changes_by_itself() -> Talk:
-    return Talk().armed().says(latch=1)
 
 
 @breaks("latched")
@@ -170,30 +163,10 @@ def _armed_in_a_fault() -> Talk:
     return talk.exchange(hand.ARM, (8, 250), hand.status(latch=1))
 
 
-@breaks("state")
-def _switched_on_by_itself() -> Talk:
-    return Talk().armed().says(hand.SWITCHED_ON)
-
-
-@breaks("state")
-def _fault_without_a_cause() -> Talk:
-    return Talk().armed().says(hand.FAULT, latch=1)
-
-
-@breaks("state")
-def _address_set_while_armed() -> Talk:
-    return Talk().armed().exchange(hand.SET_ADDRESS, (2, 1, 0x3700), hand.status())
-
-
 @breaks("ramp")
 def _without_a_ramp() -> Talk:
     talk = Talk().armed().staged(5, hand.layer(0, hand.tone(0, 100, 0.5), ramp=100))
     return talk.committed(5, levels=(5000, 0), tokens=(5, 0, 0, 0))
-
-
-@breaks("plays")
-def _another_level() -> Talk:
-    return Talk().armed().playing().says(**HALF | {"levels": (4000, 0)})
 
 
 @breaks("plays")
@@ -215,11 +188,6 @@ def _not_exact_without_a_reason() -> Talk:
 
 
 @breaks("plays")
-def _limited_below_full_level() -> Talk:
-    return Talk().armed().playing().says(**HALF, limited=True)
-
-
-@breaks("plays")
 def _not_limited_above_full_level() -> Talk:
     talk = Talk(level=1.5).armed().playing(level=0.7)
     talk.staged(6, hand.layer(1, hand.tone(0, 150, 0.7)))
@@ -235,11 +203,6 @@ def _plays_on_after_silence() -> Talk:
     return talk.exchange(hand.SILENCE, (9, 10), hand.status(**silent)).rest(0.02).says(**silent)
 
 
-@breaks("constant")
-def _other_capabilities() -> Talk:
-    return Talk().armed().exchange(hand.GET_CAPS, (), hand.capabilities(layers=5))
-
-
 @breaks("faults")
 def _fault_not_listed() -> Talk:
     talk = Talk().armed().says(hand.FAULT, fault=hand.ARC, latch=1)
@@ -250,11 +213,6 @@ def _fault_not_listed() -> Talk:
 def _fault_five_seconds_old() -> Talk:
     talk = Talk().armed().says(hand.FAULT, fault=hand.ARC, latch=1)
     return talk.exchange(hand.GET_FAULTS, (), (1, hand.ARC, 255, 0, 5000))
-
-
-@breaks("high_voltage")
-def _high_voltage_in_a_fault() -> Talk:
-    return Talk().armed().says(hand.FAULT, fault=hand.ARC, latch=1, high_voltage=True)
 
 
 @breaks("damage")

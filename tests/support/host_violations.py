@@ -8,28 +8,40 @@ from typing import Any
 import hand_written as hand
 from hand_written_talk import HALF, Broken, Talk, breaking
 
-BROKEN: Broken = {}
+BROKEN: Broken = {
+    "set_of_520_hz": (
+        "limits",
+        lambda: Talk().armed().staged(5, hand.layer(0, hand.tone(0, 520, 0.5))),
+    ),
+    "set_above_the_level": (
+        "limits",
+        lambda: Talk().armed().staged(5, hand.layer(0, hand.tone(0, 100, 0.81))),
+    ),
+    "set_for_an_unknown_channel": (
+        "limits",
+        lambda: Talk().armed().staged(5, hand.layer(0, hand.tone(2, 100, 0.5))),
+    ),
+    "set_for_an_unknown_layer": (
+        "limits",
+        lambda: Talk().armed().staged(5, hand.layer(4, hand.tone(0, 100, 0.5))),
+    ),
+    "rise_too_steep": ("limits", lambda: Talk(slew_per_s=40).armed().playing()),  # 0.5 within 10 ms
+    "message_of_an_unknown_type": ("garbage", lambda: Talk().armed().refused(27, (), 1)),
+    "set_with_half_a_command": (
+        "garbage",
+        lambda: Talk().armed().refused(hand.SET, hand.part(5, hand.layer(0, [0, 2000])), 2),
+    ),
+    "set_of_another_session": (
+        "session",
+        lambda: Talk().armed().refused(hand.SET, hand.part(5, hand.layer(0), session=8), 10),
+    ),
+    "older_set_sent": (
+        "token",
+        lambda: Talk().armed().playing().refused(hand.SET, hand.part(4, hand.layer(0)), 6),
+    ),
+}
+"""Conversations by what is wrong, each with the rule that it breaks; more are below."""
 breaks = breaking(BROKEN)
-
-
-@breaks("limits")
-def _set_of_520_hz() -> Talk:
-    return Talk().armed().staged(5, hand.layer(0, hand.tone(0, 520, 0.5)))
-
-
-@breaks("limits")
-def _set_above_the_level() -> Talk:
-    return Talk().armed().staged(5, hand.layer(0, hand.tone(0, 100, 0.81)))
-
-
-@breaks("limits")
-def _set_for_an_unknown_channel() -> Talk:
-    return Talk().armed().staged(5, hand.layer(0, hand.tone(2, 100, 0.5)))
-
-
-@breaks("limits")
-def _set_for_an_unknown_layer() -> Talk:
-    return Talk().armed().staged(5, hand.layer(4, hand.tone(0, 100, 0.5)))
 
 
 @breaks("limits")
@@ -52,27 +64,12 @@ def _channels_above_the_power_together() -> Talk:
     return talk.committed(5, tokens=(5, 0, 0, 0))
 
 
-@breaks("limits")
-def _rise_too_steep() -> Talk:
-    return Talk(slew_per_s=40).armed().playing()  # 0.5 within 10 ms
-
-
 @breaks("garbage")
 def _wrong_checksum() -> Talk:
     talk = Talk().armed()
     data = hand.frame(hand.GET_STATUS, sequence=77)
     talk.host_bytes(data[:-2] + bytes([data[-2] ^ 1]) + data[-1:])
     return talk
-
-
-@breaks("garbage")
-def _message_of_an_unknown_type() -> Talk:
-    return Talk().armed().refused(27, (), 1)
-
-
-@breaks("garbage")
-def _set_with_half_a_command() -> Talk:
-    return Talk().armed().refused(hand.SET, hand.part(5, hand.layer(0, [0, 2000])), 2)
 
 
 @breaks("enabled")
@@ -127,16 +124,6 @@ def _committed_on_one_of_two() -> Talk:
     for address in (1, 2):
         talk.staged(5, hand.layer(0, hand.tone(0, 100, 0.5)), address=address)
     return talk.committed(5, tokens=(5, 0, 0, 0)).rest(0.03)
-
-
-@breaks("session")
-def _set_of_another_session() -> Talk:
-    return Talk().armed().refused(hand.SET, hand.part(5, hand.layer(0), session=8), 10)
-
-
-@breaks("token")
-def _older_set_sent() -> Talk:
-    return Talk().armed().playing().refused(hand.SET, hand.part(4, hand.layer(0)), 6)
 
 
 @breaks("token")

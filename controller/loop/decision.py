@@ -123,6 +123,7 @@ class Decider:
         self._layer_of: Mapping[tuple[ContactKey, int], int] = {}
         self._may_play: frozenset[int] = frozenset()  # layers, since all were silent
         self._is_silent = False  # for certain
+        self._over: tuple[Content, ...] = ()  # ended by themselves
         self._retry_at: float | None = None
         self._triggered_at: float | None = None
         self._played_until = -math.inf  # s; as far as known
@@ -205,7 +206,7 @@ class Decider:
     def forget(self) -> None:
         """Discard the known playback: the next decision has a set; fingers keep their layers."""
         self._selected, self._decided, self._retry_at = None, None, None
-        self._playing, self._is_silent = {}, False
+        self._playing, self._over, self._is_silent = {}, (), False
 
     def only_ends(self, decision: Decision) -> Decision:
         """Return the last decision without what it starts, which is decided again later."""
@@ -338,10 +339,13 @@ class Decider:
         if not over or self._decided is None:
             return None
         self._playing = {**self._playing, **over}
-        over_contents = [one.content for one in over.values()]
+        contents = tuple(one.content for one in over.values())
+        self._over = (*self._over, *contents)
+        if self._selected is not None:
+            self._selected = _held_back(self._selected, contents, ENDED)
         self._decided = replace(
             self._decided,
-            selection=_held_back(self._decided.selection, over_contents, ENDED),
+            selection=_held_back(self._decided.selection, contents, ENDED),
             sets={},
             started=frozenset(),
             refusal=ENDED,
@@ -389,9 +393,11 @@ class Decider:
         self._intent_due = None
         intent = self._intent_source.intent(contacts, now)
         self._intent_due = intent.due(now)
-        return self._selector.select(
+        selection = self._selector.select(
             contacts, intent, self._capabilities, triggered_at=triggered_at
         )
+        self._over = tuple(each for each in self._over if each in selection.contents)
+        return _held_back(selection, self._over, ENDED) if self._over else selection
 
     def _with_sets(self, draft: Decision, now: float) -> Decision | None:
         """Return a draft with the sets of all layers that change; None if none does."""
@@ -498,9 +504,11 @@ def _held_back(selection: Selection, contents: Sequence[Content], reason: str) -
     """Return a selection without some of its contents, whose targets feel nothing for a reason."""
     held_back = dict.fromkeys(contact for each in contents for contact, _ in each.targets)
     skipped = [not_served(contact, reason) for contact in held_back]
+    left = tuple(each for each in selection.contents if each not in contents)
     return replace(
         selection,
-        contents=tuple(each for each in selection.contents if each not in contents),
+        contents=left,
+        reason=selection.reason if left else reason,
         not_served=(*selection.not_served, *skipped),
     )
 

@@ -77,6 +77,8 @@ class Selector:
         self._table, self._levels, self._shape = table, levels, shape
         self._thread: AnswerThread[_Chosen] = AnswerThread(arrived)
         self._lasting = _NOTHING
+        self._before_pulses = _NOTHING  # what lasts, with that of fingers whose pulse plays instead
+        self._chosen_last = _NOTHING  # of what lasts, by the thread since it has been busy
         self._short: Mapping[ContactKey, Selection] = {}
         self._current = _NOTHING
         self.triggered_at = math.inf
@@ -90,6 +92,7 @@ class Selector:
         What the thread computes goes on by the former one, envelopes included.
         """
         self._table, self._levels, self._shape = table, levels, shape
+        self._before_pulses = _NOTHING
 
     @property
     def is_choosing(self) -> bool:
@@ -117,7 +120,7 @@ class Selector:
         self.triggered_at = math.inf
         self._protected = intent.protected
         self._adopt(lasting, contacts)
-        self._lasting = _remaining(self._lasting, lasting)
+        self._keep_for_pulses(lasting, short, contacts)
         pulses = self._short
         self._short = {
             contact.key: pulses[contact.key]
@@ -149,9 +152,8 @@ class Selector:
         if chosen.short:
             self.triggered_at = chosen.triggered_at
         if chosen.lasting is not None:
-            targets, quiet = chosen.lasting.targets, chosen.lasting.quiet
-            then = {each.key for each in (*(contact for contact, _ in targets), *quiet)}
-            is_for_all = {each.key for each in contacts} <= then
+            targets = chosen.lasting.targets
+            is_for_all = _is_for(chosen.lasting, contacts)
             # Levels and places may have changed since: else a finger that moves would get nothing.
             # What plays may do again, since a finger that came has lifted meanwhile.
             is_kept = self._fits(self._lasting, lasting, contacts)
@@ -162,6 +164,24 @@ class Selector:
                 and {each.key for each, _ in lasting} <= {each.key for each, _ in targets}
             ):
                 self._lasting, self.triggered_at = chosen.lasting, chosen.triggered_at
+
+    def _keep_for_pulses(
+        self, lasting: Targets, short: Targets, contacts: Sequence[Contact]
+    ) -> None:
+        """End what lasts of fingers that feel it no more; have it again after a pulse of them."""
+        pulsing = {contact.key for contact, _ in short}
+        before = self._before_pulses
+        if before.contents and {each.key for each, _ in before.targets} <= (
+            pulsing | {contact.key for contact, _ in lasting}
+        ):
+            is_part = all(content in before.contents for content in self._lasting.contents)
+            if is_part and self._fits(before, lasting, contacts):
+                self._lasting, self._before_pulses = before, _NOTHING
+        else:
+            self._before_pulses = _NOTHING
+            if any(contact.key in pulsing for contact, _ in self._lasting.targets):
+                self._before_pulses = self._lasting
+        self._lasting = _remaining(self._lasting, lasting)
 
     def _choose(
         self,
@@ -174,9 +194,11 @@ class Selector:
     ) -> None:
         """Choose for what lasts, None where it is kept, and for new short pulses.
 
-        Several in the thread, and what comes while it is busy, which has the table for itself.
-        pulses: before these.
+        Several in the thread, and what comes while it is busy, which has the table for itself:
+        pulses first, which would be late. pulses: before these.
         """
+        if self._thread.is_busy and short:
+            lasting = None
         if self._thread.is_busy and self._is_requested(lasting, short, contacts):
             return
         table, levels, shape = self._table, self._levels, self._shape
@@ -185,9 +207,10 @@ class Selector:
         def chosen() -> _Chosen:
             found = None
             if lasting is not None:
-                found = _lasting_of(
+                found = self._chosen_last = _lasting_of(
                     table, levels, shape, lasting, contacts, capabilities, before, protected
                 )
+            beside = self._chosen_last if _is_for(self._chosen_last, contacts) else before
             new = {
                 contact.key: _alone(
                     table,
@@ -198,12 +221,14 @@ class Selector:
                     capabilities,
                     pulses.get(contact.key),
                     protected,
-                    beside=found or before,
+                    beside=beside,
                 )
                 for contact, target in short
             }
             return _Chosen(found, new, triggered_at)
 
+        if not self._thread.is_busy:
+            self._chosen_last = _NOTHING
         takes_long = lasting is not None and not _is_quick(lasting, protected)
         if self._thread.is_busy or takes_long:
             self._requested = Selection(lasting or (), contacts, protected=protected), short
@@ -281,6 +306,12 @@ def _is_quick(lasting: Targets, protected: frozenset[ContactKey]) -> bool:
 
 def _intents(targets: Targets) -> set[Target]:
     return {target for _, target in targets}
+
+
+def _is_for(chosen: Selection, contacts: Sequence[Contact]) -> bool:
+    """Whether all contacts were there when it was chosen."""
+    then = {each.key for each in (*(contact for contact, _ in chosen.targets), *chosen.quiet)}
+    return {each.key for each in contacts} <= then
 
 
 def _is_whole(chosen: Selection) -> bool:

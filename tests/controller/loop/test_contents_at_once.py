@@ -12,6 +12,7 @@ from controller.daemon.api_views import PlateView
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
+from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.effects.shapes import Rectangle
 from controller.loop.capabilities import PlaybackCapabilities
@@ -219,24 +220,83 @@ async def test_a_ramp_replaces_an_ending_that_is_refused(monkeypatch: pytest.Mon
 async def test_the_end_of_one_layer_by_itself_is_said_while_the_other_plays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One is not renewed, and ends after 2 s; the other goes on, and nothing was sent for that."""
+    """One is not renewed, and ends after 2 s; the others go on, and nothing was sent for that.
+
+    Nor does it count as felt once one of the others lifts.
+    """
     renewal = Decider.renewal
     async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
+        fingers.at = {1: LEFT, 2: RIGHT, 3: ABOVE}
         await fingers.hold(0.5)
-        (other,) = (n for n, one in fingers.applied[-1].contents.items() if _id(one) == 2)
+        layers = {_id(one): n for n, one in fingers.applied[-1].contents.items()}
 
-        def one_only(decider: Decider, now: float) -> dict[int, PlateSet]:
-            return {n: each for n, each in renewal(decider, now).items() if n == other}
+        def not_one(decider: Decider, now: float) -> dict[int, PlateSet]:
+            return {n: each for n, each in renewal(decider, now).items() if n != layers[1]}
 
-        monkeypatch.setattr(Decider, "renewal", one_only)
+        monkeypatch.setattr(Decider, "renewal", not_one)
+        count = len(fingers.applied)
         await fingers.hold(2.5)
-        assert len(fingers.applied) == 2
-        applied = fingers.applied[-1]
-        assert [*applied.contents] == [other]
+        (applied,) = fingers.applied[count:]
+        assert {*applied.contents} == {layers[2], layers[3]}
         assert applied.latency is None
         felt = {each.contact.key.id: each.held_back for each in applied.targets}
+        assert felt == {1: ENDED, 2: None, 3: None}
+        del fingers.at[3]
+        await fingers.hold(0.2)
+        assert [*fingers.applied[-1].contents] == [layers[2]]
+        felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
         assert felt == {1: ENDED, 2: None}
+
+
+@in_virtual_time
+async def test_others_feel_no_change_after_a_click_of_one_finger() -> None:
+    """What lasts of it begins again; each set since the click is of the one layer."""
+    layout = SurfaceLayout(
+        LAYOUT.regions, {**LAYOUT.effects, "tick": Click(level=14.0)}, elsewhere=None
+    )
+    async with fingers_on(table(), layout) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(0.5)
+        contents = {_id(one): one.content for one in fingers.applied[-1].contents.values()}
+        layers = {_id(one): n for n, one in fingers.applied[-1].contents.items()}
+        count = len(fingers.committed)
+        player, contact = fingers.controller._intent_source, fingers.applied[-1].contacts[0]
+        assert isinstance(player, EffectPlayer)
+        player.play("tick", contact, asyncio.get_running_loop().time(), level_db_sl=None)
+        await fingers.hold(0.4)
+        changed = [layers for _, _, layers in fingers.committed[count:] if not layers[0].renew]
+        assert [[one.layer for one in each] for each in changed] == [[layers[1]]] * 2
+        after = {_id(one): one.content for one in fingers.applied[-1].contents.values()}
+        assert after == contents
+
+
+@in_virtual_time
+async def test_a_click_goes_before_what_lasts_of_other_fingers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An answer to what lasts takes 70 ms and runs already; the click is felt 5 ms after it."""
+    loop = asyncio.get_running_loop()
+
+    def slowly(self: object, executor: object, work: Callable[[], Any]) -> "asyncio.Future[Any]":
+        future, chosen = loop.create_future(), work()
+        pause = 0.005 if chosen.lasting is None else 0.07
+        loop.call_later(pause, future.set_result, chosen)
+        return future
+
+    monkeypatch.setattr(type(loop), "run_in_executor", slowly)
+    layout = SurfaceLayout(
+        LAYOUT.regions, {**LAYOUT.effects, "any": Click(level=14.0)}, elsewhere=None
+    )
+    async with fingers_on(table(), layout) as fingers:
+        fingers.at = {1: LEFT, 2: RIGHT}
+        await fingers.hold(0.5)
+        count, begin = len(fingers.committed), loop.time()
+        fingers.at[1] = (LEFT[0] + 0.02, LEFT[1])
+        await fingers.hold(0.02)
+        fingers.at[3] = ABOVE
+        await fingers.hold(0.3)
+        at = min(at for at, _, layers in fingers.committed[count:] if layers[0].layer == 2)
+        assert 0.075 <= at - begin <= 0.08
 
 
 @in_virtual_time

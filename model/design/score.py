@@ -29,7 +29,13 @@ from model.finger.fingertip import FIVE_POINTS, fingertips_on
 from model.finger.perception import STRONG_DB_SL, detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
-from model.structure.attachments import Era, attached_stiffness, drive_forces, full_strokes
+from model.structure.attachments import (
+    Era,
+    attached_stiffness,
+    coupled_forces,
+    drive_forces,
+    full_strokes,
+)
 
 LEVEL_RESERVE = 1.2
 """Factor on the wanted level for what nine of ten plates need beyond the plate as modelled."""
@@ -174,7 +180,7 @@ class Scorer:
         A = places.between[:, :, chosen[:, None], chosen]
         E = places.to_tips[:, :, :, chosen]
         v, f = A.shape[:2]
-        K = np.linalg.inv(np.eye(n, dtype=np.float32) + Z[:, :, None] * A)
+        K = coupled_forces(A, Z, np.eye(n, dtype=np.complex64))
         G = E @ K
 
         # The finger, where it rests.

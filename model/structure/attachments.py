@@ -14,9 +14,10 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
-from typing import TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.arguments import expect_at_least
 from model.arrays import ComplexArray, FloatArray
@@ -240,6 +241,7 @@ class PointLoad:
         return cls(era.x, era.y, era.stiffness, era.damping, era.bolt_mass, era.foot)
 
 
+Complex = TypeVar("Complex", bound="np.complexfloating[Any, Any]")
 Load: TypeAlias = PointLoad | FingertipLoad
 """A passive load of the plate."""
 
@@ -291,15 +293,16 @@ def full_strokes(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
 
 
 def coupled_forces(
-    receptance: ComplexArray, dynamic_stiffness: ComplexArray, applied: ComplexArray
-) -> ComplexArray:
+    receptance: NDArray[Complex], dynamic_stiffness: NDArray[Complex], applied: NDArray[Complex]
+) -> NDArray[Complex]:
     """Forces F on the free plate [N], from those applied at its attachments: (I + D R) F = P.
 
     receptance R (..., n, n) [m/N]: of the free plate between its attachments; dynamic_stiffness
     (..., n) [N/m]: the diagonal of D; applied P (..., n, m) [N]. An attachment reacts with -D times
     its displacement R F.
     """
-    system = np.eye(receptance.shape[-1]) + dynamic_stiffness[..., None] * receptance
+    unit = np.eye(receptance.shape[-1], dtype=receptance.real.dtype)
+    system = unit + dynamic_stiffness[..., None] * receptance
     return np.asarray(np.linalg.solve(system, applied))
 
 

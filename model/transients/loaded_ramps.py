@@ -5,7 +5,7 @@ At a complex frequency s fingers are a change of low rank of the plate on its ER
 known: with displacements u0 of the fingers if they weighed nothing, receptances G between them and
 their dynamic stiffness D, they hold the plate by the forces
 
-    D (1 + G D)^-1 u0.
+    (1 + D G)^-1 D u0.
 
 The demodulated response less its quasi-static part, which a slow ramp would give, is inverted on a
 line s = i omega + sigma + i nu: it dies out, and its transform falls with the cube of nu.
@@ -19,7 +19,7 @@ from functools import lru_cache
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.structure.attachments import Fingertip
+from model.structure.attachments import Fingertip, coupled_forces
 from model.transients.base_motion import rise
 from model.transients.time_response import PlateInTime
 
@@ -143,10 +143,9 @@ def _held_by(
     if fingers:
         stiffness = np.column_stack([tip.dynamic_stiffness(-1j * s) for _, tip in fingers])
         receptance = moved[:, c:, p:].swapaxes(1, 2)
-        system = receptance * stiffness[:, None] + np.eye(k)
-        free = np.linalg.solve(system, by_drive[:, :, p:].swapaxes(1, 2))
-        forces = (stiffness[:, :, None] * free).swapaxes(1, 2)  # (m, d, k)
-        found = found - forces @ moved[:, c:, :p]
+        applied = stiffness[:, :, None] * by_drive[:, :, p:].swapaxes(1, 2)
+        forces = coupled_forces(receptance, stiffness, applied)  # (m, k, d)
+        found = found - forces.swapaxes(1, 2) @ moved[:, c:, :p]
     return np.asarray((found * (s**2)[:, None, None]).swapaxes(0, 1))
 
 

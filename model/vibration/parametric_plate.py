@@ -123,8 +123,8 @@ class ParametricPlate:
         free = self.receptances(modulus, loss_factor)
         stiffness, base = free.attached(eras, loads)
         count = base.shape[1]
-        system = np.eye(stiffness.shape[1]) + stiffness[:, :, None] * free.between
-        forces = np.linalg.inv(system)  # on the plate, by those applied
+        unit = np.eye(stiffness.shape[1], dtype=complex)
+        forces = coupled_forces(free.between, stiffness, unit)  # on the plate, by those applied
         to_points = free.to_points @ forces
         moved = (free.between @ forces)[:, :, :count] * base[:, None]  # (f, h, e)
         elastic, lossless = self._elastic(modulus, loss_factor)

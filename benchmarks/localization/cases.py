@@ -36,8 +36,6 @@ def question_of(
     targets: int = 1,
     level_db_sl: float = STRONG_DB_SL,
     drive_mode: str | None = None,
-    eras_at_most: int = 2,
-    search_time: float = 10.0,
 ) -> Question:
     """The first ones are targets, the others quiet."""
     points = [(float(x), float(y)) for x, y in places]
@@ -46,6 +44,4 @@ def question_of(
         tuple(points[targets:]),
         level_db_sl=level_db_sl,
         drive_mode=drive_mode,
-        eras_at_most=eras_at_most,
-        search_time=search_time,
     )

@@ -76,7 +76,6 @@ def _growth_figure(section: Section) -> Figure:
         sizes = [value for kind, value in section.data if kind == what]
         for name, label in (
             ("build", "table build"),
-            ("exact", "exact search, one contact set"),
             ("phased", "query, phased"),
             ("switched", "query, switched"),
         ):

@@ -21,12 +21,10 @@ from benchmarks.localization.cases import (
 from benchmarks.localization.contrast import Section
 from benchmarks.setting import RIG
 from model.arrays import FloatArray
-from model.drive_modes.exact_search import search_exactly
 from model.finger.grid import Grid
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import build_table
-from model.table.question import Question
 from model.table.table import LocalizationTable
 
 QUESTIONS = 400
@@ -60,15 +58,8 @@ def live_times(
     return np.array(times)
 
 
-def search_cells(table: LocalizationTable) -> None:
-    """The exact search for every cell of the grid."""
-    for x, y in table.cell_centres:
-        forms = table.forms(Question(((float(x), float(y)),)))
-        search_exactly(forms, eras_at_most=len(table.eras))
-
-
 def speed_section(seed: int) -> Section:
-    """Times of queries, of the exact search and of building the table."""
+    """Times of queries and of building the table."""
     table = paper_table()
     rows = []
     for drive_mode in DRIVE_MODES:
@@ -76,16 +67,6 @@ def speed_section(seed: int) -> Section:
             rng = np.random.default_rng([seed, 300 + quiet])
             times = live_times(table, drive_mode, quiet=quiet, rng=rng)
             rows.append(_row(f"query, {drive_mode}, {quiet} quiet", times))
-    rng = np.random.default_rng([seed, 310])
-    for quiet in (1, 3):
-        every = []
-        for places in contact_sets(100, fingers=quiet + 1, rng=rng):
-            question = question_of(places, eras_at_most=4, level_db_sl=12.0)
-            every.append(timed(partial(table.query, question)))
-        rows.append(_row(f"exact search, 614 655 patterns, {quiet} quiet", every))
-    clock, used = timed(partial(search_cells, table))
-    label = f"exact search, all {table.grid.cell_count} cells, the plate beyond 5 cm"
-    rows.append([label, _readable(clock), "", _readable(used), ""])
     rig = load_rig(RIG)
     clock, used = timed(lambda: build_table(rig, frequencies=FREQUENCIES))
     rows.append(["table build", _readable(clock), "", _readable(used), ""])
@@ -113,14 +94,14 @@ def growth_section(seed: int) -> Section:
     ):
         for value in values:
             data[what, value] = _times_of(what, value, seed)
-    names = ["build", "switched", "phased", "exact"]
+    names = ["build", "switched", "phased"]
     rows = [
         [f"{value} {what}", *(_readable(times[name]) for name in names)]
         for (what, value), times in data.items()
     ]
     return Section(
         "Growth: one quiet finger, medians, processor time",
-        ["", "table build", "query, switched", "query, phased", "exact search"],
+        ["", "table build", "query, switched", "query, phased"],
         rows,
         data=data,
     )
@@ -139,12 +120,7 @@ def _times_of(what: str, value: int, seed: int) -> dict[str, float]:
         rng = np.random.default_rng([seed, 320])
         used_for = live_times(table, drive_mode, quiet=1, rng=rng, questions=60)[:, 1]
         times[drive_mode] = float(np.median(used_for))
-    rng = np.random.default_rng([seed, 321])
-    exact = []
-    for places in contact_sets(7, fingers=2, rng=rng):
-        question = question_of(places, eras_at_most=eras, search_time=60.0, level_db_sl=12.0)
-        exact.append(timed(partial(table.query, question))[1])
-    return times | {"exact": float(np.median(exact))}
+    return times
 
 
 def _rig(eras: int) -> Rig:

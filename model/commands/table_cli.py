@@ -44,9 +44,6 @@ def query(
     level: Annotated[
         float, typer.Option(metavar="DB_SL", help="Level at the target, dB SL.")
     ] = 20.0,
-    eras: Annotated[
-        int, typer.Option(metavar="N", help="Maximum number of ERAs with --mode switched.")
-    ] = 2,
     envelopes: Annotated[
         bool, typer.Option("--envelopes", help="Shape onset and ending by envelopes.")
     ] = False,
@@ -87,15 +84,14 @@ def query(
         defaults = {
             "level_db_sl": level,
             "mode": drive_mode,
-            "eras_at_most": eras,
             "envelopes": envelopes,
         }
         _query_batch(table_file, batch, defaults, thorough=thorough)
         return
     if own:
-        if target or drive_mode or eras != 2 or envelopes or thorough:
+        if target or drive_mode or envelopes or thorough:
             raise InputError(
-                "--own must be given without --target, --mode, --eras, --envelopes and --thorough"
+                "--own must be given without --target, --mode, --envelopes and --thorough"
             )
         _answer(table_file, own, quiet or [], level=level, swap_bands=swap_bands, as_json=as_json)
         return
@@ -109,7 +105,6 @@ def query(
         quiet=tuple(parse_point(text, what="--quiet") for text in quiet or []),
         level_db_sl=level,
         drive_mode=drive_mode,
-        eras_at_most=eras,
         envelopes=envelopes,
     )
     table = load_table(table_file)

@@ -2,8 +2,7 @@
 
 The paper's idea: switching frequencies and activation sets moves the nulls. Four ERAs and 27
 frequencies make 4 * 27 + 6 * 27² = 4482 patterns, six and 361 two millions. Every pattern is one
-source or the sum of two: an ERA at a frequency, or a pair of ERAs at the same one
-(`model.drive_modes.exact_search` drives more of them).
+source or the sum of two: an ERA at a frequency, or a pair of ERAs at the same one.
 
 The powers of its sources, each over the squared threshold of its frequency, add to what is felt, at
 the target and at every quiet fingertip. Patterns are not enumerated: the maximum over the quiet

@@ -49,8 +49,6 @@ class Pattern:
     - felt_contrast_db, robust_felt_contrast_db, median_felt_contrast_db: level of the target above
       that of the loudest quiet point; contrast_db, robust_contrast_db: the same in peak
       acceleration. All None without quiet fingers
-    - search_gap_db: how much better another `switched` pattern may be by the robust score, of
-      `model.drive_modes.exact_search`; None of the other searches
 
     The rest is None unless computed: surroundings_contrast_db: to the plate farther than 50 mm,
     root mean square, without quiet fingers; transient_contrast_db: over the first 100 ms;
@@ -71,7 +69,6 @@ class Pattern:
     robust_felt_contrast_db: float | None = None
     median_felt_contrast_db: float | None = None
     surroundings_contrast_db: float | None = None
-    search_gap_db: float | None = None
     transient_contrast_db: float | None = None
     residual_db: float | None = None
     concentration: Concentration | None = None

@@ -14,10 +14,8 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.choice import best_first, best_of
-from model.counting import counted
 from model.drive_modes import ALTERNATIVES, UNRESTRICTED, find_drives, max_sensation
 from model.drive_modes.coherent import CoherentResult
-from model.drive_modes.exact_search import search_exactly, sensation_found
 from model.drive_modes.forms import Forms, Weights
 from model.drive_modes.phased import PHASED
 from model.drive_modes.tones import excitation_of
@@ -105,9 +103,6 @@ def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) 
     none does.
     """
     forms = _forms(question, candidates)
-    if drive_mode == "switched" and question.eras_at_most != 2:
-        found, gap = _search_exactly(question, forms)
-        return _best(question, drive_mode, candidates, found, gap)
     for some in (forms, replace(forms, level_margin=0.0)):
         found = _search(question, drive_mode, candidates, some)
         if found:
@@ -175,7 +170,6 @@ def _best(
     drive_mode: str,
     candidates: Candidates,
     found: Sequence[tuple[float, Weights]],
-    gap_db: float | None = None,
 ) -> Pattern:
     """The pattern of the drive that drawn plates prefer."""
     playable = candidates.playable
@@ -184,7 +178,7 @@ def _best(
     if len(playable) < len(candidates.frequencies):
         drives = [replace(each, frequencies=_rows(each, playable)) for each in drives]
     best = _judged(question, drives, scores, candidates)
-    return _pattern(question, drive_mode, candidates, drives[best], gap_db)
+    return _pattern(question, drive_mode, candidates, drives[best])
 
 
 def _by_point(
@@ -245,26 +239,6 @@ def _drives_of(found: CoherentResult, rows: IntArray) -> list[tuple[float, Weigh
         )
         if score > 0
     ]
-
-
-def _search_exactly(question: Question, forms: Forms) -> tuple[list[tuple[float, Weights]], float]:
-    """The best `switched` drive of at most `eras_at_most` ERAs, and how much better one may be."""
-    count = question.eras_at_most
-    for margin in (forms.level_margin, 0.0):
-        found = search_exactly(
-            replace(forms, level_margin=margin),
-            eras_at_most=count,
-            time_limit=question.search_time,
-        )
-        if found.drive is not None:
-            return [(found.score, found.drive)], float(decibels(found.bound / found.score))
-    if not found.is_complete:
-        raise InputError(
-            f"no pattern of up to {counted(count, 'ERA')} with {question.level_db_sl:g} dB SL was "
-            f"found within {question.search_time:g} s, and the search is incomplete; allow more "
-            "time, or lower the level"
-        )
-    raise _level_error(question, "switched", sensation_found(forms, eras_at_most=count))
 
 
 def _rows(drive: Weights, playable: IntArray) -> IntArray:
@@ -335,21 +309,14 @@ def _judged_over_effect(
 
 
 def _level_error(question: Question, drive_mode: str, reachable: float) -> UnreachableLevel:
-    # Not exhaustive for phases of several targets, nor for frequencies of more than two ERAs.
-    is_exhaustive = (
-        question.eras_at_most <= 2 if drive_mode == "switched" else len(question.targets) == 1
-    )
+    is_exhaustive = drive_mode == "switched" or len(question.targets) == 1
     # Rounded down, so that the level named can be reached.
     level = math.floor(10 * float(decibels(reachable))) / 10
     return UnreachableLevel(question, drive_mode, level, is_exhaustive=is_exhaustive)
 
 
 def _pattern(
-    question: Question,
-    drive_mode: str,
-    candidates: Candidates,
-    drive: Weights,
-    gap_db: float | None,
+    question: Question, drive_mode: str, candidates: Candidates, drive: Weights
 ) -> Pattern:
     """The pattern of a drive, turned down to the wanted level at nine of ten plates."""
     drawn = candidates.fingers.felt([drive], PROMISED_DRAWS)
@@ -369,7 +336,6 @@ def _pattern(
         level_db_sl=gain_db + nominal[0],
         robust_level_db_sl=gain_db + robust[0],
         drive_mode=drive_mode,
-        search_gap_db=gap_db,
         threshold=candidates.threshold_name,
     )
     if candidates.background is not None:

@@ -51,12 +51,11 @@ class _Line(BaseModel):
     apart_hz: float = APART_HZ
     mode: str | None = None
     level_db_sl: float = STRONG_DB_SL
-    eras_at_most: int = 2
     envelopes: bool = False
     loads: list[float] = []
 
 
-_OF_TARGETS = {"target", "targets", "mode", "eras_at_most", "envelopes"}
+_OF_TARGETS = {"target", "targets", "mode", "envelopes"}
 _OF_OWN = {"bands_may_swap", "apart_hz"}
 """Keys of a line that only one of both kinds of questions has."""
 
@@ -64,7 +63,7 @@ _OF_OWN = {"bands_may_swap", "apart_hz"}
 def question_from_json(line: str, defaults: Mapping[str, Any] = MappingProxyType({})) -> Question:
     """Parse the question of one line, `{"target": [x, y], "quiet": [[x, y], ...], "mode": ...}`.
 
-    Several targets: `"targets": [[x, y], ...]`; also `"level_db_sl"`, `"eras_at_most"`,
+    Several targets: `"targets": [[x, y], ...]`; also `"level_db_sl"`,
     `"envelopes"`, and `"loads"`, of each contact relative to the rig's fingertip, targets first.
     defaults: of keys that the line leaves out. Raises InputError.
     """
@@ -96,7 +95,6 @@ def _question(asked: _Line) -> Question:
         quiet=tuple((x, y) for x, y in asked.quiet),
         level_db_sl=asked.level_db_sl,
         drive_mode=asked.mode,
-        eras_at_most=asked.eras_at_most,
         envelopes=asked.envelopes,
         loads=tuple(asked.loads),
     )
@@ -143,7 +141,6 @@ def query_as_json(
         "median_felt_contrast_db": pattern.median_felt_contrast_db,
         "contrast_db": pattern.contrast_db,
         "robust_contrast_db": pattern.robust_contrast_db,
-        "search_gap_db": pattern.search_gap_db,
         "transient_contrast_db": pattern.transient_contrast_db,
         "residual_db": pattern.residual_db,
         "surroundings_contrast_db": pattern.surroundings_contrast_db,

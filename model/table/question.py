@@ -32,9 +32,7 @@ class Question:
     targets: fingers that feel it, one or more; quiet: fingers that must not; level_db_sl: at every
     target; softer_db: reduction of that level for each target, empty for none; drive_mode: a name
     in DRIVE_MODES, None for the table's own; playable: drive modes of the amplifiers; frequencies:
-    their lowest and highest [Hz]; eras_at_most: maximum number of ERAs in `switched`. More than two
-    are searched exactly, up to search_time [s], with an upper bound where the search is cut short;
-    this is too slow for live use. envelopes: whether amplifiers play any (`model.table.timing`).
+    their lowest and highest [Hz]; envelopes: whether amplifiers play any (`model.table.timing`);
     loads: of each contact relative to the rig's fingertip (`Fingertip.scaled`), targets first;
     empty for 1.
 
@@ -49,8 +47,6 @@ class Question:
     drive_mode: str | None = None
     playable: tuple[str, ...] = DRIVE_MODES
     frequencies: tuple[float, float] = (0.0, math.inf)
-    eras_at_most: int = 2
-    search_time: float = 10.0
     envelopes: bool = False
     loads: tuple[float, ...] = ()
 
@@ -82,10 +78,6 @@ class Question:
                 f"loads must have one value per contact ({count}), got {len(self.loads)}"
             )
         check_loads(self.loads)
-        if not self.search_time >= 0:
-            raise InputError(f"search time must be at least 0 s, got {self.search_time}")
-        if self.eras_at_most < 1:
-            raise InputError(f"number of ERAs must be at least 1, got {self.eras_at_most}")
         for what, contacts in (("target", self.targets), ("quiet finger", self.quiet)):
             for x, y in {contact for contact in contacts if contacts.count(contact) > 1}:
                 raise InputError(f"{what} ({x:g}, {y:g}) m must be given once, got two")
@@ -124,21 +116,9 @@ class Question:
                         f"{in_metres(x, y, length=plate.length, width=plate.width)}"
                     )
 
-    def drive_mode_on(self, own: str, *, era_count: int) -> str:
-        """Return the drive mode on a table of the given number of ERAs and default mode.
-
-        Raises InputError if it is not playable, or the number of ERAs cannot be met.
-        """
+    def drive_mode_on(self, own: str) -> str:
+        """Return the drive mode on a table of a default mode; raises InputError if unplayable."""
         drive_mode = self.drive_mode or own
-        if self.eras_at_most > max(2, era_count):
-            raise InputError(
-                f"number of ERAs must be up to {era_count} for this table, got {self.eras_at_most}"
-            )
-        if self.eras_at_most != 2 and drive_mode != "switched":
-            raise InputError(
-                f"number of ERAs can be set in mode switched only, not in {drive_mode}, which "
-                "drives all; leave it out"
-            )
         if drive_mode not in self.playable:
             raise InputError(
                 f"drive mode must be one that these amplifiers play, {', '.join(self.playable)}, "

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 from model.drive_modes import UNRESTRICTED
-from model.drive_modes.exact_search import pattern_count
 from model.drive_modes.forms import Forms
 from model.drive_modes.sources import (
     magnitudes_of_sources,
@@ -128,7 +127,8 @@ class LocalizationTable:
     @property
     def pattern_count(self) -> int:
         """Number of `switched` patterns of one or two ERAs."""
-        return pattern_count(len(self.eras), len(self.frequencies), eras_at_most=2)
+        eras, f = len(self.eras), len(self.frequencies)
+        return eras * f + math.comb(eras, 2) * f**2
 
     def query(self, question: Question, over_effect: OverEffect | None = None) -> Pattern:
         """Find the best pattern in a drive mode among those that reach a level at the targets.
@@ -141,7 +141,7 @@ class LocalizationTable:
         for contacts off the plate and for a level that cannot be reached.
         """
         question.check_on(self.plate)
-        drive_mode = question.drive_mode_on(self.drive_mode, era_count=len(self.eras))
+        drive_mode = question.drive_mode_on(self.drive_mode)
         low, high = question.frequencies
         playable = np.flatnonzero((self.frequencies >= low) & (self.frequencies <= high))
         if len(playable) == 0:

@@ -27,12 +27,11 @@ def query_thoroughly(table: LocalizationTable, question: Question) -> Pattern:
 
     In the drive mode of the question and all that it contains; takes some tenths of a second. A
     level between two multiples of LEVEL_STEP is asked as the higher one, where it can be reached.
-    Without quiet fingers, and for more than two ERAs in `switched`, as `table.query`. Raises
-    InputError as that does.
+    Without quiet fingers as `table.query`. Raises InputError as that does.
     """
-    if not question.quiet or question.eras_at_most != 2:
+    if not question.quiet:
         return table.query(question)
-    drive_mode = question.drive_mode_on(table.drive_mode, era_count=len(table.eras))
+    drive_mode = question.drive_mode_on(table.drive_mode)
     level = question.level_db_sl
     best: Pattern | None = None
     for mode in DRIVE_MODES[: 1 + DRIVE_MODES.index(drive_mode)]:

@@ -29,9 +29,7 @@ TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)
         {"quiet": QUIET * 2},
         {"quiet": (TARGET,)},
         {"targets": ((0.2, 0.1), TARGET), "quiet": ((0.095, 0.07),)},
-        {"search_time": math.nan},
         {"drive_mode": "loud"},
-        {"eras_at_most": 0},
         {"softer_db": (0.0, 3.0)},
         {"softer_db": (-1.0,)},
         {"softer_db": (math.nan,)},
@@ -44,7 +42,7 @@ TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)
     ids=str,
 )
 def test_question_refuses_what_no_table_can_answer(arguments):
-    """Numbers of contacts, levels, times, modes and ERAs; contacts on top of each other."""
+    """Numbers of contacts, levels and modes; contacts on top of each other."""
     Question((TARGET,), QUIET)
     with pytest.raises(InputError):
         Question(**{"targets": (TARGET,)} | arguments)
@@ -58,12 +56,10 @@ def test_question_refuses_what_no_table_can_answer(arguments):
         Question((TARGET,), drive_mode="phased", playable=("switched",)),
         Question((TARGET,), playable=("phased",)),
         Question((TARGET,), frequencies=(600.0, 800.0)),
-        Question((TARGET,), eras_at_most=9),
-        Question((TARGET,), eras_at_most=3, drive_mode="phased"),
     ],
 )
 def test_query_refuses_what_table_or_amplifiers_lack(question):
-    """Contacts off the plate; modes, frequencies and numbers of ERAs that cannot be driven."""
+    """Contacts off the plate; modes and frequencies that cannot be driven."""
     with pytest.raises(InputError):
         smooth_table().query(question)
 
@@ -74,7 +70,6 @@ def test_query_refuses_what_table_or_amplifiers_lack(question):
         (Question((TARGET,), QUIET, drive_mode="phased"), True),
         (Question((TARGET, (0.2, 0.1)), drive_mode="phased"), False),
         (Question((TARGET, (0.2, 0.1))), True),
-        (Question((TARGET,), QUIET, eras_at_most=4), False),
     ],
 )
 def test_query_names_a_level_that_is_reached_when_too_loud(question, is_exhaustive):
@@ -85,20 +80,6 @@ def test_query_names_a_level_that_is_reached_when_too_loud(question, is_exhausti
     reachable = refusal.value.reachable_db_sl
     assert 20 < reachable < 120
     assert smooth_table().query(replace(question, level_db_sl=reachable))
-
-
-def test_query_says_that_a_search_was_incomplete_when_it_ran_out_of_time():
-    """A level that only more than two ERAs reach is not called unreachable."""
-    question = Question((TARGET,), QUIET, eras_at_most=4)
-    with pytest.raises(UnreachableLevel) as refusal:
-        smooth_table().query(replace(question, level_db_sl=120.0, eras_at_most=2))
-    louder = replace(question, level_db_sl=refusal.value.reachable_db_sl + 0.5)
-    found = smooth_table().query(louder)
-    assert found.level_db_sl >= louder.level_db_sl
-    assert found.search_gap_db == pytest.approx(0.0, abs=1e-4)
-    with pytest.raises(InputError) as incomplete:
-        smooth_table().query(replace(louder, search_time=0.0))
-    assert not isinstance(incomplete.value, UnreachableLevel)
 
 
 def test_query_uses_frequencies_that_the_amplifiers_play():

@@ -30,15 +30,15 @@ def table_file(tmp_path_factory):
 
 
 def test_question_from_json_reads_every_key():
-    """Targets, quiet fingers, mode, level and number of ERAs."""
+    """Targets, quiet fingers, mode, level and loads."""
     question = question_from_json(
         '{"targets": [[0.1, 0.1], [0.2, 0.2]], "quiet": [[0.05, 0.02]], "mode": "phased",'
-        ' "level_db_sl": 15, "eras_at_most": 3, "loads": [1, 2, 0.5]}'
+        ' "level_db_sl": 15, "loads": [1, 2, 0.5]}'
     )
     assert question.loads == (1.0, 2.0, 0.5)
     assert question.targets == ((0.1, 0.1), (0.2, 0.2))
     assert question.quiet == ((0.05, 0.02),)
-    assert (question.drive_mode, question.level_db_sl, question.eras_at_most) == ("phased", 15.0, 3)
+    assert (question.drive_mode, question.level_db_sl) == ("phased", 15.0)
     assert question_from_json('{"target": [0.1, 0.1]}').targets == ((0.1, 0.1),)
 
 

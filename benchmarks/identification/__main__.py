@@ -1,6 +1,6 @@
 """What identification in place gains on plates that are not the model's.
 
-    python -m benchmarks.identification [--plates 50] [--sets 2] [--kinds plain,form,hard]
+    python -m benchmarks.identification [--plates 50] [--sets 2] [--kinds plain,form,hard,uneven]
         [--rounds 4] [--report]
 
 Hidden plates are thin plates in Hermite elements with viscous modal losses, in a process of their
@@ -26,7 +26,7 @@ def main() -> None:
         "--sets", type=int, default=2, help="of contacts on each plate, 0 for fits only"
     )
     parser.add_argument("--first", type=int, default=1, help="seed of the first plate")
-    parser.add_argument("--kinds", default="plain,form,hard")
+    parser.add_argument("--kinds", default="plain,form,hard,uneven")
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--report", action="store_true")
     options = parser.parse_args()
@@ -35,7 +35,7 @@ def main() -> None:
     from benchmarks.identification.answers import table_of
     from benchmarks.identification.plates import FREQUENCIES, outcome
     from benchmarks.identification.server import hidden_plates
-    from benchmarks.identification.tables import contrasts, fits
+    from benchmarks.identification.tables import contrasts, fits, promises
     from model.rig.file import load_rig
 
     rig = load_rig(RIG)
@@ -52,6 +52,7 @@ def main() -> None:
     texts = {f"fits-{options.rounds}": fits(found)}
     if options.sets:
         texts[f"contrasts-{options.rounds}"] = contrasts(found)
+        texts[f"promises-{options.rounds}"] = promises(found)
     print("\n\n".join(texts.values()))
     if options.report:
         run = f"python -m benchmarks.identification --plates {options.plates} --sets {options.sets}"

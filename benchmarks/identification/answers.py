@@ -75,12 +75,34 @@ def known_table(table: LocalizationTable, truth: Truth, factors: Reals) -> Local
     return known
 
 
-def answer(table: LocalizationTable, places: Reals) -> tuple[float, Complexes]:
-    """Frequency [Hz] and base amplitudes (n,) [m] for fingers (k, 2) [m], the first the target."""
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """A tone for a target among quiet fingers, with what nine of ten plates shall give.
+
+    frequency [Hz]; bases (n,): amplitudes [m]; threshold [m/s²] there; contrast, level [dB, dB SL].
+    """
+
+    frequency: float
+    bases: Complexes
+    threshold: float
+    contrast: float
+    level: float
+
+
+def answer(table: LocalizationTable, places: Reals) -> Answer:
+    """The table's answer for fingers (k, 2) [m], the first the target."""
     points = [(float(x), float(y)) for x, y in places]
     question = Question((points[0],), tuple(points[1:]), level_db_sl=0.0, envelopes=True)
-    tones = [table.query(question).excitation.get(era.name) for era in table.eras]
+    pattern = table.query(question)
+    tones = [pattern.excitation.get(era.name) for era in table.eras]
     (frequency,) = {tone.frequency for tone in tones if tone is not None}
-    return float(frequency), np.array(
-        [0 if tone is None else tone.phasor for tone in tones], dtype=complex
+    contrast, level = pattern.robust_felt_contrast_db, pattern.robust_level_db_sl
+    assert contrast is not None
+    assert level is not None
+    return Answer(
+        float(frequency),
+        np.array([0 if tone is None else tone.phasor for tone in tones], dtype=complex),
+        float(np.interp(frequency, table.frequencies, table.thresholds)),
+        contrast,
+        level,
     )

@@ -10,7 +10,8 @@ LENGTH, WIDTH, THICKNESS = 0.3048, 0.2286, 0.0015
 MODULUS, DENSITY, RATIO = 70e9, 2700.0, 0.33
 STIFFNESS, DAMPING_RATIO, LOSS = 17_000.0, 0.05, 0.01
 CORNERS = np.array([(0, 0), (LENGTH, 0), (LENGTH, WIDTH), (0, WIDTH)])
-SETS = ("plain", "form", "hard")
+SETS = ("plain", "form", "hard", "uneven")
+TAPER = 0.015  # of the thickness, from the middle to the ends
 NOISE, FLOOR = 0.01, 0.001
 PULP, PULP_DAMPING, CONTACT, PHALANX, JOINT, JOINT_DAMPING = 1000.0, 2.0, 2e-4, 5e-3, 500.0, 2.0
 LOAD_STD = 0.5
@@ -36,7 +37,10 @@ class Hidden:
 
 
 def draw(kind: str, seed: int) -> Hidden:
-    """Draw a plate of a set: plain, form (places and a hidden mass) or hard (all else, too)."""
+    """Draw a plate of a set.
+
+    Plain, form (places and a hidden mass), hard (all else, too) or uneven (form, and tapered).
+    """
     rng = np.random.default_rng([seed, SETS.index(kind)])
     normal = rng.standard_normal
     n, hard = len(CORNERS), kind == "hard"
@@ -51,7 +55,12 @@ def draw(kind: str, seed: int) -> Hidden:
     sides = np.array([LENGTH, WIDTH]) + hard * 0.5e-3 * normal(2)
     ratio, modulus = RATIO + hard * 0.015 * normal(), MODULUS * (1 + hard * 0.02 * normal())
     bolt, exponent = hard * np.abs(0.5e-3 * normal(n)), hard * 0.3 * normal()
-    plate = ThinPlate(sides[0], sides[1], THICKNESS * thick, modulus, DENSITY, ratio)
+    thickest = rng.uniform(0, 2 * np.pi)
+    taper = TAPER * (kind == "uneven") * np.array([np.cos(thickest), np.sin(thickest)])
+    plate = ThinPlate(
+        *(sides[0], sides[1], THICKNESS * thick, modulus, DENSITY, ratio),
+        taper=(float(taper[0]), float(taper[1])),
+    )
     corners = np.where(CORNERS > 0, sides, 0.0)
     at = corners + np.where(CORNERS > 0, -inwards, inwards)
     damping = 2 * DAMPING_RATIO * np.sqrt(STIFFNESS * LENGTH * WIDTH * THICKNESS * DENSITY / n)

@@ -140,8 +140,8 @@ def hour(seed: int, *, is_quiet: bool) -> Hour:
             mounted = replace(mounted, masses=np.vstack([mounted.masses, sticker]))
             found.named["a mass"] = None
         places = random_contacts(rng, int(rng.integers(2, 5)), (LENGTH, WIDTH), margin=0.013)
-        frequency, bases = answer(table, places)
-        bases = 0.2 * bases
+        tone = answer(table, places)
+        frequency, bases = tone.frequency, 0.2 * tone.bases
         factors = np.exp(0.5 * rng.standard_normal(len(places)))
         loads = np.array([finger_stiffness(frequency, np.full(4, each)) for each in factors])
         felt = mounted.accelerations(frequency, mounted.at, fingers=places, loads=loads) @ bases
@@ -179,8 +179,9 @@ def _judged(
         discs = [fingertip_points(float(x), float(y), live.plate) for x, y in places]
         weights = fingertip_weights(float(places[0, 0]), float(places[0, 1]), live.plate)
         for way, table in tables.items():
-            frequency, bases = answer(table, places)
-            felt = mounted.accelerations(frequency, np.concatenate(discs)) @ (bases * drives)
+            tone = answer(table, places)
+            unit = mounted.accelerations(tone.frequency, np.concatenate(discs))
+            felt = unit @ (tone.bases * drives)
             size, own = np.abs(felt), len(discs[0])
             found[way].append(float(20 * np.log10(weights @ size[:own] / size[own:].max())))
     return found

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from benchmarks.identification.answers import answer, known_table, table_of
+from benchmarks.identification.answers import Answer, answer, known_table, table_of
 from benchmarks.identification.coverage import fields_held, parameters_held
 from benchmarks.identification.hidden import LOAD_STD
 from benchmarks.identification.server import HiddenPlates
@@ -30,13 +30,16 @@ _MARGIN = 0.013
 class Outcome:
     """Of one plate: contrasts [dB] by way, load and number of quiet fingers, and its fit.
 
-    seconds: of processor time of the identification; errors, fields: see `coverage`.
+    kept: by what is promised and load, whether the plate as identified gives it; seconds: of
+    processor time of the identification; errors, fields: see `coverage`.
     """
 
     kind: str
     contrasts: dict[tuple[str, bool, int], list[float]]
+    kept: dict[tuple[str, bool], list[bool]] = field(default_factory=dict)
     chi2: float = np.nan
     held_out: float = np.nan
+    unexplained: float = np.nan
     seconds: float = np.nan
     errors: dict[str, Reals] = field(default_factory=dict)
     fields: Reals = field(default_factory=lambda: np.zeros(0))
@@ -67,7 +70,9 @@ def outcome(
         return found
     found.seconds = time.process_time() - started
     found.chi2 = identified.chi2
-    found.held_out = identified.held_out.total if identified.held_out else np.nan
+    if identified.held_out:
+        found.held_out = identified.held_out.total
+        found.unexplained = identified.held_out.unexplained
     raster = written[False].raster.points
     truth = plates.truth(kind, seed, FREQUENCIES, raster)
     found.errors = parameters_held(identified, truth)
@@ -87,11 +92,17 @@ def outcome(
                 turn = np.radians(PHASE_DEG) * rng.standard_normal(len(rig.eras))
                 drives = error * np.exp(1j * turn)
                 for way, table in {**tables, "known": known}.items():
-                    frequency, bases = answer(table, places)
-                    contrast = _contrast(
-                        plates, rig, (kind, seed), places, factors, frequency, bases * drives
+                    tone = answer(table, places)
+                    contrast, level = _felt(
+                        plates, rig, (kind, seed), places, factors, tone, drives
                     )
                     found.contrasts.setdefault((way, loaded, quiet), []).append(contrast)
+                    if way == "identified":
+                        for what, reached in (
+                            ("contrast", contrast >= tone.contrast),
+                            ("level", level >= tone.level),
+                        ):
+                            found.kept.setdefault((what, loaded), []).append(reached)
     return found
 
 
@@ -106,19 +117,26 @@ def _measurement(plates: HiddenPlates, rig: Rig, kind: str, seed: int, rounds: i
     return Measurement.of(sensors, FREQUENCIES, np.where(played[:, None], values, np.nan))
 
 
-def _contrast(
+def _felt(
     plates: HiddenPlates,
     rig: Rig,
     which: tuple[str, int],
     places: Reals,
     factors: Reals,
-    frequency: float,
-    bases: Complexes,
-) -> float:
-    """Mean under the target over the loudest point under a quiet finger, on the hidden plate."""
+    tone: Answer,
+    drives: Complexes,
+) -> tuple[float, float]:
+    """Contrast [dB] and level [dB SL] on the hidden plate, by the mean under the target.
+
+    drives (n,): factors on its ERAs; contrast: to the loudest point under a quiet finger.
+    """
     discs = [fingertip_points(float(x), float(y), rig.plate) for x, y in places]
     points = np.concatenate(discs)
-    fields = np.abs(plates.felt(*which, frequency, points, places, factors) @ bases)
+    unit = plates.felt(*which, tone.frequency, points, places, factors)
+    fields = np.abs(unit @ (tone.bases * drives))
     weights = fingertip_weights(float(places[0, 0]), float(places[0, 1]), rig.plate)
     own = len(discs[0])
-    return float(20 * np.log10(weights @ fields[:own] / fields[own:].max()))
+    mean = weights @ fields[:own]
+    ratios = np.array([mean / fields[own:].max(), mean / tone.threshold])
+    contrast, level = (20 * np.log10(ratios)).tolist()
+    return contrast, level

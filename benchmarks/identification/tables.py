@@ -13,6 +13,7 @@ NAMES = {
     "plain": "no form errors",
     "form": "places off by 1.5 mm, a hidden 3 g",
     "hard": "sides, ratio, modulus, bolts and loss law off too",
+    "uneven": "places off, a hidden 3 g, thickness ± 1.5 % from end to end",
 }
 GOALS = {
     ("plain", False): "within 0.5 dB of the plate known",
@@ -37,10 +38,30 @@ def contrasts(outcomes: Sequence[Outcome]) -> str:
         for loaded in (False, True):
             cells = [" / ".join(_cell(own, way, loaded, quiet) for quiet in QUIET) for way in WAYS]
             fingers = "loaded" if loaded else "weightless"
-            goal = GOALS[kind, loaded]
+            goal = GOALS.get((kind, loaded), "–")
             lines.append(
                 f"| {NAMES[kind]}, {fingers} | {cells[0]} | {cells[1]} | {goal} | {cells[2]} |"
             )
+    return "\n".join(lines)
+
+
+def promises(outcomes: Sequence[Outcome]) -> str:
+    """How often plates give what is promised of them."""
+    lines = [
+        "Share of answers of the rig as identified whose promise the plate keeps (nine of ten are "
+        "meant), where chi² is up to 2:",
+        "",
+        "| | contrast, weightless | loaded | level, weightless | loaded |",
+        "|---|---|---|---|---|",
+    ]
+    for kind in _kinds(outcomes):
+        own = [each for each in outcomes if each.kind == kind and each.chi2 <= MAX_CHI2]
+        cells = []
+        for what in ("contrast", "level"):
+            for loaded in (False, True):
+                kept = [reached for each in own for reached in each.kept[what, loaded]]
+                cells.append(f"{100 * np.mean(kept):.0f} % of {len(kept)}")
+        lines.append(f"| {NAMES[kind]} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -49,15 +70,16 @@ def fits(outcomes: Sequence[Outcome]) -> str:
     lines = [
         "Fits; shares of 95 % intervals and regions that hold the truth, where chi² is up to 2:",
         "",
-        "| | plates, refused | chi², median (most) | beyond 2 | held-out error | springs | "
-        "dampers | gains, phases | frequencies | places | mass | fields | processor time |",
+        "| | plates, refused | chi², median (most) | beyond 2 | held-out error, unexplained | "
+        "springs | dampers | gains, phases | frequencies | places | mass | fields | "
+        "processor time |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for kind in _kinds(outcomes):
         every = [each for each in outcomes if each.kind == kind]
         own = [each for each in every if not each.refusal]
         chi2 = np.array([each.chi2 for each in own])
-        held = np.median([each.held_out for each in own])
+        held = np.median([[each.held_out, each.unexplained] for each in own], axis=0)
         refused = len(every) - len(own)
         beyond = int((chi2 > MAX_CHI2).sum())
         seconds = np.median([each.seconds for each in own])
@@ -73,7 +95,7 @@ def fits(outcomes: Sequence[Outcome]) -> str:
         ]
         lines.append(
             f"| {NAMES[kind]} | {len(every)}, {refused} | {np.median(chi2):.2f} "
-            f"({chi2.max():.2f}) | {beyond} | {100 * held:.1f} % | "
+            f"({chi2.max():.2f}) | {beyond} | {100 * held[0]:.1f}, {100 * held[1]:.1f} % | "
             f"{' | '.join(shares)} | {seconds:.1f} s |"
         )
     return "\n".join(lines)

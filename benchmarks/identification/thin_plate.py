@@ -32,17 +32,21 @@ class Line:
         """Length of an element [m]."""
         return self.length / self.elements
 
-    def integrals(self, start: float = 0.0, end: float = np.inf) -> dict[tuple[int, int], Reals]:
+    def integrals(
+        self, start: float = 0.0, end: float = np.inf, *, slope: float = 0.0, power: int = 1
+    ) -> dict[tuple[int, int], Reals]:
         """Integrals of derivative a of one function and b of another, by (a, b).
 
-        start, end [m]: of the part over which they are taken.
+        start, end [m]: of the part over which they are taken; slope, power: of a factor
+        (1 + slope u)^power, u from -1 to 1 along the line.
         """
-        points, weights = np.polynomial.legendre.leggauss(4)
+        points, weights = np.polynomial.legendre.leggauss(6)
         size = 2 * (self.elements + 1)
         found = {key: np.zeros((size, size)) for key in ((0, 0), (1, 1), (2, 2), (2, 0))}
         for e in range(self.elements):
             low, high = np.clip((np.array([start, end]) / self.step) - e, 0, 1)
             t, own = low + (high - low) * (points + 1) / 2, weights / 2 * (high - low) * self.step
+            own = own * (1 + slope * (2 * (e + t) / self.elements - 1)) ** power
             for (a, b), total in found.items():
                 local = np.einsum("q,qi,qj->ij", own, self._local(t, a), self._local(t, b))
                 total[2 * e : 2 * e + 4, 2 * e : 2 * e + 4] += local
@@ -70,7 +74,8 @@ class Line:
 class ThinPlate:
     """A free plate: sides, thickness [m], E [Pa], rho [kg/m³], nu.
 
-    soft: x from, to, y from, to [m] of a part that has lost a share of its rigidity, the last.
+    soft: x from, to, y from, to [m] of a part that has lost a share of its rigidity, the last;
+    taper: thickness that each side's ends have more or less than its middle, relative.
     """
 
     length: float
@@ -80,6 +85,7 @@ class ThinPlate:
     density: float
     ratio: float
     soft: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    taper: tuple[float, float] = (0.0, 0.0)
 
     @cached_property
     def _lines(self) -> tuple[Line, Line]:
@@ -89,13 +95,15 @@ class ThinPlate:
     def modes(self) -> tuple[Reals, Reals]:
         """Eigenvalues omega² (r,) [rad²/s²] and modes (size, r) of modal mass 1."""
         along, across = self._lines
-        x, y = along.integrals(), across.integrals()
+        lines = list(zip(self._lines, self.taper, strict=True))
+        x, y = (line.integrals(slope=slope, power=3) for line, slope in lines)
+        mass_x, mass_y = (line.integrals(slope=slope)[0, 0] for line, slope in lines)
         rigidity = self.modulus * self.thickness**3 / 12 / (1 - self.ratio**2)
         stiffness = self._bending(x, y)
         if lost := self.soft[4]:
             part = along.integrals(*self.soft[:2]), across.integrals(*self.soft[2:4])
             stiffness = stiffness - lost * self._bending(*part)
-        mass = self.density * self.thickness * np.kron(x[0, 0], y[0, 0])
+        mass = self.density * self.thickness * np.kron(mass_x, mass_y)
         values, vectors = linalg.eigh(rigidity * stiffness, mass)
         values[:3] = 0.0
         return values, vectors

@@ -46,7 +46,7 @@ class AttachedPlate:
     - fingertip: of the rig, None for weightless ones; finger: (f,) its dynamic stiffness [N/m];
       omega: (f,) [rad/s]; load_std: standard deviation of the logarithm of its load
     - gain, phase: standard deviations of an ERA's amplitude and of its phase [rad]; gain_variance:
-      mean square of both together
+      mean square of both together; common_gain: standard deviation of that of all ERAs
     - thickness: its standard deviation, relative
     """
 
@@ -66,6 +66,7 @@ class AttachedPlate:
     gain: float
     phase: float
     gain_variance: float
+    common_gain: float
     thickness: float
 
     @property
@@ -158,5 +159,6 @@ def attach(
         gain=uncertainty.gain,
         phase=math.radians(uncertainty.phase_deg),
         gain_variance=uncertainty.gain_variance,
+        common_gain=uncertainty.common_gain,
         thickness=uncertainty.thickness,
     )

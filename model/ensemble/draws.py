@@ -56,19 +56,22 @@ def draw(
     seed: int,
     gain: float,
     phase: float,
+    common_gain: float,
     thicknesses: int,
 ) -> Draws:
     """Draw plates of ERAs, masses and fingers, of a number of thicknesses.
 
-    gain, phase [rad]: standard deviations of each ERA's. Of each thickness as many plates, or one
-    less.
+    gain, phase [rad]: standard deviations of each ERA's; common_gain: of all together. Of each
+    thickness as many plates, or one less.
     """
     rng = np.random.default_rng([seed, era_count, finger_count])
     n, k = era_count, finger_count
-    numbers = _exact(rng, 3 + n + k + 2 * n + 2 * k, count)
+    numbers = _exact(rng, 3 + n + k + 2 * n + 2 * k + 1, count)
     numbers = numbers[:, numbers[0].argsort()]  # by thickness
-    parameters, sizes, phases, real, imaginary = np.split(numbers, np.cumsum([3 + n + k, n, n, k]))
-    gains = (1 + gain * sizes) * np.exp(1j * phase * phases) - 1
+    parameters, sizes, phases, real, imaginary, common = np.split(
+        numbers, np.cumsum([3 + n + k, n, n, k, k])
+    )
+    gains = (1 + gain * sizes) * np.exp(1j * phase * phases + common_gain * common) - 1
     own = np.insert(parameters[3:], [n] * masses, 0.0, axis=0)
     drawn = Draws(
         loss=parameters[1].astype(np.float32),

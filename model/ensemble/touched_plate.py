@@ -295,6 +295,7 @@ def drawn_on(
         seed=by.seed,
         gain=plate.gain,
         phase=plate.phase,
+        common_gain=plate.common_gain,
         thicknesses=nodes,
     )
     first_base = on.first.get(by.bases, MODELLED)

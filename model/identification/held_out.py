@@ -1,54 +1,65 @@
-"""How well a fit predicts tones that it was not shown: every fifth one, five times over."""
+"""How well a fit predicts paths that it was not shown: every fifth one, five times over.
+
+A path is from an ERA to a sensor, and what it shows is shown by the reverse one as well. Paths tell
+how far the fields are off that are not measured; tones left out would tell whether a resonance was
+seen, which the covariance knows. What counts against a model is the part of the error that neither
+noise nor the uncertainty of the parameters explains.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import linalg
 
 from model.arrays import FloatArray
+from model.identification.derivatives import jacobian
 from model.identification.fit import Problem, solve
-from model.identification.stages import Fitted
+from model.identification.stages import Fitted, chi2
 
 _FOLDS = 5
 _EVALUATIONS = 8
+_PREDICTED = 0.1  # of the rms at a tone: standard error of a prediction that can be held against it
+_LEAST_VALUES = 16
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Errors of prediction at tones (f,) [Hz]: root mean square relative to the response there.
+    """Errors of prediction, root mean square relative to the responses at a tone.
 
-    errors (f,): without what noise explains; total: of all tones together, the same.
+    total: without what noise explains; unexplained: without what noise and the uncertain parameters
+    explain together.
     """
 
-    frequencies: FloatArray
-    errors: FloatArray
     total: float
-
-    def at(self, frequencies: FloatArray) -> FloatArray:
-        """Error at other frequencies [Hz], linear between tones, of their shape."""
-        return np.asarray(np.interp(frequencies, self.frequencies, self.errors))
+    unexplained: float
 
 
 def hold_out(fitted: Fitted) -> HeldOut | None:
-    """Predict tones from a fit to the others; None where there are fewer than ten."""
+    """Predict paths from a fit to the others; None where these do not tell enough of them."""
     measurement, model = fitted.problem.measurement, fitted.problem.model
-    count = len(measurement.tones)
-    if count < 2 * _FOLDS:
+    folds = (model.observed[measurement.at] + measurement.eras) % _FOLDS
+    squares, variance = np.empty((2, len(folds)))
+    free = np.flatnonzero(fitted.space.uncertain)
+    noise = min(chi2(fitted), 1.0)  # readings may be better than they are stated
+    for fold in np.unique(folds):
+        unseen = folds == fold
+        if unseen.all():
+            return None
+        part, rest = measurement.part(~unseen), measurement.part(unseen)
+        shown = Problem(model.with_frequencies(part.tones), part)
+        found = solve(shown, fitted.best.x, fitted.space.uncertain, evaluations=_EVALUATIONS)
+        plate = model.with_frequencies(rest.tones).at(found.x)
+        error = plate.responses[rest.rows, rest.at, rest.eras] - rest.values
+        squares[unseen] = np.abs(error) ** 2 - 2 * noise * rest.std**2
+        J = jacobian(plate)[rest.rows, rest.at, rest.eras][:, free]
+        covariance = linalg.inv(found.information[np.ix_(free, free)])
+        variance[unseen] = ((J @ covariance) * J.conj()).sum(axis=1).real
+    mean_square = measurement.tone_rms**2
+    predicted = variance < _PREDICTED**2 * mean_square
+    if predicted.sum() < _LEAST_VALUES:
         return None
-    predicted = np.empty(len(measurement.values), dtype=complex)
-    for fold in range(_FOLDS):
-        unseen = measurement.rows % _FOLDS == fold
-        part = measurement.part(~unseen)
-        shown = model.with_frequencies(part.tones)
-        free = fitted.space.uncertain
-        found = solve(Problem(shown, part), fitted.best.x, free, evaluations=_EVALUATIONS)
-        rest = measurement.part(unseen)
-        responses = model.with_frequencies(rest.tones).at(found.x).responses
-        predicted[unseen] = responses[rest.rows, rest.at, rest.eras]
-    values, rows = measurement.values, measurement.rows
-    squares = np.bincount(rows, np.abs(predicted - values) ** 2 - 2 * measurement.std**2)
-    sizes = np.bincount(rows, np.abs(values) ** 2)
-    return HeldOut(
-        measurement.tones,
-        np.sqrt(np.maximum(squares, 0) / sizes),
-        float(np.sqrt(max((squares / sizes).mean(), 0.0))),
-    )
+
+    def rms(parts: FloatArray) -> float:
+        return float(np.sqrt(max((parts / mean_square)[predicted].mean(), 0.0)))
+
+    return HeldOut(rms(squares), rms(squares - variance))

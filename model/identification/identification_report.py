@@ -83,11 +83,14 @@ def parameter_rows(found: Identification) -> list[str]:
 def fit_rows(found: Identification) -> list[str]:
     """Lines of how well the model explains the measurement."""
     held = found.held_out
-    error = "too few tones to tell" if held is None else percent(held.total)
+    error = "too few sensors to tell"
+    if held is not None:
+        unexplained = percent(held.unexplained)
+        error = f"{percent(held.total)}, of which the model does not explain {unexplained}"
     verdict = "explains" if found.is_explained else "does not explain"
     return [
         f"chi² {found.chi2:.2f}: the model {verdict} the measurement (at most {MAX_CHI2:g})",
-        f"tones left out are predicted within: {error}",
+        f"responses left out are predicted within: {error}",
     ]
 
 
@@ -110,6 +113,7 @@ def as_json(found: Identification, expected: Sequence[ExpectedContrast]) -> dict
         "explained": found.is_explained,
         "chi2": found.chi2,
         "held_out_error": None if found.held_out is None else found.held_out.total,
+        "unexplained_error": None if found.held_out is None else found.held_out.unexplained,
         "parameters": [
             {
                 "name": each.name,

@@ -32,7 +32,7 @@ class Identification:
     before: the rig as written; rig: with identified values and, where the model explains the
     measurement, their uncertainty; values: of the
     parameters, gains of sensors among them; posterior: their distribution; chi2: squared residuals
-    per value; held_out: how well unseen tones are predicted, None where there are too few;
+    per value; held_out: how well unseen paths are predicted, None where there are too few;
     seed: of the contacts that a promise draws.
     """
 
@@ -78,16 +78,21 @@ def identify(
     unknown = unknowns(setting, fitted, posterior)
     if unknown:
         raise InputError("measurement must show more: " + "; ".join(map(str, unknown)))
-    uncertainty = rig.uncertainty
+    held_out, uncertainty = hold_out(fitted), rig.uncertainty
     if is_explained:
-        uncertainty = posterior.uncertainty(uncertainty, gain=drive_gain, phase_deg=drive_phase_deg)
+        uncertainty = posterior.uncertainty(
+            uncertainty,
+            gain=drive_gain,
+            phase_deg=drive_phase_deg,
+            field=held_out.unexplained if held_out else 0.0,
+        )
     return Identification(
         rig,
         rig_with(rig, values, uncertainty),
         values,
         posterior,
         misfit,
-        hold_out(fitted),
+        held_out,
         fitted,
         seed,
     )

@@ -112,7 +112,8 @@ def space_of(
     exponents = np.array([-MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT]) - plate.loss_exponent
     low, high = exponents / _LOSS_EXPONENT
     add("loss_exponent", ["loss exponent"], _LOSS_EXPONENT * lossy, lower=low, upper=high)
-    add("gain", [f"gain {name}" for name in eras], uncertainty.gain)
+    gain = math.hypot(uncertainty.gain, uncertainty.common_gain)
+    add("gain", [f"gain {name}" for name in eras], gain)
     add("phase", [f"phase {name}" for name in eras], math.radians(uncertainty.phase_deg))
     # A measured gain has the lag of its drive in it.
     lagging = np.array([float(drives_lag and not era.gains) for era in rig.eras])

@@ -2,7 +2,8 @@
 
 The scale of mass, springs and dampers together changes no response to a moving base, that of all
 drives no contrast. What counts is each natural frequency, each spring and damper relative to the
-plate's mass, and each gain relative to the others.
+plate's mass, each gain relative to the others, and for levels all gains together: a response tells
+only their product with those of the sensors.
 """
 
 import math
@@ -68,11 +69,15 @@ class Posterior:
             for kind, std in own.items()
         }
 
-    def uncertainty(self, before: Uncertainty, *, gain: float, phase_deg: float) -> Uncertainty:
+    def uncertainty(
+        self, before: Uncertainty, *, gain: float, phase_deg: float, field: float
+    ) -> Uncertainty:
         """What a rig states of itself after it was identified.
 
-        before: its own, of which the fingers stay; gain, phase_deg: how far drives repeat.
+        before: its own, of which the fingers stay; gain, phase_deg: how far drives repeat; field:
+        what the model leaves unexplained of fields, relative.
         """
+        common = _rows(self.space, "gain").mean(axis=0, keepdims=True)
         rms = {kind: _rms(std) for kind, std in self.stds().items()}
         damping = max(rms["damping"], rms["loss"])
         return Uncertainty(
@@ -82,6 +87,8 @@ class Posterior:
             stiffness=min(rms["stiffness"], 0.5),
             damping=math.exp(min(damping, math.log(4.0))),
             fingertip=before.fingertip,
+            common_gain=min(float(self.std_of(common)[0]), 0.5),
+            field=min(field, 0.5),
         )
 
 

@@ -1,11 +1,6 @@
-"""The contrast that an identified rig promises, with the error of tones it was not shown.
+"""The contrast that an identified rig gives, on plates within its uncertainty solved exactly."""
 
-Answers are those of the rig's table, which rely on its uncertainty alone: weighing drives by where
-a fit is bad would lose contrast where its nulls are right. What is promised of them is less by the
-held-out error, as an error of the field at every finger of its own.
-"""
-
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -41,7 +36,7 @@ def expected_contrast(
     """Expect contrasts for one, two and three quiet fingers; the same for the same seed.
 
     frequencies (f,) [Hz]: of the tables, by default those of any. Nothing is promised, an empty
-    list, where chi² is beyond what explains a measurement or too few tones were measured.
+    list, where chi² is beyond what explains a measurement or too few sensors were there.
     """
     if not found.is_explained or found.held_out is None:
         return []
@@ -49,8 +44,6 @@ def expected_contrast(
         build_table(rig, frequencies=frequencies, drive_mode="phased")
         for rig in (found.before, found.rig)
     )
-    error = np.hypot(identified.discretisation_error, found.held_out.at(identified.frequencies))
-    judged = replace(identified, discretisation_error=error)
     expected = []
     for quiet in (1, 2, 3):
         rng = np.random.default_rng([found.seed, quiet])
@@ -68,7 +61,7 @@ def expected_contrast(
             each = []
             for table in (written, identified):
                 drive = table.query(question).excitation
-                contrast = felt_on(judged, question, drive, plates).contrast
+                contrast = felt_on(identified, question, drive, plates).contrast
                 assert contrast is not None  # noqa: S101  there are quiet fingers
                 each.append(20 * np.log10(contrast.acceleration[0]))
             before, after = each

@@ -246,6 +246,8 @@ class UncertaintySection(Section):
     stiffness: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
     damping: Annotated[float, Quantity(RATIO, at_least=1, at_most=4)] = 1.0
     fingertip: Annotated[float, Quantity(RATIO, at_least=0, at_most=1)] = 0.0
+    common_gain: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
+    field: Annotated[float, Quantity(RATIO, at_least=0, at_most=0.5)] = 0.0
 
 
 def _mapping(value: object) -> object:

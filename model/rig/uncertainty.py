@@ -12,8 +12,10 @@ class Uncertainty:
 
     gain: of each channel, relative; phase_deg: of each channel [degrees]; thickness: of the plate,
     relative; stiffness: of each ERA, relative; damping: a factor, of the ERAs' damping and of the
-    plate's loss factor, 1 for none; fingertip: of the logarithm of each finger's load. The defaults
-    are those of a plate as built from its drawing and not measured.
+    plate's loss factor, 1 for none; fingertip: of the logarithm of each finger's load; common_gain:
+    of all channels together, relative; field: of what an ERA alone does at a finger, relative to
+    its root mean square over the plate, beside all others. The defaults are those of a plate as
+    built from its drawing and not measured.
     """
 
     gain: float = 0.05
@@ -22,10 +24,12 @@ class Uncertainty:
     stiffness: float = 0.1
     damping: float = 1.5
     fingertip: float = 0.5
+    common_gain: float = 0.0
+    field: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, negative ones, and a factor below 1."""
-        for key in (field.name for field in fields(self)):
+        for key in (each.name for each in fields(self)):
             least = 1.0 if key == "damping" else 0.0
             expect_at_least(getattr(self, key), least, what=f"uncertainty: {key}")
 
@@ -36,9 +40,13 @@ class Uncertainty:
 
     @property
     def exactly_known(self) -> tuple[str, ...]:
-        """Keys of the parameters that are taken as none."""
-        none = asdict(Uncertainty.none())
-        return tuple(key for key, value in asdict(self).items() if value == none[key])
+        """Keys of the parameters that are taken as none, though a plate that is built has some."""
+        none, built = Uncertainty.none(), Uncertainty()
+        return tuple(
+            key
+            for key, value in asdict(self).items()
+            if value == getattr(none, key) != getattr(built, key)
+        )
 
     @property
     def note(self) -> str | None:
@@ -53,8 +61,8 @@ class Uncertainty:
     def __str__(self) -> str:
         """Its terms that are not none, as 'gain 5 %, phase 5°, damping x 1.5'."""
         percents = [
-            f"{key} {100 * getattr(self, key):g} %"
-            for key in ("gain", "thickness", "stiffness")
+            f"{key.replace('_', ' ')} {100 * getattr(self, key):g} %"
+            for key in ("gain", "thickness", "stiffness", "common_gain", "field")
             if getattr(self, key)
         ]
         others = [

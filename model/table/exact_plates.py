@@ -34,7 +34,7 @@ class Plates:
 
     thickness, loss (d,): of the plate; damping (d,): of the ERAs; stiffness (d, eras): of each ERA;
     load (d, contacts): of each finger's dynamic stiffness; gain (d, eras): complex, of each ERA;
-    deviation (d, contacts): of the response at each finger, in discretisation errors.
+    deviation (d, contacts): of the response at each finger, in errors of the field.
     """
 
     thickness: FloatArray
@@ -61,13 +61,16 @@ def draw_plates(
 
     phase = math.radians(uncertainty.phase_deg)
     real, imaginary = normal(contact_count), normal(contact_count)
+    common = np.exp(uncertainty.common_gain * normal(1))
     return Plates(
         thickness=1 + uncertainty.thickness * normal(),
         loss=uncertainty.damping ** normal(),
         damping=uncertainty.damping ** normal(),
         stiffness=1 + uncertainty.stiffness * normal(era_count),
         load=np.exp(uncertainty.fingertip * normal(contact_count)),
-        gain=(1 + uncertainty.gain * normal(era_count)) * np.exp(1j * phase * normal(era_count)),
+        gain=common
+        * (1 + uncertainty.gain * normal(era_count))
+        * np.exp(1j * phase * normal(era_count)),
         deviation=np.asarray(math.sqrt(0.5) * (real + 1j * imaginary)),
     )
 
@@ -108,7 +111,7 @@ def fields_on(
     """Acceleration [m/s²] of each ERA alone at full stroke on plates, (d, points, eras).
 
     At the points of `read_fingertips` of a question, finger by finger, at a row of the table's
-    frequencies; without the deviation of discretisation.
+    frequencies; without the deviation of the field.
     """
     tips = table.read_fingertips(question.contacts)
     fingers = fingertip_loads(table.fingertip, question.contacts, question.loads)

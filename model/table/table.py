@@ -368,11 +368,15 @@ class LocalizationTable:
 
     @cached_property
     def error_power(self) -> Float32Array:
-        """Mean square over the plate of the discretisation error of each ERA's field, (f, eras)."""
+        """Mean square over the plate of the error of each ERA's field, (f, eras).
+
+        Of discretisation, and of what else the rig's uncertainty says of fields.
+        """
         gram = self.shapes.T @ self.shapes / np.float32(self.raster.point_count)
         modal = self._modal_fields(())
         mean_square = np.einsum("fer,rs,fes->fe", modal.conj(), gram, modal, optimize=True).real
-        return np.asarray(self.discretisation_error[:, None] ** 2 * mean_square, dtype=np.float32)
+        error = np.hypot(self.discretisation_error, self.uncertainty.field)[:, None]
+        return np.asarray(error**2 * mean_square, dtype=np.float32)
 
     @cached_property
     def _cell_fields(self) -> Complex64Array:

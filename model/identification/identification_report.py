@@ -9,6 +9,7 @@ from model.identification.identify import MAX_CHI2, Identification
 from model.identification.promise import ExpectedContrast
 from model.quantities import percent, with_error
 
+_MISTAKEN = 0.01  # unexplained, beyond which standard errors of values say too little
 _SHOWN = 2.0  # standard errors from the rig's value, beyond which a form error is listed
 
 # What a unit of a parameter is in the report, and how it is written; all others are factors.
@@ -88,10 +89,16 @@ def fit_rows(found: Identification) -> list[str]:
         unexplained = percent(held.unexplained)
         error = f"{percent(held.total)}, of which the model does not explain {unexplained}"
     verdict = "explains" if found.is_explained else "does not explain"
-    return [
+    rows = [
         f"chi² {found.chi2:.2f}: the model {verdict} the measurement (at most {MAX_CHI2:g})",
         f"responses left out are predicted within: {error}",
     ]
+    if held is not None and held.unexplained > _MISTAKEN:
+        rows.append(
+            "the plate differs from the rig by more than its parameters, such as in thickness from "
+            "end to end: values may be off by several standard errors; answers allow for that"
+        )
+    return rows
 
 
 def contrast_rows(expected: Sequence[ExpectedContrast]) -> list[str]:

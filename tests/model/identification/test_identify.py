@@ -12,6 +12,7 @@ from model.config.document import read_document
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.identification.forward import Sensor
+from model.identification.identification_report import fit_rows
 from model.identification.identify import Identification, identify
 from model.identification.measurement import Measurement, Repeat
 from model.identification.promise import expected_contrast
@@ -108,7 +109,7 @@ def test_contrast_is_promised_of_an_explained_plate(found: Identification) -> No
 def test_uneven_plate_is_promised_less(rig: Rig, found: Identification) -> None:
     """A thickness that differs by 3 % over the plate is what no parameter explains: it is written.
 
-    Fields off by more than 1 % at quiet fingers leave less to promise to one.
+    Fields off by more than 1 % at quiet fingers leave less to promise to one; the report says it.
     """
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
     values = draw("uneven", 3).measured(FREQUENCIES, np.random.default_rng(3))
@@ -123,6 +124,9 @@ def test_uneven_plate_is_promised_less(rig: Rig, found: Identification) -> None:
         for each in (uneven, believed)
     )
     assert promised < too_much - 1
+    (said,) = set(fit_rows(uneven)[2:])
+    assert "standard errors" in said
+    assert not fit_rows(found)[2:]
 
 
 def test_file_with_identified_values_reads_back(found: Identification, tmp_path: Path) -> None:

@@ -114,6 +114,7 @@ async def test_lease_lost_within_armed_raises_at_the_next_call_and_at_the_end(
 
         with pytest.raises(LeaseLost, match="stopped by"):
             await asyncio.to_thread(study)
+        await other.status()  # the study has stopped, too
         await other.clear()
         with pytest.raises(LeaseLost, match="stopped by"):
             await async_study()

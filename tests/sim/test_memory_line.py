@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from drivers import clock
 from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
@@ -18,21 +17,6 @@ from rig_files import TWO_AMPLIFIERS, write_rig
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
 from words_bench import LIMITS, layer, memory_line, rig_in_memory
-
-
-@in_virtual_time
-async def test_hot_amplifier_is_derated_and_stopped(coarse_rig: Rig) -> None:
-    """To half its level, at first; the second status that shows it stops the group."""
-    async with rig_in_memory(coarse_rig) as rig:
-        await rig.group.arm()
-        await rig.group.apply({"main": [layer((0, 110.0, 0.8))]})
-        await rig.beat_until(clock.now() + 0.1)
-        rig.devices["main"].inject_fault(FaultWindow("over_temperature", lasts=1.0))
-        await asyncio.sleep(0.05)
-        assert rig.levels("main")[0] == pytest.approx(0.4)
-        with pytest.raises(CommandRefused, match="level of channel 0 must be 8000"):
-            await rig.beat_until(clock.now() + 0.2)
-        assert not any(rig.levels("main"))
 
 
 @in_virtual_time

@@ -51,16 +51,6 @@ def driven(rig: Rig, place: Callable[[Bench], None]) -> Bench:
     return bench
 
 
-def test_bench_goes_on_while_a_finger_is_unsolved(rig: Rig) -> None:
-    """Its amplifier plays on for 0.7 s in which nothing is solved and nothing sampled."""
-    bench = driven(rig, lambda one: one.begin_placing({"a": A, "b": B}, now=one.time))
-    (amplifier,) = bench.amplifiers.values()
-    assert amplifier.state == "OPERATION_ENABLED"
-    assert bench.unsolved is not None
-    assert not bench.unsolved.is_solved
-    assert bench.positions == {"a": A, "b": B}
-
-
 def test_finger_that_is_solved_late_is_felt_as_one_that_is_solved_at_once(rig: Rig) -> None:
     """The plate waits for it, so that samples before and after it are the same."""
     late = driven(rig, lambda one: one.begin_placing({"a": A, "b": B}, now=one.time))

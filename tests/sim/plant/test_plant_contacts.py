@@ -1,13 +1,13 @@
 """Fingers that load the plate while it vibrates: nothing jumps, nothing is gained or lost."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from driven_bases import Base, faded_base, shaped_base
+from driven_bases import faded_base, shaped_base
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_plate
@@ -103,33 +103,6 @@ def test_contacts_drop_vectors_of_lifted_fingers(coarse_rig: Rig, reduced: Reduc
 
 
 POINTS = np.array([[0.11, 0.07], [0.03, 0.2], [0.3, 0.02]])
-COMING: list[tuple[float, Mapping[str, FingertipLoad]]] = [
-    (0.013, ONE), (0.0305, TWO), (0.047, resting(*PLACES[1:])), (0.06, {}),
-]  # fmt: skip
-
-
-def run(
-    rig: Rig, reduced: ReducedPlate, bases: Sequence[Base | None], cuts: FloatArray
-) -> FloatArray:
-    """Accelerations at points while bases move and fingers come and go, time being cut so."""
-    plant = Plant(reduced, rig.eras)
-    for number, base in enumerate(bases):
-        if base is not None:
-            plant.set_input(number, base.terms)
-    samples, coming = [], dict(COMING)
-    for until in np.union1d([*coming, 0.1], cuts):
-        shapes = plant.reduced.at(POINTS)
-        samples.append(plant.advance(float(until), sample_rate=9600.0, shapes=shapes)[1])
-        if float(until) in coming:
-            plant.set_contacts(coming[float(until)])
-    return np.vstack(samples)
-
-
-def test_contacts_result_is_independent_of_steps(coarse_rig: Rig, reduced: ReducedPlate) -> None:
-    """Cut at three hundred moments by chance, or not at all: the same samples to rounding."""
-    whole = run(coarse_rig, reduced, BASES, np.array([]))
-    cut = run(coarse_rig, reduced, BASES, np.random.default_rng(1).uniform(0, 0.1, 300))
-    assert_allclose(cut, whole, rtol=0, atol=1e-10 * np.abs(whole).max())
 
 
 def test_contacts_are_solved_once(

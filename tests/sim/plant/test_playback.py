@@ -51,15 +51,6 @@ def test_feel_separates_driven_frequencies() -> None:
     np.testing.assert_allclose(clean.amplitude, [first, second], atol=1e-7)
 
 
-def test_feel_without_frequencies() -> None:
-    """Without a frequency there is a peak only."""
-    felt = measure_vibration(
-        Record(np.zeros((1, 2)), np.ones(1), np.arange(5.0), np.full((5, 1), -3.0)), []
-    )
-    assert felt.amplitude.shape == (0, 1)
-    assert felt.peak == [3.0]
-
-
 def test_fingers_felt_uses_the_last_position(coarse_rig: Rig) -> None:
     """Samples from before a move do not count, nor those outside the window."""
     fingers = Fingers(flat_plate(coarse_rig))

@@ -191,19 +191,6 @@ def test_recorder_survives_a_full_disk(coarse_rig: Rig, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_recorder_keeps_the_old_file_without_samples(coarse_rig: Rig, tmp_path: Path) -> None:
-    """A file is replaced only by a complete one."""
-    path = tmp_path / "run.csv"
-    path.write_text("time_s,old")
-    bench = Bench(coarse_rig, now=0.0)
-    recorder = Recorder(bench, path, sensors=[Accelerometer("P1", 0.1, 0.1)], fingers=[])
-    recorder.stop()
-    with pytest.raises(InputError, match=path.name):
-        recorder.finish()
-    assert path.read_text() == "time_s,old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
 @pytest.fixture
 def recorded() -> Recording:
     """Two sensors, awkward numbers, begun late."""

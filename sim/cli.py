@@ -118,11 +118,11 @@ def sim(
         from model.config.points import parse_point
         from model.rig.file import load_rig
         from sim.far_ends.wires import Wire, assign_wires
-        from sim.faults.fault_file import FaultFile, load_faults
-        from sim.firmware.programs import find_firmware
+        from sim.faults.fault_window import FaultFile, load_faults
+        from sim.firmware.bench import find_firmware
         from sim.plant.imperfections import Imperfections, draw_imperfections
         from sim.process.simulation import Simulation
-        from sim.transport.links import links_by_amplifier
+        from sim.transport.pseudo_terminal import links_by_amplifier
 
         defaults = Wire("serial", speed=speed, shared=shared, unpluggable=faults is not None)
         common = _common_wire(

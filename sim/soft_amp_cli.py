@@ -14,7 +14,7 @@ from sim.soft_amp.settings import Law, Protocol, Settings
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from sim.soft_amp.place import Place
+    from sim.soft_amp.settings import Place
 
 
 def port_option(served: str) -> Any:
@@ -141,7 +141,7 @@ def _serial_number(given: str | None, *, device: str) -> str:
 def _place(
     *, serial: bool, tcp: int | None, modbus_tcp: int | None, link: Path | None
 ) -> "AbstractContextManager[Place]":
-    from sim.soft_amp.place import tcp_place, terminal_place
+    from sim.soft_amp.settings import tcp_place, terminal_place
 
     given = [
         name

@@ -26,10 +26,15 @@ from drivers.protocol.table import (
     STATUS_FLAGS,
 )
 from sim.amplifier.readings import (
+    DERATE_ABOVE,
+    DERATED,
+    FAULT_ABOVE,
+    GOOD_BELOW,
     HIGH_VOLTAGE,
     LIMITED,
     AmplifierSummary,
     FaultRecord,
+    ThermalState,
     achieved,
     capabilities,
     exceeds_full,
@@ -38,7 +43,6 @@ from sim.amplifier.readings import (
 )
 from sim.amplifier.set_intake import SetIntake, derated
 from sim.amplifier.state_table import TRANSITIONS
-from sim.amplifier.thermal_model import DERATE_ABOVE, DERATED, FAULT_ABOVE, GOOD_BELOW, ThermalState
 
 SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
 _FAULTS_KEPT = 16

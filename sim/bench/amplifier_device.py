@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 
 from drivers import clock
 from drivers.protocol.records import Refusal, Values
-from sim.amplifier.thermal_model import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
+from sim.amplifier.readings import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
 from sim.bench.bench import Bench
 from sim.faults.fault_window import Faults, FaultWindow
 

@@ -54,7 +54,7 @@ from collections.abc import Mapping
 from model.errors import InputError
 from sim.control.context import SimulationContext
 from sim.control.plate_operations import OPERATIONS, Operation, Request, Response, parse_number
-from sim.faults.fault_file import parse_fault
+from sim.faults.fault_window import parse_fault
 
 VERSION = 3
 _MAX_STEP = 3600.0  # s of virtual time in one request

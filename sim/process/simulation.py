@@ -19,15 +19,14 @@ from sim.bench.bench import Bench, keep_time
 from sim.control.context import SimulationContext
 from sim.control.server import control_socket
 from sim.far_ends.wires import Wire, open_wires
-from sim.faults.fault_file import FaultFile
-from sim.firmware.bench import FirmwareBench
-from sim.firmware.programs import running
+from sim.faults.fault_window import FaultFile
+from sim.firmware.bench import FirmwareBench, running
 from sim.plant.accelerometer import Accelerometer
 from sim.plant.fingers import Position
 from sim.plant.imperfections import Imperfections
 from sim.plant.plant import SAMPLE_RATE
 from sim.process.virtual_time import SteppedLoop
-from sim.transport.links import linked_urls
+from sim.transport.pseudo_terminal import linked_urls
 
 _VIEW_INTERVAL = 0.2  # s
 _NICE = 5  # beside firmware: its replies are due in milliseconds, while its samples can wait

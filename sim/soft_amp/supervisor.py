@@ -20,8 +20,7 @@ from drivers.errors import LinkError
 from model.errors import InputError
 from sim.soft_amp.__main__ import LOST
 from sim.soft_amp.engine import Counters, counters_in, new_file
-from sim.soft_amp.place import Place
-from sim.soft_amp.settings import Settings
+from sim.soft_amp.settings import Place, Settings
 
 STALL = 0.1
 """Time [s] without a rendered block, after which the process that plays is killed."""

@@ -9,10 +9,17 @@ from collections.abc import Collection, Hashable, Mapping, Sequence
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import LATCHED, QUANTITIES
-from sim.witness.amplifier_session import AmplifierSession, Deadlines, Delays, is_vibrating
+from sim.witness.amplifier_session import (
+    AmplifierSession,
+    Deadlines,
+    Delays,
+    ExpectedSets,
+    check_expected,
+    check_set,
+    is_vibrating,
+)
 from sim.witness.config import TimeLimits
 from sim.witness.decoded import A_READ, FEEDING, HELLO, Request, Sent
-from sim.witness.set_rules import ExpectedSets, check_expected, check_set
 
 _IN_FLIGHT = 0.003  # s; from the host's write until a frame is seen, of Modbus RTU at its end
 _IN_TRANSPORT = 0.010  # s; bytes may wait before they pass, while their host counts from its write

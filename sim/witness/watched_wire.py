@@ -4,7 +4,7 @@ import math
 from collections import deque
 from collections.abc import Hashable, Mapping
 
-from sim.witness.amplifier_session import AmplifierSession, Delays
+from sim.witness.amplifier_session import AmplifierSession, Delays, check_sums
 from sim.witness.can_decoder import CanDecoder
 from sim.witness.capture import Direction, Report
 from sim.witness.config import TimeLimits
@@ -19,11 +19,10 @@ from sim.witness.decoded import (
     Reply,
     Request,
     Sent,
+    SerialDecoder,
 )
 from sim.witness.host_rules import HostRules
 from sim.witness.modbus_decoder import ModbusDecoder
-from sim.witness.serial_decoder import SerialDecoder
-from sim.witness.set_rules import check_sums
 
 _RECOVERY = 0.5  # s; after a fault a wire counts as disturbed for so long
 _COPIES = 64  # frames kept to recognise repeated ones

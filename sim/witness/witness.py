@@ -4,12 +4,11 @@ import math
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from typing import Any, Literal
 
-from sim.witness.amplifier_session import AmplifierSession, Delays
+from sim.witness.amplifier_session import AmplifierSession, Delays, ExpectedSets
 from sim.witness.capture import Direction, Report, Violation, capture_line
 from sim.witness.config import WitnessConfig, parse_config
 from sim.witness.expected_amplifier import ExpectedAmplifier
 from sim.witness.host_rules import HostRules
-from sim.witness.set_rules import ExpectedSets
 from sim.witness.watched_wire import WatchedWire
 
 OperatorCommand = Literal["arm", "disarm", "stop", "clear"]

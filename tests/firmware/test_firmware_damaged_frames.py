@@ -21,7 +21,7 @@ from firmware_requests import RandomHost
 from firmware_script import request, stuffed, unstuffed
 from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware
 from mutation import damage
-from sim.far_ends.modbus_frames import rtu_frame
+from sim.far_ends.modbus_amplifiers import rtu_frame
 
 COUNT = int(os.environ.get("FRAMES", "1000"))
 GET_CAPS, GET_STATUS = 2, 9

@@ -6,8 +6,7 @@ import pytest
 
 from model.errors import InputError
 from sim.soft_amp.library import compile_engine
-from sim.soft_amp.place import Place, terminal_place
-from sim.soft_amp.settings import Law, Protocol, Settings
+from sim.soft_amp.settings import Law, Place, Protocol, Settings, terminal_place
 
 
 def settings(**changed: object) -> Settings:

@@ -16,8 +16,8 @@ from drivers.codec.modbus.adu import (
     build_adu,
 )
 from drivers.statistics import WireCounters
-from sim.far_ends.modbus_frames import FRAME_TIMEOUT, RequestReader, rtu_frame, tcp_frame
-from sim.far_ends.modbus_frames import RequestAdu as FarEndRequest
+from sim.far_ends.modbus_amplifiers import FRAME_TIMEOUT, RequestReader, rtu_frame, tcp_frame
+from sim.far_ends.modbus_amplifiers import RequestAdu as FarEndRequest
 
 WORDS = (4711, *range(12))
 

@@ -35,10 +35,7 @@ def build(
     workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Solve the plate and write its table.
-
-    Resume an interrupted build.
-    """
+    """Solve the plate and write its table."""
     from model.commands.options import progress_bar
     from model.config.points import parse_frequencies, parse_pair
     from model.drive_modes import DRIVE_MODES
@@ -46,11 +43,9 @@ def build(
     from model.files.replacing import begins_with, check_ending, check_place, check_replaceable
     from model.finger.grid import Grid
     from model.rig.file import load_rig
-    from model.table.build import build_in_parts
+    from model.table.build import TableProblem, solve_table
     from model.table.file import ZIP, save_table
-    from model.table.kept_parts import KeptParts
     from model.table.table import default_drive_frequencies
-    from model.table.table_parts import TableProblem
 
     if drive_mode not in DRIVE_MODES:
         raise InputError(f"--mode must be one of {', '.join(DRIVE_MODES)}, got {drive_mode!r}")
@@ -63,23 +58,9 @@ def build(
         parse_frequencies(frequencies) if frequencies else default_drive_frequencies(rig.limits)
     )
     problem = TableProblem(rig, chosen, Grid(*parse_pair(grid, what="--grid")))
-    kept = KeptParts.beside(output, problem.digest)
     with progress_bar("parts") as progress:
-        try:
-            built = build_in_parts(
-                problem, drive_mode=drive_mode, workers=workers, kept=kept, progress=progress
-            )
-        except KeyboardInterrupt:
-            state = (
-                f"finished parts are in {kept.folder}; run the same command to resume"
-                if kept.folder.is_dir()
-                else "no part was finished"
-            )
-            typer.echo(f"era: interrupted; {state}", err=True)
-            raise
-    table = built.table
+        table = solve_table(problem, drive_mode=drive_mode, workers=workers, progress=progress)
     save_table(table, output)
-    kept.clear()
     elapsed = time.perf_counter() - started
     error = 100 * float(table.discretisation_error.max())
     warning = _coarse(error, table.mesh)
@@ -95,16 +76,12 @@ def build(
             "fingerprint": table.fingerprint,
             "code_version": table.code_version,
             "exactly_known": [*rig.uncertainty.exactly_known],
-            "parts": built.part_count,
-            "parts_reused": built.reused_count,
             "build_time_s": elapsed,
             "files": [str(output)],
         }
         print(json.dumps(answer))
         _warn(warning)
         return
-    if built.reused_count:
-        print(f"reused {built.reused_count} of {built.part_count} parts of an interrupted build")
     print(
         f"{counted(table.pattern_count, 'pattern')} of "
         f"{counted(len(table.frequencies), 'frequency', plural='frequencies')} for "

@@ -1,11 +1,10 @@
-"""Building a localization table from independent parts.
+"""Building a localization table: its numbers are the same to the bit by any number of processes."""
 
-The result is the same to the bit for any number of processes. Finished parts can be kept
-(`model.table.kept_parts`), so that an interrupted build can be resumed.
-"""
-
-from collections.abc import Callable, Mapping
+import hashlib
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,21 +15,82 @@ from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.files.array_file import Arrays
 from model.finger.grid import Grid
+from model.finger.perception import check_has_threshold
 from model.processes import on_processes
-from model.rig.rig import Rig
-from model.table.kept_parts import KeptParts
+from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.rig import Rig, canonical_json
+from model.spectral.mesh import PlateMesh
+from model.structure.attachments import footprints_of
+from model.structure.dispersion import Dispersion
+from model.structure.support import check_supported
+from model.table.file import FORMAT_VERSION, MAX_BYTES
+from model.table.raster import Raster
 from model.table.table import PAPER_GRID, LocalizationTable, default_drive_frequencies
-from model.table.table_parts import Part, TableProblem, solve_part
-from model.version import code_version
+from model.version import NUMERICS_VERSION, code_version
+from model.vibration.convergence import estimate_error, finer_mesh
 
 
 @dataclass(frozen=True, eq=False)
-class Build:
-    """A table, with the number of its parts that were reused from an interrupted build."""
+class TableProblem:
+    """All that the numbers of a table depend on; the drive mode is not among it.
 
-    table: LocalizationTable
-    part_count: int
-    reused_count: int
+    frequencies (f,) [Hz], ascending, within the rig's limits. Raises InputError for others, and
+    for a rig whose ERAs do not support its plate.
+    """
+
+    rig: Rig
+    frequencies: FloatArray
+    grid: Grid
+
+    def __post_init__(self) -> None:
+        """Refuse frequencies that make no table, and a table that would be too large to be read."""
+        _check_frequencies(self.frequencies, self.rig)
+        check_supported(self.rig.plate, self.rig.eras, loads=self.rig.masses)
+        plate = self.rig.plate
+        wavelength = plate.bending_wavelength(2 * float(self.frequencies[-1]))
+        modes = math.pi * plate.length * plate.width / wavelength**2
+        size = 4 * self.raster.point_count * modes
+        if size > MAX_BYTES:
+            raise InputError(
+                f"a table must have up to {MAX_BYTES / 1e9:.1f} GB, got {size / 1e9:.1f} GB; take "
+                "lower frequencies"
+            )
+
+    @cached_property
+    def raster(self) -> Raster:
+        """Points of the fields."""
+        return Raster.for_plate(self.rig.plate, frequency_max=float(self.frequencies[-1]))
+
+    @cached_property
+    def free_plate(self) -> FreePlate:
+        """Free plate, solved up to the highest frequency."""
+        highest = float(self.frequencies[-1])
+        return solve_free_plate(self.rig.plate, self.rig.mesh, frequency_max=highest)
+
+    @property
+    def reference_mesh(self) -> PlateMesh:
+        """Finer mesh for the discretisation error."""
+        return finer_mesh(
+            self.rig.plate,
+            self.rig.mesh,
+            frequency_max=self.rig.limits.frequency_max,
+            stiffness=max(era.stiffness for era in self.rig.eras),
+        )
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 over everything that decides the numbers of the table, and their format."""
+        decisive = {
+            "format": FORMAT_VERSION,
+            "numerics": NUMERICS_VERSION,
+            "plate": self.rig.fingerprint,
+            "mesh": self.rig.mesh.to_dict(),
+            "reference_mesh": self.reference_mesh.to_dict(),  # follows from the rig's limits
+            "grid": [self.grid.nx, self.grid.ny],
+            "frequencies": self.frequencies.tolist(),
+        }
+        return hashlib.sha256(canonical_json(decisive).encode()).hexdigest()
 
 
 def build_table(
@@ -47,49 +107,30 @@ def build_table(
     """
     if frequencies is None:
         frequencies = default_drive_frequencies(rig.limits)
-    return build_in_parts(TableProblem(rig, frequencies, grid), drive_mode=drive_mode).table
+    return solve_table(TableProblem(rig, frequencies, grid), drive_mode=drive_mode)
 
 
-def build_in_parts(
+def solve_table(
     problem: TableProblem,
     *,
     drive_mode: str,
     workers: int = 1,
-    kept: KeptParts | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Build:
-    """Solve the parts of a table by several processes, and join them.
+) -> LocalizationTable:
+    """Solve modes and discretisation error by several processes.
 
-    kept: where finished parts are read from and stored, an exception or Ctrl-C included. progress:
-    called with the number of finished parts and the total. Raises InputError.
+    progress: called with the number of finished parts and the total. Raises InputError.
     """
     if drive_mode not in DRIVE_MODES:
         raise InputError(f"drive mode must be one of {', '.join(DRIVE_MODES)}, got {drive_mode!r}")
-    parts = dict(enumerate(problem.parts()))
-    found = {number: kept.load(part) for number, part in parts.items()} if kept else {}
-    done = {number: arrays for number, arrays in found.items() if arrays is not None}
-    reused_count = len(done)
-    progress(len(done), len(parts))
-    missing = {number: part for number, part in parts.items() if number not in done}
+    parts = dict(enumerate((_discretisation, _modes)))
+    solved: dict[str, NDArray[Any]] = {}
     # A copy without cached properties, which cannot all be sent to a process.
-    for number, arrays in on_processes(workers, solve_part, replace(problem), missing):
-        if kept:
-            kept.store(parts[number], arrays)
-        done[number] = arrays
-        progress(len(done), len(parts))
-    table = _joined(problem, drive_mode, {parts[number]: done[number] for number in parts})
-    return Build(table, len(parts), reused_count)
-
-
-def _joined(
-    problem: TableProblem, drive_mode: str, solved: Mapping[Part, Arrays]
-) -> LocalizationTable:
-    def joined(name: str, *, axis: int) -> NDArray[Any]:
-        pieces = [arrays[name] for arrays in solved.values() if name in arrays]
-        return np.concatenate(pieces, axis=axis)
-
+    found = on_processes(workers, _solve, replace(problem), parts)
+    for done, (_, arrays) in enumerate(found, start=1):
+        solved |= arrays
+        progress(done, len(parts))
     rig = problem.rig
-    (modes,) = (arrays for part, arrays in solved.items() if part.kind == "modes")
     return LocalizationTable(
         plate=rig.plate,
         eras=rig.eras,
@@ -104,6 +145,55 @@ def _joined(
         code_version=code_version(),
         frequencies=problem.frequencies,
         reference_mesh=problem.reference_mesh,
-        discretisation_error=joined("discretisation_error", axis=0),
-        **modes,
+        **solved,
     )
+
+
+def _solve(problem: TableProblem, part: Callable[[TableProblem], Arrays]) -> Arrays:
+    return part(problem)
+
+
+def _modes(problem: TableProblem) -> Arrays:
+    """Reduced plate at ERAs and loads, and on the raster."""
+    rig, highest = problem.rig, float(problem.frequencies[-1])
+    attached = footprints_of(rig.eras, rig.masses)
+    reduced = reduce_plate(rig.plate, rig.mesh, attached, frequency_max=highest)
+    dispersion = reduced.dispersion
+    if dispersion is None:
+        nothing = np.zeros((0, len(reduced.omega)), dtype=complex)
+        dispersion = Dispersion(np.empty(0), nothing)
+    return {
+        "omega": reduced.omega,
+        "losses": reduced.losses,
+        "dispersion_frequencies": dispersion.frequencies,
+        "dispersion": dispersion.values,
+        "attachment_shapes": reduced.at(attached),
+        "shapes": reduced.at(problem.raster.points).astype(np.float32),
+    }
+
+
+def _discretisation(problem: TableProblem) -> Arrays:
+    """Estimated relative L2 error of the fields, maximum over the ERAs (f,)."""
+    error = estimate_error(
+        problem.free_plate,
+        problem.reference_mesh,
+        problem.rig.eras,
+        problem.frequencies,
+        problem.raster.points,
+        loads=problem.rig.masses,
+    )
+    return {"discretisation_error": error.max(axis=1)}
+
+
+def _check_frequencies(frequencies: FloatArray, rig: Rig) -> None:
+    if len(frequencies) == 0 or not (np.isfinite(frequencies).all()):
+        raise InputError("frequencies of a table must be finite numbers, at least one")
+    if not (np.diff(frequencies) > 0).all():
+        raise InputError("frequencies of a table must ascend without repetition")
+    low, high = rig.limits.frequency_min, rig.limits.frequency_max
+    if frequencies[0] < low or frequencies[-1] > high:
+        raise InputError(
+            f"frequencies must be within the rig's limits.frequency of {low:g} to {high:g} Hz, got "
+            f"{frequencies[0]:g} to {frequencies[-1]:g} Hz; choose others or change the limits"
+        )
+    check_has_threshold(frequencies, rig.threshold)

@@ -11,10 +11,9 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.rig.rig import Rig
-from model.table.build import build_in_parts
+from model.table.build import TableProblem, solve_table
 from model.table.file import FORMAT_VERSION, load_table, save_table
 from model.table.table import PAPER_GRID, LocalizationTable, default_drive_frequencies
-from model.table.table_parts import TableProblem
 from model.version import NUMERICS_VERSION
 
 MAX_CACHED_TABLES = 50  # of some megabytes each; the least recently used go first
@@ -50,7 +49,7 @@ def cached_table(
         with suppress(OSError):
             os.utime(path)
         return table, path
-    table = build_in_parts(problem, drive_mode=drive_mode).table
+    table = solve_table(problem, drive_mode=drive_mode)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         save_table(table, path)

@@ -24,7 +24,7 @@ from model.calibration import calibrate
 
 WRITING = {
     "table build rig.yaml -o out.npz --frequencies 60:90:30 --grid 4x3": (
-        "model.table.build.build_in_parts"
+        "model.table.build.solve_table"
     ),
     "table export table.npz --format csv -o out.csv": "model.table.export.export_csv",
     "table export table.npz --format mat -o out.mat": "model.table.export.export_mat",

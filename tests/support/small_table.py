@@ -6,9 +6,8 @@ from functools import cache
 import numpy as np
 
 from model.finger.grid import Grid
-from model.table.build import build_in_parts
+from model.table.build import TableProblem, solve_table
 from model.table.table import LocalizationTable
-from model.table.table_parts import TableProblem
 from paper_plate import make_paper_rig
 
 FREQUENCIES = np.array([60.0, 110.0, 250.0])
@@ -22,7 +21,7 @@ def small_problem(*, nx: int = 12, ny: int = 9) -> TableProblem:
 @cache
 def small_table(*, drive_mode: str = "switched") -> LocalizationTable:
     """On the paper's own mesh."""
-    return build_in_parts(small_problem(), drive_mode=drive_mode).table
+    return solve_table(small_problem(), drive_mode=drive_mode)
 
 
 def with_strokes(table: LocalizationTable, factor: float) -> LocalizationTable:

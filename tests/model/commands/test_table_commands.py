@@ -1,13 +1,9 @@
 """`era table` as a user types it."""
 
 import json
-import os
 import re
 import shlex
-import signal
-import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -76,7 +72,6 @@ def test_build_writes_a_table_and_what_made_it(tmp_path: Path) -> None:
     assert (answer["patterns"], answer["cells"], answer["mode"]) == (66, 12, "phased")
     assert (answer["mesh"], answer["element"]) == ([12, 9], "MITC4")
     assert 10 < answer["discretisation_error_percent"] < 100  # the paper's mesh is a coarse one
-    assert answer["parts_reused"] == 0
     assert answer["files"] == [str(path)]
     assert load_table(path).fingerprint == answer["fingerprint"]
     assert list(tmp_path.iterdir()) == [path]
@@ -96,42 +91,6 @@ def test_build_notes_a_coarse_mesh_and_what_is_taken_as_none(tmp_path: Path) -> 
     assert answer["exactly_known"] == []
     assert answer["discretisation_error_percent"] < 5
     assert table("build", RIG, "-o", path, *fine).stderr == ""
-
-
-@pytest.mark.parametrize(
-    ("ending", "status"),
-    [
-        pytest.param(signal.SIGINT, 130, marks=pytest.mark.long),
-        (signal.SIGKILL, -signal.SIGKILL),
-    ],
-)
-def test_build_resumes_when_it_was_ended(
-    tmp_path: Path, ending: signal.Signals, status: int
-) -> None:
-    """Ctrl-C or a kill in the middle of two workers; the same command reuses finished parts."""
-    path, folder = tmp_path / "t.npz", tmp_path / "t.npz.parts"
-    long = ["--mesh", "24x18", "--frequencies", "60:320:2"]
-    with subprocess.Popen(
-        [ERA, "table", "build", RIG, "-o", str(path), *long, "--workers", "2"],
-        stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        text=True,
-        start_new_session=True,
-    ) as running:
-        while len(list(folder.glob("*.part.npz"))) < 1:
-            assert running.poll() is None
-            time.sleep(0.01)
-        os.killpg(running.pid, ending)
-        _, printed = running.communicate(timeout=60)
-    assert running.returncode == status
-    assert not path.exists()
-    if ending is signal.SIGINT:
-        assert str(folder) in printed
-        assert "Traceback" not in printed
-    kept = len(list(folder.glob("[!.]*.part.npz")))
-    assert kept >= 1
-    assert as_json("build", RIG, "-o", path, *long)["parts_reused"] == kept
-    assert [left.name for left in tmp_path.iterdir()] == ["t.npz"]
 
 
 def test_show_prints_summary_map_and_a_query_that_has_an_answer(

@@ -16,12 +16,11 @@ from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.structure.plate import Material, Plate
-from model.table.build import build_table
+from model.table.build import TableProblem, build_table
 from model.table.live_table import table_following
 from model.table.question import Question
 from model.table.raster import Raster
 from model.table.table import LocalizationTable, default_drive_frequencies
-from model.table.table_parts import TableProblem
 from model.vibration.excitation import tone_amplitudes
 from paper_plate import make_paper_rig
 from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table

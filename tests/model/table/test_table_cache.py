@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from model.finger.grid import Grid
-from model.table import table_cache, table_parts
+from model.table import build, table_cache
 from model.table.table_cache import cached_table
 from paper_plate import make_paper_rig
 
@@ -35,13 +35,13 @@ def cache(tmp_path, monkeypatch):
 def builds(monkeypatch):
     """The problems that are solved."""
     solved = []
-    build = table_cache.build_in_parts
+    solve = table_cache.solve_table
 
     def counting(problem, **options):
         solved.append(problem)
-        return build(problem, **options)
+        return solve(problem, **options)
 
-    monkeypatch.setattr(table_cache, "build_in_parts", counting)
+    monkeypatch.setattr(table_cache, "solve_table", counting)
     return solved
 
 
@@ -90,7 +90,7 @@ def test_cached_table_is_built_again_when_its_file_is_damaged_or_foreign(builds)
 def test_cached_table_of_other_numerics_is_replaced(builds, monkeypatch, cache):
     """A table of another NUMERICS_VERSION is not used, and removed with the next that is kept."""
     with monkeypatch.context() as older:
-        older.setattr(table_parts, "NUMERICS_VERSION", 0)
+        older.setattr(build, "NUMERICS_VERSION", 0)
         older.setattr(table_cache, "_CURRENT", "table-4.0-")
         cached_table(RIG, **FEW)
     (cache / "table-0123456789abcdef.npz").touch()

@@ -20,7 +20,7 @@ def live() -> dict[str, float]:
     plate = parametric_plate(rig, points, np.linspace(60.0, 320.0, 27))
     eras = np.array([(era.stiffness, era.damping, era.bolt_mass) for era in rig.eras])
     of = rig.plate
-    free = plate.receptances(of.material.E, of.loss_factor)
+    free = plate.receptances(of.material.E, of.loss_factor, of.thickness)
 
     def changed_plate() -> None:
         found = plate.receptances(1.01 * of.material.E, 0.02, thickness=1.01 * of.thickness)

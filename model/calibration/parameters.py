@@ -118,7 +118,8 @@ def responses_at(
     parameters: as `parameters_of` orders them.
     """
     modulus, loss_factor, eras = _values(parameters, x)
-    return plate.receptances(modulus, loss_factor).responses(eras, rig.masses)
+    free = plate.receptances(modulus, loss_factor, rig.plate.thickness)
+    return free.responses(eras, rig.masses)
 
 
 def response_slopes(
@@ -126,7 +127,9 @@ def response_slopes(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Responses as `responses_at`, and their derivatives by x (n, f, e, p)."""
     modulus, loss_factor, eras = _values(parameters, x)
-    responses, slopes = plate.response_slopes(modulus, loss_factor, eras, rig.masses)
+    responses, slopes = plate.response_slopes(
+        modulus, loss_factor, rig.plate.thickness, eras, rig.masses
+    )
     own = [p.slope(float(at)) for p, at in zip(parameters, x, strict=True)]
     return responses, slopes * np.array(own)[:, None, None, None]
 

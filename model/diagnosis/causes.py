@@ -3,9 +3,8 @@
 Each is varied over a range with the rest of the rig unchanged; for the best the rest may then vary
 within its priors (`model.diagnosis.plate_match`).
 
-Not tried: two causes at once, plates that are not rectangles, further supports. A plate t times as
-thick moves like one with t² times the modulus on ERAs and masses divided by t, apart from shear and
-rotary inertia, which are small in a thin plate. Density cannot be distinguished from these.
+Not tried: two causes at once, plates that are not rectangles, further supports, and density, which
+cannot be distinguished from the others.
 """
 
 import math
@@ -143,13 +142,12 @@ def explain(
     explained = [
         Explanation(
             cause,
-            # A thicker plate is replaced by one of the old thickness.
-            cause.value(rig) * factor if cause.key == "plate.thickness" else cause.value(match.rig),
+            cause.value(match.rig),
             cause.value(rig),
             match,
             float(weight),
         )
-        for (cause, factor, match), weight in zip(fits, weights / weights.sum(), strict=True)
+        for (cause, _, match), weight in zip(fits, weights / weights.sum(), strict=True)
     ]
     return ranked_by(explained, lambda each: each.share)
 
@@ -195,26 +193,7 @@ def _misfit(values: ComplexArray, model: ComplexArray) -> float:
 
 
 def _thickness(rig: Rig, factor: float) -> Rig:
-    """Plate of the old thickness that moves as a thicker one does."""
-    eras = tuple(
-        replace(
-            era,
-            stiffness=era.stiffness / factor,
-            damping=era.damping / factor,
-            bolt_mass=era.bolt_mass / factor,
-        )
-        for era in rig.eras
-    )
-    masses = tuple(
-        replace(
-            load,
-            stiffness=load.stiffness / factor,
-            damping=load.damping / factor,
-            mass=load.mass / factor,
-        )
-        for load in rig.masses
-    )
-    return replace(_modulus(rig, factor**2), eras=eras, masses=masses)
+    return replace(rig, plate=rig.plate.scaled(thickness=factor))
 
 
 def _stretched(rig: Rig, along_x: float, along_y: float) -> Rig:

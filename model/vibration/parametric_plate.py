@@ -92,16 +92,12 @@ class ParametricPlate:
         """
         eras = np.array([(era.stiffness, era.damping, era.bolt_mass) for era in rig.eras])
         plate = rig.plate
-        free = self.receptances(plate.material.E, plate.loss_factor, thickness=plate.thickness)
+        free = self.receptances(plate.material.E, plate.loss_factor, plate.thickness)
         return free.responses(eras, rig.masses)
 
-    def receptances(
-        self, modulus: float, loss_factor: float, *, thickness: float | None = None
-    ) -> FreeReceptances:
-        """Receptances of the free plate, by default with its own thickness [m]."""
-        thicker = 1.0 if thickness is None else thickness / self.plate.thickness
-        elastic, _ = self._elastic(modulus * thicker**3, loss_factor)
-        modal = 1 / (elastic - thicker * (self.omega**2)[:, None])
+    def receptances(self, modulus: float, loss_factor: float, thickness: float) -> FreeReceptances:
+        """Receptances of the free plate with another modulus [Pa], loss and thickness [m]."""
+        _, _, modal = self._modal(modulus, loss_factor, thickness)
         # Real products of both parts: the shapes are real.
         found = np.empty((len(modal), self._products.shape[1]), dtype=complex)
         found.real, found.imag = modal.real @ self._products, modal.imag @ self._products
@@ -112,24 +108,29 @@ class ParametricPlate:
         )
 
     def response_slopes(
-        self, modulus: float, loss_factor: float, eras: FloatArray, loads: Sequence[Load]
+        self,
+        modulus: float,
+        loss_factor: float,
+        thickness: float,
+        eras: FloatArray,
+        loads: Sequence[Load],
     ) -> tuple[ComplexArray, ComplexArray]:
         """Responses of ERAs (e, 3) and loads (f, e, p), and their derivatives (2 + 3 e, f, e, p).
 
-        As `FreeReceptances.responses`. Derivatives are by modulus [1/Pa], loss factor and the
-        stiffness, damping and bolt mass of one ERA after the other [m/N, m/(N s), 1/kg]. With
-        T = A (1 + Z A)^-1, changes dA and dZ change T by (1 - T Z) dA (1 - Z T) - T dZ T.
+        As `FreeReceptances.responses`, at a thickness [m]. Derivatives are by modulus [1/Pa], loss
+        factor and the stiffness, damping and bolt mass of one ERA after the other [m/N, m/(N s),
+        1/kg]. With T = A (1 + Z A)^-1, changes dA and dZ change T by
+        (1 - T Z) dA (1 - Z T) - T dZ T.
         """
-        free = self.receptances(modulus, loss_factor)
+        free = self.receptances(modulus, loss_factor, thickness)
         stiffness, base = free.attached(eras, loads)
         count = base.shape[1]
         unit = np.eye(stiffness.shape[1], dtype=complex)
         forces = coupled_forces(free.between, stiffness, unit)  # on the plate, by those applied
         to_points = free.to_points @ forces
         moved = (free.between @ forces)[:, :, :count] * base[:, None]  # (f, h, e)
-        elastic, lossless = self._elastic(modulus, loss_factor)
+        elastic, lossless, modal = self._modal(modulus, loss_factor, thickness)
         omega = self.omega[:, None]
-        modal = 1 / (elastic - omega**2)
         # Shapes at points where all else is held by its attachments, and forces on modes (f, r, e).
         held = self.shapes - (to_points * stiffness[:, None]) @ self.attachment_shapes
         driven = self.attachment_shapes.T @ (forces[:, :, :count] * base[:, None])
@@ -147,13 +148,18 @@ class ParametricPlate:
         responses = scale * to_points[:, :, :count] * base[:, None]
         return np.swapaxes(responses, 1, 2), np.swapaxes(scale * np.array(found), 2, 3)
 
-    def _elastic(self, modulus: float, loss_factor: float) -> tuple[ComplexArray, FloatArray]:
-        """Complex stiffness of each mode (f, r) [rad²/s²], and by how much it turns with loss."""
+    def _modal(
+        self, modulus: float, loss_factor: float, thickness: float
+    ) -> tuple[ComplexArray, FloatArray, ComplexArray]:
+        """Complex stiffness of each mode (f, r) [rad²/s²], its slope by loss, and receptance."""
         elasticity = ModalElasticity.of(self.plate, self.eigenvalues, self.losses, self.dispersion)
-        stiffer = modulus / self.plate.material.E
+        thicker = thickness / self.plate.thickness
+        stiffer = modulus / self.plate.material.E * thicker**3
         turned = elasticity.loss_ratios(self.omega) * elasticity.eigenvalues
         lossy = elasticity.eigenvalues + 1j * loss_factor * turned
-        return stiffer * (lossy + elasticity.further(self.omega)), stiffer * turned
+        elastic = stiffer * (lossy + elasticity.further(self.omega))
+        modal = 1 / (elastic - thicker * (self.omega**2)[:, None])
+        return elastic, stiffer * turned, modal
 
     @cached_property
     def _products(self) -> FloatArray:

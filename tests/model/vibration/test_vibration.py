@@ -196,7 +196,8 @@ def test_responses_scale_with_stiffness_and_mass(plate, other):
 
 def test_receptances_of_a_plate_serve_any_eras_and_fingers(plate):
     """Worked out once, for values of ERAs and fingers that change afterwards."""
-    free = plate.receptances(RIG.plate.material.E, RIG.plate.loss_factor)
+    own = RIG.plate
+    free = plate.receptances(own.material.E, own.loss_factor, own.thickness)
     other = _mounted(RIG, stiffness=1.3, damping=0.5, mass=2.0)
     eras = np.array([(era.stiffness, era.damping, era.bolt_mass) for era in other.eras])
     found = free.responses(eras, other.masses)[: len(FREQUENCIES)]
@@ -205,15 +206,20 @@ def test_receptances_of_a_plate_serve_any_eras_and_fingers(plate):
 
 
 def test_response_slopes_are_exact(plate):
-    """By modulus, loss factor and values of four ERAs beside a finger, to 1e-7 of the largest."""
+    """Of a thicker plate by modulus, loss factor and values of four ERAs beside a finger.
+
+    To 1e-7 of the largest.
+    """
+    thickness = 1.1 * RIG.plate.thickness
     eras = np.array([(era.stiffness, era.damping, era.bolt_mass + 0.01) for era in RIG.eras])
     at = np.concatenate([[RIG.plate.material.E, RIG.plate.loss_factor], eras.ravel()])
 
     def responses(shares: np.ndarray) -> np.ndarray:
         modulus, loss, *own = shares * at
-        return plate.receptances(modulus, loss).responses(np.reshape(own, (4, 3)), RIG.masses)
+        free = plate.receptances(modulus, loss, thickness)
+        return free.responses(np.reshape(own, (4, 3)), RIG.masses)
 
-    found, slopes = plate.response_slopes(at[0], at[1], eras, RIG.masses)
+    found, slopes = plate.response_slopes(at[0], at[1], thickness, eras, RIG.masses)
     np.testing.assert_allclose(found, responses(np.ones(14)), atol=1e-12 * np.abs(found).max())
     exact = extrapolated_slopes(responses, np.ones(14), step=1e-3)
     for own, true, size in zip(slopes, exact, at, strict=True):

@@ -132,6 +132,7 @@ bench-latency: .venv/installed-test
 # Others: make bench-promise PROMISE='--sets 20'
 bench-promise: .venv/installed-peers
 	$(BIN)/python -m benchmarks.promise --report $(PROMISE)
+	$(BIN)/python -m benchmarks.promise.contents --plates 60 --report
 
 bench-localization: .venv/installed
 	$(BIN)/python -m benchmarks.localization --report

@@ -180,6 +180,11 @@ class ContactStatus(Message):
         description="of the contents of others there, which nine of ten plates do not exceed; "
         "null where there are none",
     )
+    leak_db_sl: float | None = Field(
+        None,
+        description="of the contents of others where it is now, on the plate as modelled: more "
+        "than promised while it moves; in the status only, null where there are none",
+    )
     held_back: str | None = Field(
         None, description="why a target does not feel its own; null if it does"
     )

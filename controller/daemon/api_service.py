@@ -121,7 +121,7 @@ class ApiService:
             watchdog_s=self._controller.watchdog,
             armed_by=lease.owner if lease else None,
             lease_left_s=lease.expires_at - now if lease else None,
-            contacts=view.contact_statuses(),
+            contacts=view.statuses_now(self._controller.table),
             drive=view.drive() if pattern else {},
             silence_reason=view.silenced.reason if view.silenced and lease else None,
             robust_felt_contrast_db=pattern.robust_felt_contrast_db if pattern else None,

@@ -22,6 +22,7 @@ from controller.api.schema import (
 from controller.api.topics import ContactsEvent, PatternEvent, PlateEvent, SilenceEvent
 from controller.daemon.config import DaemonConfig
 from controller.learning.learning_status import LearningStatus
+from controller.loop.leak import leaks_db_sl
 from controller.loop.observer import Applied, Silenced
 from controller.loop.routing import Drive
 from controller.sources.contacts import Contact, ContactKey
@@ -55,6 +56,18 @@ class PlateView:
         return [
             contact_status(contact, self.applied or self.silenced, self.effect_of(contact.key))
             for contact in self.contacts
+        ]
+
+    def statuses_now(self, table: LocalizationTable) -> list[ContactStatus]:
+        """All contacts with their roles, and what leaks to them where they are now."""
+        statuses = self.contact_statuses()
+        if self.applied is None:
+            return statuses
+        contents = [each.content for each in self.applied.contents.values() if each.drive]
+        leaks = leaks_db_sl(table, contents, self.contacts)
+        return [
+            status.model_copy(update={"leak_db_sl": _finite(leaks[contact.key])})
+            for status, contact in zip(statuses, self.contacts, strict=True)
         ]
 
     def contacts_event(self) -> ContactsEvent:

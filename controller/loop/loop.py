@@ -158,6 +158,11 @@ class Controller:
         return self._drive_mode or DRIVE_MODES[-1]
 
     @property
+    def table(self) -> LocalizationTable:
+        """The table that answers."""
+        return self._table
+
+    @property
     def rejected_touches(self) -> Mapping[str, int]:
         """Number of touches that could not be contacts, by reason."""
         return self._rejects.counts

@@ -221,7 +221,9 @@ async def _moved(on: Any, table: "LocalizationTable") -> float:
         on.at[2] = (x + far * way[0], y + far * way[1])
         on.report()
         await asyncio.sleep(REPORT)
-        contacts = [Contact(ContactKey("panel", id), *at, since=0.0) for id, at in on.at.items()]
+        contacts = [
+            Contact(ContactKey("panel", id), x, y, since=0.0) for id, (x, y) in on.at.items()
+        ]
         contents = [each.content for each in on.applied[-1].contents.values()]
         highest = max(highest, leaks_db_sl(table, contents, contacts)[key])
     return highest

@@ -4,6 +4,7 @@ import asyncio
 import math
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 from controller.demo.far_end import SimulatedPlate
@@ -25,21 +26,18 @@ from drivers.errors import LinkError
 from model.transients.measures import ONSET_WINDOW
 
 STEADY_WINDOW = 0.25
-"""Length [s] of the measured end of a pattern: settled, and it separates tones 10 Hz apart."""
+"""Time [s] over which a pattern is measured: settled, and it separates tones 10 Hz apart.
+
+It is the end of the longest time in which no finger lands, moves or lifts.
+"""
 
 MARGIN = 0.005
 """Time [s] from the last byte on the wire to the plate, and before the next command."""
-
-RESPONSE = 0.5
-"""Longest time [s] on a busy machine from a change of fingers to the reply to what it led to."""
 
 STEADY_DURATION = 0.4
 """Shortest pattern [s] that counts as steady; the plate rings for 50 ms to 1 s."""
 
 _NOT_THE_TARGET = "another finger came down at the same moment and was the target"
-
-SLIDE_PAUSE = 0.25
-"""Shortest rest [s] after which a finger that moves begins another slide."""
 
 MIN_MOVEMENT = 0.001
 """Movement [m] below which a finger's sensor stays in place, so that its window is not broken."""
@@ -92,8 +90,7 @@ class TouchRecorder:
         self._start = clock.now()
         self._touches: dict[ContactKey, _Touch] = {}
         self._playing: _Playing | None = None
-        self._changed_at = -math.inf  # when a finger landed, lifted or began to slide last
-        self._moved_at = -math.inf
+        self._changes: list[float] = []  # when fingers landed, moved or lifted
         self._sensors: dict[str, Position] = {}
         self._loads: dict[str, float] = {}
         self._tasks: set[asyncio.Task[Any]] = set()
@@ -145,7 +142,7 @@ class TouchRecorder:
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         self._move_sensors(contacts)
         if change.down or change.up:
-            self._changed_at = clock.now()
+            self._changes.append(clock.now())
         for contact in change.down:
             others = {_id(other): _place(other) for other in contacts if other != contact}
             self._touches[contact.key] = _Touch(contact, others, reason=self._fault)
@@ -190,10 +187,12 @@ class TouchRecorder:
         if ended is None:
             return
         ended.until = now
+        # Its end is reported with the reply to what ended it, some time after the fingers changed.
         settled = ended.applied.time + ended.applied.pattern.ramp
-        # Its end is reported with the reply to what ended it: the change of a finger is the end.
-        end = self._changed_at if now - RESPONSE < self._changed_at < now else now
-        since, until = max(settled, end - STEADY_WINDOW) + MARGIN, end - MARGIN
+        changes = [each for each in self._changes if settled < each < now]
+        start, end = max(pairwise([settled, *changes, now]), key=lambda rest: rest[1] - rest[0])
+        since, until = max(start, end - STEADY_WINDOW) + MARGIN, end - MARGIN
+        self._changes = changes
         if is_measured and since < until:
             ended.steady = self._run(self._plate.vibration(since, until))
         for touch in ended.touches:
@@ -216,11 +215,8 @@ class TouchRecorder:
             before = self._sensors.get(_id(contact), (math.inf, math.inf))
             is_at_rest = math.dist(before, position) < MIN_MOVEMENT
             sensors[_id(contact)] = before if is_at_rest else position
-        before_now = self._sensors.items()
-        if any(sensors.get(id, position) != position for id, position in before_now):
-            if clock.now() - self._moved_at > SLIDE_PAUSE:
-                self._changed_at = clock.now()
-            self._moved_at = clock.now()
+        if any(sensors.get(id, position) != position for id, position in self._sensors.items()):
+            self._changes.append(clock.now())
         loads = {_id(contact): contact.load for contact in contacts}
         if sensors != self._sensors or loads != self._loads:
             self._sensors, self._loads = sensors, loads

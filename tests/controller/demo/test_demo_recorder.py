@@ -1,16 +1,19 @@
 """Rows of touches that were not played, a plate that is armed again, a far end that fails."""
 
 import asyncio
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
 from controller.demo import far_end, run
 from controller.demo.far_end import SimulatedPlate, simulated_plate
 from controller.demo.recorder import TouchRecorder
-from controller.demo.touch_row import TouchRow
-from controller.loop.content import not_served
-from controller.loop.observer import Silenced
+from controller.demo.touch_row import FingerVibration, TouchRow
+from controller.loop.content import Prediction, not_served
+from controller.loop.observer import Applied, Silenced
 from controller.plate_control import PlateControl
 from controller.sources.contacts import Change, Contact, ContactKey
 from daemon_bench import ENABLED, ready_daemon, until, until_state
@@ -18,6 +21,7 @@ from drivers import clock
 from drivers.errors import LinkError
 from model.rig.file import example_rig_path
 from sim.faults.fault_window import FaultWindow
+from virtual_loop import in_virtual_time
 
 FAULT = "amplifier d: state must be OPERATION_ENABLED, got FAULT with fault WATCHDOG"
 
@@ -65,6 +69,39 @@ async def test_recorder_raises_a_fault_that_lasts(tmp_path: Path) -> None:
     recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
     with pytest.raises(LinkError, match=f"aborted: {FAULT}$"):
         await recorder.finish()
+
+
+@in_virtual_time
+async def test_pattern_is_measured_while_no_finger_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before a slide that lasts until the next pattern; what it rings to afterwards is no level."""
+    monkeypatch.setattr(clock, "now", asyncio.get_running_loop().time)
+    windows: list[tuple[float, float]] = []
+
+    async def vibration(since: float, until: float) -> dict[str, FingerVibration]:
+        windows.append((since, until))
+        return {}
+
+    async def place_fingers(*_: object) -> None:
+        pass
+
+    plate = SimpleNamespace(vibration=vibration, place_fingers=place_fingers)
+    recorder = TouchRecorder(cast(SimulatedPlate, plate), on_row=lambda row: None)
+    observer, start = recorder.observer, clock.now()
+    finger = contact(1)
+    observer.contacts_changed((finger,), Change(down=(finger,)))
+    for _ in range(2):
+        felt = Prediction(finger, 20.0)
+        applied = SimpleNamespace(
+            time=clock.now(), targets=(felt,), pattern=SimpleNamespace(ramp=0.04), quiet=()
+        )
+        applied.from_rest = True
+        observer.pattern_applied(cast(Applied, applied))
+        await asyncio.sleep(1.0)
+        for _ in range(8):
+            finger = replace(finger, x=finger.x + 0.004)
+            observer.contacts_changed((finger,), Change(moved=(finger,)))
+            await asyncio.sleep(0.1)
+    assert windows == [pytest.approx((start + 0.755, start + 0.995))]
 
 
 async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(

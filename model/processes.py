@@ -4,8 +4,8 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -35,48 +35,25 @@ def on_processes(
     if count == 1:
         yield from ((number, solve(shared, task)) for number, task in tasks.items())
         return
-    with process_pool(min(count, len(tasks)) or 1, solve, shared) as submit:
-        numbers = dict(zip(submit(tasks.values()), tasks, strict=True))
-        for future in as_completed(numbers):
-            yield numbers[future], future.result()
-
-
-@contextmanager
-def process_pool(
-    count: int, solve: Callable[[Shared, Task], Result], shared: Shared
-) -> Iterator[Callable[[Iterable[Task]], list[Future[Result]]]]:
-    """A function that begins to solve tasks on processes.
-
-    count, solve, shared: as for `on_processes`. Raises InputError if a process dies.
-    """
     for variable in _THREAD_COUNTS:
         os.environ.setdefault(variable, "1")  # read by numpy when a new process loads it
     pool = ProcessPoolExecutor(
-        count,
+        min(count, len(tasks)) or 1,
         mp_context=multiprocessing.get_context("spawn"),
         initializer=_start_worker,
         initargs=(solve, shared),
     )
-
-    def submit(tasks: Iterable[Task]) -> list[Future[Result]]:
-        with _interrupts_blocked():
-            return [pool.submit(_run, task) for task in tasks]
-
     try:
-        yield submit
+        with _interrupts_blocked():
+            numbers = {pool.submit(_run, task): number for number, task in tasks.items()}
+        for future in as_completed(numbers):
+            yield numbers[future], future.result()
     except BrokenProcessPool:
         raise InputError(
             "a worker process died, perhaps short of memory; use fewer of them (--workers)"
         ) from None
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def processor_count() -> int:
-    """Number of processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 @contextmanager

@@ -35,14 +35,14 @@ def plot(
     from model.figures import save_figure
     from model.figures.table_pictures import table_figures
     from model.table.file import load_table
-    from model.table.overview import kept_overview
+    from model.table.overview import find_overview
 
     table = load_table(table_file)
     output.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     files = []
     with progress_bar("cells and contact sets") as progress:
-        overview = kept_overview(table_file, table, progress=progress)
+        overview = find_overview(table, progress=progress)
     for name, figure in table_figures(table, overview):
         path = output / f"{name}.png"
         save_figure(figure, path)

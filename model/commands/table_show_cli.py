@@ -22,13 +22,13 @@ def show(
     """Show levels, weak cells, contrast and origin of a table."""
     from model.commands.options import progress_bar
     from model.table.file import load_table
-    from model.table.overview import kept_overview
+    from model.table.overview import find_overview
     from model.table.summary import summarize
 
     table = load_table(table_file)
     started = time.perf_counter()
     with progress_bar("cells and contact sets") as progress:
-        overview = kept_overview(table_file, table, progress=progress)
+        overview = find_overview(table, progress=progress)
     summary, cells = summarize(table, overview), overview.cells
     elapsed = time.perf_counter() - started
     if as_json:

@@ -7,20 +7,20 @@ finger is then at its threshold. It is *weak* if more than one other finger in t
 """
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import islice
-from typing import Any
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import FloatArray
+from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
+from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Plate
-from model.table.many_answers import Ask, Contrasts, ask_here
-from model.table.mirrored_questions import mirror_images
 from model.table.question import Question
 from model.table.table import LocalizationTable
 
@@ -36,6 +36,11 @@ STRATA = (2, 2)
 Their mirror images in both axes are used too, so that a symmetric plate has a symmetric map, with
 less variance than from places drawn freely.
 """
+
+Contrasts: TypeAlias = tuple[float, float]
+"""Felt contrast [dB] of nine of ten plates, and that of the plate as modelled."""
+
+_DECIMALS = 9  # of places [m]: below that is rounding
 
 # Weak places are as large as a quarter of a wavelength.
 _MAX_GRID = Grid(8, 6)
@@ -111,22 +116,18 @@ def map_grid(table: LocalizationTable) -> Grid:
 def find_weak_cells(
     table: LocalizationTable,
     *,
-    ask: Ask | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> WeakCells:
     """Query the table for each cell of `map_grid` in its default drive mode.
 
-    ask: answers the questions, in this process by default; progress: called with the number of
-    finished cells and the total.
+    progress: called with the number of finished cells and the total.
     """
     grid = map_grid(table)
     centres = grid.centres(table.plate)
     found, errors = np.full((2, 2, len(centres)), np.nan)
-    asked = pair_questions(table)
-    answers = (ask or ask_here(table))([question for some in asked for question in some])
     pairs: list[Contrasts] = []
-    for cell, questions in enumerate(asked):
-        answered = list(islice(answers, len(questions)))
+    for cell, questions in enumerate(pair_questions(table)):
+        answered = [contrasts_of(table, question) for question in questions]
         pairs += filter(None, answered)
         # -inf where the level is not reached.
         contrasts = [-np.inf if each is None else each[0] for each in answered]
@@ -148,8 +149,7 @@ def pair_questions(table: LocalizationTable) -> list[list[Question]]:
     """
     grid, plate = map_grid(table), table.plate
     centres = grid.centres(plate)
-    images = mirror_images(table)
-    along_x, along_y = (True, False) in images, (False, True) in images
+    along_x, along_y = (_is_symmetric(table, axis) for axis in range(2))
 
     def seed(x: int, y: int) -> list[int]:
         return [
@@ -162,6 +162,36 @@ def pair_questions(table: LocalizationTable) -> list[list[Question]]:
         for y in range(grid.ny)
         for x in range(grid.nx)
     ]
+
+
+def contrasts_of(table: LocalizationTable, question: Question) -> Contrasts | None:
+    """Robust and nominal felt contrast [dB], None where the level is not reached."""
+    try:
+        found = table.query(question)
+    except InputError:
+        return None
+    robust, nominal = found.robust_felt_contrast_db, found.felt_contrast_db
+    return None if robust is None or nominal is None else (robust, nominal)
+
+
+def _is_symmetric(table: LocalizationTable, axis: int) -> bool:
+    """Whether the ERAs and masses of a plate are their own mirror image along x (0) or y (1)."""
+    side = (table.plate.length, table.plate.width)[axis]
+
+    def places(attached: Iterable[Era | PointLoad], *, mirrored: bool) -> Counter[Era | PointLoad]:
+        """What is attached, without names, at its places or their images."""
+        found: Counter[Era | PointLoad] = Counter()
+        for each in attached:
+            at = [each.x, each.y]
+            at[axis] = side - at[axis] if mirrored else at[axis]
+            nameless = replace(each, name="") if isinstance(each, Era) else each
+            found[replace(nameless, x=round(at[0], _DECIMALS), y=round(at[1], _DECIMALS))] += 1
+        return found
+
+    return all(
+        places(attached, mirrored=True) == places(attached, mirrored=False)
+        for attached in (table.eras, table.masses)
+    )
 
 
 def text_map(weak: WeakCells) -> Iterator[str]:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from command_page import WRITER, command_reference
 from controller.cli.main import load_commands
 from model.cli import app
-from model.table import contact_sets
+from model.table import overview
 from page_part import insert
 
 ROOT = Path(__file__).parents[2]
@@ -122,7 +122,7 @@ def test_the_keys_are_those_that_are_printed(
 ) -> None:
     """The table names the keys at the top of what `--json` prints, and no others."""
     monkeypatch.chdir(built)
-    monkeypatch.setattr(contact_sets, "CONTACT_SETS", 12)
+    monkeypatch.setattr(overview, "CONTACT_SETS", 12)
     result = CliRunner().invoke(app, [*arguments, "--json"])
     assert result.exit_code == 0, result.output
     name = " ".join(["era", *arguments[:2]])

@@ -44,7 +44,7 @@ QUICK = [
 
 LONG = {
     "table plot table.npz -o plots": "model.figures.table_pictures.table_figures",
-    "table show table.npz": "model.table.overview.kept_overview",
+    "table show table.npz": "model.table.overview.find_overview",
     "table verify table.npz rig.yaml": "model.table.verify.verify_table",
     "plate convergence rig.yaml": "model.vibration.convergence.study_convergence",
     "rig check rig.yaml --measured measured.csv": "model.diagnosis.verdict.diagnose",

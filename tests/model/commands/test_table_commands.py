@@ -7,7 +7,6 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,7 +16,7 @@ from typer.testing import CliRunner
 from model.cli import app
 from model.errors import InputError
 from model.rig.file import example_rig_path
-from model.table import contact_sets, overview
+from model.table import overview
 from model.table.file import load_table, save_table
 from model.table.pattern_choice import UnreachableLevel
 
@@ -44,13 +43,10 @@ def as_json(*arguments: str | Path) -> dict[str, Any]:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def few_sets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Distributions of few contact sets, kept in a folder of these tests."""
-    folder = tmp_path_factory.mktemp("cache")
+def few_sets() -> Iterator[None]:
+    """Distributions of few contact sets."""
     with pytest.MonkeyPatch.context() as patch:
-        cache = SimpleNamespace(user_cache_path=lambda *_, **__: folder)
-        patch.setattr(overview, "platformdirs", cache)
-        patch.setattr(contact_sets, "CONTACT_SETS", 12)
+        patch.setattr(overview, "CONTACT_SETS", 12)
         yield
 
 

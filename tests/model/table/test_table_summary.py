@@ -9,16 +9,15 @@ import pytest
 
 from model.errors import InputError
 from model.finger.grid import Grid
+from model.structure.attachments import PointLoad
 from model.table.build import build_table
-from model.table.contact_sets import CONTACT_SETS, contrast_distribution
-from model.table.file import save_table
-from model.table.many_answers import ask_on_processes
-from model.table.overview import Overview, find_overview, kept_overview
+from model.table.overview import CONTACT_SETS, Overview, contrast_distribution, find_overview
 from model.table.summary import similar_share, summarize
 from model.table.weak_cells import (
     WeakCells,
     find_weak_cells,
     map_grid,
+    pair_questions,
     sampling_error,
     text_map,
 )
@@ -43,7 +42,7 @@ def test_weak_cells_of_a_symmetric_plate_are_symmetric(table):
     assert np.ptp(weak.median_db) > 0.5
 
 
-def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
+def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table, monkeypatch):
     """Half of a cell's contrasts are below its median, a tenth below the other.
 
     Its other fingers are in different ones of 4 by 4 fields, at least 5 cm from the cell.
@@ -52,15 +51,15 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
     drawn: dict[tuple[float, float], list[float]] = {}
     tried: dict[tuple[float, float], list[tuple[float, float]]] = {}
 
-    def at_random(questions):
-        for question in questions:
-            (target,), (other,) = question.targets, question.quiet
-            assert math.dist(target, other) >= 0.05
-            tried.setdefault(target, []).append(other)
-            drawn.setdefault(target, []).append(float(rng.uniform(0, 30)))
-            yield drawn[target][-1], None
+    def at_random(_, question):
+        (target,), (other,) = question.targets, question.quiet
+        assert math.dist(target, other) >= 0.05
+        tried.setdefault(target, []).append(other)
+        drawn.setdefault(target, []).append(float(rng.uniform(0, 30)))
+        return drawn[target][-1], 0.0
 
-    weak = find_weak_cells(table, ask=at_random)
+    monkeypatch.setattr("model.table.weak_cells.contrasts_of", at_random)
+    weak = find_weak_cells(table)
     assert len(drawn) == len(weak.centres) == 12
     for values, share in ((weak.median_db, 0.5), (weak.tenth_db, 0.1)):
         for value, contrasts in zip(values, drawn.values(), strict=True):
@@ -80,6 +79,31 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
         )
 
 
+def test_other_fingers_mirror_each_other_only_where_the_plate_does(table):
+    """A mass on the middle line leaves symmetry along x, a weaker corner none."""
+    length, width = table.plate.length, table.plate.width
+
+    def rounded(places):
+        return sorted((round(x, 9), round(y, 9)) for x, y in places)
+
+    def symmetries(some):
+        asked = {
+            rounded(each[0].targets)[0]: [one.quiet[0] for one in each]
+            for each in pair_questions(some)
+        }
+        for at in (lambda x, y: (length - x, y), lambda x, y: (x, width - y)):
+            yield all(
+                rounded(at(*place) for place in places) == rounded(asked[rounded([at(*target)])[0]])
+                for target, places in asked.items()
+            )
+
+    mass = PointLoad(length / 2, width / 4, mass=0.05)
+    weaker = replace(table.eras[0], stroke=0.9 * table.eras[0].stroke)
+    assert list(symmetries(table)) == [True, True]
+    assert list(symmetries(replace(table, masses=(mass,)))) == [True, False]
+    assert list(symmetries(replace(table, eras=(weaker, *table.eras[1:])))) == [False, False]
+
+
 def test_sampling_error_is_how_much_a_percentile_of_random_samples_varies():
     """Of 5000 samples of 64 normal values the median is within 0.157, the tenth within 0.214.
 
@@ -92,56 +116,6 @@ def test_sampling_error_is_how_much_a_percentile_of_random_samples_varies():
         assert stated.mean() == pytest.approx(expected, rel=0.15)
         assert sampling_error(np.tile(samples[0], 4), percent) == stated[0]
     assert math.isnan(sampling_error([-np.inf, -np.inf, 1.0, 2.0], 50))
-
-
-@pytest.mark.long
-def test_overview_is_the_same_on_processes(table, monkeypatch):
-    """Questions are drawn and counted in the same order, whoever answers them."""
-    monkeypatch.setattr("model.table.contact_sets.CONTACT_SETS", 20)
-    with ask_on_processes(table, questions=100, count=2) as ask:
-        found = find_overview(table, ask=ask)
-    here = find_overview(table)
-    np.testing.assert_array_equal(found.cells.median_db, here.cells.median_db)
-    assert summarize(table, found) == summarize(table, here)
-
-
-def test_overview_is_computed_once_for_a_table_file(table, tmp_path, monkeypatch):
-    """Kept until the file or the code is another, and where what is kept is damaged."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    computed = []
-
-    def find(table, *, ask, progress):
-        computed.append(table)
-        cells = WeakCells(
-            map_grid(table),
-            map_grid(table).centres(table.plate),
-            np.array([-np.inf, np.nan, *range(10)]),
-            np.zeros(12),
-            np.array([[np.nan, *range(11)], range(12)]),
-            np.array([[12.0, 13.0], [15.0, 16.0]]),
-        )
-        return Overview(cells, [cells.pairs_db, np.zeros((2, 3)), np.empty((2, 0))])
-
-    monkeypatch.setattr("model.table.overview.find_overview", find)
-    path = tmp_path / "table.npz"
-    save_table(table, path)
-    first, again = (kept_overview(path, table) for _ in range(2))
-    assert len(computed) == 1
-    for one, other in zip(
-        (*vars(first.cells).values(), *first.contrasts),
-        (*vars(again.cells).values(), *again.contrasts),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(one, other)
-    (kept,) = (tmp_path / "cache" / "era-haptics").glob("overview-*")
-    kept.write_bytes(kept.read_bytes()[:-20])
-    kept_overview(path, table)
-    save_table(replace(table, drive_mode="phased"), path)
-    kept_overview(path, table)
-    monkeypatch.setattr("model.table.overview.code_version", lambda: "another")
-    kept_overview(path, table)
-    kept_overview(path, table)
-    assert len(computed) == 4
 
 
 def test_map_grid_is_coarser_than_a_fine_grid(table):

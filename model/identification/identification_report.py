@@ -6,24 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from model.identification.identify import MAX_CHI2, Identification
+from model.identification.parameters import KINDS
 from model.identification.promise import ExpectedContrast
 from model.quantities import percent, with_error
 
 _MISTAKEN = 0.01  # unexplained, beyond which standard errors of values say too little
 _SHOWN = 2.0  # standard errors from the rig's value, beyond which a form error is listed
-
-# What a unit of a parameter is in the report, and how it is written; all others are factors.
-_UNITS = {
-    "phase": (math.degrees(1), "°", "deg"),
-    "sensor_phase": (math.degrees(1), "°", "deg"),
-    "bolt_mass": (1e3, "g", "g"),
-    "place": (1e3, "mm", "mm"),
-    "loss_exponent": (1.0, "", ""),
-    "inertia": (1.0, "/kHz²", "1/kHz^2"),
-    "drag": (1.0, "/kHz", "1/kHz"),
-}
-_PERCENT = (100.0, "%", "percent")
-_MASS_UNITS = (_UNITS["bolt_mass"], _UNITS["place"], _UNITS["place"])
 
 _ALWAYS = ("thickness", "modulus", "stiffness", "damping", "loss", "gain", "phase")
 
@@ -59,16 +47,15 @@ def estimates(found: Identification) -> list[Estimate]:
         if not space.std[number]:
             continue
         kind = kinds[number]
-        if kind == "masses":
-            scale, unit, key = _MASS_UNITS[(number - space.groups[kind].start) % 3]
-        else:
-            scale, unit, key = _UNITS.get(kind, _PERCENT)
+        is_place = kind == "masses" and (number - space.groups[kind].start) % 3
+        known = KINDS["place" if is_place else kind]
         std, error = float(space.std[number]), float(posterior.std[number])
         difference = std * float(posterior.x[number])
-        if unit == "%":  # of logarithms of factors
+        if known.unit == "%":  # of logarithms of factors
             std, error = math.expm1(std), math.exp(difference) * error
             difference = math.expm1(difference)
-        rows.append(Estimate(name, kind, scale * difference, scale * error, scale * std, unit, key))
+        difference, error, std = (known.per_unit * each for each in (difference, error, std))
+        rows.append(Estimate(name, kind, difference, error, std, known.unit, known.key))
     return rows
 
 

@@ -9,7 +9,6 @@ crack or a change that nothing explains the plate counts as changed, until patte
 plate as it was.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -25,7 +24,7 @@ from model.identification.identified_rig import rig_with
 from model.identification.identify import Identification, solved_for
 from model.identification.kalman import State, update
 from model.identification.noise import NoiseLevel
-from model.identification.parameters import FINGER, FINGER_PARTS, MODE_SHIFTS, Space, space_of
+from model.identification.parameters import FINGER_PARTS, KINDS, MODE_SHIFTS, Space, space_of
 from model.identification.posterior import THEORY
 from model.identification.settled import SettledPattern, Touched
 from model.identification.stages import Setting
@@ -38,31 +37,12 @@ _EARLY, _HELD = 4, 6  # patterns that are explained together, at first and at la
 _AFTER_ALARM = 2  # patterns before a change counts as unexplained
 _CERTAIN = 12.0  # of the cost: by how much an early explanation is better than any other
 _ITERATIONS = 3
+_FINGER = KINDS["fingers"].std
 
 _NOT_STATED = (
     *("modulus", "damping_each", "loss_exponent", "bolt_mass"),
     *("place", "mode_shifts", "mode_losses"),
 )
-
-DRIFT = {
-    "thickness": 0.01,
-    "stiffness": 0.03,
-    "damping_each": 0.07,
-    "loss": 0.1,
-    "gain": 0.01,
-    "phase": math.radians(1),
-}
-"""By kind, how far a parameter walks in an hour, one standard deviation."""
-
-UNMEASURED = {
-    "thickness": Uncertainty().thickness,
-    "stiffness": Uncertainty().stiffness,
-    "damping_each": math.log(Uncertainty().damping),
-    "loss": math.log(Uncertainty().damping),
-    "gain": Uncertainty().gain,
-    "phase": math.radians(Uncertainty().phase_deg),
-}
-"""By kind, how uncertain a plate is that nobody measured: drift makes it no worse than that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +161,7 @@ class LivePlate:
 
     def take(self, pattern: SettledPattern) -> Report:
         """Take a settled pattern: update the state, or hold it and explain what happened."""
-        touched = Touched.of(self._model, pattern, FINGER, noise=self._noise.relative)
+        touched = Touched.of(self._model, pattern, _FINGER, noise=self._noise.relative)
         drifted = self._drifted(pattern.time)
         if self._held:
             self._held.append(touched)
@@ -204,7 +184,7 @@ class LivePlate:
         if self.can_update and not self.has_changed and not self._alarm.is_odd:
             self._state, self._time = after.state, pattern.time
             self._noise.take(after)
-        fingers = np.exp(FINGER * after.fingers.reshape(-1, len(FINGER_PARTS)))
+        fingers = np.exp(_FINGER * after.fingers.reshape(-1, len(FINGER_PARTS)))
         return Report(after.nis, after.count, False, False, None, fingers)
 
     def _go_back(self, suspect: list[Taken]) -> None:
@@ -253,12 +233,12 @@ class LivePlate:
             self._time = time
         space, variance = self.space, np.zeros(self.space.size)
         before = np.diag(self._state.covariance)
-        for kind, std in DRIFT.items():
-            group = space.groups[kind]
+        for name, kind in KINDS.items():
+            group = space.groups[name]
             known = space.std[group]
             scale = np.divide(1.0, known, out=np.zeros_like(known), where=known > 0)
-            room = np.maximum((UNMEASURED[kind] * scale) ** 2 - before[group], 0.0)
-            variance[group] = np.minimum((std * scale) ** 2 * hours, room)
+            room = np.maximum((kind.widest * scale) ** 2 - before[group], 0.0)
+            variance[group] = np.minimum((kind.drift * scale) ** 2 * hours, room)
         return State(self._state.x, self._state.covariance + np.diag(variance))
 
 

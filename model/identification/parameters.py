@@ -19,19 +19,61 @@ MODE_SHIFTS = 12
 FINGER_PARTS = ("contact mass", "pulp", "phalanx", "joint")
 """Groups of a finger's load that vary on their own."""
 
-# Standard deviations of what a rig's `uncertainty` does not state: of logarithms, in rad, kg and m.
-_MODULUS = 0.02
-_DAMPING_EACH = 0.2  # of one ERA beside that of all
-_LOSS_EXPONENT = 0.3  # of the loss factor's power of frequency
-_SENSOR_GAIN, _SENSOR_PHASE = 0.05, math.radians(5)
-_BOLT_MASS = 0.5e-3
-_PLACE = 1.5e-3  # of an ERA, on each axis
-_MASS = 2e-3
-_MODE_SHIFT, _MODE_LOSS = 0.01, 0.5  # of an eigenvalue omega², of the loss factor of a mode
-_INERTIA, _DRAG = 1 / 0.7**2, 1 / 0.7  # of a resonance at 700 Hz with a damping ratio of 0.5
 
-FINGER = 0.5
-"""Standard deviation of the logarithm of each group of a finger's load."""
+@dataclass(frozen=True)
+class Kind:
+    """What is known beforehand of all parameters of a kind.
+
+    std: standard deviation in the unit of `Values`, of a plate that was not measured; unit, key,
+    per_unit: how reports write it, for people and for programs, and how many of it are one in
+    `Values`: by default per cent of logarithms; drift: how far it walks in an hour in service,
+    drifts_to: how uncertain it becomes at most, by default as before it was measured.
+    """
+
+    std: float
+    unit: str = "%"
+    key: str = "percent"
+    per_unit: float = 100.0
+    drift: float = 0.0
+    drifts_to: float = 0.0
+
+    @property
+    def widest(self) -> float:
+        """How uncertain drift makes it at most."""
+        return self.drifts_to or self.std
+
+
+_BUILT = Uncertainty()
+_PHASE = ("°", "deg", math.degrees(1))
+_LENGTH, _WEIGHT = ("mm", "mm", 1e3), ("g", "g", 1e3)
+
+KINDS = {
+    "thickness": Kind(_BUILT.thickness, drift=0.01),
+    "modulus": Kind(0.02),
+    "stiffness": Kind(_BUILT.stiffness, drift=0.03),
+    "damping": Kind(math.log(_BUILT.damping)),
+    # Of one ERA beside that of all.
+    "damping_each": Kind(0.2, drift=0.07, drifts_to=math.log(_BUILT.damping)),
+    "loss": Kind(math.log(_BUILT.damping), drift=0.1),
+    # The power of frequency that the loss factor follows.
+    "loss_exponent": Kind(0.3, "", "", 1.0),
+    "gain": Kind(_BUILT.gain, drift=0.01),
+    "phase": Kind(math.radians(_BUILT.phase_deg), *_PHASE, drift=math.radians(1)),
+    # A resonance at 700 Hz with a damping ratio of 0.5.
+    "inertia": Kind(1 / 0.7**2, "/kHz²", "1/kHz^2", 1.0),
+    "drag": Kind(1 / 0.7, "/kHz", "1/kHz", 1.0),
+    "sensor_gain": Kind(0.05),
+    "sensor_phase": Kind(math.radians(5), *_PHASE),
+    "bolt_mass": Kind(0.5e-3, *_WEIGHT),
+    # Of an ERA, on each axis.
+    "place": Kind(1.5e-3, *_LENGTH),
+    "masses": Kind(2e-3, *_WEIGHT),
+    "mode_shifts": Kind(0.01),
+    "mode_losses": Kind(0.5),
+    # Of each group of a finger's load.
+    "fingers": Kind(0.5),
+}
+"""Kinds of parameters; of some a rig's `uncertainty` states the standard deviation instead."""
 
 _AT_EDGE = 1e-6  # m
 
@@ -101,53 +143,56 @@ def space_of(
     builder = _Builder()
     add = builder.add
     add("thickness", ["thickness"], uncertainty.thickness)
-    add("modulus", ["modulus"], _MODULUS if uncertainty.thickness else 0.0)
+    add("modulus", ["modulus"], KINDS["modulus"].std * (uncertainty.thickness > 0))
     add("stiffness", [f"stiffness {name}" for name in eras], uncertainty.stiffness)
     damping = math.log(uncertainty.damping)
     damped = [float(damping > 0 and era.damping > 0) for era in rig.eras]
     add("damping", ["damping"], damping * max(damped))
-    add("damping_each", [f"damping {name}" for name in eras], _DAMPING_EACH * np.array(damped))
+    add(
+        "damping_each",
+        [f"damping {name}" for name in eras],
+        KINDS["damping_each"].std * np.array(damped),
+    )
     lossy = float(damping > 0 and plate.loss_factor > 0)
     add("loss", ["loss factor"], damping * lossy)
     exponents = np.array([-MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT]) - plate.loss_exponent
-    low, high = exponents / _LOSS_EXPONENT
-    add("loss_exponent", ["loss exponent"], _LOSS_EXPONENT * lossy, lower=low, upper=high)
+    exponent = KINDS["loss_exponent"].std
+    low, high = exponents / exponent
+    add("loss_exponent", ["loss exponent"], exponent * lossy, lower=low, upper=high)
     gain = math.hypot(uncertainty.gain, uncertainty.common_gain)
     add("gain", [f"gain {name}" for name in eras], gain)
     add("phase", [f"phase {name}" for name in eras], math.radians(uncertainty.phase_deg))
     # A measured gain has the lag of its drive in it.
     lagging = np.array([float(drives_lag and not era.gains) for era in rig.eras])
-    for kind, std in (("inertia", _INERTIA), ("drag", _DRAG)):
-        add(kind, [f"{kind} of drive {name}" for name in eras], std * lagging, lower=0.0)
-    add("sensor_gain", [f"gain of sensor {name}" for name in sensors], _SENSOR_GAIN)
-    add("sensor_phase", [f"phase of sensor {name}" for name in sensors], _SENSOR_PHASE)
-    least = [-era.bolt_mass / _BOLT_MASS for era in rig.eras]
-    add("bolt_mass", [f"bolt mass {name}" for name in eras], _BOLT_MASS, lower=least)
+    for kind in ("inertia", "drag"):
+        std = KINDS[kind].std * lagging
+        add(kind, [f"{kind} of drive {name}" for name in eras], std, lower=0.0)
+    add("sensor_gain", [f"gain of sensor {name}" for name in sensors])
+    add("sensor_phase", [f"phase of sensor {name}" for name in sensors])
+    least = [-era.bolt_mass / KINDS["bolt_mass"].std for era in rig.eras]
+    add("bolt_mass", [f"bolt mass {name}" for name in eras], lower=least)
     sides = np.array([plate.length, plate.width])
     places = np.array([(era.x, era.y) for era in rig.eras])
     add(
         "place",
         [f"{axis} of {name}" for name in eras for axis in "xy"],
-        _PLACE,
-        lower=(-places / _PLACE).ravel(),
-        upper=((sides - places) / _PLACE).ravel(),
+        lower=(-places / KINDS["place"].std).ravel(),
+        upper=((sides - places) / KINDS["place"].std).ravel(),
     )
     # About the middle of the plate.
     add(
         "masses",
         [f"{of}mass {n}" for n in range(1, masses + 1) for of in ("", "x of ", "y of ")],
-        np.tile([_MASS, *sides / 3], masses),
+        np.tile([KINDS["masses"].std, *sides / 3], masses),
         lower=np.tile([0.0, -1.5, -1.5], masses),
         upper=np.tile([np.inf, 1.5, 1.5], masses),
     )
     modes = range(1, min(mode_count, MODE_SHIFTS) + 1)
-    add("mode_shifts", [f"stiffness of mode {number}" for number in modes], _MODE_SHIFT)
-    add("mode_losses", [f"loss of mode {number}" for number in modes], _MODE_LOSS * lossy)
-    add(
-        "fingers",
-        [f"{part} of finger {n}" for n in range(1, fingers + 1) for part in FINGER_PARTS],
-        FINGER,
-    )
+    add("mode_shifts", [f"stiffness of mode {number}" for number in modes])
+    of_mode = KINDS["mode_losses"].std * lossy
+    add("mode_losses", [f"loss of mode {number}" for number in modes], of_mode)
+    resting = range(1, fingers + 1)
+    add("fingers", [f"{part} of finger {n}" for n in resting for part in FINGER_PARTS])
     return builder.space()
 
 
@@ -177,11 +222,13 @@ class _Builder:
         self,
         kind: str,
         names: Sequence[str],
-        std: float | Sequence[float] | FloatArray,
+        std: float | FloatArray | None = None,
         *,
         lower: Sequence[float] | FloatArray | float = -np.inf,
         upper: Sequence[float] | FloatArray | float = np.inf,
     ) -> None:
+        if std is None:
+            std = KINDS[kind].std
         start, count = len(self._names), len(names)
         self._names += names
         self._groups[kind] = slice(start, start + count)

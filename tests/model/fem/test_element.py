@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import eigh
 
 from model.arrays import FloatArray
-from model.fem.mesh import ELEMENTS, MITC4, Element, Mesh, rigidities
+from model.fem.mesh import ELEMENTS, Element, Mesh, rigidities
 from model.fem.plate import assemble, lowest_modes
 from model.structure.plate import Plate
 from paper_plate import ALUMINIUM
@@ -56,21 +56,6 @@ def test_high_order_nodes_are_gauss_lobatto(name, side):
     assert ELEMENTS[name].side[-2] == pytest.approx(side, rel=1e-14)
 
 
-def test_matrices_are_symmetric_and_mirrored(element):
-    """Under reflection along x and y too, as a quarter plate requires; the mass is definite."""
-    count = len(element.side)
-    number = np.arange(count**2).reshape(count, count)
-    for matrix in (element.stiffness(PLATE, DX, DY), element.mass(PLATE, DX, DY)):
-        tolerance = 1e-9 * np.abs(matrix).max()
-        np.testing.assert_allclose(matrix, matrix.T, atol=tolerance)
-        for order, signs in ((number[:, ::-1], [1, -1, 1]), (number[::-1], [1, 1, -1])):
-            place = (3 * order.reshape(-1, 1) + np.arange(3)).ravel()
-            sign = np.tile(signs, count**2)
-            mirrored = matrix[np.ix_(place, place)] * np.outer(sign, sign)
-            np.testing.assert_allclose(mirrored, matrix, atol=tolerance)
-    assert np.linalg.eigvalsh(element.mass(PLATE, DX, DY))[0] > 0
-
-
 def test_three_motions_take_no_force(element):
     """Up and down, and both tilts; there are no spurious modes."""
     stiffness = element.stiffness(PLATE, DX, DY)
@@ -117,35 +102,6 @@ def test_mass_is_that_of_the_section(element):
         motion = nodal(element, *fields[shift:], *fields[:shift])
         found = motion @ element.mass(PLATE, DX, DY) @ motion / (DX * DY)
         assert found == pytest.approx(expected, rel=1e-9)
-
-
-def strains(xi: float, eta: float) -> tuple[FloatArray, FloatArray]:
-    """Curvature (3, 12) and shear (2, 12) of the 12 dof of four nodes (paper Eq. 5 and 3)."""
-    corners = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
-    x, y = (1 + corners * [xi, eta]).T
-    along_x, along_y = corners[:, 0] * y / (2 * DX), corners[:, 1] * x / (2 * DY)
-    curvature, shear = np.zeros((3, 12)), np.zeros((2, 12))
-    curvature[0, 1::3] = curvature[2, 2::3] = shear[0, 0::3] = along_x
-    curvature[1, 2::3] = curvature[2, 1::3] = shear[1, 0::3] = along_y
-    shear[0, 1::3] = shear[1, 2::3] = -x * y / 4
-    return curvature, shear
-
-
-def test_mitc4_ties_its_shear_at_the_middles_of_its_sides():
-    """By definition (Bathe and Dvorkin 1985), integrated at 2 x 2 points."""
-    bending, shear, _ = rigidities(PLATE)
-    below, above, left, right = (strains(*at)[1] for at in ((0, -1), (0, 1), (-1, 0), (1, 0)))
-    total = np.zeros((12, 12))
-    for xi, eta in ((-1, -1), (1, -1), (-1, 1), (1, 1)) * np.sqrt([1 / 3]):
-        curvature, _ = strains(xi, eta)
-        tied = [
-            (1 - eta) * below[0] + (1 + eta) * above[0],
-            (1 - xi) * left[1] + (1 + xi) * right[1],
-        ]
-        strain = np.array(tied) / 2
-        total += (curvature.T @ bending @ curvature + shear * strain.T @ strain) * DX * DY / 4
-    found = MITC4.stiffness(PLATE, DX, DY)
-    np.testing.assert_allclose(found, total, atol=1e-12 * np.abs(total).max())
 
 
 def frequency_error(element: Element, count: int) -> float:

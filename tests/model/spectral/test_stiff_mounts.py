@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 from scipy import special
-from scipy.integrate import quad, trapezoid
+from scipy.integrate import trapezoid
 from scipy.special import eval_legendre
 
 from model.fem.mesh import Mesh, element_of
 from model.reduction.free_plate import solve_free_plate
-from model.spectral.functions import EVEN, ODD, EdgedFunctions, _polynomials
+from model.spectral.functions import EVEN, EdgedFunctions, _polynomials
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import Era
 from paper_plate import make_paper_rig
@@ -76,68 +76,7 @@ def test_patches_dent_as_the_infinite_plate_says():
     assert weights @ np.diagonal(between[0]).real == pytest.approx(expected, rel=0.02)
 
 
-LENGTH, DEGREE, DECAY = 0.3, 8, 2000.0
-
-
-def _layer(x: float, parity: int) -> float:
-    return np.exp(-DECAY * x) + parity * np.exp(-DECAY * (LENGTH - x))
-
-
-@pytest.mark.parametrize("parity", [EVEN, ODD])
-def test_slope_integrals_are_those_of_legendre_polynomials(parity):
-    """The integrals of f'g and f'g' of normalised Legendre polynomials, by adaptive quadrature."""
-    direction = EdgedFunctions(LENGTH, DEGREE, (DECAY,))
-    degrees = range((1 - parity) // 2, DEGREE + 1, 2)
-    others = range((1 + parity) // 2, DEGREE + 1, 2)
-
-    def value(degree, x):
-        return np.sqrt((2 * degree + 1) / LENGTH) * eval_legendre(degree, 2 * x / LENGTH - 1)
-
-    def slope(degree, x):
-        step = 1e-6 * LENGTH
-        return (value(degree, x + step) - value(degree, x - step)) / (2 * step)
-
-    products = [
-        [quad(lambda x, i=i, j=j: slope(i, x) * value(j, x), 0, LENGTH)[0] for j in others]
-        for i in degrees
-    ]
-    squares = [
-        [quad(lambda x, i=i, j=j: slope(i, x) * slope(j, x), 0, LENGTH)[0] for j in degrees]
-        for i in degrees
-    ]
-    found = direction.slope_products[parity][: len(degrees), : len(others)]
-    np.testing.assert_allclose(found, products, rtol=1e-6, atol=1e-6 / LENGTH)
-    found = direction.slope_squares[parity][: len(degrees), : len(degrees)]
-    np.testing.assert_allclose(found, squares, rtol=1e-6, atol=1e-6 / LENGTH**2)
-
-
-@pytest.mark.parametrize("parity", [EVEN, ODD])
-def test_the_layer_is_orthogonal_to_the_polynomials_and_of_unit_norm(parity):
-    """Its slope integral is that of the layer less its polynomials, by adaptive quadrature."""
-    direction = EdgedFunctions(LENGTH, DEGREE, (DECAY,))
-    degrees = range((1 - parity) // 2, DEGREE + 1, 2)
-    near_edges = {"points": [3 / DECAY, LENGTH - 3 / DECAY], "limit": 400}
-
-    def polynomial(degree, x):
-        return np.sqrt((2 * degree + 1) / LENGTH) * eval_legendre(degree, 2 * x / LENGTH - 1)
-
-    share = [
-        quad(lambda x, n=n: polynomial(n, x) * _layer(x, parity), 0, LENGTH, **near_edges)[0]
-        for n in degrees
-    ]
-
-    def rest(x):
-        return _layer(x, parity) - sum(
-            part * polynomial(n, x) for part, n in zip(share, degrees, strict=True)
-        )
-
-    def slope(x):
-        step = 1e-3 / DECAY
-        return (rest(x + step) - rest(x - step)) / (2 * step)
-
-    norm = quad(lambda x: rest(x) ** 2, 0, LENGTH, **near_edges)[0]
-    square = quad(lambda x: slope(x) ** 2, 0, LENGTH, **near_edges)[0] / norm
-    assert direction.slope_squares[parity][-1, -1] == pytest.approx(square, rel=1e-5)
+LENGTH, DECAY = 0.3, 2000.0
 
 
 def test_a_layer_that_polynomials_resolve_is_left_out():

@@ -243,11 +243,6 @@ class Playback:
         known = self._layers.get(layer)
         return math.inf if known is None else known.ends
 
-    def is_endless(self, layer: int) -> bool:
-        """Whether a layer plays until it is silenced, with no set that waits."""
-        known = self._layers.get(layer)
-        return known is not None and known.ends == math.inf and known.waiting is None
-
     @property
     def ends_by(self) -> float:
         """Latest time at which all is silent by itself [s]; infinite without `valid_for`."""

@@ -17,7 +17,7 @@ from serial.tools.list_ports import comports
 from drivers.codec.can_bus.adapter_text import SLCAN, SLCAN_RATES, TextReader
 from drivers.codec.can_bus.canopen import BITRATE, cob_id
 from drivers.codec.can_bus.segments import NODE_MAX
-from drivers.ports.opening import remedy_of
+from drivers.ports.serial_port import remedy_of
 from drivers.urls import ADDRESS, BAUD, RTU_BAUD
 
 _BAUD = 115_200  # ignored by USB devices, which most adapters are

@@ -18,7 +18,7 @@ from drivers.codec.can_bus.segments import (
     segments,
     unpack_frames,
 )
-from drivers.host.wire import Arrival, OtherHost, Reply, Several, read_event, read_reply
+from drivers.host.wire import Arrival, OtherHost, Reply, Several, Wire, read_event, read_reply
 from drivers.protocol.records import Values
 from drivers.protocol.table import (
     BROADCAST,
@@ -36,7 +36,7 @@ _VERSIONS_READ = bytes((0x4B, 0x00, 0x20, 5))  # two bytes of data follow
 _START: int = CANOPEN["nmt"]["start"]
 
 
-class CanWire:
+class CanWire(Wire):
     """A bus at a bit rate [bit/s]; sequence: before the first request to a node, 0 to 255.
 
     delay [s]: of a network on the way to the bus.
@@ -44,7 +44,6 @@ class CanWire:
 
     def __init__(self, bitrate: int, *, sequence: int, delay: float = 0.0) -> None:
         self.counters = WireCounters()
-        self.busy = self.takes = 0.0
         self.is_kept = True
         self.delay = delay
         self._frame_time = frame_time(bitrate)
@@ -91,10 +90,6 @@ class CanWire:
     def transit(self, words: int) -> float:
         """Return how long a request of so many words takes to arrive [s]."""
         return frames_of(words) * self._frame_time
-
-    def exchange_time(self, words: int, reply: int) -> float:
-        """Return how long a request and a reply of so many words take [s]."""
-        return self.transit(words) + self.transit(reply)
 
     def _arrivals(self, frame: CanFrame) -> list[Arrival]:
         node = frame.id & NODE_MAX

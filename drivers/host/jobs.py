@@ -113,11 +113,6 @@ class Priority(IntEnum):
     OTHER = 6
     READING = 7
 
-    @property
-    def is_stop_class(self) -> bool:
-        """Whether it silences the amplifier: sent and repeated before all others."""
-        return self <= Priority.SILENCE
-
 
 _SUPERSEDED = {
     # A queued heartbeat would feed the watchdog of an amplifier that did not receive the stop.
@@ -156,6 +151,11 @@ class Job:
     delays: int = 0
     is_last_look: bool = False
     had_no_reply: bool = False
+
+    @property
+    def is_stop_class(self) -> bool:
+        """Whether it silences the amplifier: sent and repeated before all others."""
+        return self.priority <= Priority.SILENCE
 
     def has_waited(self, now: float) -> bool:
         """Whether it is as urgent as a heartbeat by now [s], for it waits for long."""
@@ -200,14 +200,11 @@ class JobQueue:
 
     def next(self, now: float) -> Job | None:
         """Return the job whose turn it is; None while all pause, or a stop does."""
-        if len(self.jobs) == 1:
-            (first,) = self.jobs
-        else:
-            first = min(self.jobs, key=lambda job: self._rank(job, now))
-            if first.not_before > now and not first.priority.is_stop_class:
-                ready = [job for job in self.jobs if job.not_before <= now]
-                return min(ready, key=lambda job: self._rank(job, now), default=None)
-        return first if first.not_before <= now else None
+        first: Job | None = self.jobs[0]
+        if len(self.jobs) > 1:
+            ready = [job for job in self.jobs if job.not_before <= now or job.is_stop_class]
+            first = min(ready, key=lambda job: self._rank(job, now), default=None)
+        return None if first is None or first.not_before > now else first
 
     def superseded_by(self, priority: Priority, member: "Dialogue | None") -> list[Job]:
         """Return the jobs that a request for an amplifier, None for all, makes obsolete."""

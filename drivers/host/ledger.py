@@ -195,8 +195,8 @@ class Ledger:
         self, layers: tuple[LayerSet, ...], now: float, delay: float
     ) -> tuple[LayerSet, ...]:
         """Return silent layers, their ramps within the time that is left, endings only if safe."""
-        left = self._budget.fade_left(now)
-        silent = tuple(_within_ramp(one, left) for one in layers)
+        left = math.floor(min(self._budget.fade_left(now), _RAMP.high) * _RAMP.per_unit)
+        silent = tuple(replace(one, ramp=min(one.ramp, left)) for one in layers)
         try:
             if self._doubt is None:
                 self._check_sums(silent, now, delay)
@@ -338,10 +338,3 @@ def is_vibrating(*layers: LayerSet) -> bool:
             if command.is_driven:
                 return True
     return False
-
-
-def _within_ramp(one: LayerSet, left: float) -> LayerSet:
-    """Return a silent layer with its ramp shortened to a time that is left [s]."""
-    if _RAMP.from_wire(one.ramp) <= left:
-        return one
-    return replace(one, ramp=math.floor(left * _RAMP.per_unit))

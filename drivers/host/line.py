@@ -226,9 +226,9 @@ class Line:
 
     def _must_yield(self, job: Job) -> bool:
         """Whether a request gives way to one that silences."""
-        if job.priority.is_stop_class:
+        if job.is_stop_class:
             return False
-        return any(other.priority.is_stop_class for other in self._queue.jobs)
+        return any(other.is_stop_class for other in self._queue.jobs)
 
     def _end(self, job: Job, arrival: Reply | Nak | Broken) -> None:
         """End the request that was on the line by what came back."""
@@ -284,7 +284,7 @@ class Line:
 
     def _preempt(self, current: Job) -> None:
         """Shorten the time of the request on the line for one that must not wait."""
-        if current.priority.is_stop_class:
+        if current.is_stop_class:
             return
         waiting = [job.priority for job in self._queue.jobs if job.priority < current.priority]
         free_at = max(self.time(), self._free_at)

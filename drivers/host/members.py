@@ -377,9 +377,10 @@ async def _status_of(amplifier: Amplifier, token: int, sent: Awaitable[Values]) 
 def _unchanged(amplifier: Amplifier) -> list[Layer]:
     """Return a layer that is silent, or renewed without end; none if all end soon by themselves."""
     playback = amplifier.ledger.playback
+    changing = {due[1] for due in playback.dues}  # end by themselves, or start what waits
     for number in range(amplifier.capabilities["layers"]):
         if number not in playback.tokens:
             return [Layer(number)]
-        if playback.is_endless(number):
+        if number not in changing:
             return [Layer(number, renew=True)]
     return []

@@ -6,15 +6,13 @@ length over RTU, and by the tag.
 """
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from drivers.codec.modbus.adu import (
     ModbusResponse,
-    Read,
     RequestAdu,
     ResponseReader,
-    Write,
     build_adu,
 )
 from drivers.host.wire import (
@@ -25,6 +23,7 @@ from drivers.host.wire import (
     Nak,
     Reply,
     Several,
+    Wire,
     read_nak,
     reply_words,
 )
@@ -35,7 +34,7 @@ from drivers.statistics import WireCounters
 _BOX = 256  # registers of a message
 _REPLY = 128  # offset of its reply
 _REPLY_HEAD = 2  # registers: tag, result
-_IDENTITY = Read(1065, 2 + len(TEXTS) * TEXT_MAX // 2)
+_IDENTITY = 1065, 2 + len(TEXTS) * TEXT_MAX // 2  # first register, count
 _WRITE_SIZE = 9  # bytes on RTU of a write, without its registers
 _FRAME_SIZE = 3  # bytes on RTU of a frame beside its PDU
 _HEADER_SIZE = 7  # bytes on TCP of a frame beside its PDU
@@ -58,12 +57,11 @@ class _Request:
     """A request and its transaction on the wire; tag: 0 for one that only reads."""
 
     name: str
-    unit: int
     tag: int
     adu: RequestAdu
 
 
-class ModbusWire:
+class ModbusWire(Wire):
     """A line at a speed [baud], 0 for a network; number: of the last tag and transaction.
 
     silence: before each frame of a serial line [s], kept by its port; delay [s]: of a network.
@@ -73,8 +71,6 @@ class ModbusWire:
         self.counters = WireCounters()
         self.silence = max(_GAP * _BITS / baud, _SHORTEST_GAP) if baud else 0.0
         self.delay = delay
-        self.busy = self.takes = 0.0
-        self.is_kept = False
         self._baud = baud
         self._is_rtu = is_rtu
         self._number = number
@@ -100,7 +96,7 @@ class ModbusWire:
             return b"".join(adu.frame for adu in adus)
         self._sizes.setdefault(address, WIDEST)
         if name == "Hello":
-            self._request = _Request(name, address, 0, self._adu(address, _IDENTITY))
+            self._request = _Request(name, 0, self._adu(address, *_IDENTITY))
         else:
             self._request = self._written(address, name, values)
         return self._request.adu.frame
@@ -142,11 +138,11 @@ class ModbusWire:
     def _time(self, characters: int) -> float:
         return _BITS * characters / self._baud if self._baud else 0.0
 
-    def _adu(self, unit: int, transfer: Read | Write) -> RequestAdu:
+    def _adu(self, unit: int, address: int, transfer: int | Sequence[int]) -> RequestAdu:
         self._number = self._number % 0xFFFF + 1
         self.counters.frames_out += 1
         transaction = 0 if self._is_rtu else self._number
-        adu = build_adu(transfer, unit=unit, transaction=transaction, is_rtu=self._is_rtu)
+        adu = build_adu(unit, transaction, address, transfer, is_rtu=self._is_rtu)
         size = len(adu.frame) - (0 if self._is_rtu else _HEADER_SIZE - _FRAME_SIZE)
         self.takes = self._time(size) + self.silence
         if self._is_rtu:
@@ -157,8 +153,8 @@ class ModbusWire:
         """Return a request whose write goes first."""
         message = MESSAGES[name]
         tag = self._number % 0xFFFF + 1
-        write = Write(message.number * _BOX, (tag, *message.request.pack(values)))
-        return _Request(name, unit, tag, self._adu(unit, write))
+        registers = (tag, *message.request.pack(values))
+        return _Request(name, tag, self._adu(unit, message.number * _BOX, registers))
 
     def _arrival(self, request: _Request, response: ModbusResponse) -> Arrival | None:
         """Return what a response to the transaction on the wire means."""
@@ -169,11 +165,11 @@ class ModbusWire:
             if (refusal := _EXCEPTIONS.get(response.exception)) is not None:
                 return Nak(refusal, None)
             return Broken(f"Modbus exception {response.exception}")
-        if isinstance(request.adu.transfer, Write):
+        unit = request.adu.unit
+        if request.adu.is_write:
             first = MESSAGES[request.name].number * _BOX + _REPLY
-            count = _REPLY_HEAD + reply_words(request.name, *self._sizes[request.unit])
-            read = Read(first, count)
-            request.adu = self._adu(request.unit, read)
+            count = _REPLY_HEAD + reply_words(request.name, *self._sizes[unit])
+            request.adu = self._adu(unit, first, count)
             return More(request.adu.frame)
         tag, result, *words = response.registers
         if request.name != "Hello" and tag != request.tag:
@@ -189,7 +185,7 @@ class ModbusWire:
         except Refusal as error:
             return Broken(str(error))
         if request.name == "GetCaps":
-            self._sizes[request.unit] = values["channels"], values["layers"]
+            self._sizes[unit] = values["channels"], values["layers"]
         return Reply(values)
 
 

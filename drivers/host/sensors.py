@@ -112,9 +112,8 @@ async def start_reading(
         "tones": len(frequencies),
         "frequencies": [_Q["frequency"].to_wire(each) for each in frequencies],
     }
-    started = _reading(await amplifier.request("Measure", values, Priority.READING))
-    _check_same(started, number=number, tones=len(frequencies))
-    return started
+    found = await amplifier.request("Measure", values, Priority.READING)
+    return _reading(found, number=number, tones=len(frequencies))
 
 
 async def measure_tones(
@@ -171,22 +170,8 @@ def check_tones(frequencies: Sequence[float], window: float) -> None:
 
 async def _same_reading(amplifier: Amplifier, started: Reading, first: int) -> Reading:
     """Read the reading that was started, its sensors from one on."""
-    found = _reading(await amplifier.request("GetReading", {"first": first}, Priority.READING))
-    _check_same(found, number=started.number, tones=started.tones)
-    return found
-
-
-def _check_same(found: Reading, *, number: int, tones: int) -> None:
-    """Raise CommandRefused for a reading of another number, FrameError for other tones."""
-    if found.number != number:
-        raise CommandRefused(
-            f"reading {number} was replaced by {found.number or 'none'}: another host measures, or "
-            "the amplifier has restarted; measure again"
-        )
-    if found.tones != tones:
-        raise FrameError(
-            f"reading {number} must have {tones} tones, got {found.tones}; {_VIOLATION}"
-        )
+    found = await amplifier.request("GetReading", {"first": first}, Priority.READING)
+    return _reading(found, number=started.number, tones=started.tones)
 
 
 def _sensor(values: Values) -> Sensor:
@@ -205,11 +190,21 @@ def _place(at: int) -> float | None:
     return None if at == UNKNOWN_PLACE else _Q["place"].from_wire(at)
 
 
-def _reading(values: Values) -> Reading:
-    """Read a reading with its sensors; raises FrameError."""
-    tones, count = values["tones"], values["count"]
-    if tones > _Q["tone_count"].maximum:
-        raise FrameError(f"tones must be at most {_Q['tone_count'].maximum}, got {tones}")
+def _reading(values: Values, *, number: int, tones: int) -> Reading:
+    """Read a reading of a number of tones, with its sensors.
+
+    Raises CommandRefused for a reading of another number, FrameError for other tones.
+    """
+    if values["reading"] != number:
+        raise CommandRefused(
+            f"reading {number} was replaced by {values['reading'] or 'none'}: another host "
+            "measures, or the amplifier has restarted; measure again"
+        )
+    if values["tones"] != tones:
+        raise FrameError(
+            f"reading {number} must have {tones} tones, got {values['tones']}; {_VIOLATION}"
+        )
+    count = values["count"]
     record = Record(Rows("sensors", count, sensor_reading(tones)))
     try:
         rows = record.unpack(values["sensors"], is_strict=False)["sensors"] if count else []

@@ -17,6 +17,7 @@ from drivers.host.wire import (
     Broken,
     Reply,
     Several,
+    Wire,
     read_event,
     read_reply,
 )
@@ -35,13 +36,11 @@ from drivers.statistics import WireCounters
 _BITS = 10  # of a byte, with start and stop
 
 
-class SerialWire:
+class SerialWire(Wire):
     """A line at a speed [baud], 0 for a network; sequence: number of the last request."""
 
     def __init__(self, baud: int, *, sequence: int) -> None:
         self.counters = WireCounters()
-        self.busy = self.takes = 0.0
-        self.is_kept = False
         self.delay = 0.0 if baud else NETWORK_DELAY
         self._byte_time = _BITS / baud if baud else 0.0
         self._sequence = sequence
@@ -79,7 +78,12 @@ class SerialWire:
                 or (frame.address, frame.sequence) != (pending.address, pending.sequence)
             ):
                 self.counters.unexpected_frames += 1
-                if self._is_second(frame):
+                last = self._replied
+                if (
+                    last is not None
+                    and frame != last
+                    and (frame.address, frame.sequence) == (last.address, last.sequence)
+                ):
                     arrivals.append(Several(frame.address))
             else:
                 self._pending, self._replied = None, frame
@@ -93,10 +97,6 @@ class SerialWire:
     def transit(self, words: int) -> float:
         """Return how long a request of so many words takes to arrive [s]."""
         return self._byte_time * frame_length(2 * words)
-
-    def exchange_time(self, words: int, reply: int) -> float:
-        """Return how long a request and a reply of so many words take [s]; 0 behind a server."""
-        return self.transit(words) + self.transit(reply)
 
     def _reply(self, frame: Frame, request: Frame) -> Arrival:
         """Read the reply to a request."""
@@ -112,13 +112,6 @@ class SerialWire:
             return Reply(BY_NUMBER[kind].reply.unpack(words, is_strict=False))
         except Refusal as refusal:
             return Broken(str(refusal))
-
-    def _is_second(self, frame: Frame) -> bool:
-        """Whether a frame is another reply to the request that was replied to last."""
-        last = self._replied
-        if last is None or frame == last:
-            return False
-        return (frame.address, frame.sequence) == (last.address, last.sequence)
 
     def _count_invalid(self, piece: bytes) -> None:
         self.counters.invalid_frames += 1

@@ -51,13 +51,10 @@ class Stop:
         # On a line that others share each has three exchanges: a stop and two statuses.
         exchanges = ATTEMPTS * members * amplifier.exchange_time("GetStatus")
         self._timeout = timeout + ramp + exchanges
-        self._ends = self._now() + self._timeout * (members + 1)  # on a line that others keep busy
+        self._ends = clock.now() + self._timeout * (members + 1)  # on a line that others keep busy
         self.result = asyncio.ensure_future(self._confirm())
         with contextlib.suppress(Exception):  # then it is requested in `_confirm`
             self._first = self._request()
-
-    def _now(self) -> float:
-        return asyncio.get_running_loop().time()
 
     def _request(self) -> "asyncio.Future[Values]":
         amplifier = self._amplifier
@@ -70,7 +67,7 @@ class Stop:
         """Return the values of the request, which goes out now."""
         if not self.is_sent:
             self.is_sent = True
-            self._ends = self._now() + self._timeout
+            self._ends = clock.now() + self._timeout
             if self._limit is not None:
                 self._limit.reschedule(self._ends)
         return self._values

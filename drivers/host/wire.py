@@ -179,11 +179,11 @@ class Wire(Protocol):
     counters: WireCounters
     delay: float
     """By which a frame may arrive later than its bits take [s]: `NETWORK_DELAY` over a network."""
-    is_kept: bool
+    is_kept: bool = False
     """Whether a frame is sent again until somebody takes it, as by an adapter on a CAN bus."""
-    takes: float
+    takes: float = 0.0
     """How long what was sent last takes to arrive [s]; 0 over a network."""
-    busy: float
+    busy: float = 0.0
     """For how long what was sent last and its reply take a line in turn [s]; 0 on others."""
 
     def request(self, address: int, name: str, values: Values) -> bytes:
@@ -200,3 +200,4 @@ class Wire(Protocol):
 
     def exchange_time(self, words: int, reply: int) -> float:
         """Return how long a request and a reply of so many words take [s]; 0 if unknown."""
+        return self.transit(words) + self.transit(reply)

@@ -1,10 +1,12 @@
-"""An open serial port. It never blocks the event loop.
+"""Opening of what carries bytes: serial ports and USB adapters of this machine, and TCP ports.
 
-A frame that the port does not take at once follows as soon as it takes it, unless a newer frame
-replaces the rest of it: what the line delivers late must not delay a stop.
+A serial port never blocks the event loop. A frame that it does not take at once follows as soon as
+it takes it, unless a newer frame replaces the rest of it: what the line delivers late must not
+delay a stop.
 """
 
 import contextlib
+import errno
 import os
 import select
 import threading
@@ -13,11 +15,91 @@ from typing import final
 
 import serial
 
-from drivers.errors import LinkError
+from drivers.errors import LinkError, system_message
+from drivers.hardware import PORT_OPENER, Port
 from drivers.ports.device_port import DevicePort
+from drivers.ports.tcp import open_connection
+from drivers.threads import in_thread
+from drivers.urls import Place
 
 READ_TIMEOUT = 0.1  # s; interval in which a reader thread notices its end
 _READ_MAX = 4096
+_OPENING_FAILURES: tuple[type[Exception], ...] = (OSError, ValueError)  # of pyserial, at opening
+with contextlib.suppress(ImportError):  # Windows has no terminals
+    import termios
+
+    _OPENING_FAILURES += (termios.error,)
+
+_NO_PERMISSION = (
+    "no permission; add the user to the group that owns the port "
+    "(often dialout: sudo usermod -aG dialout $USER) and log in again"
+)
+_UNKNOWN = "check its name, the plug, its speed and its parity"
+_IN_USE = "in use by another program; close that one"
+_REMEDIES = {
+    errno.ENOENT: "no such port; plug in the adapter and check its name in /dev",
+    errno.EACCES: _NO_PERMISSION,
+    errno.EPERM: _NO_PERMISSION,
+    errno.EAGAIN: _IN_USE,
+    errno.EBUSY: _IN_USE,
+}
+
+
+async def open_port(
+    place: Place, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+) -> Port:
+    """Open a device, exclusively if the system can, or connect; raises LinkError.
+
+    on_data: called with received bytes; on_loss: called once with the cause of a loss.
+    """
+    if place.host:
+        return await open_connection(place.host, place.port, on_data, on_loss)
+    name = place.device
+    opener = PORT_OPENER.get()
+    if opener is not None:
+        return await opener(name, on_data, on_loss)
+    try:
+        port = await in_thread(
+            lambda: _open_device(place), name=f"era-open {name}", undo=lambda port: port.close()
+        )
+    except _OPENING_FAILURES as error:
+        raise LinkError(
+            f"serial port {name} cannot be opened: {remedy_of(error)} (the system says: "
+            f"{system_message(error)})"
+        ) from error
+    return SerialPort(port, name, on_data, on_loss)
+
+
+def _open_device(place: Place) -> serial.Serial:
+    # A pseudo-terminal has no parity and may refuse all settings if one is given.
+    is_pseudo = os.path.realpath(place.device).startswith("/dev/pts/")
+    port = serial.Serial(
+        place.device,
+        baudrate=place.baud,
+        parity=serial.PARITY_NONE if is_pseudo else place.parity,
+        stopbits=place.stop,
+        timeout=READ_TIMEOUT,
+        exclusive=True,
+    )
+    try:
+        # USB adapters delay bytes by 16 ms unless low latency is set; most support it.
+        with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
+            port.set_low_latency_mode(True)
+        port.reset_input_buffer()
+    except BaseException:
+        port.close()  # else it stays this program's, which could not open it again
+        raise
+    return port
+
+
+def remedy_of(error: BaseException | None) -> str:
+    """Return the remedy for an opening error by the error code of it or its cause."""
+    while error is not None:
+        code = getattr(error, "errno", None)
+        if code is not None:
+            return _REMEDIES.get(code, _UNKNOWN)
+        error = error.__cause__ or error.__context__
+    return _UNKNOWN
 
 
 @final

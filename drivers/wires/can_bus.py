@@ -27,7 +27,7 @@ from drivers.errors import LinkError
 from drivers.hardware import Port
 from drivers.host.can_wire import CanWire
 from drivers.host.wire import NETWORK_DELAY
-from drivers.ports.opening import open_port
+from drivers.ports.serial_port import open_port
 from drivers.urls import ADDRESS, AmplifierUrl
 from drivers.wires.address import PortAbove, WireAddress
 

@@ -14,7 +14,7 @@ from drivers.errors import LinkError
 from drivers.hardware import Port
 from drivers.host.modbus_wire import ModbusWire
 from drivers.host.wire import NETWORK_DELAY
-from drivers.ports.opening import open_port
+from drivers.ports.serial_port import open_port
 from drivers.urls import ADDRESS, ADDRESS_MAX, RTU_BAUD, AmplifierUrl
 from drivers.wires.address import PortAbove, WireAddress
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from drivers.hardware import Port
 from drivers.host.serial_wire import SerialWire
-from drivers.ports.opening import open_port
+from drivers.ports.serial_port import open_port
 from drivers.urls import ADDRESS, ADDRESS_MAX, BAUD, AmplifierUrl
 from drivers.wires.address import WireAddress
 

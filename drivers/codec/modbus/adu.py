@@ -5,6 +5,7 @@ counted.
 """
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from drivers.codec.modbus.crc import crc16
@@ -19,22 +20,6 @@ _READS = (3, 4, 23)
 _WRITES = (5, 6, 15, 16)
 
 
-@dataclass(frozen=True, slots=True)
-class Write:
-    """Registers to write at consecutive addresses."""
-
-    address: int
-    registers: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Read:
-    """A number of registers to read from an address on."""
-
-    address: int
-    count: int
-
-
 @dataclass(frozen=True)
 class RequestAdu:
     """A request to one unit: its frame, and what identifies its response.
@@ -46,14 +31,13 @@ class RequestAdu:
     unit: int
     transaction: int
     frame: bytes
-    transfer: Read | Write
     head: bytes
     size: int
 
     @property
-    def function(self) -> int:
-        """Function code."""
-        return self.head[0]
+    def is_write(self) -> bool:
+        """Whether it writes registers, else it reads some."""
+        return self.head[0] == _WRITE
 
 
 @dataclass(frozen=True)
@@ -64,21 +48,23 @@ class ModbusResponse:
     exception: int = 0
 
 
-def build_adu(transfer: Read | Write, *, unit: int, transaction: int, is_rtu: bool) -> RequestAdu:
-    """Build the request that reads or writes."""
-    if isinstance(transfer, Read):
-        pdu = struct.pack(">BHH", _READ, transfer.address, transfer.count)
-        head, size = bytes([_READ, 2 * transfer.count]), 2 + 2 * transfer.count
+def build_adu(
+    unit: int, transaction: int, address: int, transfer: int | Sequence[int], *, is_rtu: bool
+) -> RequestAdu:
+    """Build the request of registers from an address on: how many to read, or those to write."""
+    if isinstance(transfer, int):
+        pdu = struct.pack(">BHH", _READ, address, transfer)
+        head, size = bytes([_READ, 2 * transfer]), 2 + 2 * transfer
     else:
-        count = len(transfer.registers)
-        head, size = struct.pack(">BHH", _WRITE, transfer.address, count), 5
-        pdu = head + struct.pack(f">B{count}H", 2 * count, *transfer.registers)
+        count = len(transfer)
+        head, size = struct.pack(">BHH", _WRITE, address, count), 5
+        pdu = head + struct.pack(f">B{count}H", 2 * count, *transfer)
     if is_rtu:
         frame = bytes([unit]) + pdu
         frame += crc16(frame)
     else:
         frame = struct.pack(">HHHB", transaction, 0, 1 + len(pdu), unit) + pdu
-    return RequestAdu(unit, transaction, frame, transfer, head, size)
+    return RequestAdu(unit, transaction, frame, head, size)
 
 
 class ResponseReader:
@@ -157,7 +143,7 @@ class ResponseReader:
         frame of another unit.
         """
         unit, function, count = self._buffer[start : start + 3]
-        if start and (to is None or unit != to.unit or function & ~_EXCEPTION != to.function):
+        if start and (to is None or unit != to.unit or function & ~_EXCEPTION != to.head[0]):
             return 0
         if function & _EXCEPTION:
             return 5
@@ -169,7 +155,7 @@ class ResponseReader:
 
 def _response(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
     """Decode a PDU as the response to a request; None if it is not."""
-    if len(pdu) == 2 and pdu[0] == to.function | _EXCEPTION and pdu[1]:
+    if len(pdu) == 2 and pdu[0] == to.head[0] | _EXCEPTION and pdu[1]:
         return ModbusResponse(exception=pdu[1])
     if len(pdu) != to.size or not pdu.startswith(to.head):
         return None

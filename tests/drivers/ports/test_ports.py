@@ -17,7 +17,7 @@ import serial
 
 from drivers.errors import LinkError, LinkTimeout
 from drivers.hardware import Port
-from drivers.ports import opening, tcp
+from drivers.ports import serial_port, tcp
 from drivers.ports.serial_port import SerialPort
 from drivers.ports.tcp import open_connection
 from drivers.urls import Place
@@ -31,8 +31,8 @@ def test_device_is_opened_alone_with_low_latency_and_its_settings(
 ) -> None:
     """A pseudo-terminal has no parity."""
     made = Mock()
-    monkeypatch.setattr(opening.serial, "Serial", made)
-    opening._open_device(Place(device, baud=19_200, parity="O", stop=2))
+    monkeypatch.setattr(serial_port.serial, "Serial", made)
+    serial_port._open_device(Place(device, baud=19_200, parity="O", stop=2))
     made.return_value.set_low_latency_mode.assert_called_once_with(True)
     settings = {key: made.call_args.kwargs[key] for key in ("baudrate", "parity", "stopbits")}
     assert settings == {"baudrate": 19_200, "parity": parity, "stopbits": 2}
@@ -47,7 +47,7 @@ async def test_port_that_fails_amid_its_opening_is_released(
     name = os.ttyname(near)
 
     async def open_it() -> Port:
-        return await opening.open_port(
+        return await serial_port.open_port(
             Place(name, baud=9600), lambda data: None, lambda cause: None
         )
 

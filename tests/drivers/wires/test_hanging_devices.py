@@ -13,7 +13,7 @@ import pytest
 
 from drivers import threads
 from drivers.hardware import Port
-from drivers.ports import opening
+from drivers.ports import serial_port
 from drivers.urls import Place
 from drivers.wires import bus_port
 
@@ -57,7 +57,7 @@ class _HangingRead(_Hanging):
 HEARD: list[bytes] = []
 OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port]]] = {
     "port": partial(
-        opening.open_port,
+        serial_port.open_port,
         Place("/dev/ttyUSB9", baud=9600),
         lambda data: None,
         lambda what: None,
@@ -76,7 +76,7 @@ OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port]]] = {
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[_Hanging]:
     """The device that is opened; released after the test."""
     device: _Hanging = request.param()
-    monkeypatch.setattr(opening, "_open_device", device.open)
+    monkeypatch.setattr(serial_port, "_open_device", device.open)
     monkeypatch.setattr(can, "Bus", lambda **how: device.open())
     monkeypatch.setattr(threads, "CLOSE_TIMEOUT", 0.05)
     HEARD.clear()

@@ -9,10 +9,8 @@ from hypothesis import strategies as st
 
 from drivers.codec.modbus.adu import (
     ModbusResponse,
-    Read,
     RequestAdu,
     ResponseReader,
-    Write,
     build_adu,
 )
 from drivers.statistics import WireCounters
@@ -25,7 +23,7 @@ WORDS = (4711, *range(12))
 def asked_and_answered(is_rtu: bool) -> tuple[RequestAdu, bytes]:
     """Make a request of registers and the frame of its response, FC4 by hand."""
     transaction = 0 if is_rtu else 300
-    request = build_adu(Read(3200, len(WORDS)), unit=1, transaction=transaction, is_rtu=is_rtu)
+    request = build_adu(1, transaction, 3200, len(WORDS), is_rtu=is_rtu)
     pdu = struct.pack(f">BB{len(WORDS)}H", 4, 2 * len(WORDS), *WORDS)
     return request, rtu_frame(1, pdu) if is_rtu else tcp_frame(FarEndRequest(1, b"", 300), pdu)
 
@@ -86,7 +84,7 @@ def test_any_bytes_leave_the_reader_usable(is_rtu: bool, stream: list[bytes]) ->
 @pytest.mark.parametrize("is_rtu", [True, False])
 def test_truncated_request_does_not_merge_with_the_next(is_rtu: bool) -> None:
     """A set that ends early, and a complete one after the longest pause within a frame."""
-    frame = build_adu(Write(1280, WORDS), unit=1, transaction=0, is_rtu=is_rtu).frame
+    frame = build_adu(1, 0, 1280, WORDS, is_rtu=is_rtu).frame
     for missing in range(1, len(frame)):
         reader = RequestReader(is_rtu=is_rtu)
         assert reader.feed(frame[:-missing], 10.0) == []

@@ -19,7 +19,7 @@ _RAMP, _STEP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["envelope_step"], QUANTITI
 _FREQUENCY, _VALID_FOR = QUANTITIES["frequency"], QUANTITIES["valid_for"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Path:
     """Magnitudes after a commit, in full levels: at its start, then a step [s] apart.
 
@@ -31,9 +31,9 @@ class Path:
     is_cosine: bool
 
     @property
-    def times(self) -> tuple[float, ...]:
-        """Times of the magnitudes [s] after the commit."""
-        return tuple([self.step * index for index in range(len(self.magnitudes))])
+    def end(self) -> float:
+        """Time of the last magnitude [s] after the commit."""
+        return self.step * (len(self.magnitudes) - 1)
 
     def at(self, time: float) -> float:
         """Return an upper bound of the magnitude at a time [s] after the commit."""
@@ -109,48 +109,46 @@ class ChannelBounds:
 
     def _keep(self, voice: Voice, one: LayerSet | None) -> None:
         """Add a voice that the set does not change, but for a layer that may let it fade later."""
-        transition, peak = voice.transition, voice.transition.peak(self._time)
-        self.steady += max(peak, _peak(voice.ending))
-        rise = change = 0.0
-        if transition.end > self._time:
-            change = transition.slope(self._time)
-            rise = 0.0 if transition.last == 0 and not transition.knots else change
+        transition, time = voice.transition, self._time
+        self.steady += max(transition.peak(time), _peak(voice.ending))
+        change = transition.slope(time) if transition.end > time else 0.0
+        ways = [(change if transition.last or transition.knots else 0.0, change)]
+        points = _points(transition, time)
         if not voice.has_ended:
             # A layer without `valid_for` ends by a set alone, which has a ramp of its own.
             is_endless = self._playback.end_of(voice.layer) == math.inf
             ramp = math.inf if is_endless else self._playback.ramp_of(voice.layer)
-            if voice.ending is None:
-                change = max(change, steepest((peak, 0j), ramp, is_cosine=True)[1])
-            for start in _points(transition, self._time):
-                ending = _steepest_of_ending(start, voice.ending)
-                rise, change = max(rise, ending[0]), max(change, ending[1])
+            ways.append(_steepest_from(points, voice.ending, 0j, ramp))
         # Also where it does not change: another voice of its frequency may cease to cancel it.
-        self._note(voice.frequency, rise, change)
+        self._note(voice.frequency, *ways)
         if one is not None and not voice.has_ended:
-            fade = steepest((peak, 0j), _RAMP.from_wire(one.ramp), is_cosine=True)
-            self._note(voice.frequency, *fade)
+            self._note(voice.frequency, _steepest_from(points, None, 0j, _ramp_of(one)))
 
     def _fade(self, voice: Voice, one: LayerSet, ending: Envelope | None) -> None:
         """Add a voice that falls silent, along its ending or the ramp of the set."""
-        step = _RAMP.from_wire(one.ramp) if ending is None else _STEP.from_wire(ending.step)
-        points = (*amplitudes_of(ending), 0j)
-        is_cosine = len(points) == 1
         starts = _points(voice.transition, self._time)
-        self._note(voice.frequency, *_steepest_from(starts, points, step, is_cosine=is_cosine))
-        magnitudes = (max(map(abs, starts)), *map(abs, points))
-        self.paths.append(Path(step, magnitudes, is_cosine))
+        self._note(voice.frequency, _steepest_from(starts, ending, 0j, _ramp_of(one)))
+        self._add_path(starts, ending, 0.0, _ramp_of(one))
 
     def _lead(
         self, frequency: float, starts: Sequence[complex], one: LayerSet, command: Command
     ) -> None:
         """Add a voice that a command leads from one of some amplitudes; its ending may follow."""
-        step, is_cosine = self._note_way(frequency, starts, one, command)
-        *others, last = map(abs, _course(command))
-        ending = _peak(command.ending)
-        magnitudes = (max(map(abs, starts)), *others, max(last, ending))
-        if one.valid_for and _VALID_FOR.from_wire(one.valid_for) < step * len(magnitudes[1:]):
-            magnitudes = tuple(max(each, ending) for each in magnitudes)  # it may begin amid
-        self.paths.append(Path(step, magnitudes, is_cosine))
+        self._note_way(frequency, starts, one, command)
+        ending, last = _peak(command.ending), command.level / _LEVEL.per_unit
+        path = self._add_path(starts, command.onset, max(last, ending), _ramp_of(one))
+        if one.valid_for and _VALID_FOR.from_wire(one.valid_for) < path.end:  # it may begin amid
+            path.magnitudes = tuple(max(each, ending) for each in path.magnitudes)
+
+    def _add_path(
+        self, starts: Sequence[complex], onset: Envelope | None, last: float, ramp: float
+    ) -> Path:
+        """Add the way along an envelope, or a ramp [s] without one, to a magnitude."""
+        between = map(abs, amplitudes_of(onset))
+        magnitudes = (max(map(abs, starts)), *between, last)
+        path = Path(_step_of(onset, ramp), magnitudes, len(magnitudes) == 2)
+        self.paths.append(path)
+        return path
 
     def _lead_later(self, one: LayerSet, command: Command) -> None:
         """Add a command that starts at another time, with the largest that it may reach.
@@ -162,31 +160,25 @@ class ChannelBounds:
         for voice in self._voices:
             if voice.layer == one.layer and not voice.has_ended:
                 points = _points(voice.transition, self._time)
-                ramp = _RAMP.from_wire(one.ramp)
-                self._note(voice.frequency, *_steepest_from(points, (0j,), ramp, is_cosine=True))
+                self._note(voice.frequency, _steepest_from(points, None, 0j, _ramp_of(one)))
                 starts += points if voice.frequency == frequency else ()
         self._note_way(frequency, starts, one, command)
         self.steady += max(*map(abs, _course(command)), _peak(command.ending))
 
     def _note_way(
         self, frequency: float, starts: Sequence[complex], one: LayerSet, command: Command
-    ) -> tuple[float, bool]:
-        """Note how fast a command leads, and its ending from wherever it is by then.
+    ) -> None:
+        """Note how fast a command leads, and its ending from wherever it is by then."""
+        course = _course(command)
+        ways = [_steepest_from(starts, command.onset, course[-1], _ramp_of(one))]
+        if command.ending is not None:
+            ways.append(_steepest_from((*starts, *course), command.ending, 0j, math.inf))
+        self._note(frequency, *ways)
 
-        Returns the step [s] of its onset or ramp, and whether it is a raised cosine.
-        """
-        course, onset = _course(command), command.onset
-        step = _RAMP.from_wire(one.ramp) if onset is None else _STEP.from_wire(onset.step)
-        is_cosine = len(course) == 1
-        rise, change = _steepest_from(starts, course, step, is_cosine=is_cosine)
-        for start in (*starts, *course):
-            ending = _steepest_of_ending(start, command.ending)
-            rise, change = max(rise, ending[0]), max(change, ending[1])
-        self._note(frequency, rise, change)
-        return step, is_cosine
-
-    def _note(self, frequency: float, rise: float, change: float) -> None:
-        self._rises.setdefault(frequency, []).append((rise, change))
+    def _note(self, frequency: float, *ways: tuple[float, float]) -> None:
+        """Note the steepest rise and the fastest change of a voice, by one of some ways."""
+        worst_way = max(rise for rise, _ in ways), max(change for _, change in ways)
+        self._rises.setdefault(frequency, []).append(worst_way)
 
 
 def worst(channels: Sequence[ChannelBounds]) -> tuple[list[float], float]:
@@ -196,10 +188,11 @@ def worst(channels: Sequence[ChannelBounds]) -> tuple[list[float], float]:
     all go the same way; else each may be at either end.
     """
     paths = [path for channel in channels for path in channel.paths]
-    times = sorted({at for path in paths for at in path.times} | {0.0})
+    moments = {path.step * index for path in paths for index in range(len(path.magnitudes))}
+    times = sorted(moments | {0.0})
     corners = [[channel.at(time) for channel in channels] for time in times]
     for since, until in pairwise(times):
-        ways = {path.step if path.is_cosine else None for path in paths if since < path.times[-1]}
+        ways = {path.step if path.is_cosine else None for path in paths if since < path.end}
         if len(ways) > 1:
             corners.append([channel.within(since, until) for channel in channels])
     levels = [max(each) for each in zip(*corners, strict=True)]
@@ -222,18 +215,23 @@ def _command_of(one: LayerSet, channel: int) -> Command | None:
 
 
 def _steepest_from(
-    starts: Sequence[complex], points: Sequence[complex], step: float, *, is_cosine: bool
+    starts: Sequence[complex], envelope: Envelope | None, last: complex, ramp: float
 ) -> tuple[float, float]:
-    """Return the steepest rise and the fastest change from any of some amplitudes on."""
-    found = [steepest((start, *points), step, is_cosine=is_cosine) for start in starts]
-    return max(rise for rise, _ in found), max(change for _, change in found)
+    """Return the steepest rise and the fastest change from any of some amplitudes to a last one.
+
+    Along an envelope, or a ramp [s] without one.
+    """
+    knots, step = amplitudes_of(envelope), _step_of(envelope, ramp)
+    ways = [steepest((start, *knots, last), step, is_cosine=not knots) for start in starts]
+    return max(rise for rise, _ in ways), max(change for _, change in ways)
 
 
-def _steepest_of_ending(start: complex, ending: Envelope | None) -> tuple[float, float]:
-    if ending is None:
-        return 0.0, 0.0
-    points = (start, *amplitudes_of(ending), 0j)
-    return steepest(points, _STEP.from_wire(ending.step), is_cosine=not ending.knots)
+def _step_of(envelope: Envelope | None, ramp: float) -> float:
+    return ramp if envelope is None else _STEP.from_wire(envelope.step)
+
+
+def _ramp_of(one: LayerSet) -> float:
+    return _RAMP.from_wire(one.ramp)
 
 
 def _peak(envelope: Envelope | None) -> float:

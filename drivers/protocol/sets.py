@@ -88,17 +88,24 @@ def pack_layers(layers: Iterable[LayerSet]) -> list[int]:
     words: list[int] = []
     for layer in layers:
         head = {
-            **{"layer": layer.layer, "after": layer.after, "renew": layer.renew},
-            **{"count": len(layer.commands), "ramp": layer.ramp, "valid_for": layer.valid_for},
+            "layer": layer.layer,
+            "after": layer.after,
+            "renew": layer.renew,
+            "count": len(layer.commands),
+            "ramp": layer.ramp,
+            "valid_for": layer.valid_for,
         }
         LAYER.append(head, words)
         for command in layer.commands:
             values = {
-                **{"channel": command.channel, "frequency": command.frequency},
-                **{"level": command.level, "phase": command.phase},
-                **{"keep_phase": command.keep_phase, "skip_ending": command.skip_ending},
+                "channel": command.channel,
+                "keep_phase": command.keep_phase,
+                "skip_ending": command.skip_ending,
                 "onset": command.onset is not None,
                 "ending": command.ending is not None,
+                "frequency": command.frequency,
+                "level": command.level,
+                "phase": command.phase,
             }
             COMMAND.append(values, words)
             for shape in (command.onset, command.ending):

@@ -116,14 +116,11 @@ class UncertainPlayback:
         self.playback.advance(certain)
 
     def _pass_until(self, time: float) -> None:
+        """Carry out what is due by a time."""
         while (due := self.playback.next_due) <= time:
-            self._pass(due)
-
-    def _pass(self, due: float) -> None:
-        """Carry out what is due at a time."""
-        half, before = max(self.half), [*self.playback.all_voices]
-        self.playback.advance(due)
-        self._mark(before, (due - half, due + half))
+            half, before = max(self.half), [*self.playback.all_voices]
+            self.playback.advance(due)
+            self._mark(before, (due - half, due + half))
 
     def possible(self, start: float, end: float) -> Iterator["UncertainPlayback"]:
         """Yield what may play between two times: before and after what may be due, in any order.
@@ -189,9 +186,7 @@ class UncertainPlayback:
         _, half, radius = self._mark_of(way)
         center = _reached(way, (start + end) / 2)
         since, until = max(start - half, way.start), max(end + half, way.start)
-        moments = (way.start + way.step * (index + 1) for index in range(len(way.knots)))
-        between = [knot for at, knot in zip(moments, way.knots, strict=True) if since < at < until]
-        reach = max(abs(each - center) for each in (way.at(since), *between, way.at(until)))
+        reach = max(abs(each - center) for each in way.points(since, until))
         if not radius:
             return reach
         # The first amplitude counts the less the farther its transition has led.

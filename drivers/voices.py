@@ -69,17 +69,19 @@ class Transition:
         if not uncertainty:
             return self.at(time)
         since, until = max(time - uncertainty, self.start), max(time + uncertainty, self.start)
+        return max(self.points(since, until), key=abs)
+
+    def points(self, since: float, until: float = math.inf) -> tuple[complex, ...]:
+        """Return the amplitudes at two times [s] and at the knots between: others are between."""
         moments = (self.start + self.step * (index + 1) for index in range(len(self.knots)))
         between = [
             knot for moment, knot in zip(moments, self.knots, strict=True) if since < moment < until
         ]
-        return max((self.at(since), *between, self.at(until)), key=abs)
+        return (self.at(since), *between, self.at(until))
 
     def peak(self, time: float) -> float:
         """Return the largest magnitude from a time on."""
-        passed = math.floor((time - self.start) / self.step) if self.step else len(self.knots)
-        points = (self.at(time), self.last, *self.knots[max(passed, 0) :])
-        return max(map(abs, points))
+        return max(map(abs, self.points(time)))
 
     def slope(self, time: float) -> float:
         """Return the steepest change [full levels/s] from a time on; infinite for a jump."""

@@ -13,7 +13,7 @@ from itertools import pairwise
 from drivers.playback import Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
-from drivers.voices import Transition, Voice, amplitude_of, amplitudes_of, steepest
+from drivers.voices import Voice, amplitude_of, amplitudes_of, steepest
 
 _RAMP, _STEP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["envelope_step"], QUANTITIES["level"]
 _FREQUENCY, _VALID_FOR = QUANTITIES["frequency"], QUANTITIES["valid_for"]
@@ -78,7 +78,7 @@ class ChannelBounds:
                 self._keep(voice, one)
             elif command is not None and voice.is_continued_by(command):
                 continued.add(voice.layer)
-                self._lead(voice.frequency, _points(voice.transition, time), one, command)
+                self._lead(voice.frequency, voice.transition.points(time), one, command)
             else:
                 skips = command is not None and (command.is_driven or command.skip_ending)
                 self._fade(voice, one, None if skips else voice.ending)
@@ -113,7 +113,7 @@ class ChannelBounds:
         self.steady += max(transition.peak(time), _peak(voice.ending))
         change = transition.slope(time) if transition.end > time else 0.0
         ways = [(change if transition.last or transition.knots else 0.0, change)]
-        points = _points(transition, time)
+        points = transition.points(time)
         if not voice.has_ended:
             # A layer without `valid_for` ends by a set alone, which has a ramp of its own.
             is_endless = self._playback.end_of(voice.layer) == math.inf
@@ -126,7 +126,7 @@ class ChannelBounds:
 
     def _fade(self, voice: Voice, one: LayerSet, ending: Envelope | None) -> None:
         """Add a voice that falls silent, along its ending or the ramp of the set."""
-        starts = _points(voice.transition, self._time)
+        starts = voice.transition.points(self._time)
         self._note(voice.frequency, _steepest_from(starts, ending, 0j, _ramp_of(one)))
         self._add_path(starts, ending, 0.0, _ramp_of(one))
 
@@ -159,7 +159,7 @@ class ChannelBounds:
         starts = [0j]
         for voice in self._voices:
             if voice.layer == one.layer and not voice.has_ended:
-                points = _points(voice.transition, self._time)
+                points = voice.transition.points(self._time)
                 self._note(voice.frequency, _steepest_from(points, None, 0j, _ramp_of(one)))
                 starts += points if voice.frequency == frequency else ()
         self._note_way(frequency, starts, one, command)
@@ -241,11 +241,3 @@ def _peak(envelope: Envelope | None) -> float:
 def _course(command: Command) -> tuple[complex, ...]:
     """Return the amplitudes through which a command leads, the last one lasting."""
     return (*amplitudes_of(command.onset), amplitude_of(command.level, command.phase))
-
-
-def _points(transition: Transition, time: float) -> tuple[complex, ...]:
-    """Return points between which the amplitude is from a time [s] on."""
-    if time >= transition.end:
-        return (transition.last,)
-    passed = int((time - transition.start) / transition.step) if transition.knots else 0
-    return (transition.at(time), *transition.knots[passed:], transition.last)

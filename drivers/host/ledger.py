@@ -37,13 +37,8 @@ class Ledger:
 
     def __init__(self, limits: GuardLimits, capabilities: Values) -> None:
         self._configured = limits
-        self.limits = wire_limits(limits, capabilities)
-        self.capabilities = capabilities
-        self._rounding = Rounding(self.limits, capabilities)
+        self.adopt(capabilities)  # which refuses limits that are none
         self._budget = Budget(limits)
-        self.playback = playback_of(capabilities)
-        self.lag = 0.0  # s; by which what plays may be later than `playback` says
-        self._doubt: tuple[int, tuple[LayerSet, ...], float, Vibration | None] | None = None
 
     @property
     def doubt(self) -> int:
@@ -59,7 +54,8 @@ class Ledger:
     def forget(self) -> None:
         """Start anew: the amplifier is silent, armed or not."""
         self.playback = playback_of(self.capabilities)
-        self.lag, self._doubt = 0.0, None
+        self.lag = 0.0  # s; by which what plays may be later than `playback` says
+        self._doubt: tuple[int, tuple[LayerSet, ...], float, Vibration | None] | None = None
 
     def go_on_from(self, earlier: "Ledger") -> None:
         """Count the vibrations of an earlier ledger of the same rig, as after a reconnection."""
@@ -139,9 +135,7 @@ class Ledger:
 
     def resolve(self, token: int, now: float) -> None:
         """Resolve the doubt by the token that the amplifier says it committed last."""
-        if self._doubt is None:
-            return
-        if token == self._doubt[0]:
+        if self._doubt is not None and token == self._doubt[0]:
             self.confirmed(now)
         else:
             self.refused()

@@ -74,12 +74,13 @@ INLINE void keep(float *values, lanes found, const draws *by, size_t group) {
     memcpy(values + first, &found, count * sizeof(float));
 }
 
-/* Factors on the gains to the levels: those of one priority take one of what is left of the stroke. */
+/* Factors on the gains to the levels: of one priority the louder ones are lowered first, to one level (max-min), until
+ * all fit into what is left of the stroke. */
 SHARED float share_stroke(float *gains, const question *of, const float *weights, size_t n, arena *memory) {
     const size_t contents = of->contents;
     const arena mark = *memory;
     float *left = floats(memory, n), *full = floats(memory, n), least = 1;
-    int *done = integers(memory, contents);
+    int *done = integers(memory, contents), *is_lowered = integers(memory, contents);
     for (size_t e = 0; e < n; e++) left[e] = 1;
     memset(done, 0, contents * sizeof(int));
     for (;;) {
@@ -87,21 +88,33 @@ SHARED float share_stroke(float *gains, const question *of, const float *weights
         for (size_t j = 0; j < contents; j++)
             if (!done[j] && (!any || of->priority[j] > highest)) highest = of->priority[j], any = 1;
         if (!any) break;
-        float factor = 1;
-        for (size_t e = 0; e < n; e++) {
-            full[e] = 0;
+        float level = INFINITY;
+        for (size_t j = 0; j < contents; j++) is_lowered[j] = !done[j] && of->priority[j] == highest;
+        for (int raised = 1; raised;) {
+            level = INFINITY, raised = 0;
+            for (size_t e = 0; e < n; e++) {
+                float kept = 0, per_level = 0;
+                for (size_t j = 0; j < contents; j++)
+                    if (!done[j] && of->priority[j] == highest) {
+                        const float full = gains[j] * hypotf(weights[2 * (j * n + e)], weights[2 * (j * n + e) + 1]);
+                        if (is_lowered[j]) per_level += full / of->level[j];
+                        else kept += full;
+                    }
+                level = fminf(level, fmaxf(left[e] - kept, 0) / fmaxf(per_level, LEAST));
+            }
             for (size_t j = 0; j < contents; j++)
-                if (!done[j] && of->priority[j] == highest)
-                    full[e] += gains[j] * hypotf(weights[2 * (j * n + e)], weights[2 * (j * n + e) + 1]);
-            factor = fminf(factor, left[e] / fmaxf(full[e], LEAST));
+                if (is_lowered[j] && of->level[j] <= level) is_lowered[j] = 0, raised = 1;
         }
-        for (size_t e = 0; e < n; e++) {
-            const float used = factor * full[e];
-            left[e] = used >= left[e] * (1 - NEARLY) ? 0 : left[e] - used; /* rounding leaves no stroke */
-        }
+        memset(full, 0, n * sizeof(float));
         for (size_t j = 0; j < contents; j++)
-            if (!done[j] && of->priority[j] == highest) gains[j] *= factor, done[j] = 1;
-        least = fminf(least, factor);
+            if (!done[j] && of->priority[j] == highest) {
+                const float factor = is_lowered[j] ? level / of->level[j] : 1;
+                gains[j] *= factor, done[j] = 1, least = fminf(least, factor);
+                for (size_t e = 0; e < n; e++)
+                    full[e] += gains[j] * hypotf(weights[2 * (j * n + e)], weights[2 * (j * n + e) + 1]);
+            }
+        for (size_t e = 0; e < n; e++) /* rounding leaves no stroke */
+            left[e] = full[e] >= left[e] * (1 - NEARLY) ? 0 : left[e] - full[e];
     }
     release(memory, mark);
     return least;

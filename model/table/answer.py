@@ -52,7 +52,8 @@ def answer(
     fingers: those that are to feel nothing; apart_hz: distance of the contents' frequencies, where
     their bands allow it; bands_may_swap: whether a content may have the band of another one;
     min_contrast_db: below which the promise at the worst finger is not served as requested. Levels
-    are lowered by one factor where the ERAs' stroke does not allow all; higher priorities first.
+    are lowered where the ERAs' stroke does not allow all: of the lower priorities first, of one
+    priority the louder ones first.
     Raises InputError for requests that contradict each other, and a band without frequencies.
     """
     expect_at_least(apart_hz, 0.0, what="apart_hz")

@@ -310,7 +310,8 @@ def _promised(
         promise(felt_amplitudes(power, shares, alone, j, s.targets)) for j, s in enumerate(streams)
     ]
     gains = levels / np.maximum(own, 1e-30)
-    gains, factor = share_stroke(gains, weights, [stream.priority for stream in streams])
+    priorities = [stream.priority for stream in streams]
+    gains, factor = share_stroke(gains, weights, levels.astype(float), priorities)
     power = power * np.square(gains, dtype=np.float32)[:, None, None, None]
     contrast, level, foreign_amplitudes = (np.full(size, np.nan) for size in ((k, 3), (k, 2), k))
     each_own = [felt_amplitudes(power, shares, rows, j, s.targets) for j, s in enumerate(streams)]
@@ -349,18 +350,26 @@ def _promised(
 
 
 def share_stroke(
-    gains: FloatArray, weights: Complex64Array, priorities: Sequence[int]
+    gains: FloatArray, weights: Complex64Array, levels: FloatArray, priorities: Sequence[int]
 ) -> tuple[FloatArray, float]:
-    """Gains (K,) within the stroke, and the least factor on them.
+    """Gains (K,) to levels (K,) within the stroke, and the least factor on them.
 
-    The contents of each priority take one factor of what is left by the higher ones.
+    Of each priority the louder contents are lowered first, to one level (max-min), until all fit
+    into what is left by the higher ones.
     """
     amplitudes = gains[:, None] * np.abs(weights)
     factors, left = np.zeros(len(gains)), np.ones(amplitudes.shape[1])
     for priority in sorted({*priorities}, reverse=True):
         of = np.array(priorities) == priority
-        full = np.maximum(amplitudes[of].sum(axis=0), 1e-30)
-        factors[of] = min(1.0, float((left / full).min()))
+        level, is_lowered = 0.0, of
+        while is_lowered.any():
+            kept = amplitudes[of & ~is_lowered].sum(axis=0)
+            per_level = (amplitudes[is_lowered] / levels[is_lowered, None]).sum(axis=0)
+            level = float((np.maximum(left - kept, 0) / np.maximum(per_level, 1e-30)).min())
+            if (levels[is_lowered] > level).all():
+                break
+            is_lowered = is_lowered & (levels > level)
+        factors[of] = np.where(is_lowered[of], level / levels[of], 1.0)
         used = factors[of] @ amplitudes[of]
         left = np.where(used >= left * (1 - NEARLY), 0.0, left - used)  # rounding leaves no stroke
     return gains * factors, float(factors.min())

@@ -207,6 +207,28 @@ def test_levels_share_the_stroke_by_one_factor_and_by_priority():
     assert 52 - first.layers[1].promised_level_db_sl < lost[1]
 
 
+def test_a_louder_content_does_not_starve_a_softer_one():
+    """It is lowered first: the softer keeps its level, at least as long as it is the softer."""
+    table, soft = smooth_table(), 12.0
+    requests = [Request(NEAR, level_db_sl=70), Request(FAR, level_db_sl=soft)]
+    found = answer(table, requests, min_contrast_db=-99)
+    loud = found.layers[0].promised_level_db_sl
+    assert soft < loud < 70 - 0.5
+    assert found.layers[1].promised_level_db_sl == pytest.approx(soft, abs=1e-3)
+    assert found.stroke_factor == pytest.approx(10 ** ((loud - 70) / 20), rel=1e-3)
+    full = [
+        sum(each.excitation[era.name].amplitude for each in found.layers) / era.stroke
+        for era in table.eras
+    ]
+    assert max(full) == pytest.approx(1.0, abs=1e-5)
+    # Two that both must be lowered end at one level.
+    requests = [Request(NEAR, level_db_sl=57), Request(FAR, level_db_sl=54)]
+    found = answer(table, requests, min_contrast_db=-99)
+    felt = [each.promised_level_db_sl for each in found.layers]
+    assert felt[0] == pytest.approx(felt[1], abs=1e-3)
+    assert felt[0] < 53.5
+
+
 def test_fingers_that_may_share_feel_one_content():
     """The nearest two of those that may; all others keep their own."""
     places = ((0.09, 0.07), (0.14, 0.08), (0.25, 0.18), (0.05, 0.19))

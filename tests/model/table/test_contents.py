@@ -206,8 +206,18 @@ def test_worst_finger_of_combinations_is_counted_plate_by_plate() -> None:
 
 
 def test_stroke_is_shared_by_one_factor_for_each_priority() -> None:
-    """By hand: the higher priority has all of it, two others half of what is left."""
+    """By hand: the higher priority has all of it, two others half of what is left, max-min."""
     weights = np.array([[0.5, 0.1], [0.5, 1.0], [0.5, 1.0]], dtype=np.complex64)
-    gains, factor = share_stroke(np.ones(3), weights, [1, 0, 0])
+    gains, factor = share_stroke(np.ones(3), weights, np.ones(3), [1, 0, 0])
     assert gains == pytest.approx([1.0, 0.45, 0.45])
     assert factor == pytest.approx(0.45)
+    # Levels of 8, 2 and 1 that would need 0.8, 0.4 and 0.3 of one ERA: the first is lowered.
+    one = np.array([[0.8], [0.4], [0.3]], dtype=np.complex64)
+    gains, factor = share_stroke(np.ones(3), one, np.array([8.0, 2.0, 1.0]), [0, 0, 0])
+    assert gains == pytest.approx([0.375, 1.0, 1.0])
+    assert factor == pytest.approx(0.375)
+    # Needing 0.8, 0.8 and 0.3, the first two end at the level 1.4: 0.14 + 0.56 + 0.3.
+    two = np.array([[0.8], [0.8], [0.3]], dtype=np.complex64)
+    gains, factor = share_stroke(np.ones(3), two, np.array([8.0, 2.0, 1.0]), [0, 0, 0])
+    assert gains == pytest.approx([0.175, 0.7, 1.0])
+    assert factor == pytest.approx(0.175)

@@ -52,7 +52,8 @@ _ResultT = TypeVar("_ResultT", bound=Message)
 class AsyncClient:
     """A client of the daemon, made by `connect`; any number of calls may be pending.
 
-    A lost connection is made again by the next call, with all subscriptions. Every method ends
+    Without that its first call connects. A lost connection, and one without a response in time, is
+    made again by the next call, with all subscriptions. Every method ends
     within the timeout and raises RpcError for an error of the daemon, Unreachable (a LinkError)
     without a response, and LeaseLost, except for `stop` and `disarm`, once the lease of `armed` is
     lost.
@@ -89,6 +90,13 @@ class AsyncClient:
         client = cls(find_socket(path), name=name, timeout=timeout)
         await client._within_timeout(client._repeated(client._connected))
         return client
+
+    async def keep_connected(self) -> None:
+        """Connect again after every loss, until cancelled, so that no call has to wait for it."""
+        while True:
+            with suppress(Unreachable, RpcError):
+                await self._within_timeout(self._connected())
+            await asyncio.sleep(_MAX_RETRY_INTERVAL)
 
     async def __aenter__(self) -> Self:
         return self
@@ -303,6 +311,8 @@ class AsyncClient:
             async with asyncio.timeout(self._timeout):
                 return await work
         except TimeoutError as error:
+            if self._channel is not None:  # else what waits in it would grow without bounds
+                self._channel.close()
             raise Unreachable.at(self.path, error) from error
 
     async def _connected(self) -> Channel:

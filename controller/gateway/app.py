@@ -1,6 +1,7 @@
 """The gateway's routes: the page, the API over HTTP, and the WebSocket."""
 
 import asyncio
+import contextlib
 import json
 import math
 import time
@@ -18,7 +19,8 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
-from controller.api.client_protocol import Unreachable, read_result
+from controller.api.async_client import AsyncClient
+from controller.api.client_protocol import RESPONSE_TIMEOUT, Unreachable
 from controller.api.jsonrpc import (
     ErrorCode,
     RpcError,
@@ -27,13 +29,11 @@ from controller.api.jsonrpc import (
     read_request,
     unknown_method,
 )
-from controller.api.methods import DisarmParams, RequestedBy, StatusResult
+from controller.api.methods import METHODS, DisarmParams, RequestedBy, StatusResult
 from controller.api.rate_limit import RateLimiter
-from controller.api.schema import Empty
 from controller.gateway.access import SUBPROTOCOL, Access
 from controller.gateway.bridge import bridge, client_name
 from controller.gateway.field import DrawnField
-from controller.gateway.lasting import LastingLink
 from controller.gateway.link import KeptLink, request_of
 from controller.gateway.metrics import exposition
 from controller.gateway.openapi import HTTP_METHODS, HTTP_STATUS, openapi
@@ -46,7 +46,7 @@ MAX_OPENING_RATE, OPENING_BURST = 10.0, 32.0  # 1/s; of a host's connections to 
 MAX_TOTAL_RATE, TOTAL_BURST = 16.0, 48.0  # the same of all hosts together: fewer than the daemon
 # accepts of one process, so that there are always some for the gateway's own
 _MAX_HOSTS = 256  # above which those that have not connected lately are forgotten
-# Over the lasting connection, whoever sends them; with their parameters.
+# Over the own connection, whoever sends them; with their parameters.
 _SILENCING: dict[str, type[RequestedBy]] = {"stop": RequestedBy, "disarm": DisarmParams}
 _METRICS_TIME = 0.5  # s; for which the same metrics are given
 _MAX_DISARMS = 8  # at once; the daemon carries out as many of one client
@@ -64,7 +64,8 @@ class Gateway:
         self._session_count = 0
         self._rates: dict[str, RateLimiter] = {}  # of connections to the daemon, by host
         self._rate = RateLimiter(MAX_TOTAL_RATE, burst=TOTAL_BURST, clock=time.monotonic)
-        self._lasting = LastingLink(settings.socket)
+        # For what must not wait for a new connection, which the daemon may refuse.
+        self._own = AsyncClient(settings.socket, name="gateway", timeout=RESPONSE_TIMEOUT)
         self._disarms = asyncio.Semaphore(_MAX_DISARMS)
         self._reading = asyncio.Lock()
         self._read_at = -math.inf  # s; when the metrics were read
@@ -98,7 +99,7 @@ class Gateway:
         """Keep what it has of the daemon for all browsers, until cancelled."""
         async with asyncio.TaskGroup() as own:
             own.create_task(self.field.run())
-            own.create_task(self._lasting.run())
+            own.create_task(self._own.keep_connected())
 
     async def _metrics(self, _: Request) -> Response:
         """The daemon's status for Prometheus, read once for all who need it: it needs no token."""
@@ -111,7 +112,7 @@ class Gateway:
     async def _status(self) -> StatusResult | None:
         """The daemon's status, None without a daemon."""
         try:
-            return read_result(await self._lasting.request("status", Empty()), StatusResult)
+            return await self._own.status()
         except (RpcError, Unreachable):
             return None
 
@@ -153,10 +154,9 @@ class Gateway:
         read = read_request(request_of(name, method, params))
         given = read_params(_SILENCING[method], read)
         given = given.model_copy(update={"client": given.client or name})
-        if method == "stop":
-            return await self._lasting.request(method, given)
-        async with self._disarms:
-            return await self._lasting.request(method, given)
+        async with contextlib.nullcontext() if method == "stop" else self._disarms:
+            result = await self._own.call(method, given, METHODS[method].result)
+        return result.model_dump(mode="json")
 
     async def _serve(self, socket: WebSocket) -> None:
         """Serve one browser."""

@@ -96,7 +96,7 @@ async def test_metrics_are_read_once_for_all(
 ) -> None:
     """However many read them within half a second."""
     status = AsyncMock(side_effect=Unreachable)
-    monkeypatch.setattr(app.LastingLink, "request", status)
+    monkeypatch.setattr(app.AsyncClient, "status", status)
     monkeypatch.setattr(app, "_METRICS_TIME", 1e9)
     transport = httpx.ASGITransport(app.Gateway(Settings(socket=tmp_path / "era.sock")).app)
     async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:

@@ -9,10 +9,10 @@ from unittest.mock import AsyncMock
 
 import pytest
 
+from controller.api.async_client import AsyncClient
 from controller.api.client_protocol import Unreachable
-from controller.api.methods import RequestedBy
 from controller.api.schema import API_VERSION
-from controller.gateway import bridge, lasting, link
+from controller.gateway import bridge, link
 from controller.gateway.field import DrawnField
 from daemon_bench import PATIENCE
 from gateway_bench import TOKEN, GatewayProcess, ScriptedDaemon, gateway_process, wait_for_daemon
@@ -83,41 +83,12 @@ async def test_stop_is_answered_although_the_daemon_hangs(
     full_queue: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Otherwise nobody is told to switch the amplifiers off by hand."""
-    for module in (lasting, link):
-        monkeypatch.setattr(module, "RESPONSE_TIMEOUT", 0.05)
+    monkeypatch.setattr(link, "RESPONSE_TIMEOUT", 0.05)
     async with asyncio.timeout(100 * link.RESPONSE_TIMEOUT):
         with pytest.raises(Unreachable, match="does not respond"):
             await link.DaemonLink.open(full_queue, "browser")
         with pytest.raises(Unreachable, match="does not respond"):
-            await lasting.LastingLink(full_queue).request("stop", RequestedBy())
-
-
-async def test_stop_is_repeated_if_the_connection_is_lost(
-    daemon: ScriptedDaemon, tmp_path: Path
-) -> None:
-    """As when the daemon closes it at the same time for a new client."""
-    path = tmp_path / "era.sock"
-    lost = 0
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        nonlocal lost
-        ours, theirs = await asyncio.open_unix_connection(daemon.socket)
-        theirs.write(await reader.readline())
-        writer.write(await ours.readline())
-        request = await reader.readline()
-        if lost:
-            theirs.write(request)
-            writer.write(await ours.readline())
-        lost += 1
-        writer.close()
-        theirs.close()
-
-    async with await asyncio.start_unix_server(serve, path):
-        assert await lasting.LastingLink(path).request("stop", RequestedBy()) == {
-            "epoch": 1,
-            "amplifiers": {},
-        }
-    assert lost == 2
+            await AsyncClient(full_queue, name="gateway", timeout=0.05).stop()
 
 
 class DeafBrowser:

@@ -188,10 +188,6 @@ def _show_summary(summary: dict[str, Any]) -> None:
         ("least level", f"{summary['least_level_at_full_stroke_db_sl']:.1f} dB SL at full stroke"),
         *contrast,
         (
-            "similar patterns",
-            f"{percent('alike_pattern_pairs_share')} of pairs, correlation > 0.95",
-        ),
-        (
             "mesh",
             f"{summary['mesh_name']}, error of the fields "
             f"{summary['discretisation_error_percent']:.3g} %, estimated with "

@@ -5,58 +5,12 @@ frequency add as complex numbers, at two frequencies their magnitudes add (paper
 every pattern is one source or the sum of two.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
-from model.drive_modes.forms import SILENT
-
-
-@dataclass(frozen=True, eq=False)
-class Combinations:
-    """All patterns of one or two ERAs, as sums of two sources.
-
-    index (n, eras): of each ERA's frequency, or SILENT; first every ERA alone, then every pair,
-    frequencies of the pair's first ERA running slowest. first, second (n,): rows of the sources,
-    which are: each ERA at each frequency, each pair together at each frequency, and nothing.
-    """
-
-    index: NDArray[np.int16]
-    first: IntArray
-    second: IntArray
-
-
-@lru_cache(maxsize=8)
-def all_combinations(era_count: int, frequency_count: int) -> Combinations:
-    """List every pattern of the given numbers of ERAs and frequencies: 4482 of 4 and 27."""
-    f = np.arange(frequency_count)
-    pairs = list(combinations(range(era_count), 2))
-    together = era_count * frequency_count
-    nothing = together + len(pairs) * frequency_count
-    index, first, second = [], [], []
-    for era in range(era_count):
-        block = np.full((frequency_count, era_count), SILENT, dtype=np.int16)
-        block[:, era] = f
-        index.append(block)
-        first.append(era * frequency_count + f)
-        second.append(np.full(frequency_count, nothing))
-    for number, (one, other) in enumerate(pairs):
-        f_one, f_other = np.repeat(f, frequency_count), np.tile(f, frequency_count)
-        block = np.full((frequency_count**2, era_count), SILENT, dtype=np.int16)
-        block[:, one], block[:, other] = f_one, f_other
-        index.append(block)
-        same = f_one == f_other
-        coherent = together + number * frequency_count + f_one
-        first.append(np.where(same, coherent, one * frequency_count + f_one))
-        second.append(np.where(same, nothing, other * frequency_count + f_other))
-    found = Combinations(np.concatenate(index), np.concatenate(first), np.concatenate(second))
-    for shared in (found.index, found.first, found.second):
-        shared.setflags(write=False)  # cached, and so shared
-    return found
 
 
 def magnitudes_of_sources(acceleration: Complex64Array | ComplexArray) -> Float32Array:
@@ -89,7 +43,11 @@ def per_source(threshold: Float32Array | FloatArray, era_count: int) -> Float32A
 
 
 def sums_of_sources(rows: Float32Array, eras: int) -> Float32Array:
-    """Values of all patterns (c, n), from those of all sources (c, sources)."""
+    """Values of all patterns (c, n), from those of all sources (c, sources).
+
+    Sources are each ERA at each frequency, each pair together at each frequency, and nothing;
+    patterns every ERA alone, then every pair, frequencies of its first ERA running slowest.
+    """
     c = len(rows)
     f = (rows.shape[1] - 1) // (eras * (eras + 1) // 2)
     alone = rows[:, : eras * f].reshape(c, eras, f)

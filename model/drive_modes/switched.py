@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from model.arrays import Complex64Array, Float32Array, IntArray
 from model.choice import NEARLY, best_few
 from model.drive_modes.forms import SILENT, Forms, Weights
-from model.drive_modes.sources import all_combinations
+from model.drive_modes.sources import sums_of_sources
 
 BATCH = 256
 """Patterns evaluated together."""
@@ -126,13 +126,11 @@ def find_switched(forms: Forms, min_score: float) -> list[tuple[float, Weights]]
 
 def max_sensation_switched(forms: Forms) -> float:
     """Return the highest amplitude to threshold at the weakest target, the same pattern for all."""
-    eras, f = forms.era_count, forms.frequency_count
+    eras = forms.era_count
     powers = source_powers(forms, _members(eras))
     target = powers.target.reshape(len(powers.target), -1)
-    patterns = all_combinations(eras, f)
     padded = np.concatenate([target, np.zeros((len(target), 1), np.float32)], axis=1)
-    sums = padded[:, patterns.first] + padded[:, patterns.second]
-    return float(np.sqrt(sums.min(axis=0).max()))
+    return float(np.sqrt(sums_of_sources(padded, eras).min(axis=0).max()))
 
 
 def _pairs(gain: Float32Array, eras: int, count: int) -> tuple[IntArray, IntArray]:
@@ -156,7 +154,7 @@ def _pairs(gain: Float32Array, eras: int, count: int) -> tuple[IntArray, IntArra
 
 @lru_cache(maxsize=8)
 def _members(eras: int) -> NDArray[np.float32]:
-    """Every ERA alone, then every pair, (groups, eras), in the order of `all_combinations`."""
+    """Every ERA alone, then every pair, (groups, eras), as sources are ordered."""
     groups = [*((era,) for era in range(eras)), *combinations(range(eras), 2)]
     members = np.zeros((len(groups), eras), dtype=np.float32)
     for row, group in enumerate(groups):

@@ -9,10 +9,6 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.structure.plate import Plate
 
-# Points per side at which a cell of the grid is sampled; five put them 5 mm apart on the paper's
-# plate, a fiftieth of the shortest bending wavelength that a table holds.
-CELL_SAMPLES = 5
-
 
 @dataclass(frozen=True)
 class Grid:
@@ -38,17 +34,7 @@ class Grid:
 
     def centres(self, plate: Plate) -> FloatArray:
         """Centres of the cells [m], (cell_count, 2)."""
-        return self._points(plate, samples=1)
-
-    def samples(self, plate: Plate) -> FloatArray:
-        """Points [m] spread evenly, cell after cell, (cell_count * CELL_SAMPLES², 2)."""
-        return self._points(plate, samples=CELL_SAMPLES)
-
-    def _points(self, plate: Plate, *, samples: int) -> FloatArray:
-        inside = (np.arange(samples) + 0.5) / samples
-        cell_y, cell_x, sample_y, sample_x = np.meshgrid(
-            np.arange(self.ny), np.arange(self.nx), inside, inside, indexing="ij"
-        )
-        x = (cell_x + sample_x) * plate.length / self.nx
-        y = (cell_y + sample_y) * plate.width / self.ny
+        cell_y, cell_x = np.meshgrid(np.arange(self.ny), np.arange(self.nx), indexing="ij")
+        x = (cell_x + 0.5) * plate.length / self.nx
+        y = (cell_y + 0.5) * plate.width / self.ny
         return np.column_stack([x.ravel(), y.ravel()])

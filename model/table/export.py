@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 
 from model.arrays import Complex64Array
-from model.drive_modes.forms import SILENT
-from model.drive_modes.sources import all_combinations
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_rows
@@ -32,15 +30,12 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
     """
     from scipy.io import savemat
 
-    size = table.pattern_count * (
-        4 * table.grid.cell_count + 8 * len(table.eras)
-    ) + 8 * table.raster.point_count * len(table.frequencies) * len(table.eras)
+    size = 8 * table.raster.point_count * len(table.frequencies) * len(table.eras)
     if size > MAX_MAT_BYTES:
         raise InputError(
             f"a .mat file of version 5 must have up to {MAX_MAT_BYTES / 1e9:.1f} GB, got "
             f"{size / 1e9:.1f} GB; open the table itself, a .npz file, with numpy.load"
         )
-    pattern_hz = _pattern_frequencies(table)
     content = {
         "format_version": float(FORMAT_VERSION),
         "code_version": table.code_version,
@@ -65,8 +60,6 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
         "cell_centre_m": table.cell_centres,
         "cells_along_x": float(table.grid.nx),
         "cells_along_y": float(table.grid.ny),
-        "pattern_frequency_hz": pattern_hz,
-        "pattern_response_m_s2": table.cell_response,
     }
     with whole_or_nothing(path) as stream:
         savemat(
@@ -86,12 +79,6 @@ def export_csv(table: LocalizationTable, path: Path, *, content: str) -> None:
     and imaginary acceleration by each ERA alone at full stroke.
     """
     write_rows(path, {"patterns": _pattern_rows, "fields": _field_rows}[content](table))
-
-
-def _pattern_frequencies(table: LocalizationTable) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Frequency [Hz] of each ERA in each pattern, 0 where it is silent, (n, eras)."""
-    index = all_combinations(len(table.eras), len(table.frequencies)).index
-    return np.where(index == SILENT, 0.0, table.frequencies[index])
 
 
 def _pattern_rows(table: LocalizationTable) -> Iterator[list[object]]:

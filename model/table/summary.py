@@ -4,16 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from model.arrays import FloatArray, IntArray
-from model.drive_modes.sources import all_combinations
 from model.finger.perception import FELT_DB_SL, highest_measured
 from model.table.overview import Overview
 from model.table.table import LocalizationTable
 from model.table.weak_cells import sampling_error
-
-PAIRS = 20_000
-MIN_SIMILARITY = 0.95
-"""Correlation of responses at the cells above which two patterns count as similar."""
 
 
 def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
@@ -48,7 +42,6 @@ def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
                 error = sampling_error(contrasts, percentile) if len(contrasts) else None
                 summary[f"{kind}_contrast_{others}_quiet_{name}_db"] = value
                 summary[f"{kind}_contrast_{others}_quiet_{name}_error_db"] = error
-    summary["alike_pattern_pairs_share"] = similar_share(table)
     summary["mesh_name"] = str(table.mesh)
     summary["discretisation_error_percent"] = 100 * float(table.discretisation_error.max())
     summary["reference_mesh"] = str(table.reference_mesh)
@@ -56,26 +49,3 @@ def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
     summary["code_version"] = table.code_version
     summary["fingerprint"] = table.fingerprint
     return summary
-
-
-def similar_share(table: LocalizationTable) -> float | None:
-    """Share of similar pairs of `switched` patterns in a random sample of PAIRS.
-
-    None for a single pattern or cell.
-    """
-    patterns = all_combinations(len(table.eras), len(table.frequencies))
-    count = len(patterns.first)
-    if min(count, table.grid.cell_count) < 2:
-        return None
-    rng = np.random.default_rng(0)
-    one = rng.integers(count, size=PAIRS)
-    other = (one + rng.integers(1, count, size=PAIRS)) % count  # never a pattern with itself
-
-    def scaled(chosen: IntArray) -> FloatArray:
-        sources = table.cell_sources.astype(float)
-        rows = sources[patterns.first[chosen]] + sources[patterns.second[chosen]]
-        rows -= rows.mean(axis=1, keepdims=True)
-        return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
-
-    correlation = (scaled(one) * scaled(other)).sum(axis=1)
-    return float((correlation > MIN_SIMILARITY).mean())

@@ -25,7 +25,7 @@ from model.ensemble.attached_plate import AttachedPlate, attach
 from model.ensemble.plate_on_eras import PlateOnEras
 from model.ensemble.touched_by_kernel import touch
 from model.errors import InputError
-from model.finger.grid import CELL_SAMPLES, Grid
+from model.finger.grid import Grid
 from model.finger.perception import decibels, detection_threshold, is_background
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import physics_fingerprint
@@ -256,22 +256,6 @@ class LocalizationTable:
         # Cell by cell, since fine frequency steps make millions of patterns.
         maxima = [sums_of_sources(cell[None], len(self.eras)).max() for cell in powers.T]
         return decibels(np.sqrt(np.array(maxima, dtype=float)))
-
-    @cached_property
-    def cell_sources(self) -> Float32Array:
-        """Mean peak acceleration over each cell of the sources of patterns, (sources, cells)."""
-        each = CELL_SAMPLES**2
-        samples = self.grid.samples(self.plate)
-        parts = [
-            magnitudes_of_sources(self.unit_fields(some)).reshape(-1, len(some) // each, each)
-            for some in np.split(samples, range(36 * each, len(samples), 36 * each))
-        ]
-        return np.concatenate([part.mean(axis=-1) for part in parts], axis=1)
-
-    @property
-    def cell_response(self) -> Float32Array:
-        """Mean peak acceleration over each cell of every `switched` pattern, (n, cells) [m/s²]."""
-        return sums_of_sources(self.cell_sources.T, len(self.eras)).T
 
     @cached_property
     def cell_centres(self) -> FloatArray:

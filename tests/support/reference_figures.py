@@ -46,7 +46,6 @@ def reference_figures() -> dict[str, list[float]]:
         "table_acceleration": np.linalg.norm(
             table.unit_fields(table.raster.points), axis=2
         ).ravel(),
-        "table_cell_sources": table.cell_sources.mean(axis=1),
         "table_discretisation_error": table.discretisation_error,
         "table_shapes": np.linalg.norm(table.shapes[:, :8], axis=0),
     }

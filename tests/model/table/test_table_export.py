@@ -55,23 +55,6 @@ def test_export_mat_holds_the_table_to_the_bit(table, struct):
     assert struct.eras[2].x_m == 0.3048
 
 
-def test_export_mat_patterns_match_their_frequencies(table, struct):
-    """4 * 3 + 6 * 9 rows; of two ERAs at two frequencies the response is the sum of both alone."""
-    hz = struct.pattern_frequency_hz
-    assert hz.shape == (66, 4)
-    assert struct.pattern_response_m_s2.shape == (66, 12)
-
-    def response(**eras):
-        wanted = [eras.get(name, 0.0) for name in ("SW", "SE", "NE", "NW")]
-        (row,) = np.flatnonzero((hz == wanted).all(axis=1))
-        return struct.pattern_response_m_s2[row]
-
-    together = response(SW=60.0, NE=250.0)
-    np.testing.assert_allclose(together, response(SW=60.0) + response(NE=250.0), rtol=1e-6)
-    coherent = response(SW=110.0, NE=110.0)
-    assert (coherent < response(SW=110.0) + response(NE=110.0)).all()
-
-
 def test_export_mat_holds_masses(table, tmp_path):
     """One mass is a struct of one, none is empty."""
     attachment_shapes = np.vstack([table.attachment_shapes, table.attachment_shapes[:1]])

@@ -12,7 +12,7 @@ from model.finger.grid import Grid
 from model.structure.attachments import PointLoad
 from model.table.build import build_table
 from model.table.overview import CONTACT_SETS, Overview, contrast_distribution, find_overview
-from model.table.summary import similar_share, summarize
+from model.table.summary import summarize
 from model.table.weak_cells import (
     WeakCells,
     find_weak_cells,
@@ -218,23 +218,3 @@ def test_contrast_distribution_uses_fingers_apart(table, others):
         assert contacts.shape == (others + 1, 2)
         gaps = np.linalg.norm(contacts[:, None] - contacts, axis=-1)
         assert gaps[np.triu_indices(others + 1, 1)].min() >= 0.05
-
-
-def test_similar_share_of_copies_noise_and_a_single_cell():
-    """Copies of one pattern are all similar, noise is not; a single cell has no share."""
-    copies = np.tile(np.linspace(1, 2, 12, dtype=np.float32), (4 * 3 + 6 * 3 + 1, 1))
-    copies[-1] = 0  # nothing driven beside the first source
-
-    def plate(sources):
-        return SimpleNamespace(
-            eras=range(4),
-            frequencies=range(3),
-            grid=Grid(sources.shape[1], 1),
-            cell_sources=sources,
-        )
-
-    assert similar_share(plate(copies)) == 1.0
-    rng = np.random.default_rng(0)
-    noise = rng.uniform(0, 1, copies.shape).astype(np.float32)
-    assert similar_share(plate(noise)) < 0.05
-    assert similar_share(plate(noise[:, :1])) is None

@@ -3,6 +3,8 @@
 import json
 import math
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
@@ -78,8 +80,8 @@ def witness(
         },
         "times_s": {"slack": slack * 1e-3},
     }
-    with _Capture(record) as capture:
-        checker = Witness(config, record=capture.write)
+    with _capture(record) as write:
+        checker = Witness(config, record=write)
         if replay is not None:
             end = _replay(replay, checker)
         else:
@@ -129,45 +131,39 @@ def _check_apart(endpoints: list["WireEndpoint"]) -> None:
             )
 
 
-class _Capture:
-    """A capture file, if there is one; its end tells what could not be written.
+@contextmanager
+def _capture(path: Path | None) -> Iterator[Callable[[str], None]]:
+    """Yield what appends a line to a capture file, if there is one; its end tells what was lost.
 
-    Relaying goes on where writing fails. Raises InputError where it cannot be opened.
+    Relaying goes on where writing fails. Raises InputError where it cannot be opened, or is
+    incomplete.
     """
+    problems: list[OSError] = []
+    try:
+        opened = path and open(path, "w", encoding="utf-8", opener=regular_file)  # noqa: SIM115
+    except OSError as problem:
+        raise InputError(f"--record {path}: cannot be written: {problem.strerror}") from problem
 
-    def __init__(self, path: Path | None) -> None:
-        self._path = path
-        self._problem: OSError | None = None
-        self._file = None
-        try:
-            if path is not None:
-                self._file = open(path, "w", encoding="utf-8", opener=regular_file)  # noqa: SIM115
-        except OSError as problem:
-            raise InputError(f"--record {path}: cannot be written: {problem.strerror}") from problem
-
-    def write(self, line: str) -> None:
-        """Append a line, unless an earlier one failed."""
-        if self._file is not None and self._problem is None:
+    def write(line: str) -> None:
+        if opened and not problems:
             try:
-                print(line, file=self._file)
+                print(line, file=opened)
             except OSError as problem:
-                self._problem = problem
+                problems.append(problem)
 
-    def __enter__(self) -> "_Capture":
-        return self
-
-    def __exit__(self, *of_error: object) -> None:
-        """Close it; raise InputError if it is incomplete."""
+    try:
+        yield write
+    finally:
         try:
-            if self._file is not None:
-                self._file.close()
+            if opened:
+                opened.close()
         except OSError as problem:
-            self._problem = self._problem or problem
-        if self._problem is not None:
+            problems.append(problem)
+        if problems:
             raise InputError(
-                f"--record {self._path}: capture incomplete: {self._problem.strerror}; free disk "
-                "space, or record elsewhere"
-            ) from self._problem
+                f"--record {path}: capture incomplete: {problems[0].strerror}; free disk space, or "
+                "record elsewhere"
+            ) from problems[0]
 
 
 def _replay(path: Path, checker: "Witness") -> float:

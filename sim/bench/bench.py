@@ -325,20 +325,28 @@ class Bench:
             self._is_sampling = False
 
     def _sample(self, end: float) -> None:
-        layout, probes = self._fingers.layout, tuple(self._probes)
-        if not (layout.positions or probes):
+        if not (self._fingers.layout.positions or self._probes):
             self._plant.skip(end)
             return
-        shapes = [layout.shapes, *(probe.shapes for probe in probes)]
+        shapes = self._listening()
         times, accelerations = self._plant.advance(
             end,
             sample_rate=self.sample_rate,
             shapes=np.concatenate(shapes),
-            precision=np.float64 if probes else np.float32,  # of what is kept of fingers
+            precision=np.float64 if self._probes else np.float32,  # of what is kept of fingers
         )
-        parts = np.split(accelerations, np.cumsum([len(each) for each in shapes])[:-1], axis=1)
-        self._fingers.record(times, parts[0])
-        for probe, part in zip(probes, parts[1:], strict=True):
+        self._pass_on(times, accelerations, shapes)
+
+    def _listening(self) -> list[FloatArray]:
+        """Shapes of the fingers, then of each probe."""
+        return [self._fingers.layout.shapes, *(probe.shapes for probe in self._probes)]
+
+    def _pass_on(self, times: FloatArray, felt: FloatArray, shapes: Sequence[FloatArray]) -> None:
+        """Hand samples at these shapes over to the fingers and to each probe."""
+        ends = np.cumsum([len(each) for each in shapes])[:-1]
+        under_fingers, *others = np.split(felt, ends, axis=1)
+        self._fingers.record(times, under_fingers)
+        for probe, part in zip([*self._probes], others, strict=True):
             probe.record(times, part)
 
     def _update_plant(self) -> None:

@@ -228,12 +228,9 @@ class FirmwareBench(Bench):
         times: FloatArray = self._start + np.arange(self._count + 0.5, last) / RATE
         self._count, self._time = last, float(times[-1])
         bases = levels * self._gains * [era.stroke for era in self.rig.eras]
-        shapes = [self._fingers.layout.shapes, *(probe.shapes for probe in self._probes)]
+        shapes = self._listening()
         felt = self._sampled.advance(bases, shapes=np.concatenate(shapes))
-        parts = np.split(felt, np.cumsum([len(each) for each in shapes])[:-1], axis=1)
-        self._fingers.record(times, parts[0])
-        for probe, part in zip(self._probes, parts[1:], strict=True):
-            probe.record(times, part)
+        self._pass_on(times, felt, shapes)
         self._recent.append((float(times[0]), levels))
         while self._recent[0][0] < self._time - KEPT:
             self._recent.popleft()

@@ -8,13 +8,13 @@ effect; modes other than raw mode, extended identifiers, discovery by broadcast.
 import re
 
 from drivers import clock
+from drivers.codec.can_bus.adapter_text import SLCAN
 from drivers.codec.can_bus.canopen import CanFrame
 from sim.far_ends.can_bus.bus import CanBus
 from sim.transport.far_end import FarEnd, Send
 
 _CR, _BELL = b"\r", b"\x07"
 _MAX_LENGTH = 64  # characters; a frame has 21
-_FRAME = re.compile(rb"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 _REMOTE = re.compile(rb"r[0-7][0-9A-Fa-f]{2}[0-8]|R[01][0-9A-Fa-f]{7}[0-8]")
 _EXTENDED = re.compile(rb"T[01][0-9A-Fa-f]{7}[0-8](?:[0-9A-Fa-f]{2})*")
 _SETTING = re.compile(rb"S[0-9]|s[0-9A-Fa-f]{4,6}|Y[0-9]|[Mm][0-9A-Fa-f]{8}|[ZX][01]|W[0-9]|")
@@ -61,7 +61,7 @@ class SlcanAdapter(FarEnd):
         if self._is_open and self._may_send:
             if _REMOTE.fullmatch(line) or _EXTENDED.fullmatch(line):
                 return (b"z" if line[:1] == b"r" else b"Z") + _CR  # no receiver for these
-            if frame := _parse(line):
+            if frame := SLCAN.decode(line):
                 self._bus.send(frame, sender=self._listener)
                 return b"z" + _CR
         if not self._is_open and _SETTING.fullmatch(line):
@@ -70,16 +70,7 @@ class SlcanAdapter(FarEnd):
 
     def _hear(self, frame: CanFrame) -> None:
         if self._is_open:
-            data = frame.data.hex().upper()
-            self._send(f"t{frame.id:03X}{len(frame.data)}{data}\r".encode())
-
-
-def _parse(line: bytes) -> CanFrame | None:
-    """The frame of a command t, else None."""
-    found = _FRAME.fullmatch(line)
-    if found is None or len(found[3]) != 2 * int(found[2]):
-        return None
-    return CanFrame(int(found[1], 16), bytes.fromhex(found[3].decode()))
+            self._send(SLCAN.encode(frame))
 
 
 BUS_NAME = "can0"

@@ -404,6 +404,24 @@ async def test_stop_reaches_those_beside_a_mute_amplifier(
     assert not any(stopped[name].is_confirmed for name in alone)
 
 
+@grouped(tuple("ab"), wire="serial")
+async def test_mute_amplifier_keeps_no_heartbeat_waiting(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """On one serial line: the other one is fed within 10 ms, though replies are awaited for 30."""
+    (end,) = ends
+    muted = end.hosts["a"].address
+    end.inward = lambda name, data: [] if end.kind.request_of(data)[0] == muted else [(0, data)]  # type: ignore[index]
+    with pytest.raises(LinkDegraded):
+        await group.beat()
+    await asyncio.sleep(0.11)  # until the reading of its status was given up
+    for _ in range(2):
+        began = end.loop.time()
+        await group.beat()
+        assert end.loop.time() - began < 0.01
+        await asyncio.sleep(0.001)
+
+
 @grouped(("a", "b"))
 async def test_ledger_knows_what_a_lost_broadcast_started(
     group: Group, ends: list[MemoryLine]

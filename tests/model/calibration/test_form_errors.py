@@ -46,22 +46,6 @@ def test_form_model_without_form_errors_is_the_parametric_plate(rig: Rig) -> Non
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
-def test_derivatives_of_form_model_agree_with_differences(rig: Rig) -> None:
-    """By every parameter and every form error, at a point away from zero."""
-    parameters = parameters_of(rig)
-    model = form_model(rig, SENSORS[:3] * [rig.plate.length, rig.plate.width], FREQUENCIES[::4])
-    at = np.array([parameter.start + 0.1 for parameter in parameters])
-    form = 0.5 * np.random.default_rng(1).standard_normal(len(model.std))
-    value, derivatives = model.responses(parameters, at, form)
-    step = 1e-5
-    for number, derivative in enumerate(derivatives):
-        moved = np.concatenate([at, form])
-        moved[number] += step
-        other, _ = model.responses(parameters, *np.split(moved, [len(at)]))
-        difference = (other - value) / step
-        np.testing.assert_allclose(derivative, difference, atol=1e-3 * np.abs(difference).max())
-
-
 def test_stiffening_does_not_depend_on_rounding(rig: Rig) -> None:
     """Moduli that differ in the eleventh digit give derivatives by the sides that agree to 1e-4.
 

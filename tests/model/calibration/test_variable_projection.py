@@ -1,4 +1,4 @@
-"""Exact Jacobians of projected gains, against extrapolated differences of the residuals."""
+"""Exact Jacobians of searches, against extrapolated differences of their residuals."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,7 +12,6 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration import fit, least_squares
 from model.calibration.form_errors import form_model
 from model.calibration.parameters import parameters_of
-from model.calibration.variable_projection import project_gains, projection_slopes
 from model.diagnosis import plate_match
 from model.rig.rig import Rig
 from model.vibration.parametric_plate import parametric_plate
@@ -21,45 +20,6 @@ from paper_plate import make_paper_rig
 RIG = make_paper_rig(12, 9)
 POINTS = np.random.default_rng(0).uniform(0.02, 0.2, (5, 2))
 FREQUENCIES = np.array([70.0, 130.0, 260.0, 410.0])
-
-
-def curved(count: int, shape: tuple[int, ...]) -> Callable[[FloatArray], ComplexArray]:
-    """A random complex function of count arguments, of second degree."""
-    rng = np.random.default_rng(1)
-    parts = rng.standard_normal((2, 1 + 2 * count, *shape))
-    terms = parts[0] + 1j * parts[1]
-
-    def function(z: FloatArray) -> ComplexArray:
-        return np.asarray(np.tensordot(np.concatenate([[1.0], z, z**2]), terms, axes=1))
-
-    return function
-
-
-@pytest.mark.parametrize("is_expected", [False, True], ids=["free gains", "expected magnitudes"])
-def test_projection_slopes_are_those_of_gains_and_residual(is_expected: bool) -> None:
-    """Of a random curved model with values left out, to 1e-8 of the largest."""
-    rng = np.random.default_rng(2)
-    model = curved(3, (2, 4, 5))
-    values = model(rng.standard_normal(3))[::-1] + 0.3
-    weight = rng.uniform(0.5, 2.0, values.shape) * (rng.random(values.shape) < 0.8)
-    expected_slopes = rng.uniform(-0.2, 0.2, (3, 4))
-
-    def known(z: FloatArray) -> dict[str, Any]:
-        if not is_expected:
-            return {}
-        return {"expected": 1.5 + z @ expected_slopes, "tolerance": 0.2}
-
-    at = np.array([0.3, -0.2, 0.1])
-    slopes = extrapolated_slopes(model, at, step=1e-3)
-    further: dict[str, Any] = {"expected_slopes": expected_slopes} if is_expected else {}
-    found = projection_slopes(model(at), slopes, values, weight, **known(at), **further)
-    for number, own in enumerate(found):
-
-        def projected(z: FloatArray, number: int = number) -> ComplexArray:
-            return project_gains(model(z), values, weight, **known(z))[number]
-
-        exact = extrapolated_slopes(projected, at, step=1e-3)
-        np.testing.assert_allclose(own, exact, atol=1e-8 * np.abs(exact).max())
 
 
 def measured(rig: Rig) -> ComplexArray:

@@ -10,10 +10,11 @@ from model.arrays import FloatArray
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.weak_cells import (
+    Ask,
     Contrasts,
     WeakCells,
     are_apart,
-    contrasts_of,
+    ask_once,
     find_weak_cells,
     map_grid,
 )
@@ -42,15 +43,17 @@ def find_overview(
 
     progress: called with the number of finished cells and sets, and the total.
     """
-    cells = map_grid(table).cell_count
+    ask, cells = ask_once(table), map_grid(table).cell_count
     total = cells + 2 * CONTACT_SETS
-    found = find_weak_cells(table, progress=lambda done, _: progress(done, total))
+    found = find_weak_cells(table, ask=ask, progress=lambda done, _: progress(done, total))
     rng = np.random.default_rng(0)
     contrasts = [found.pairs_db]
     for others in (2, 3):
         before = cells + (others - 2) * CONTACT_SETS
         report = partial(_report_sets, progress, before=before, total=total)
-        contrasts.append(contrast_distribution(table, others=others, rng=rng, progress=report))
+        contrasts.append(
+            contrast_distribution(table, others=others, rng=rng, ask=ask, progress=report)
+        )
     return Overview(found, contrasts)
 
 
@@ -65,19 +68,21 @@ def contrast_distribution(
     *,
     others: int,
     rng: np.random.Generator,
+    ask: Ask | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> FloatArray:
     """Robust and nominal felt contrast [dB] of random contact sets, (2, up to CONTACT_SETS).
 
-    Sets with an unreachable target are left out, and all on a plate too small for them. progress:
-    called with the number of finished sets.
+    Sets with an unreachable target are left out, and all on a plate too small for them. ask:
+    answers questions, `ask_once` by default; progress: called with the number of finished sets.
     """
     size = np.array([table.plate.length, table.plate.width])
+    ask = ask or ask_once(table)
     contrasts: list[Contrasts] = []
     drawn = (rng.uniform(0, size, (others + 1, 2)) for _ in range(50 * CONTACT_SETS))
     for tried, contacts in enumerate(filter(are_apart, drawn), start=1):
         target, *quiet = [(float(x), float(y)) for x, y in contacts]
-        found = contrasts_of(table, Question((target,), tuple(quiet)))
+        found = ask(Question((target,), tuple(quiet)))
         if found is not None:
             contrasts.append(found)
         progress(len(contrasts))

@@ -8,7 +8,7 @@ finger is then at its threshold. It is *weak* if more than one other finger in t
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
@@ -21,7 +21,7 @@ from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
 from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Plate
-from model.table.question import Question
+from model.table.question import Point, Question
 from model.table.table import LocalizationTable
 
 MIN_DISTANCE = 0.05
@@ -39,6 +39,9 @@ less variance than from places drawn freely.
 
 Contrasts: TypeAlias = tuple[float, float]
 """Felt contrast [dB] of nine of ten plates, and that of the plate as modelled."""
+
+Ask: TypeAlias = Callable[[Question], Contrasts | None]
+"""Answers a question with quiet fingers, None where the level is not reached."""
 
 _DECIMALS = 9  # of places [m]: below that is rounding
 
@@ -116,18 +119,21 @@ def map_grid(table: LocalizationTable) -> Grid:
 def find_weak_cells(
     table: LocalizationTable,
     *,
+    ask: Ask | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> WeakCells:
     """Query the table for each cell of `map_grid` in its default drive mode.
 
-    progress: called with the number of finished cells and the total.
+    ask: answers questions, `ask_once` by default; progress: called with the number of finished
+    cells and the total.
     """
     grid = map_grid(table)
     centres = grid.centres(table.plate)
     found, errors = np.full((2, 2, len(centres)), np.nan)
+    ask = ask or ask_once(table)
     pairs: list[Contrasts] = []
     for cell, questions in enumerate(pair_questions(table)):
-        answered = [contrasts_of(table, question) for question in questions]
+        answered = list(map(ask, questions))
         pairs += filter(None, answered)
         # -inf where the level is not reached.
         contrasts = [-np.inf if each is None else each[0] for each in answered]
@@ -149,7 +155,8 @@ def pair_questions(table: LocalizationTable) -> list[list[Question]]:
     """
     grid, plate = map_grid(table), table.plate
     centres = grid.centres(plate)
-    along_x, along_y = (_is_symmetric(table, axis) for axis in range(2))
+    images = mirror_images(table)
+    along_x, along_y = (True, False) in images, (False, True) in images
 
     def seed(x: int, y: int) -> list[int]:
         return [
@@ -164,8 +171,24 @@ def pair_questions(table: LocalizationTable) -> list[list[Question]]:
     ]
 
 
-def contrasts_of(table: LocalizationTable, question: Question) -> Contrasts | None:
-    """Robust and nominal felt contrast [dB], None where the level is not reached."""
+def ask_once(table: LocalizationTable) -> Ask:
+    """Robust and nominal felt contrast [dB] of questions, None where the level is not reached.
+
+    Questions that mirror each other, where plate, ERAs and masses do, have one answer, so that the
+    noise of the drawn plates does not make several samples of one.
+    """
+    images, known = mirror_images(table), dict[Question, Contrasts | None]()
+
+    def ask(question: Question) -> Contrasts | None:
+        first = _first_image(question, table, images)
+        if first not in known:
+            known[first] = _contrasts(table, first)
+        return known[first]
+
+    return ask
+
+
+def _contrasts(table: LocalizationTable, question: Question) -> Contrasts | None:
     try:
         found = table.query(question)
     except InputError:
@@ -174,24 +197,53 @@ def contrasts_of(table: LocalizationTable, question: Question) -> Contrasts | No
     return None if robust is None or nominal is None else (robust, nominal)
 
 
-def _is_symmetric(table: LocalizationTable, axis: int) -> bool:
-    """Whether the ERAs and masses of a plate are their own mirror image along x (0) or y (1)."""
-    side = (table.plate.length, table.plate.width)[axis]
+def mirror_images(table: LocalizationTable) -> list[tuple[bool, bool]]:
+    """The reflections, along x, along y or both, under which a table's plate is the same.
 
-    def places(attached: Iterable[Era | PointLoad], *, mirrored: bool) -> Counter[Era | PointLoad]:
-        """What is attached, without names, at its places or their images."""
-        found: Counter[Era | PointLoad] = Counter()
-        for each in attached:
-            at = [each.x, each.y]
-            at[axis] = side - at[axis] if mirrored else at[axis]
-            nameless = replace(each, name="") if isinstance(each, Era) else each
-            found[replace(nameless, x=round(at[0], _DECIMALS), y=round(at[1], _DECIMALS))] += 1
-        return found
+    That along neither is always one of them.
+    """
+    every = [(False, False), (True, False), (False, True), (True, True)]
+    return [
+        along
+        for along in every
+        if all(
+            _placed(attached, table, along) == _placed(attached, table, every[0])
+            for attached in (table.eras, table.masses)
+        )
+    ]
 
-    return all(
-        places(attached, mirrored=True) == places(attached, mirrored=False)
-        for attached in (table.eras, table.masses)
+
+def _first_image(
+    question: Question, table: LocalizationTable, images: Sequence[tuple[bool, bool]]
+) -> Question:
+    """The image of a question that is the same for all its images."""
+    if len(images) == 1:
+        return question
+    count = len(question.targets)
+    contacts = min(
+        tuple(_reflected(at, table, along) for at in question.contacts) for along in images
     )
+    return replace(question, targets=contacts[:count], quiet=contacts[count:])
+
+
+def _reflected(at: Point, table: LocalizationTable, along: tuple[bool, bool]) -> Point:
+    (x, y), plate = at, table.plate
+    return (
+        round(plate.length - x if along[0] else x, _DECIMALS),
+        round(plate.width - y if along[1] else y, _DECIMALS),
+    )
+
+
+def _placed(
+    attached: Iterable[Era | PointLoad], table: LocalizationTable, along: tuple[bool, bool]
+) -> Counter[Era | PointLoad]:
+    """What is attached, without names, at its reflected places."""
+    found: Counter[Era | PointLoad] = Counter()
+    for each in attached:
+        x, y = _reflected((each.x, each.y), table, along)
+        nameless = replace(each, name="") if isinstance(each, Era) else each
+        found[replace(nameless, x=x, y=y)] += 1
+    return found
 
 
 def text_map(weak: WeakCells) -> Iterator[str]:

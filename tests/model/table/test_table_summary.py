@@ -2,19 +2,19 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from model.errors import InputError
 from model.finger.grid import Grid
 from model.structure.attachments import PointLoad
 from model.table.build import build_table
 from model.table.overview import CONTACT_SETS, Overview, contrast_distribution, find_overview
+from model.table.question import Question
 from model.table.summary import summarize
 from model.table.weak_cells import (
     WeakCells,
+    ask_once,
     find_weak_cells,
     map_grid,
     pair_questions,
@@ -42,7 +42,7 @@ def test_weak_cells_of_a_symmetric_plate_are_symmetric(table):
     assert np.ptp(weak.median_db) > 0.5
 
 
-def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table, monkeypatch):
+def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
     """Half of a cell's contrasts are below its median, a tenth below the other.
 
     Its other fingers are in different ones of 4 by 4 fields, at least 5 cm from the cell.
@@ -51,15 +51,14 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table, monk
     drawn: dict[tuple[float, float], list[float]] = {}
     tried: dict[tuple[float, float], list[tuple[float, float]]] = {}
 
-    def at_random(_, question):
+    def at_random(question):
         (target,), (other,) = question.targets, question.quiet
         assert math.dist(target, other) >= 0.05
         tried.setdefault(target, []).append(other)
         drawn.setdefault(target, []).append(float(rng.uniform(0, 30)))
         return drawn[target][-1], 0.0
 
-    monkeypatch.setattr("model.table.weak_cells.contrasts_of", at_random)
-    weak = find_weak_cells(table)
+    weak = find_weak_cells(table, ask=at_random)
     assert len(drawn) == len(weak.centres) == 12
     for values, share in ((weak.median_db, 0.5), (weak.tenth_db, 0.1)):
         for value, contrasts in zip(values, drawn.values(), strict=True):
@@ -102,6 +101,21 @@ def test_other_fingers_mirror_each_other_only_where_the_plate_does(table):
     assert list(symmetries(table)) == [True, True]
     assert list(symmetries(replace(table, masses=(mass,)))) == [True, False]
     assert list(symmetries(replace(table, eras=(weaker, *table.eras[1:])))) == [False, False]
+
+
+def test_questions_that_mirror_each_other_are_one_sample(table):
+    """On a symmetric plate both have the answer of one of them, to the bit; not on another one."""
+    (target,), (other,) = (pair := pair_questions(table)[0][0]).targets, pair.quiet
+    image = Question(
+        ((table.plate.length - target[0], target[1]),),
+        ((table.plate.length - other[0], other[1]),),
+        level_db_sl=pair.level_db_sl,
+    )
+    ask = ask_once(table)
+    assert ask(pair) == ask(image)
+    weaker = replace(table.eras[0], stroke=0.5 * table.eras[0].stroke)
+    ask = ask_once(replace(table, eras=(weaker, *table.eras[1:])))
+    assert ask(pair) != ask(image)
 
 
 def test_sampling_error_is_how_much_a_percentile_of_random_samples_varies():
@@ -196,19 +210,17 @@ def test_contrast_distribution_uses_fingers_apart(table, others):
 
     def answer(question):
         asked.append(np.array([*question.targets, *question.quiet]))
-        return SimpleNamespace(
-            robust_felt_contrast_db=float(len(asked)), felt_contrast_db=float(len(asked)) + 3
-        )
+        return len(asked), len(asked) + 3
 
     def refuse(question):
         answer(question)
-        raise InputError("out of reach")
 
     found, none = (
         contrast_distribution(
-            SimpleNamespace(plate=table.plate, query=each),
+            table,
             others=others,
             rng=np.random.default_rng(1),
+            ask=each,
         )
         for each in (answer, refuse)
     )

@@ -3,7 +3,9 @@
 A path is from an ERA to a sensor, and what it shows is shown by the reverse one as well. Paths tell
 how far the fields are off that are not measured; tones left out would tell whether a resonance was
 seen, which the covariance knows. What counts against a model is the part of the error that neither
-noise nor the uncertainty of the parameters explains.
+noise nor the uncertainty of the parameters explains. In that part fits to different paths disagree
+in parameters, too, by more than their covariance says (a jackknife over groups: B. Efron, The
+Jackknife, the Bootstrap and Other Resampling Plans, SIAM 1982, ch. 3).
 """
 
 from dataclasses import dataclass
@@ -20,6 +22,8 @@ _FOLDS = 5
 _EVALUATIONS = 8
 _PREDICTED = 0.1  # of the rms at a tone: standard error of a prediction that can be held against it
 _LEAST_VALUES = 16
+# Of standard deviations: what no path tells is wrong in all fits alike.
+_IN_COMMON = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +31,12 @@ class HeldOut:
     """Errors of prediction, root mean square relative to the responses at a tone.
 
     total: without what noise explains; unexplained: without what noise and the uncertain parameters
-    explain together.
+    explain together; disagreement: covariance (p, p) of parameters x beside that of their fit.
     """
 
     total: float
     unexplained: float
+    disagreement: FloatArray
 
 
 def hold_out(fitted: Fitted) -> HeldOut | None:
@@ -39,7 +44,7 @@ def hold_out(fitted: Fitted) -> HeldOut | None:
     measurement, model = fitted.problem.measurement, fitted.problem.model
     folds = (model.observed[measurement.at] + measurement.eras) % _FOLDS
     squares, variance = np.empty((2, len(folds)))
-    free = np.flatnonzero(fitted.space.uncertain)
+    free, fits = np.flatnonzero(fitted.space.uncertain), []
     noise = min(chi2(fitted), 1.0)  # readings may be better than they are stated
     for fold in np.unique(folds):
         unseen = folds == fold
@@ -48,6 +53,7 @@ def hold_out(fitted: Fitted) -> HeldOut | None:
         part, rest = measurement.part(~unseen), measurement.part(unseen)
         shown = Problem(model.with_frequencies(part.tones), part)
         found = solve(shown, fitted.best.x, fitted.space.uncertain, evaluations=_EVALUATIONS)
+        fits.append(found.x)
         plate = model.with_frequencies(rest.tones).at(found.x)
         error = plate.responses[rest.rows, rest.at, rest.eras] - rest.values
         squares[unseen] = np.abs(error) ** 2 - 2 * noise * rest.std**2
@@ -62,4 +68,8 @@ def hold_out(fitted: Fitted) -> HeldOut | None:
     def rms(parts: FloatArray) -> float:
         return float(np.sqrt(max((parts / mean_square)[predicted].mean(), 0.0)))
 
-    return HeldOut(rms(squares), rms(squares - variance))
+    total, unexplained = rms(squares), rms(squares - variance)
+    share = (unexplained / total) ** 2 if unexplained else 0.0
+    off = np.array(fits) - np.mean(fits, axis=0)
+    jackknife = (1 - 1 / len(fits)) * off.T @ off
+    return HeldOut(total, unexplained, share * _IN_COMMON**2 * jackknife)

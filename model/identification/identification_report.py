@@ -10,7 +10,7 @@ from model.identification.parameters import KINDS
 from model.identification.promise import ExpectedContrast
 from model.quantities import percent, with_error
 
-_MISTAKEN = 0.01  # unexplained, beyond which standard errors of values say too little
+_MISTAKEN = 0.01  # unexplained, beyond which a plate is not quite the rig's
 _SHOWN = 2.0  # standard errors from the rig's value, beyond which a form error is listed
 
 _ALWAYS = ("thickness", "modulus", "stiffness", "damping", "loss", "gain", "phase")
@@ -83,7 +83,7 @@ def fit_rows(found: Identification) -> list[str]:
     if held is not None and held.unexplained > _MISTAKEN:
         rows.append(
             "the plate differs from the rig by more than its parameters, such as in thickness from "
-            "end to end: values may be off by several standard errors; answers allow for that"
+            "end to end; errors of values and answers allow for that"
         )
     return rows
 

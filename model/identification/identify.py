@@ -30,10 +30,10 @@ class Identification:
     """A rig as its responses show it.
 
     before: the rig as written; rig: with identified values and, where the model explains the
-    measurement, their uncertainty; values: of the
-    parameters, gains of sensors among them; posterior: their distribution; chi2: squared residuals
-    per value; held_out: how well unseen paths are predicted, None where there are too few;
-    seed: of the contacts that a promise draws.
+    measurement, their uncertainty; values: of the parameters, gains of sensors among them;
+    posterior: their distribution, wider by what paths disagree in; chi2: squared residuals per
+    value; held_out: how well unseen paths are predicted, None where there are too few; seed: of the
+    contacts that a promise draws.
     """
 
     before: Rig
@@ -86,6 +86,8 @@ def identify(
             phase_deg=drive_phase_deg,
             field=held_out.unexplained if held_out else 0.0,
         )
+    if held_out:
+        posterior = posterior.widened(held_out.disagreement)
     return Identification(
         rig,
         rig_with(rig, values, uncertainty),

@@ -38,7 +38,7 @@ def check(
         typer.Option("--output", "-o", metavar="PICTURE", help="Picture to write, e.g. P.png."),
     ] = None,
 ) -> None:
-    """Simulate what every region makes felt, and which can be felt apart at once.
+    """Simulate what every region makes felt, and what is felt apart.
 
     In time, by touches over the region, alone and with a resting second finger; and what two and
     three fingers at once are promised at their worst places. Exit status 1 if a region falls short

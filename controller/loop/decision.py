@@ -354,8 +354,7 @@ class Decider:
         return self._decided
 
     def decide(self, now: float) -> Decision | None:
-        """Decide at a time [s]; None if nothing changes."""
-        self.expire(now)
+        """Decide at a time [s], for the contacts as of `expire`; None if nothing changes."""
         contacts = self._tracker.contacts
         triggered_at = now if self._triggered_at is None else min(self._triggered_at, now)
         if any(each.drive for each in self._playing.values()):

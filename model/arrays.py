@@ -1,4 +1,4 @@
-"""Array types of signatures, and the points of a lattice."""
+"""Array types of signatures, the points of a lattice, and how near points are."""
 
 from typing import TypeAlias
 
@@ -15,3 +15,9 @@ Complex64Array: TypeAlias = NDArray[np.complex64]
 def lattice(x: FloatArray, y: FloatArray) -> FloatArray:
     """All points of a lattice, (len(x) * len(y), 2): row after row, x running first."""
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def least_gap(places: FloatArray) -> float:
+    """Least distance of any two of some places (n, 2), infinite for fewer than two."""
+    gaps = np.linalg.norm(places[:, None] - places, axis=-1)
+    return float(gaps[np.triu_indices(len(places), 1)].min(initial=np.inf))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, Strict
 
-from model.arrays import FloatArray, IntArray
+from model.arrays import FloatArray, IntArray, least_gap
 from model.choice import best_of
 from model.config.document import read_document
 from model.config.sections import Quantity, Section, Validation
@@ -98,20 +98,16 @@ class ContactRule:
         for _ in range(_MAX_TRIES):
             others = rng.choice(len(pool), count, replace=False)
             numbers = np.concatenate([[first], others])
-            if self._is_apart(pool[numbers]):
+            if least_gap(pool[numbers]) > self.apart:
                 return np.asarray(numbers)
         raise self._no_room(count + 1)
 
     def _one(self, rng: np.random.Generator, fingers: int) -> FloatArray:
         for _ in range(_MAX_TRIES):
             places = self.draw(rng, fingers)
-            if self._is_apart(places):
+            if least_gap(places) > self.apart:
                 return places
         raise self._no_room(fingers)
-
-    def _is_apart(self, places: FloatArray) -> bool:
-        gaps = np.linalg.norm(places[:, None] - places, axis=-1)
-        return bool(gaps[np.triu_indices(len(places), 1)].min() > self.apart)
 
     def _no_room(self, fingers: int) -> InputError:
         return InputError(

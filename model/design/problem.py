@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from model.arrays import FloatArray, IntArray
+from model.arrays import FloatArray, IntArray, least_gap
 from model.design.area import EDGE, Area, candidates_of
 from model.design.contacts import ContactRule
 from model.errors import InputError
@@ -193,8 +193,7 @@ class DesignProblem:
 
     def are_apart(self, positions: FloatArray) -> bool:
         """Whether positions (n, 2) [m] keep the least distance."""
-        gaps = np.linalg.norm(positions[:, None] - positions, axis=-1)
-        return bool(gaps[np.triu_indices(len(gaps), 1)].min(initial=np.inf) >= self.apart)
+        return least_gap(positions) >= self.apart
 
     def random_layout(self, rng: np.random.Generator) -> FloatArray:
         """ERAs at candidates by chance, those kept first, far enough apart: (count, 2) [m].

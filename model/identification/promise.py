@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import FloatArray, least_gap
 from model.ensemble.measures import PERCENTILE
 from model.identification.identify import Identification
 from model.table.build import build_table
@@ -76,6 +76,5 @@ def _contacts(rng: np.random.Generator, count: int, table: LocalizationTable) ->
     margin, apart = min(_MARGIN, sides.min() / 4), min(_APART, sides.min() / (2 * count))
     while True:
         places = rng.uniform(margin, sides - margin, (count, 2))
-        gaps = np.linalg.norm(places[:, None] - places, axis=-1)
-        if gaps[np.triu_indices(count, 1)].min() > apart:
+        if least_gap(places) > apart:
             return tuple((float(x), float(y)) for x, y in places)

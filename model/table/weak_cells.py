@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.arrays import FloatArray
+from model.arrays import FloatArray, least_gap
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
@@ -90,9 +90,8 @@ class WeakCells:
 
 
 def are_apart(contacts: FloatArray) -> bool:
-    """Whether all of two or more contacts (n, 2) [m] are MIN_DISTANCE apart."""
-    gaps = np.linalg.norm(contacts[:, None] - contacts, axis=-1)
-    return bool(gaps[np.triu_indices(len(contacts), 1)].min() >= MIN_DISTANCE)
+    """Whether all contacts (n, 2) [m] are MIN_DISTANCE apart."""
+    return least_gap(contacts) >= MIN_DISTANCE
 
 
 def sampling_error(values: ArrayLike, percent: float) -> float:

@@ -116,10 +116,11 @@ def _label_finger(axes: Axes, finger: FingerRow, colors: Mapping[float, str]) ->
         lines.append(f"{finger.measured_contrast_db:.0f} dB above the others")
     x, y = (100 * value for value in finger.at_m)
     is_high = y > sum(axes.get_ylim()) / 2
+    radius = 100 * FINGERTIP_RADIUS
     axes.annotate(
         "\n".join(lines),
-        (x, y),
-        xytext=(0, -24 if is_high else 24),
+        (x, y - radius if is_high else y + radius),
+        xytext=(0, -10 if is_high else 10),
         textcoords="offset points",
         ha="center",
         va="top" if is_high else "bottom",

@@ -23,6 +23,8 @@ def leaks_db_sl(
 
     On the plate as modelled with the contacts where they are; some milliseconds.
     """
+    if not contacts:  # lifted, while what plays is not known to have ended
+        return {}
     places = [(each.x, each.y) for each in contacts]
     loads = [each.load for each in contacts]
     points = [fingertip_points(*at, table.plate) for at in places]

@@ -87,3 +87,13 @@ async def test_weights_follow_a_finger_at_half_a_metre_a_second() -> None:
         assert statuses(fingers)[3] == pytest.approx(measured(fingers)[3], abs=1.0)
         assert max(on_the_way) > rested
         assert statuses(fingers)[3] < max(on_the_way)
+
+
+@in_virtual_time
+async def test_nothing_leaks_without_fingers() -> None:
+    """The status is read when the last has lifted and its silence is not confirmed yet."""
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: LEFT}
+        await fingers.hold(0.3)
+        view = PlateView(lambda key: None, (), fingers.applied[-1])
+        assert view.statuses_now(table()) == []

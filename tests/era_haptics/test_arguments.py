@@ -30,8 +30,8 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.calibrate: {"rig": RIG, "measured": "measured.csv"},
     era.design: {
         "rig": RIG, "eras": 4, "layouts": "random:3", "where": "edge",
-        "contacts": "contacts.yaml", "apart": 0.03, "lowest": 20.0, "finalists": 1, "starts": 1,
-        "seed": 0, "workers": 1,
+        "contacts": "contacts.yaml", "contents": 1, "apart": 0.03, "lowest": 20.0, "finalists": 1,
+        "starts": 1, "seed": 0, "workers": 1,
     },
     era.SolvedPlate: {"rig": RIG, "seed": 1},
     PLATE.map: {"drive": DRIVE, "raster": (3, 3)},

@@ -10,6 +10,7 @@ import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 from operator import attrgetter
 
@@ -27,6 +28,7 @@ def amplitude_of(level: int, phase: int) -> complex:
     return cmath.rect(level / _PER_FULL, math.radians(phase / _PER_DEGREE))
 
 
+@lru_cache(maxsize=256)  # a set names an envelope several times, and its commit again
 def amplitudes_of(envelope: Envelope | None) -> tuple[complex, ...]:
     """Return the complex amplitudes of the knots of an envelope in full levels, if there is one."""
     if envelope is None:

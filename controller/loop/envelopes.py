@@ -7,7 +7,6 @@ knot; an ending is sent whole or not at all. The last value of an envelope, the 
 silence, is that of the command and not among the knots on the wire.
 """
 
-import cmath
 import math
 from collections import defaultdict
 from collections.abc import Mapping
@@ -112,12 +111,10 @@ def _thinned(envelope: BaseEnvelope, steps: int) -> BaseEnvelope:
 
 
 def _shape(envelope: BaseEnvelope, stroke: float) -> Shape:
-    return Shape(envelope.step, tuple(_rounded(value / stroke) for value in envelope.knots[:-1]))
-
-
-def _rounded(value: complex) -> complex:
-    """Return a level without the rounding errors of the knot search, which may exceed 1."""
-    return cmath.rect(round(abs(value), _DIGITS), cmath.phase(value))
+    """Return an envelope in full levels, without the rounding errors of the knot search."""
+    knots = np.array(envelope.knots[:-1], dtype=complex) / stroke
+    knots = np.round(np.abs(knots), _DIGITS) * np.exp(1j * np.angle(knots))  # else it may exceed 1
+    return Shape(envelope.step, tuple(knots.tolist()))
 
 
 def duration_of(shape: Shape | None) -> float:

@@ -8,7 +8,7 @@ largest where each transition is at one of its points.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import starmap
 
 from drivers.playback import Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
@@ -35,16 +35,21 @@ class Path:
         """Time of the last magnitude [s] after the commit."""
         return self.step * (len(self.magnitudes) - 1)
 
-    def at(self, time: float) -> float:
-        """Return an upper bound of the magnitude at a time [s] after the commit."""
-        steps = time / self.step if self.step else math.inf
-        if steps >= len(self.magnitudes) - 1:
-            return self.magnitudes[-1]
-        index = int(steps)
-        way = steps - index
-        if self.is_cosine:
-            way = (1 - math.cos(math.pi * way)) / 2
-        return self.magnitudes[index] * (1 - way) + self.magnitudes[index + 1] * way
+    def along(self, times: Sequence[float]) -> list[float]:
+        """Return upper bounds of the magnitude at times [s] after the commit."""
+        between = len(self.magnitudes) - 1
+        values = []
+        for time in times:
+            steps = time / self.step if self.step else math.inf
+            if steps >= between:
+                values.append(self.magnitudes[-1])
+                continue
+            index = int(steps)
+            way = steps - index
+            if self.is_cosine:
+                way = (1 - math.cos(math.pi * way)) / 2
+            values.append(self.magnitudes[index] * (1 - way) + self.magnitudes[index + 1] * way)
+        return values
 
 
 class ChannelBounds:
@@ -99,13 +104,9 @@ class ChannelBounds:
             for several in self._rises.values()
         )
 
-    def at(self, time: float) -> float:
-        """Return the level at a time [s] after the commit, at the most."""
-        return self.steady + sum([path.at(time) for path in self.paths])
-
-    def within(self, since: float, until: float) -> float:
-        """Return the level between two times [s] after the commit, at the most."""
-        return self.steady + sum([max(path.at(since), path.at(until)) for path in self.paths])
+    def along(self, times: Sequence[float]) -> list[list[float]]:
+        """Return upper bounds at times [s] after the commit: what is steady, and each path."""
+        return [[self.steady] * len(times), *[path.along(times) for path in self.paths]]
 
     def _keep(self, voice: Voice, one: LayerSet | None) -> None:
         """Add a voice that the set does not change, but for a layer that may let it fade later."""
@@ -190,13 +191,21 @@ def worst(channels: Sequence[ChannelBounds]) -> tuple[list[float], float]:
     paths = [path for channel in channels for path in channel.paths]
     moments = {path.step * index for path in paths for index in range(len(path.magnitudes))}
     times = sorted(moments | {0.0})
-    corners = [[channel.at(time) for channel in channels] for time in times]
-    for since, until in pairwise(times):
-        ways = {path.step if path.is_cosine else None for path in paths if since < path.end}
-        if len(ways) > 1:
-            corners.append([channel.within(since, until) for channel in channels])
-    levels = [max(each) for each in zip(*corners, strict=True)]
-    return levels, max(sum(level**2 for level in each) for each in corners)
+    bounds = [channel.along(times) for channel in channels]
+    levels: list[list[float]] = [[*map(sum, zip(*each, strict=True))] for each in bounds]
+    for index in _of_several_ways(paths, times):
+        for level, each in zip(levels, bounds, strict=True):
+            level.append(sum([max(values[index : index + 2]) for values in each]))
+    return [*map(max, levels)], max(starmap(math.hypot, zip(*levels, strict=True))) ** 2
+
+
+def _of_several_ways(paths: Sequence[Path], times: Sequence[float]) -> list[int]:
+    """Return the intervals between times in which not all paths go the same way, by index."""
+    ways = [(path.end, path.step if path.is_cosine else None) for path in paths]
+    if len({way for _, way in ways}) < 2:
+        return []
+    since = enumerate(times[:-1])
+    return [index for index, time in since if len({way for end, way in ways if time < end}) > 1]
 
 
 def all_bounds(

@@ -268,9 +268,16 @@ class Line:
         member.counts.retries += 1
         if pause:
             job.not_before = self.time() + pause
-            self._loop.call_at(job.not_before, self.pump)
+            self._loop.call_at(job.not_before, self._pump_from, job.not_before)
         # Behind those of its priority, so that a mute amplifier does not keep others waiting.
         self._queue.add(job)
+
+    def _pump_from(self, time: float) -> None:
+        """Pump at a time [s]; a timer may come too early, by up to a tick of the clock."""
+        if self.time() < time:
+            self._loop.call_at(time, self._pump_from, time)
+        else:
+            self.pump()
 
     def _fail(self, job: Job, error: Exception) -> None:
         """End a request with an error, unless its caller has gone."""

@@ -15,7 +15,6 @@ from enum import IntEnum, StrEnum
 from pathlib import Path
 
 from model.errors import InputError
-from sim.transport.pseudo_terminal import linked
 
 MAX_CHANNELS = 32
 """Of two amplifiers; one has at most 16 by the protocol."""
@@ -121,6 +120,8 @@ class Place:
 @contextmanager
 def terminal_place(link: Path | None) -> Iterator[Place]:
     """A pseudo-terminal, and a symbolic link to it while this lasts; raises InputError."""
+    from sim.transport.pseudo_terminal import linked  # loads asyncio, which the help does without
+
     with ExitStack() as stack:
         near, far = os.openpty()
         stack.callback(os.close, near)

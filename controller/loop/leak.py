@@ -21,7 +21,7 @@ def leaks_db_sl(
 ) -> dict[ContactKey, float]:
     """Return what each contact feels of contents that are not for it, at its loudest point [dB SL].
 
-    On the plate as modelled with the contacts where they are; some milliseconds.
+    On the plate as modelled with the contacts where they are; a few milliseconds.
     """
     if not contacts:  # lifted, while what plays is not known to have ended
         return {}
@@ -30,11 +30,10 @@ def leaks_db_sl(
     points = [fingertip_points(*at, table.plate) for at in places]
     ends = np.cumsum([len(each) for each in points])[:-1]
     power = {each.key: np.zeros(len(own)) for each, own in zip(contacts, points, strict=True)}
+    fields = table.unit_fields(np.concatenate(points), contacts=places, loads=loads)
     for content in contents:
-        frequencies, felt = table.amplitudes(
-            content.pattern.excitation, np.concatenate(points), contacts=places, loads=loads
-        )
-        sensed = felt / detection_threshold(frequencies, table.threshold)[:, None]
+        frequencies, felt = table.driven(content.pattern.excitation, fields)
+        sensed = np.abs(felt) / detection_threshold(frequencies, table.threshold)[:, None]
         own = {contact.key for contact, _ in content.targets}
         for each, part in zip(contacts, np.split((sensed**2).sum(axis=0), ends), strict=True):
             if each.key not in own:

@@ -202,13 +202,15 @@ class LocalizationTable:
         tips = self.read_fingertips(question.contacts)
         return self._fingers(question, tips).forms(background)
 
-    def unit_fields(self, points: FloatArray, *, contacts: Sequence[Point] = ()) -> Complex64Array:
+    def unit_fields(
+        self, points: FloatArray, *, contacts: Sequence[Point] = (), loads: Sequence[float] = ()
+    ) -> Complex64Array:
         """Acceleration [m/s²] at points (p, 2) [m] by each ERA alone at full stroke, (f, eras, p).
 
-        contacts [m]: of the fingers that load the plate.
+        contacts, loads: see `amplitudes`.
         """
         shapes = self.raster.at(self.shapes, points)
-        return np.ascontiguousarray(self._modal_fields(contacts) @ shapes.T)
+        return np.ascontiguousarray(self._modal_fields(contacts, loads) @ shapes.T)
 
     def amplitudes(
         self,
@@ -223,12 +225,18 @@ class LocalizationTable:
         The excitation's frequencies must be the table's own. contacts [m]: of the fingers that load
         the plate; loads: of each relative to the rig's fingertip, empty for 1.
         """
+        frequencies, modal = self.driven(excitation, self._modal_fields(contacts, loads))
+        shapes = self.raster.at(self.shapes, points)
+        return frequencies, np.abs(modal @ shapes.T).astype(float)
+
+    def driven(
+        self, excitation: Excitation, fields: Complex64Array
+    ) -> tuple[FloatArray, Complex64Array]:
+        """Frequencies (k,) [Hz] of an excitation, and its field by unit fields (f, eras, ...)."""
         frequencies, bases = base_amplitudes(excitation, self.eras)
         weights = (bases / [era.stroke for era in self.eras]).astype(np.complex64)
         rows = np.searchsorted(self.frequencies, frequencies)
-        modal = weights[:, None] @ self._modal_fields(contacts, loads)[rows]
-        shapes = self.raster.at(self.shapes, points)
-        return frequencies, np.abs(modal[:, 0] @ shapes.T).astype(float)
+        return frequencies, (weights[:, None] @ fields[rows])[:, 0]
 
     def shapes_at(self, points: Sequence[Point] | FloatArray) -> FloatArray:
         """Shapes of the reduced plate at points or footprints [m] of it, (p, r)."""

@@ -82,8 +82,7 @@ class Generator:
         elif header == "*CLS":
             self.errors.clear()
         elif header == "SOUR1:PHAS:SYNC":
-            for output in self.outputs:
-                output.origin = clock.now()
+            self.outputs[0].origin = self.outputs[1].origin = clock.now()
         elif found := re.fullmatch(r"(?:SOUR|OUTP)([12]):?(.*)", header):
             return self._set(self.outputs[int(found[1]) - 1], found[2], argument)
         else:

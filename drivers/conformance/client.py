@@ -124,6 +124,8 @@ class Client(ABC):
     """Whether the wire carries messages that were not asked for."""
     addresses: ClassVar[int] = 247
     """The highest address."""
+    transactions: ClassVar[int] = 1
+    """What the wire makes of a request that changes something, each with a reply."""
 
     port: Port
     """Of its line; given once it is open."""

@@ -39,6 +39,7 @@ class ModbusClient(Client):
     """A line or a connection; number: of the last transaction and tag."""
 
     has_events = False
+    transactions = 2
 
     def __init__(self, address: int, *, is_rtu: bool) -> None:
         super().__init__(address)

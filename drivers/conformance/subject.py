@@ -24,7 +24,7 @@ from drivers.conformance.expected import ENABLED, NAMES, OFF, Expected
 from drivers.conformance.material import FULL, Material, Rows, Send, layer, play, send
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, pack_layers, parts
-from drivers.protocol.table import MESSAGES, QUANTITIES, STATES
+from drivers.protocol.table import MESSAGES, QUANTITIES, REACTION, STATES
 
 LEVEL = 0.2
 """Level of driven channels unless another is given: perceptible, and far from any limit."""
@@ -55,7 +55,7 @@ class Subject(Material):
         self.session, self.token = 1, 0
         self.expected: Expected | None = None
         self.is_starving = True
-        self.exchange_time = math.inf
+        self._exchange_time = self._read_time = math.inf
         client.quiet = REPLY_TIMEOUT
         self.heard_at = clock.now()
         channels, layers = can["channels"], can["layers"]
@@ -119,8 +119,10 @@ class Subject(Material):
         self._check_fed()  # or it may have been carried out after the watchdog
         took = clock.now() - sent
         self.client.quiet = min(self.client.quiet, QUIET + took)
-        if name not in _READ_ALONE:
-            self.exchange_time = min(self.exchange_time, took)
+        if name in _READ_ALONE:
+            self._read_time = min(self._read_time, took)
+        else:
+            self._exchange_time = min(self._exchange_time, took)
         self.heard_at = answer.when.latest
         return answer
 
@@ -172,12 +174,15 @@ class Subject(Material):
         """Feed the watchdog."""
         return await self.request("Ping")
 
-    async def arm(self, watchdog: float = 2.0) -> Answer:
-        """Arm under a new session with a watchdog [s], or the nearest that is possible."""
+    async def arm(self, watchdog: float = 2.0, *, is_fed: bool = True) -> Answer:
+        """Arm under a new session with a watchdog [s], or the nearest that is possible.
+
+        is_fed: the nearest in which it can be fed, else it may expire from now on.
+        """
         self.session = self.client.session = self.next_session
-        self.token, self.is_starving = 0, False
-        milliseconds = max(round(1000 * watchdog), self.shortest_watchdog)
-        milliseconds = min(milliseconds, self.can["watchdog_max"])
+        self.token, self.is_starving = 0, not is_fed
+        shortest = self.shortest_watchdog if is_fed else self.can["watchdog_min"]
+        milliseconds = min(max(round(1000 * watchdog), shortest), self.can["watchdog_max"])
         return await self.request("Arm", session=self.session, watchdog=milliseconds)
 
     @property
@@ -242,6 +247,17 @@ class Subject(Material):
         return await self.send(play(*layers))
 
     # In time
+
+    @property
+    def exchange_time(self) -> float:
+        """The shortest exchange [s] so far, or what it may take on this line if that is less.
+
+        Lest an amplifier that is late has longer times. A line may delay more than is known of it,
+        which a reading shows.
+        """
+        count = self.client.transactions
+        line = max(self.client.transit, count * self._read_time)
+        return min(self._exchange_time, count * REACTION + line)
 
     @property
     def slowness(self) -> float:

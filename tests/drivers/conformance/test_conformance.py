@@ -223,6 +223,7 @@ SLOW = {
         *("renew", "after", "endings_amid", "doubled_frames", "tolerated_frames"),
     ],
     "tcp": ["pieces", "lengths", "watchdog_ranges", "arms_again", "watchdog_unread", "renew"],
+    "can": ["watchdog_ranges", "network_management"],
 }
 
 
@@ -232,6 +233,75 @@ def test_slow_line_has_its_verdicts(kind: str, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("judged_line.DELAY", 0.02)
     for found in judged(kind, SLOW[kind]):
         assert (found.result, found.attempts) == (Result.PASSED, 1), found
+
+
+def test_heartbeat_on_its_way_at_a_reset_is_none_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 7 ms each way one arrives after reset_node was sent, from before it was heard."""
+    monkeypatch.setattr("judged_line.DELAY", 0.007)
+    (result,) = judged("can", ["network_management"])
+    assert result.result is Result.PASSED, result.reason
+
+
+READ_ALONE = {MESSAGES[name].number for name in ("GetStatus", "GetCaps", "GetFaults")}
+
+
+def obey_late(monkeypatch: pytest.MonkeyPatch, delay: float) -> None:
+    """Let the amplifier of a serial line reply late [s] to all but what is only read."""
+    send = JudgedLine._send
+
+    def late(line: JudgedLine, data: bytes) -> None:
+        (frame,) = FrameReader().feed(data)
+        is_late = frame.type & 0x7F not in READ_ALONE
+        asyncio.get_running_loop().call_later(is_late * delay, send, line, data)
+
+    monkeypatch.setattr(JudgedLine, "_send", late)
+
+
+class _LongWatchdog(Amplifier):
+    """An amplifier that takes a watchdog shorter than 120 ms as one of 1.5 s."""
+
+    def handle(self, name: str, values: Values, now: float) -> Values:
+        if name == "Arm" and values["watchdog"] < 120:
+            values = {**values, "watchdog": 1500}
+        return super().handle(name, values, now)
+
+
+def test_shortest_watchdog_is_tried_though_it_cannot_be_fed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One of 100 ms beside replies that take 12 ms: as stated it passes, else it fails."""
+    obey_late(monkeypatch, 0.012)
+    found = []
+    for kind in (Amplifier, _LongWatchdog):
+        far = kind("short", channels=2)
+        far.capabilities.update(watchdog_min=100)
+        found += judged("serial", ["watchdog_ranges"], far=far)
+    assert [each.result for each in found] == ["passed", "failed"], found
+    assert "watchdog" in found[1].seen
+
+
+def test_amplifier_that_obeys_late_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After 25 ms: what is only read, at once, is in time, and the rest is not."""
+    obey_late(monkeypatch, 0.025)
+    read, obeyed = judged("serial", ["replies_in_time", "obeys_in_time"])
+    assert (read.result, obeyed.result) == ("passed", "failed"), obeyed.reason
+    assert "replies to Ping" in obeyed.seen
+
+
+@in_virtual_time
+async def test_late_amplifier_has_no_longer_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After 80 ms on a line of 0.4 ms: an exchange counts as the 10 ms that it may take there."""
+    obey_late(monkeypatch, 0.08)
+    seen = []
+
+    async def note(subject: Subject) -> None:
+        seen.append(subject.exchange_time)
+
+    line = JudgedLine("serial", varied())
+    check = Check("noted", "passes", "", drives=True, kinds=(), run=note)
+    await run_checks([(1, check)], line.client, level=0.2)
+    line.close()
+    assert seen == [pytest.approx(0.0105, abs=0.0002)]
 
 
 def test_request_that_comes_after_an_onset_is_no_violation(

@@ -148,7 +148,11 @@ def portaudio_stream(
         userdata=ffi.cast("void *", given),
         **options,
     )
-    stream.start()
+    try:
+        stream.start()
+    except BaseException:
+        stream.close(ignore_errors=True)
+        raise
     return stream
 
 

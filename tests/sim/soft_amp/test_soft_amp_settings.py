@@ -1,11 +1,13 @@
 """What a software amplifier refuses before any sound device is opened."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from model.errors import InputError
 from sim.soft_amp.library import compile_engine
+from sim.soft_amp.output import portaudio_stream
 from sim.soft_amp.settings import Law, Place, Protocol, Settings, terminal_place
 
 
@@ -69,3 +71,28 @@ def test_link_follows_the_terminal_and_has_one_user(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no symbolic link"), terminal_place(link):
         pass
     assert link.read_text() == "mine"
+
+
+class _Busy:
+    """A stream that cannot be started, as one of a device that was taken since."""
+
+    is_closed = False
+
+    def __init__(self, **options: object) -> None: ...
+
+    def start(self) -> None:
+        """Fail as PortAudio does."""
+        raise OSError("Device unavailable")
+
+    def close(self, *, ignore_errors: bool) -> None:
+        """Note it."""
+        _Busy.is_closed = ignore_errors
+
+
+def test_stream_that_does_not_start_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or its device would stay taken until the program ends."""
+    library = SimpleNamespace(_StreamBase=_Busy, _ffi=SimpleNamespace(cast=lambda *_: None))
+    monkeypatch.setattr("sim.soft_amp.output.sounddevice", lambda: library)
+    with pytest.raises(OSError, match="unavailable"):
+        portaudio_stream(0, 0, 0, outputs=2)
+    assert _Busy.is_closed

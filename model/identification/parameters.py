@@ -136,8 +136,9 @@ def space_of(
     """Parameters of a rig with sensors by name, with additional masses and fingers on it.
 
     uncertainty: of the rig; a modulus is known where the thickness is, the damping of each ERA and
-    mode where that of all is. drives_lag: whether bases follow what is played with a lag that
-    nothing states; mode_count: elastic modes of the model, of which the lowest may shift.
+    mode where that of all is. Its `common_gain` is no parameter: sensors may be those that it was
+    found by, and tell nothing more of it. drives_lag: whether bases follow what is played with a
+    lag that nothing states; mode_count: elastic modes of the model, of which the lowest may shift.
     """
     plate, eras = rig.plate, [era.name for era in rig.eras]
     builder = _Builder()
@@ -159,8 +160,7 @@ def space_of(
     exponent = KINDS["loss_exponent"].std
     low, high = exponents / exponent
     add("loss_exponent", ["loss exponent"], exponent * lossy, lower=low, upper=high)
-    gain = math.hypot(uncertainty.gain, uncertainty.common_gain)
-    add("gain", [f"gain {name}" for name in eras], gain)
+    add("gain", [f"gain {name}" for name in eras], uncertainty.gain)
     add("phase", [f"phase {name}" for name in eras], math.radians(uncertainty.phase_deg))
     # A measured gain has the lag of its drive in it.
     lagging = np.array([float(drives_lag and not era.gains) for era in rig.eras])

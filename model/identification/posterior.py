@@ -78,10 +78,11 @@ class Posterior:
     ) -> Uncertainty:
         """What a rig states of itself after it was identified.
 
-        before: its own, of which the fingers stay; gain, phase_deg: how far drives repeat; field:
+        before: its own, of which the fingers stay; its common_gain, which no fit narrows, counts
+        beside what is unknown of the gains' mean. gain, phase_deg: how far drives repeat; field:
         what the model leaves unexplained of fields, relative.
         """
-        common = _rows(self.space, "gain").mean(axis=0, keepdims=True)
+        mean = _rows(self.space, "gain").mean(axis=0, keepdims=True)
         rms = {kind: _rms(std) for kind, std in self.stds().items()}
         damping = max(rms["damping"], rms["loss"])
         return Uncertainty(
@@ -91,7 +92,7 @@ class Posterior:
             stiffness=min(rms["stiffness"], 0.5),
             damping=math.exp(min(damping, math.log(4.0))),
             fingertip=before.fingertip,
-            common_gain=min(float(self.std_of(common)[0]), 0.5),
+            common_gain=min(math.hypot(before.common_gain, self.std_of(mean)[0]), 0.5),
             field=min(field, 0.5),
         )
 

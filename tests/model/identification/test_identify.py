@@ -80,6 +80,25 @@ def test_level_of_all_drives_is_known_as_far_as_four_sensors_tell(found: Identif
     assert found.rig.uncertainty.common_gain == pytest.approx(0.05 / np.sqrt(8), rel=0.05)
 
 
+def test_the_same_data_again_tell_no_more_of_the_level(rig: Rig) -> None:
+    """What is unknown of the level stays, and the level itself, since the sensors may be the same.
+
+    Drives that repeat to 1 % each add 0.5 % of their mean. A fit that takes the sensors for new
+    ones moves half of their own level into that of the drives, each time.
+    """
+    tones = np.linspace(40.0, 500.0, 47)
+    values = draw("plain", 3).measured(tones, np.random.default_rng(3))
+    sensors = [Sensor(era.name, era.name) for era in rig.eras]
+    same = Measurement.of(sensors, tones, 1.1 * values)
+    once = identify(rig, same, seed=1)
+    again = identify(once.rig, same, seed=1)
+    first, second = (each.rig.uncertainty.common_gain for each in (once, again))
+    assert first <= second <= np.hypot(first, 0.006)
+    level, moved = (np.log(np.abs(each.values.drive_gains)).mean() for each in (once, again))
+    assert level > 0.03
+    assert abs(moved) < 0.1 * level
+
+
 @pytest.mark.parametrize(
     "factors",
     [

@@ -6,14 +6,14 @@ decide(now)  ->  contacts -> intent -> contents -> the layers that change, on ev
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.content import Content, Selection, not_served
 from controller.loop.intent import IntentSource
 from controller.loop.plate_set import FADE_RAMP, PlateSet, SetBuilder
-from controller.loop.routing import Drive, tones_by_era
+from controller.loop.routing import Drive, continues_all_tones, tones_by_era
 from controller.loop.selection import Selector
 from controller.loop.validity import Validity, first_lasts, valid_for
 from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
@@ -406,6 +406,10 @@ class Decider:
             for number, before in self._playing.items()
             if before.content == numbers.get(number)
         }
+        restarting = self._restarting(numbers, playing)
+        playing = {
+            n: before for n, before in playing.items() if before.content.key[0] not in restarting
+        }
         changed = {n: content for n, content in numbers.items() if n not in playing}
         sets: dict[int, PlateSet] = {}
         for number, content in changed.items():
@@ -417,6 +421,7 @@ class Decider:
                 content.question,
                 playing={} if before is None else before.drive,
                 valid_for=valid_for(targets, confirmed_until=until, now=now),
+                restarts=content.key[0] in restarting,
                 is_shaped=not targets[0][1].is_short,
                 lasts=first_lasts(targets, now),
                 among=len(changed),
@@ -432,6 +437,23 @@ class Decider:
         self._layer_of = {each.key: number for number, each in numbers.items()}
         self._may_play |= started
         return replace(draft, sets=sets, started=started)
+
+    def _restarting(
+        self, numbers: Mapping[int, Content], unchanged: Container[int]
+    ) -> set[ContactKey]:
+        """Return the fingers of several voices of which one starts, by the contents of layers.
+
+        A carrier and its side bands must count their phases from one moment.
+        """
+        voiced = {content.key[0] for content in numbers.values() if content.voice}
+        found = set()
+        for number, content in numbers.items():
+            before = self._playing.get(number)
+            drive = {} if before is None else before.drive
+            is_continued = continues_all_tones(content.pattern.excitation, drive)
+            if content.key[0] in voiced and number not in unchanged and not is_continued:
+                found.add(content.key[0])
+        return found
 
     def _numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
         """Contents by layer: a finger's in the layer that it has, new ones in those that end."""

@@ -21,7 +21,7 @@ from model.arrays import Complex64Array
 from model.finger.perception import FELT_DB_SL, decibels
 from model.table import request
 from model.table.answer import answer
-from model.table.modulation import with_modulation
+from model.table.modulation import frequency_of, with_modulation
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, ONSET_RAMP, Pattern
 from model.table.question import Question
 from model.table.request import OWN_CONTRAST_DB, Answer, Finger, Layer, Request
@@ -56,7 +56,9 @@ def query_jointly(
     fingers = [Finger((each.x, each.y), each.load, _bound(each, protected)) for each in quiet]
     found = _answer(table, requests, fingers, _kept(requests, targets, before))
     modulations = _modulations(targets, capabilities.layers)
-    found = with_modulation(table, requests, fingers, found, modulations)
+    found = with_modulation(
+        table, requests, fingers, found, modulations, playable=capabilities.frequencies
+    )
     places = [each.at for each in requests]
     fields = table.unit_fields(np.array(places), contacts=places)
     factor = _factor_within(found, capabilities)
@@ -72,14 +74,21 @@ def query_jointly(
                 if one.verdict == SHARED and one.excitation == layer.excitation
             ]
             served = [(contact, target, layer), *sharing]
-            for voice, tones in enumerate((layer.excitation, *layer.side_bands)):
-                then = before.get((contact.key, voice))
+            voices = [layer.excitation, *layer.side_bands]
+            is_continued = all(
+                (then := before.get((contact.key, voice))) is not None
+                and then.frequency == frequency_of(replace(layer, excitation=tones))
+                for voice, tones in enumerate(voices)
+            )
+            carrier = before.get((contact.key, 0))
+            for voice, tones in enumerate(voices):
                 pattern = _pattern(table, replace(layer, excitation=tones), capabilities)
                 pattern = pattern.scaled(float(decibels(factor)))
-                if then is not None or layer.side_bands:
+                if carrier is not None or layer.side_bands:
+                    then = carrier if is_continued else None
                     pattern = _in_phase(pattern, then, fields[:, :, number], table)
                 contents.append(
-                    _content(served, targets, quiet, pattern, then, factor, shape, voice)
+                    _content(served, targets, quiet, pattern, is_continued, factor, shape, voice)
                 )
     change = float(decibels(factor))
     return Selection(
@@ -218,7 +227,7 @@ def _content(
     targets: Sequence[tuple[Contact, Target]],
     quiet: Sequence[Contact],
     pattern: Pattern,
-    then: Content | None,
+    is_continued: bool,
     factor: float,
     shape: Shape,
     voice: int,
@@ -232,7 +241,6 @@ def _content(
     )
     frequencies = {tone.frequency for tone in pattern.excitation.values()}
     (frequency,) = frequencies if len(frequencies) == 1 else (None,)
-    is_continued = then is not None and then.frequency == frequency
     change = float(decibels(factor))
     predictions = tuple(
         Prediction(
@@ -281,17 +289,17 @@ def _held_back(contact: Contact, layer: Layer) -> Prediction:
 def _in_phase(
     pattern: Pattern, before: Content | None, fields: Complex64Array, table: LocalizationTable
 ) -> Pattern:
-    """Turn a pattern so that its finger feels it in the phase of the one before, 0 without any.
+    """Turn a pattern so that its finger feels it in the phase of the tone before, 0 without any.
 
-    Side bands in phase with their carrier modulate its amplitude, not its frequency. fields (f,
-    eras): at the finger, of each ERA at full stroke.
+    Side bands in phase with their carrier modulate its amplitude, not its frequency: all have the
+    phase of the carrier before. fields (f, eras): at the finger, of each ERA at full stroke.
     """
     felt = _felt(pattern.excitation, fields, table)
     felt_before = {} if before is None else _felt(before.pattern.excitation, fields, table)
+    (then,) = felt_before.values() if len(felt_before) == 1 else (1.0,)
     turned = {}
     for name, tone in pattern.excitation.items():
         now = felt[tone.frequency]
-        then = 1.0 if before is None else felt_before.get(tone.frequency)
         change = cmath.phase(then / now) if now and then else 0.0
         turned[name] = replace(tone, phase=tone.phase + change)
     return replace(pattern, excitation=turned)

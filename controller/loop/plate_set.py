@@ -93,13 +93,15 @@ class SetBuilder:
         *,
         playing: Drive,
         valid_for: float,
+        restarts: bool = False,
         is_shaped: bool = True,
         lasts: float = math.inf,
         among: int = 1,
     ) -> tuple[PlateSet, Pattern]:
         """Build the set of a pattern in a layer; returns it and the pattern as it is played.
 
-        playing: what each ERA plays now in this layer; a tone that continues needs no onset.
+        playing: what each ERA plays now in this layer; a tone that continues needs no onset, unless
+        it restarts.
         valid_for [s]: for how long it plays unless it is renewed. is_shaped: whether it may have an
         onset and an ending, which it has only if its first pulse lasts [s] until the onset is over.
         among: layers that change at once, which share the time on the wires.
@@ -110,13 +112,14 @@ class SetBuilder:
             ramp=min(pattern.ramp, self._ramp_max),
             number=number,
             playing=playing,
+            restarts=restarts,
             valid_for=valid_for,
         )
         ramp = max(layer.ramp for layer in layers.values())
         pattern = replace(pattern, ramp=ramp)
         plain = PlateSet(layers, ramp)
         if is_shaped:
-            is_continued = continues_any_tone(pattern.excitation, playing)
+            is_continued = not restarts and continues_any_tone(pattern.excitation, playing)
             is_ended = lasts > KNOT_STEP * ONSET_KNOTS
             pattern = self.shape(question, pattern, is_continued, is_ended=is_ended)
         if not (pattern.onset or pattern.ending):

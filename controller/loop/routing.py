@@ -30,6 +30,7 @@ def route(
     ramp: float,
     number: int = 0,
     playing: Drive | None = None,
+    restarts: bool = False,
     valid_for: float = 0.0,
 ) -> dict[str, Layer]:
     """Return the layer of a number for every amplifier of the rig, by name.
@@ -37,9 +38,9 @@ def route(
     Every wired channel has a tone: level = amplitude / stroke, phase in degrees within (-180, 180],
     level 0 for an ERA that is not driven. ramp [s]: lengthened to the rig's slew limit, on all
     amplifiers alike. playing: what each ERA plays now in this layer (`tones_by_era`); a frequency
-    keeps its phase if all its ERAs play it already. valid_for [s]: of the layers. All other limits
-    belong to the ledgers of the amplifiers. Raises InputError for an ERA that the rig does not
-    have.
+    keeps its phase if all its ERAs play it already, unless it restarts. valid_for [s]: of the
+    layers. All other limits belong to the ledgers of the amplifiers. Raises InputError for an ERA
+    that the rig does not have.
     """
     unknown = sorted(excitation.keys() - rig.wiring.keys())
     if unknown:
@@ -47,7 +48,7 @@ def route(
             f"pattern must drive ERAs of the rig, got {', '.join(unknown)}; build a table for this "
             "rig"
         )
-    restarted = _restarted(excitation, playing or {})
+    restarted = _restarted(excitation, {} if restarts else playing or {})
     strokes = {era.name: era.stroke for era in rig.eras}
     drive = {
         name: _tone(excitation.get(name), rig, channel.number, strokes[name], restarted=restarted)
@@ -119,6 +120,11 @@ def tones_by_era(
 def phasor_of(tone: Tone) -> complex:
     """Return the complex level of a tone."""
     return cmath.rect(tone.level, math.radians(tone.phase))
+
+
+def continues_all_tones(excitation: physics.Excitation, playing: Drive) -> bool:
+    """Whether all tones of an excitation continue what ERAs play now."""
+    return not _restarted(excitation, playing)
 
 
 def continues_any_tone(excitation: physics.Excitation, playing: Drive) -> bool:

@@ -19,6 +19,7 @@ from model.finger.perception import decibels
 from model.table.answer import answer
 from model.table.contents import PROMISED_DRAWS, PROMISED_PERCENTILE
 from model.table.request import (
+    ANY_BAND,
     APART_HZ,
     MIN_CONTRAST_DB,
     Answer,
@@ -62,11 +63,14 @@ def with_modulation(
     fingers: Sequence[Finger],
     found: Answer,
     modulations: Sequence[float | None],
+    *,
+    playable: tuple[float, float] = ANY_BAND,
 ) -> Answer:
     """Return an answer whose contents are modulated [Hz] where that leaves all fingers served.
 
-    modulations: of each request, None for none. Side bands are at the nearest frequencies of the
-    table that are as far above as below the carrier.
+    modulations: of each request, None for none; playable: lowest and highest frequency [Hz] of side
+    bands. These are as far below as above the carrier, where the table has a frequency nearest to
+    the modulation, and APART_HZ from all tones of other contents.
     """
     layers = [*found.layers]
     every: list[Request | Finger] = [*requests, *fingers]
@@ -76,8 +80,8 @@ def with_modulation(
         if any(each.verdict == "shared" and each.excitation == layers[number].excitation
                for each in layers):  # fmt: skip
             continue
-        taken = [frequency_of(each) for n, each in enumerate(layers) if n != number]
-        best = _modulated(table, every, number, layers[number], modulation, taken)
+        taken = [f for n, each in enumerate(layers) if n != number for f in _frequencies(each)]
+        best = _modulated(table, every, number, layers[number], modulation, taken, playable)
         if best is None:
             continue
         carrier, *sides = best.tones
@@ -108,7 +112,7 @@ def _is_served(found: Answer, fingers: Sequence[Finger], steady_db: float | None
         level is None or level <= bound for level, bound in zip(levels, bounds, strict=True)
     ) and all(
         each.promised_contrast_db is None
-        or each.verdict not in ("own", "mixed")
+        or each.verdict == "held back"
         or each.promised_contrast_db >= each.request.min_contrast_db
         for each in found.layers
     )
@@ -119,6 +123,12 @@ def frequency_of(layer: Layer) -> float:
     return next((tone.frequency for tone in layer.excitation.values()), math.inf)
 
 
+def _frequencies(layer: Layer) -> list[float]:
+    """Frequencies of a layer's tones [Hz]."""
+    every = (layer.excitation, *layer.side_bands)
+    return [tone.frequency for tones in every for tone in [*tones.values()][:1]]
+
+
 def _modulated(
     table: LocalizationTable,
     every: Sequence[Request | Finger],
@@ -126,21 +136,27 @@ def _modulated(
     layer: Layer,
     modulation: float,
     taken: Sequence[float],
+    playable: tuple[float, float],
 ) -> _Modulated | None:
     """The best carrier with its side bands; None where the table has none."""
     frequencies = table.frequencies
     low, high = layer.request.band_hz
+    lowest, highest = max(playable[0], frequencies[0]), min(playable[1], frequencies[-1])
     row = int(np.argmin(np.abs(frequencies - frequency_of(layer))))
     around = range(max(row - _NEAR, 0), min(row + _NEAR + 1, len(frequencies)))
     alone: dict[int, Layer] = {}
     tried: list[_Modulated] = []
     for carrier in around:
         f = float(frequencies[carrier])
-        sides = [int(np.argmin(np.abs(frequencies - f - sign * modulation))) for sign in (-1, 1)]
-        gaps = np.abs(frequencies[sides] - f)
-        is_even = gaps.min() > 0 and abs(gaps[0] - gaps[1]) <= _SAME
-        is_apart = all(abs(f - other) >= APART_HZ for other in taken)
-        if not (is_even and low <= f <= high and (is_apart or carrier == row)):
+        above = int(np.argmin(np.abs(frequencies - f - modulation)))
+        gap = frequencies[above] - f
+        sides = [int(np.argmin(np.abs(frequencies - f + gap))), above]
+        is_even = gap > 0 and abs(f - frequencies[sides[0]] - gap) <= _SAME
+        tones = [f, *frequencies[sides]]
+        is_within = low <= f <= high and lowest <= f - max(gap, modulation)
+        is_within = is_within and f + max(gap, modulation) <= highest
+        is_apart = all(abs(tone - other) >= APART_HZ for tone in tones for other in taken)
+        if not (is_even and is_within and is_apart):
             continue
         for each in (carrier, *sides):
             if each not in alone:
@@ -187,24 +203,34 @@ def _promised(
         with_powers=True,
     ).powers  # fmt: skip
     power = np.asarray(powers, dtype=float).reshape(len(rows), *shares.shape, -1)
+    contents = {number: layers[number].excitation for number in dict.fromkeys(owners)}
+    content_of = {
+        finger: next(number for number, each in contents.items() if each == layer.excitation)
+        for finger, layer in enumerate(layers)
+        if layer.excitation
+    }
     felt = {
-        number: np.sqrt(
-            sum((shares[number] @ np.sqrt(each[number])) ** 2 for each in power[owner == number])
+        finger: np.sqrt(
+            sum((shares[finger] @ np.sqrt(each[finger])) ** 2 for each in power[owner == number])
         )
-        for number in {*owners}
+        for finger, number in content_of.items()
     }
     ratios, new, quiet = [], [*layers], [*found.quiet]
     for finger in range(len(every)):
         is_target = finger in felt
-        if finger < len(layers) and not is_target:  # shared or held back
+        is_held = finger < len(layers) and not is_target
+        if is_held and layers[finger].foreign_level_db_sl is None:  # nor protected
             continue
-        others = power[owner != finger][:, finger]
+        others = power[owner != content_of.get(finger)][:, finger]
         own = felt[finger] if is_target else np.min([*felt.values()], axis=0)
         heard = np.sqrt(np.maximum(others.sum(axis=0).max(axis=0), 1e-20)) if len(others) else None
         ratio = None if heard is None else own / heard
         if ratio is not None:
             ratios.append(ratio)
-        if not is_target and ratio is not None and heard is not None:
+        if is_held and heard is not None:
+            level = _promise(heard, 100 - PROMISED_PERCENTILE)
+            new[finger] = replace(new[finger], foreign_level_db_sl=level)
+        elif not is_target and ratio is not None and heard is not None:
             at = finger - len(layers)
             quiet[at] = replace(
                 quiet[at],
@@ -241,7 +267,7 @@ def _compared(layer: Layer, ratio: FloatArray) -> Layer:
         felt_contrast_db=float(decibels(ratio[0])),
         median_felt_contrast_db=_promise(ratio, 50),
         promised_contrast_db=promised,
-        verdict=verdict_of(promised),
+        verdict=layer.verdict if layer.verdict == "shared" else verdict_of(promised),
     )
 
 

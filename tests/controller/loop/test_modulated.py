@@ -1,6 +1,7 @@
 """A modulated content beside a steady one, over the wire at the fingertips."""
 
 import asyncio
+from dataclasses import replace
 
 import numpy as np
 from scipy.signal import hilbert
@@ -10,7 +11,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.effects.shapes import Rectangle
 from drivers.errors import CommandRefused
-from several_fingers import LEFT, RIGHT, fingers_on, table
+from several_fingers import LEFT, RIGHT, Fingers, fingers_on, table
 from virtual_loop import in_virtual_time
 
 LAYOUT = SurfaceLayout(
@@ -21,6 +22,17 @@ LAYOUT = SurfaceLayout(
     {"rough": Buzz(level=14.0, modulation=20.0), "smooth": Buzz(level=14.0)},
     elsewhere=None,
 )
+
+
+def depth_of(fingers: Fingers, id: str) -> float:
+    """How deep the envelope at a finger comes and goes 20 times a second, 1 for to zero."""
+    now, bench = asyncio.get_running_loop().time(), fingers.far.bench
+    bench.advance(now)
+    record = bench.fingers.felt(now - 0.5, now)
+    envelope = np.abs(hilbert(record[id].accelerations @ record[id].weights))[200:-200]
+    times = np.arange(len(envelope)) / bench.sample_rate
+    part = envelope * np.hanning(len(envelope))
+    return float(2 * abs((part * np.exp(-2j * np.pi * 20.0 * times)).sum()) / part.sum())
 
 
 @in_virtual_time
@@ -36,16 +48,8 @@ async def test_a_modulated_content_beats_at_its_own_finger_and_at_no_other() -> 
         of_first = sorted(each.frequency or 0.0 for each in voices if each.key[0].id == 1)
         assert first.frequency == of_first[1]
         assert np.diff(of_first).tolist() == [20.0, 20.0]
-        now, bench = asyncio.get_running_loop().time(), fingers.far.bench
-        bench.advance(now)
-        record = bench.fingers.felt(now - 0.5, now)
-        for id, least, most in (("1", 0.8, 1.3), ("2", 0.0, 0.35)):
-            motion = record[id].accelerations @ record[id].weights
-            envelope = np.abs(hilbert(motion))[200:-200]
-            times = np.arange(len(envelope)) / bench.sample_rate
-            part = envelope * np.hanning(len(envelope))
-            depth = 2 * abs((part * np.exp(-2j * np.pi * 20.0 * times)).sum()) / part.sum()
-            assert least < depth < most
+        assert 0.8 < depth_of(fingers, "1") < 1.3
+        assert depth_of(fingers, "2") < 0.35
         assert second.verdict == "own"
 
 
@@ -61,6 +65,25 @@ async def test_a_modulated_content_is_steady_where_layers_are_few() -> None:
         fingers.at[1] = (LEFT[0] - 0.02, LEFT[1])
         await fingers.hold(1.0)
         assert len(fingers.applied[-1].contents) == 3
+        # Its carrier has played before: all three start anew, or they would beat in frequency.
+        assert 0.8 < depth_of(fingers, "1") < 1.3
+
+
+@in_virtual_time
+async def test_a_slide_to_another_band_keeps_the_beat() -> None:
+    """Carrier and side bands change their frequencies together, in one phase at the finger."""
+    west = Region("west", Rectangle(0.0, 0.0, 0.17, 0.12), on_press="rough", on_move="rough")
+    east = Region("east", Rectangle(0.17, 0.0, 0.13, 0.12), on_press="rough", on_move="rough")
+    bands = replace(west, band=(200.0, 300.0)), replace(east, band=(100.0, 160.0))
+    async with fingers_on(table(), replace(LAYOUT, regions=bands)) as fingers:
+        fingers.at = {1: LEFT}
+        await fingers.hold(0.5)
+        for x in np.linspace(LEFT[0], RIGHT[0], 8):
+            fingers.at = {1: (float(x), LEFT[1])}
+            await fingers.hold(0.08)
+        await fingers.hold(1.0)
+        assert max(one.content.frequency for one in fingers.applied[-1].contents.values()) < 200
+        assert 0.8 < depth_of(fingers, "1") < 1.3
 
 
 @in_virtual_time

@@ -1,5 +1,7 @@
 """Modulated contents: a carrier and two side bands, by plates solved exactly."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -25,6 +27,11 @@ def powers(table, tones, places, plates):
     rows, power = powers_on(table, Question(tuple(places)), tones, plates)
     sensed = power[0] / detection_threshold(table.frequencies[rows]) ** 2
     return sensed.reshape(*tips.fine_weights.shape, -1), tips.fine_weights
+
+
+def sides_of(layer):
+    """Frequencies of a layer's side bands."""
+    return sorted(next(iter(tones.values())).frequency for tones in layer.side_bands)
 
 
 @pytest.mark.parametrize("modulation", [10.0, 30.0])
@@ -72,8 +79,8 @@ def test_side_bands_lie_evenly_about_the_carrier_at_half_its_amplitude(table):
     found = with_modulation(table, requests, [], plain, [20.0, None])
     layer = found.layers[0]
     carrier = frequency_of(layer)
-    sides = [next(iter(tones.values())).frequency for tones in layer.side_bands]
-    assert sorted(sides) == pytest.approx([carrier - 20.0, carrier + 20.0])
+    sides = sides_of(layer)
+    assert sides == pytest.approx([carrier - 20.0, carrier + 20.0])
     assert abs(carrier - frequency_of(found.layers[1])) >= 30
     fields = {}
     for tones in (layer.excitation, *layer.side_bands):
@@ -117,3 +124,84 @@ def test_a_modulation_is_left_out_where_a_finger_would_feel_too_much(table):
     low = [Request((0.09, 0.07), (40.0, 50.0), level_db_sl=12.0)]
     found = answer(table, low, [quiet])
     assert with_modulation(table, low, [quiet], found, [30.0]) == found
+
+
+def test_fingers_that_share_or_are_held_back_feel_side_bands_too(table):
+    """What they say of others' contents nine of ten unseen plates keep; their bounds hold."""
+    shares = [
+        Request((0.095, 0.121), content="a"),
+        Request((0.287, 0.211), content="a"),
+        Request((0.076, 0.059)),
+    ]
+    held = [
+        Request((0.042, 0.184), priority=1),
+        Request((0.089, 0.108), priority=1),
+        Request((0.242, 0.085), max_foreign_db_sl=8.0),
+    ]
+    for requests, verdict in ((shares, "shared"), (held, "held back")):
+        plain = answer(table, requests)
+        (finger,) = (n for n, each in enumerate(plain.layers) if each.verdict == verdict)
+        other = next(
+            n
+            for n, each in enumerate(plain.layers)
+            if each.excitation and each.excitation != plain.layers[finger].excitation
+        )
+        modulations = [20.0 if n == other else None for n in range(len(requests))]
+        found = with_modulation(table, requests, [], plain, modulations)
+        said = found.layers[finger].foreign_level_db_sl
+        assert found.layers[finger].verdict == verdict
+        assert found.layers[other].side_bands
+        places = [each.at for each in requests]
+        plates = draw_plates(
+            np.random.default_rng(1), table.uncertainty, count=200, era_count=4, contact_count=3
+        )
+        tones = [
+            tones
+            for n, each in enumerate(found.layers)
+            if n != finger and each.excitation not in ({}, plain.layers[finger].excitation)
+            for tones in (each.excitation, *each.side_bands)
+        ]
+        power = sum(powers(table, each, places, plates)[0][finger] for each in tones)
+        level = 10 * np.log10(power.max(axis=0))
+        assert 0.82 <= (level <= said).mean() <= 0.97
+        bounded = [*plain.layers]
+        bounded[finger] = replace(
+            bounded[finger], request=replace(requests[finger], max_foreign_db_sl=said - 0.1)
+        )
+        steady = replace(plain, layers=tuple(bounded))
+        assert with_modulation(table, requests, [], steady, modulations) == steady
+
+
+@pytest.mark.parametrize("modulation", [15.0, 25.0])
+def test_a_modulation_between_two_steps_of_the_table_plays_the_nearest(table, modulation):
+    """At steps of 10 Hz 15 are 10 or 20 and 25 are 20 or 30, the same on both sides."""
+    requests = [Request((0.126, 0.081), (150.0, 200.0)), Request((0.234, 0.049), (290.0, 320.0))]
+    found = with_modulation(table, requests, [], answer(table, requests), [modulation, None])
+    carrier, (low, high) = frequency_of(found.layers[0]), sides_of(found.layers[0])
+    assert carrier - low == pytest.approx(high - carrier)
+    assert abs(high - carrier - modulation) == pytest.approx(5.0)
+
+
+def test_side_bands_stay_within_what_amplifiers_play(table):
+    """At the lowest frequency of 100 Hz a carrier needs 120 Hz, else it is steady."""
+    requests = [Request((0.126, 0.081), (100.0, 110.0))]
+    fingers = [Finger((0.234, 0.049))]
+    plain = answer(table, requests, fingers)
+    assert with_modulation(table, requests, fingers, plain, [20.0]).layers[0].side_bands
+    found = with_modulation(table, requests, fingers, plain, [20.0], playable=(100.0, 300.0))
+    assert found == plain
+
+
+@pytest.mark.parametrize("modulation", [20.0, 30.0])
+def test_all_tones_of_two_contents_are_apart(table, modulation):
+    """By 30 Hz, side bands of one and carrier and side bands of the other, where any is."""
+    gaps = []
+    for places in contact_sets(8, fingers=2, seed=7):
+        requests = [Request(at) for at in places]
+        plain = answer(table, requests)
+        found = with_modulation(table, requests, [], plain, [modulation, modulation])
+        if any(each.side_bands for each in found.layers):
+            one, other = ([frequency_of(each), *sides_of(each)] for each in found.layers)
+            gaps.append(min(abs(a - b) for a in one for b in other))
+    assert len(gaps) >= 4
+    assert min(gaps) >= 30.0

@@ -8,13 +8,15 @@ ERAs e of dynamic stiffness Z on the plate, a finger f of dynamic stiffness D an
     K = (1 + Z A_ee)^-1,  G = A_pe K,  L = A_pf - G Z A_ef,  M = D / (1 + D L_f)
     t_e = G_p - L_p M G_f,  h = -w² t_e z stroke,  r_e = stroke - u_e,  r_f = -u_f
     R = mean_p {h* h^T + dh* dh^T + dc* dc^T + sum_j |s_j w² t_j|² r_j* r_j^T + sigma² diag |h|²}
+        + field² mean_plate diag |h|²
 
 with dh of the plates thicker and thinner by a standard deviation, each solved exactly and counting
-half, dc by the ERAs' damping, s_j of each ERA's stiffness and the finger's load. The score of a set
-is |h_t w|² / max_q w^H R_q w of the best weights w at the best frequency, less a tenth of what they
-miss the wanted level by: an answer that has to reach it loses little. Of several contents that of
-the worst, all other fingers quiet: their foreign levels add to little more than the highest
-(docs/decisions, 0067), each searched at as many times the level, since they share the stroke.
+half, dc by the ERAs' damping, s_j of each ERA's stiffness and the finger's load, and the last over
+the plate without fingers, as `LocalizationTable.error_power`. The score of a set is |h_t w|² /
+max_q w^H R_q w of the best weights w at the best frequency, less a tenth of what they miss the
+wanted level by: an answer that has to reach it loses little. Of several contents that of the worst,
+all other fingers quiet: their foreign levels add to little more than the highest (docs/decisions,
+0067), each searched at as many times the level, since they share the stroke.
 """
 
 import math
@@ -26,6 +28,7 @@ import numpy as np
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.choice import best_rows
 from model.finger.fingertip import FIVE_POINTS, fingertips_on
+from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL, detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -55,12 +58,14 @@ _RIDGE, _LEAST = np.float32(1e-6), np.float32(1e-30)
 class Places:
     """Receptances [m/N] from c places of plates of v thicknesses, the modelled one first.
 
-    at (c, 2) [m]; between (v, f, c, c); to_tips (v, f, m p, c): at the points of m fingertips.
+    at (c, 2) [m]; between (v, f, c, c); to_tips (v, f, m p, c): at the points of m fingertips;
+    to_plate (f, g, c): over the modelled plate, at no point where the rig's field is certain.
     """
 
     at: FloatArray
     between: Complex64Array
     to_tips: Complex64Array
+    to_plate: Complex64Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +116,9 @@ class Scorer:
         )
         self._points = points.reshape(-1, 2)
         self._weights: Float32Array = weights.astype(np.float32)  # (m, p), of the centre first
+        self._cells = np.empty((0, 2))
+        if uncertainty.field > 0:
+            self._cells = Grid(12, 9).centres(rig.plate)
         self._groups = _grouped([len(each) for each in sets], numbers.ravel())
         # Of a fingertip's points from its centre, (v, f, m, p).
         every, tips = np.arange(len(centres)), self._solved(centres).to_tips
@@ -136,7 +144,11 @@ class Scorer:
             np.array(each, dtype=np.complex64) for each in zip(*solved, strict=True)
         )
         to_tips = np.ascontiguousarray(to_points.swapaxes(2, 3))
-        return Places(footprints[:, :2], between, to_tips)
+        _, to_plate = self._free.receptances(
+            footprints, self._cells, self._frequencies, loads=self._rig.masses
+        )
+        over_plate = np.asarray(to_plate.swapaxes(1, 2), dtype=np.complex64)
+        return Places(footprints[:, :2], between, to_tips, over_plate)
 
     def mounts(self, eras: Sequence[Era]) -> Mounts:
         """What the score needs of ERAs, whose places do not matter."""
@@ -214,6 +226,10 @@ class Scorer:
         ridge = _RIDGE / n * diagonal.real.sum(axis=2, keepdims=True)
         gains = np.float32(uncertainty.gain_variance) * _mean_power(h, weights)
         diagonal += gains + ridge + _LEAST
+        if uncertainty.field > 0:
+            over_plate = places.to_plate[:, :, chosen] @ K[0] * scale
+            mean_square = (np.abs(over_plate) ** 2).mean(axis=1, keepdims=True)
+            diagonal += np.float32(uncertainty.field**2) * mean_square
         return (h * weights[..., None]).sum(axis=2), power
 
     def _score(

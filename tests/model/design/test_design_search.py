@@ -15,6 +15,7 @@ from model.design.contacts import ContactRule, anywhere
 from model.design.judge import judge
 from model.design.layouts import layouts_of
 from model.design.problem import DesignProblem, shortfall
+from model.design.score import Scorer
 from model.design.search import LayoutSearch
 from model.errors import InputError
 from model.finger.fingertip import FIVE_POINTS, fingertips_on
@@ -250,6 +251,21 @@ def test_scores_count_plates_of_other_thickness_exactly(monkeypatch) -> None:
     assert found.score_db == pytest.approx(dense, abs=0.05)
     certain = replace(loud, uncertainty=GAINS)
     assert dense < dense_score(certain, some.own_positions, pairs, some.searched_frequencies) - 1
+
+
+def test_scores_fall_with_the_error_of_fields_as_answers_do() -> None:
+    """From 2 % on an uneven plate to 5 %, where little else is wrong: by what answers lose."""
+    pairs = [np.array([[0.06, 0.05], [0.2, 0.15]]), np.array([[0.1, 0.15], [0.25, 0.05]])]
+    scores, answers = [], []
+    for field in (0.02, 0.05):
+        known = Uncertainty(0.005, 0.5, 0.002, 0.01, 1.1, 0.5, field=field)
+        some = replace(rig(), uncertainty=known)
+        scorer = Scorer(some, np.arange(60.0, 320.0, 10.0), pairs)
+        places = scorer.places(np.array([[era.x, era.y] for era in some.eras]))
+        scores.append(scorer.mean(places, np.arange(4), scorer.mounts(some.eras)))
+        answers.append(judge(some, pairs).mean_db)
+    assert answers[0] - answers[1] > 4
+    assert scores[0] - scores[1] == pytest.approx(answers[0] - answers[1], abs=2)
 
 
 def test_the_score_of_two_contents_is_that_of_the_worse(monkeypatch) -> None:

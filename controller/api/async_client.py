@@ -10,6 +10,7 @@ import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -67,12 +68,13 @@ class AsyncClient:
         self._connecting = asyncio.Lock()
         self._is_closed = False
         self._rates: dict[Topic, float | None] = {}  # of the subscriptions
-        self._events: deque[Notification] = deque(maxlen=MAX_QUEUED_EVENTS)
+        self._events: deque[tuple[int, Notification]] = deque(maxlen=MAX_QUEUED_EVENTS)
+        self._connections = 0
         self._changed = asyncio.Event()  # an event arrived, or the connection was lost
         self._lease: ArmResult | None = None  # of `armed`
         self._lease_lost: LeaseLost | None = None
         self._renewing: asyncio.Task[None] | None = None
-        self._seen: int | None = None  # epoch of the last status, stop or state event
+        self._seen: tuple[int, int] | None = None  # connection and epoch of what was seen last
 
     @classmethod
     async def connect(
@@ -150,7 +152,7 @@ class AsyncClient:
 
         One that came after its last `status`, `stop` or state event is not: RpcError.
         """
-        await self._call(Empty, "clear", epoch=self._seen)
+        await self._call(Empty, "clear", epoch=None if self._seen is None else self._seen[1])
 
     async def forget(self) -> None:
         """Discard what was learned of the plate; answers are those of the table as built."""
@@ -258,8 +260,8 @@ class AsyncClient:
                         await self._changed.wait()
         if not self._events:
             return None
-        event = self._events.popleft()
-        self._seen = event.data.get("epoch", self._seen)
+        connection, event = self._events.popleft()
+        self._see(connection, event.data.get("epoch"))
         return event
 
     async def call(self, method: str, params: Message, result: type[_ResultT]) -> _ResultT:
@@ -268,7 +270,7 @@ class AsyncClient:
             raise self._lease_lost.with_traceback(None)
         found = await self._within_timeout(self._send(method, params))
         read = read_result(found, result)
-        self._seen = getattr(read, "epoch", self._seen)
+        self._see(self._connections, getattr(read, "epoch", None))
         return read
 
     async def _call(self, result: type[_ResultT], method: str, **values: object) -> _ResultT:
@@ -284,7 +286,8 @@ class AsyncClient:
         if method in METHODS and not METHODS[method].is_repeated:
             channel = await self._repeated(self._connected)
             return await channel.request(method, params)
-        return await self._repeated(attempt)
+        after = Unreachable if method == "stop" else ConnectionLost
+        return await self._repeated(attempt, after=after)
 
     async def _repeated(
         self,
@@ -321,8 +324,12 @@ class AsyncClient:
             if self._is_closed:
                 raise Unreachable(f"this client of the daemon at {self.path} is closed")
             if self._channel is None or self._channel.lost is not None:
+                connection = self._connections + 1
                 channel = await Channel.open(
-                    self.path, name=self._name, on_event=self._received, on_lost=self._changed.set
+                    self.path,
+                    name=self._name,
+                    on_event=partial(self._received, connection),
+                    on_lost=self._changed.set,
                 )
                 try:
                     for rate in dict.fromkeys(self._rates.values()):
@@ -332,12 +339,17 @@ class AsyncClient:
                 except BaseException:
                     channel.close()
                     raise
-                self._channel = channel
+                self._channel, self._connections = channel, connection
             return self._channel
 
-    def _received(self, event: Notification) -> None:
-        self._events.append(event)
+    def _received(self, connection: int, event: Notification) -> None:
+        self._events.append((connection, event))
         self._changed.set()
+
+    def _see(self, connection: int, epoch: int | None) -> None:
+        """Note an epoch seen, unless a later one was: another connection may begin lower."""
+        if epoch is not None:
+            self._seen = max(self._seen or (0, 0), (connection, epoch))
 
     def _release(self) -> None:
         """Stop renewing the lease."""
@@ -380,7 +392,7 @@ class AsyncClient:
         try:
             found = await self._within_timeout(self._send("status", Empty()))
             status = read_result(found, StatusResult)
-            self._seen = status.epoch
+            self._see(self._connections, status.epoch)
         except (RpcError, Unreachable):
             return LeaseLost(str(reason))
         return LeaseLost(headline(status.state, status.cause))

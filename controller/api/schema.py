@@ -94,7 +94,11 @@ Name: TypeAlias = Annotated[
 
 Count: TypeAlias = Annotated[int, Field(ge=0)]
 Epoch: TypeAlias = Annotated[
-    int, Field(ge=0, description="rises with every change of state, stop, fault and loss")
+    int,
+    Field(
+        ge=0,
+        description="rises with every change of state, stop, fault and loss; begins by chance",
+    ),
 ]
 
 

@@ -136,7 +136,7 @@ class TopicData(NamedTuple):
 
 
 TOPICS: dict[Topic, TopicData] = {
-    "state": TopicData(StateEvent, "every change of state, with its cause"),
+    "state": TopicData(StateEvent, "every change of state or epoch, with its cause"),
     "contacts": TopicData(ContactsEvent, "fingers touched, moved or lifted", "newest"),
     "pattern": TopicData(PatternEvent, "what plays now, as the amplifiers confirmed it", "newest"),
     "silence": TopicData(SilenceEvent, "nothing plays now, and why", "newest"),

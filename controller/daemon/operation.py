@@ -5,6 +5,7 @@ Actions come before observers: these are called a moment later, each guarded (`D
 
 import asyncio
 import logging
+import secrets
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from dataclasses import replace
@@ -27,6 +28,7 @@ from drivers import clock
 from drivers.errors import DriverError
 from registry.plugins import failure_text
 
+_EPOCHS = 2**31  # of which a daemon begins at one by chance: exact as numbers of JSON
 LEASE_OVER = DaemonEvent(Trigger.LEASE_LOST, "the arming lease was not renewed", "arm again")
 StateObserver = Callable[[StateMachine, StateMachine], None]
 """Receives the old and the new state machine."""
@@ -45,11 +47,12 @@ class Operation(ABC):
     """Applies events to the state machine and has their actions carried out.
 
     An unexpected exception in a transition or action ends in a stop of all amplifiers and in FAULT.
-    state_changed are called a moment after every transition.
+    state_changed are called a moment after every change of the state or its epoch.
     """
 
     def __init__(self, state_changed: Sequence[StateObserver]) -> None:
-        self.machine = StateMachine()
+        # Not that of a daemon before, whose clients may be left.
+        self.machine = StateMachine(epoch=secrets.randbelow(_EPOCHS))
         self._state_observers = (_log_transition, *state_changed)
         self._reports = DeferredCalls()
         self._tasks: set[asyncio.Task[Any]] = set()
@@ -131,8 +134,8 @@ class Operation(ABC):
         return actions
 
     def _report_transition(self, before: StateMachine) -> None:
-        """Notify the observers of a new state, deferred; look after a lease that has begun."""
-        if self.machine.state is before.state:
+        """Notify the observers of a new epoch, deferred; look after a lease that has begun."""
+        if self.machine.epoch == before.epoch:
             return
         self._changed.set()
         for observer in self._state_observers:
@@ -169,6 +172,8 @@ class Operation(ABC):
 
 
 def _log_transition(before: StateMachine, after: StateMachine) -> None:
+    if after.state is before.state:
+        return
     _logger.log(
         _LOG_LEVELS.get(after.state, logging.INFO),
         "%s -> %s",

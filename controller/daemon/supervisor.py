@@ -118,7 +118,7 @@ class Supervisor(Operation):
 
         Amplifiers that do not reply at the start, or refuse, are searched for as after a loss; one
         in a fault leads to the state FAULT. Raises CommandError and InputError for
-        amplifiers that do not fit the configuration.
+        amplifiers that do not fit the configuration, RuntimeError if the control loop ends early.
         """
         self._controller_if_running = controller
         loop = asyncio.create_task(self._run_control_loop(), name="control loop")
@@ -126,6 +126,8 @@ class Supervisor(Operation):
             await self._open()
             self.started.set()
             while self.machine.state is not DaemonState.NOT_READY:
+                if loop.done():
+                    raise RuntimeError("control loop has ended before the daemon")
                 self._changed.clear()
                 if self._must_reopen:
                     await self._restore_link()
@@ -144,8 +146,19 @@ class Supervisor(Operation):
                 await self._controller.run()
             except Exception as error:
                 _logger.exception("control loop failed, stopping all amplifiers")
-                await self._fail(error)
+                while not await self._is_stopped_after(error):
+                    pass
             await asyncio.sleep(_RECHECK)
+
+    async def _is_stopped_after(self, error: Exception) -> bool:
+        """Whether a failed control loop is stopped; it sends no heartbeat before. Else pause."""
+        try:
+            await self._fail(error)
+        except Exception:
+            _rate_limited_logger.exception("stop after a failure of the control loop failed")
+            await asyncio.sleep(_RECHECK)
+            return False
+        return True
 
     async def close(self, cause: str) -> None:
         """Ramp down, read back, disarm and close the amplifiers; ends `run`."""
@@ -356,23 +369,28 @@ class Supervisor(Operation):
     async def _restore_link(self) -> None:
         """Reopen the amplifiers, with growing pauses; leave COMM_LOST once they are all silent."""
         try:
-            for pause in pauses():
-                if self.machine.state is not DaemonState.COMM_LOST:
-                    return
-                if await self._reopen():
-                    break
-                await self._pause(pause)
-            while self.assume_energised(clock.now()) and not self._closing.is_set():
-                await self._pause(_RECHECK)
-            if self._controller.is_open:  # none was lost again
-                await self.handle(DaemonEvent(Trigger.RECONNECTED))
+            try:
+                await self._reconnect()
+            finally:
+                if self.machine.state is DaemonState.COMM_LOST:
+                    await self._controller.release()
         except DriverError as error:
             _rate_limited_logger.info("failed: %s", error)
         except Exception:
             _rate_limited_logger.exception("reconnection failed")
             await self._pause(STATUS_INTERVAL)
-        if self.machine.state is DaemonState.COMM_LOST:
-            await self._controller.release()
+
+    async def _reconnect(self) -> None:
+        for pause in pauses():
+            if self.machine.state is not DaemonState.COMM_LOST:
+                return
+            if await self._reopen():
+                break
+            await self._pause(pause)
+        while self.assume_energised(clock.now()) and not self._closing.is_set():
+            await self._pause(_RECHECK)
+        if self._controller.is_open:  # none was lost again
+            await self.handle(DaemonEvent(Trigger.RECONNECTED))
 
     async def _reopen(self) -> bool:
         """Open all amplifiers, disarmed; none that may be armed stays open."""

@@ -273,10 +273,12 @@ class Controller:
         try:
             await self._group.close(CLOSING_RAMP)
         finally:
-            if lines is not None:
-                await lines.close()
-            if self._lines_if_open is lines:
-                self._lines_if_open = None
+            try:
+                if lines is not None:
+                    await lines.close()
+            finally:
+                if self._lines_if_open is lines:
+                    self._lines_if_open = None
 
     async def run(self) -> None:
         """Run the loop until `close` or cancellation, also while amplifiers are lost or closed.

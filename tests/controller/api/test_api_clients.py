@@ -14,12 +14,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import pytest
 
 import controller
 from controller.api.async_client import AsyncClient
+from controller.api.channel import Channel
 from controller.api.client import Client
 from controller.api.client_protocol import ConnectionLost, LeaseLost, Unreachable
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError, event_line
@@ -268,6 +269,23 @@ def test_request_is_repeated_when_the_connection_is_lost_if_that_is_harmless(
         getattr(era, method)(*arguments)
     sent = [json.loads(line)["method"] for line in received]
     assert (sent.count(method) > 1) is is_repeated
+
+
+async def test_stop_is_repeated_while_no_daemon_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may be restarting: the stop reaches it at its return."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        open_channel, refusing = Channel.open, [tmp_path / "none"]
+
+        async def open_later(path: Path, **options: Any) -> Channel:
+            return await open_channel(refusing.pop() if refusing else path, **options)
+
+        monkeypatch.setattr(Channel, "open", open_later)
+        async with AsyncClient(bench.socket, name="late", timeout=10) as late:
+            await late.stop()
+        assert not refusing
+        assert (await era.status()).state == "QUICK_STOP_ACTIVE"
 
 
 async def test_client_waits_while_the_queue_of_the_daemon_is_full(tmp_path: Path) -> None:

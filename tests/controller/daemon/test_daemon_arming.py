@@ -68,6 +68,36 @@ async def test_clear_acknowledges_no_stop_that_its_client_has_not_seen(tmp_path:
         assert (await other.status()).state == READY
 
 
+async def test_client_that_follows_events_may_clear_after_a_second_stop(tmp_path: Path) -> None:
+    """Which changes no state, but what an acknowledgement must name."""
+    async with ready_daemon(tmp_path) as (bench, era), await bench.client() as other:
+        await era.subscribe("state")
+        await other.stop()
+        epoch = (await other.stop()).epoch
+        while (await next_event(era, "state")).data["epoch"] != epoch:
+            pass
+        await era.clear()
+        assert (await other.status()).state == READY
+
+
+async def test_event_read_late_takes_nothing_back_that_was_seen(tmp_path: Path) -> None:
+    """Of this connection or one before, even if this daemon counts from less."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        await era.subscribe("state")
+        await era.stop()
+        epoch = (await era.stop()).epoch
+        assert (await next_event(era, "state")).data["epoch"] < epoch
+        await era.clear()
+        supervisor = bench.daemon._supervisor
+        supervisor.machine = replace(supervisor.machine, epoch=0)
+        assert era._channel is not None
+        era._channel.close()
+        await era.stop()
+        assert (await next_event(era, "state")).data["epoch"] >= epoch - 1
+        await era.clear()
+        assert (await era.status()).state == READY
+
+
 async def test_lease_lasts_from_armed_state_when_arming_takes_longer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

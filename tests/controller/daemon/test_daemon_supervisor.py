@@ -8,7 +8,7 @@ import pytest
 from controller.daemon.lease import Lease
 from controller.daemon.states import DaemonEvent, DaemonState, Trigger
 from controller.loop.loop import Controller
-from controller_bench import DISARMED, STOPPED
+from controller_bench import DISARMED, STOPPED, BenchLines
 from controller_bench import ENABLED as ARMED
 from drivers.errors import CommandRefused, LinkError
 from drivers.host.line import GRACE
@@ -68,6 +68,108 @@ async def test_unforeseen_exception_in_the_control_loop_is_a_fault(
         daemon.touch_elsewhere()
         await asyncio.sleep(0.1)
         assert (daemon.state, any(daemon.far_end.levels)) == (ENABLED, True)
+
+
+@in_virtual_time
+async def test_control_loop_whose_failure_cannot_be_stopped_runs_again_once_it_can() -> None:
+    """No heartbeat is sent before that; once cleared and armed, they are."""
+    async with watched() as daemon:
+        await daemon.handle(ARM)
+        controller = daemon.controller
+        step, stop = controller.step, controller.stop
+
+        async def fail() -> None:
+            raise ZeroDivisionError("a bug")
+
+        def fail_to_stop() -> None:
+            raise OSError("another bug")
+
+        controller.step, controller.stop = fail, fail_to_stop
+        controller.request_update()
+        await asyncio.sleep(0.02)
+        controller.step = step
+        begun = len(daemon.far_end.times("Ping"))
+        await asyncio.sleep(0.5)
+        assert len(daemon.far_end.times("Ping")) == begun
+        assert daemon.far_end.state != ARMED  # its watchdog has expired
+        controller.stop = stop
+        await asyncio.sleep(0.5)
+        await daemon.handle(CLEAR)
+        await daemon.handle(ARM)
+        await asyncio.sleep(1)
+        assert daemon.state is ENABLED
+        assert len(daemon.far_end.times("Ping")) >= begun + 18
+
+
+@in_virtual_time
+async def test_end_of_the_control_loop_ends_the_daemon() -> None:
+    """By whatever cancels it: nothing can be armed without it."""
+
+    async def cancel_loop() -> None:
+        async with watched():
+            (loop,) = (each for each in asyncio.all_tasks() if each.get_name() == "control loop")
+            loop.cancel()
+            await asyncio.sleep(1)
+
+    with pytest.raises(RuntimeError, match="control loop"):
+        await cancel_loop()
+
+
+@pytest.mark.parametrize("error", [LinkError("a line"), OSError("a line")])
+@in_virtual_time
+async def test_line_that_cannot_be_closed_is_opened_again(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    """After a loss, as any other."""
+    async with watched() as daemon:
+        close, errors = BenchLines.close, [error]
+
+        async def fail_once(lines: BenchLines) -> None:
+            await close(lines)
+            if errors:
+                raise errors.pop()
+
+        monkeypatch.setattr(BenchLines, "close", fail_once)
+        daemon.cut()
+        await asyncio.sleep(3)
+        assert not errors
+        daemon.obey()
+        await asyncio.sleep(10)
+        assert daemon.state in (DaemonState.READY_TO_SWITCH_ON, DaemonState.FAULT)
+
+
+@in_virtual_time
+async def test_amplifiers_that_can_be_neither_opened_nor_released_are_opened_again() -> None:
+    """An unforeseen exception of either does not end the daemon."""
+    async with watched() as daemon:
+        controller = daemon.controller
+        open_again, release = controller.open, controller.release
+        errors = [ZeroDivisionError("a bug"), OSError("another bug")]
+
+        async def fail_to_release() -> None:
+            controller.release = release
+            raise errors.pop()
+
+        async def fail_to_open() -> None:
+            controller.open, controller.release = open_again, fail_to_release
+            raise errors.pop(0)
+
+        controller.open = fail_to_open
+        await daemon.handle(ARM)
+        await daemon.handle(DaemonEvent(Trigger.LINK_LOST))
+        await asyncio.sleep(3)
+        assert (errors, daemon.state) == ([], DaemonState.FAULT)
+
+
+@in_virtual_time
+async def test_epochs_of_two_daemons_differ() -> None:
+    """An acknowledgement of what another daemon latched is none; all are exact in JSON numbers."""
+    epochs = set()
+    for _ in range(2):
+        async with watched() as daemon:
+            epochs.add(daemon.supervisor.machine.epoch)
+    assert len(epochs) == 2
+    assert max(epochs) < 2**32
 
 
 @in_virtual_time

@@ -1,14 +1,18 @@
-"""A daemon within the test's event loop, over a pseudo-terminal to a simulated amplifier."""
+"""A daemon within the test's event loop, over a line to simulated amplifiers.
+
+In virtual time the line is memory, and a witness that reads every byte is the judge; in real time
+it is a pseudo-terminal.
+"""
 
 import asyncio
 import contextlib
 import logging
-import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
+from typing import Any, get_args
 
 import pytest
 
@@ -20,12 +24,19 @@ from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogThread
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
+from controller.sources.touch import TouchFrame
+from drivers import clock
+from drivers.host.amplifier import WATCHDOG
+from memory_machine import live_in_memory
 from model.rig.file import load_rig
 from model.table.table import LocalizationTable
 from rig_files import write_rig
 from rig_on_wire import FarSide, far_side
+from sim.witness.witness import OperatorCommand, Witness
 from small_table import small_table
+from virtual_sockets import VirtualSocketsLoop
 from wires import WIRES
+from witness_config import witness_config
 
 PATIENCE = 180.0  # s; generous, for a loaded machine
 PLACE = (0.1, 0.1)
@@ -97,8 +108,10 @@ async def running_daemon(folder: Path, more: str = "") -> AsyncIterator[DaemonBe
 async def far_end(
     folder: Path, *, changes: Sequence[tuple[str, str]] = ()
 ) -> AsyncIterator[FarSide]:
-    """The example's amplifier on a pseudo-terminal; changes: replacements in the rig's text."""
+    """The example's amplifier on a serial line; changes: replacements in the rig's text."""
     rig = load_rig(write_rig(folder / "bench.yaml", *changes))
+    if isinstance(asyncio.get_running_loop(), VirtualSocketsLoop):
+        live_in_memory()
     async with far_side(WIRES["serial"], rig) as far:
         yield far
 
@@ -111,16 +124,19 @@ async def daemon_at(
     config = load_daemon_config(write_daemon(folder, dict(far.urls), more, changes=changes))
     lock = SocketLock(config.socket)
     log = LogThread(folder / "log")
-    # Daemon, amplifier and test share a process, which a busy machine delays; here the watchdog is
-    # the longest of the protocol, since no test of this bench lets it expire.
+    loop = asyncio.get_running_loop()
+    is_virtual = isinstance(loop, VirtualSocketsLoop)
+    # Daemon, amplifier and test share a process, which a busy machine delays; in real time the
+    # watchdog is the longest of the protocol, since no test of this bench lets it expire.
     daemon = Daemon(
         config,
         daemon_table(),
         log=log,
         manager=ServiceManager({}),
         dashboard=None,
-        watchdog=2.0,
+        watchdog=WATCHDOG if is_virtual else 2.0,
     )
+    witness = judged(daemon, far) if is_virtual else None
     task = asyncio.create_task(daemon.run(lock))
     logging.getLogger().addHandler(log)
     try:
@@ -136,6 +152,54 @@ async def daemon_at(
             logging.getLogger().removeHandler(log)
             log.close()
             lock.release()
+    if witness is not None:
+        assert not witness.finish(clock.now())
+        assert witness.frames
+
+
+def judged(daemon: Daemon, far: FarSide) -> Witness:
+    """A witness of a daemon's lines in virtual time, which is told of commands, fingers, faults."""
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualSocketsLoop)
+    witness = Witness(witness_config(far.urls))
+    loop.seen = lambda link, toward, data: witness.record_bytes(
+        link,
+        toward,  # type: ignore[arg-type]
+        clock.now(),
+        data,
+    )
+    controller, down = daemon._controller, dict[str, list[tuple[str, int]]]()
+    for command in get_args(OperatorCommand):
+        tell = partial(witness.operator_command, command=command)
+        _tell_first(controller, command, lambda *_, tell=tell: tell(clock.now()))
+
+    def touched(frame: TouchFrame) -> None:
+        down[frame.source] = [(frame.source, touch.id) for touch in frame.touches]
+        witness.contacts(
+            clock.now(), [one for each in down.values() for one in each], is_answerable=False
+        )
+
+    _tell_first(controller, "deliver", touched)
+    for link in witness.wires:
+        witness.opened(link, clock.now())
+    for device in far.devices.values():
+        _tell_first(
+            device,
+            "inject_fault",
+            lambda *_: [witness.faults(clock.now(), each, are_on=True) for each in witness.wires],
+        )
+    return witness
+
+
+def _tell_first(owner: Any, method: str, tell: Callable[..., object]) -> None:
+    """Let somebody be told of each call of a method, before it is carried out."""
+    carry_out = getattr(owner, method)
+
+    def told(*arguments: Any) -> Any:
+        tell(*arguments)
+        return carry_out(*arguments)
+
+    setattr(owner, method, told)
 
 
 @asynccontextmanager
@@ -162,17 +226,17 @@ async def holding(
 
 async def until(holds: Callable[[], object], *, patience: float = PATIENCE) -> None:
     """Wait until a condition holds; fail after `patience` [s]."""
-    end = time.monotonic() + patience
+    end = clock.now() + patience
     while not holds():
-        assert time.monotonic() < end, "condition not met in time"
+        assert clock.now() < end, "condition not met in time"
         await asyncio.sleep(0.005)
 
 
 async def until_state(client: AsyncClient, *states: str) -> str:
     """Wait until the daemon is in one of these states; return it."""
-    end = time.monotonic() + PATIENCE
+    end = clock.now() + PATIENCE
     while (state := (await client.status()).state) not in states:
-        assert time.monotonic() < end, f"daemon stays in {state}: {(await client.status()).cause}"
+        assert clock.now() < end, f"daemon stays in {state}: {(await client.status()).cause}"
         await asyncio.sleep(0.01)
     return state
 

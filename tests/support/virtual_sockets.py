@@ -2,7 +2,9 @@
 
 import asyncio
 import functools
+import random
 import selectors
+import threading
 from collections.abc import Callable, Coroutine
 from typing import Any, ParamSpec, TypeVar
 
@@ -12,8 +14,15 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
+_REAL_WAIT = 0.001  # s; for a thread that works
+_AWAITED = ("reload", "dump")  # names of threads for which time stands still
+
+
 class _Selector(selectors.DefaultSelector):
-    """Waiting for a timer costs no time, waiting for the machine does: the clock jumps."""
+    """Waiting for a timer costs no time, waiting for the machine does: the clock jumps.
+
+    It stands still while a daemon's threads work with files.
+    """
 
     now = virtual_loop.START
 
@@ -21,16 +30,23 @@ class _Selector(selectors.DefaultSelector):
         ready = super().select(0)
         if ready or timeout is None:
             return ready or super().select(timeout)
+        if timeout > 0 and any(each.name in _AWAITED for each in threading.enumerate()):
+            return super().select(_REAL_WAIT)
         self.now += timeout
         return ready
 
 
 class VirtualSocketsLoop(asyncio.SelectorEventLoop):
-    """asyncio's own loop on a virtual clock, which stands still while threads would work."""
+    """asyncio's own loop on a virtual clock.
+
+    rng, seen: as of a `VirtualLoop`, of lines in memory.
+    """
 
     def __init__(self) -> None:
         self._virtual = _Selector()
         super().__init__(self._virtual)
+        self.rng = random.Random(0)
+        self.seen: virtual_loop.Seen = lambda link, toward, data: None
 
     def time(self) -> float:
         """Virtual seconds."""

@@ -20,6 +20,7 @@ from daemon_bench import ready_daemon, until
 from model.errors import InputError
 from model.structure.plate import Material, Plate
 from tuio_panel import free_port
+from virtual_sockets import in_virtual_time_on_sockets
 
 PLATE = Plate(0.4, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
 
@@ -183,6 +184,7 @@ async def test_failed_input_is_restarted_after_growing_pauses(
     await inputs.close()
 
 
+@in_virtual_time_on_sockets
 async def test_daemon_combines_contacts_of_panels_and_clients(tmp_path: Path) -> None:
     """One is the target, two are quiet; each lies where its source's calibration puts it.
 

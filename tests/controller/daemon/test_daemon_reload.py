@@ -19,6 +19,7 @@ from controller.daemon.reload import changed_keys, reload_problem
 from daemon_bench import ENABLED, ready_daemon
 from model.errors import InputError
 from model.rig.file import example_rig_path
+from virtual_sockets import in_virtual_time_on_sockets
 
 MAX_CALLS = 2000
 """Most calls of a callback that handles input of clients or files: about 1 ms."""
@@ -161,6 +162,7 @@ def write_layout(path: Path) -> None:
     path.write_text("\n".join([*lines, "elsewhere: null", ""]), encoding="utf-8")
 
 
+@in_virtual_time_on_sockets
 async def test_reload_costs_the_loop_nothing(tmp_path: Path) -> None:
     """A large layout, added while armed and subscribed."""
     write_layout(tmp_path / "large.yaml")
@@ -171,12 +173,14 @@ async def test_reload_costs_the_loop_nothing(tmp_path: Path) -> None:
             file.write("layout: large.yaml\n")
         with counted_callbacks() as work:
             await bench.daemon.reload()
+            await asyncio.sleep(0.2)  # until all is as the layout says
         assert bench.daemon._config.layout is not None
         assert len(work.calls) > 10
         work.assert_short()
         assert (await era.status()).state == ENABLED
 
 
+@in_virtual_time_on_sockets
 async def test_reload_reads_its_files_in_another_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

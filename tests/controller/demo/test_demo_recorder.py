@@ -22,6 +22,7 @@ from drivers.errors import LinkError
 from model.rig.file import example_rig_path
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
+from virtual_sockets import in_virtual_time_on_sockets
 
 FAULT = "amplifier d: state must be OPERATION_ENABLED, got FAULT with fault WATCHDOG"
 
@@ -104,6 +105,7 @@ async def test_pattern_is_measured_while_no_finger_moves(monkeypatch: pytest.Mon
     assert windows == [pytest.approx((start + 0.755, start + 0.995))]
 
 
+@in_virtual_time_on_sockets
 async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

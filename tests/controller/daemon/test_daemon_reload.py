@@ -172,7 +172,7 @@ async def test_reload_costs_the_loop_nothing(tmp_path: Path) -> None:
         with (tmp_path / "daemon.yaml").open("a", encoding="utf-8") as file:
             file.write("layout: large.yaml\n")
         with counted_callbacks() as work:
-            await bench.daemon.reload()
+            await asyncio.create_task(bench.daemon.reload())
             await asyncio.sleep(0.2)  # until all is as the layout says
         assert bench.daemon._config.layout is not None
         assert len(work.calls) > 10

@@ -122,8 +122,8 @@ def _matrix(names: "Sequence[str]", promised: "FloatArray") -> list[str]:
     """Format what fingers in every two regions are promised."""
     width = max(map(len, names)) + 4
     lines = [
-        "promised contrast of the worst finger in dB, of effects that last: below the diagonal in "
-        "two regions at once, above it in three, with the worst third",
+        "promised contrast of the worst finger in dB: below the diagonal in two regions at once, "
+        "above it in three, with the worst third",
         "(from 12 own, from 6 mixed, below shared or held back)",
         f"{'':{width}}" + "".join(f"{number:6d}" for number in range(1, len(names) + 1)),
     ]

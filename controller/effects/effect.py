@@ -7,10 +7,10 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import BeforeValidator
 
-from controller.effects.band import TunedSection
+from controller.effects.band import Band, TunedSection
 from controller.effects.region import Region
-from controller.loop.intent import Pulse
-from controller.sources.contacts import Contact
+from controller.loop.intent import Pulse, Target
+from controller.sources.contacts import Contact, ContactKey
 from model.config.sections import Quantity
 from model.config.units import FREQUENCY, RATIO
 from model.finger.perception import STRONG_DB_SL
@@ -62,6 +62,32 @@ class Sensation:
     allow_weaker: bool = False
     pulse: Pulse | None = None
     modulation_hz: float | None = None
+
+    def target(
+        self,
+        key: ContactKey,
+        effect: str,
+        region: Region | None,
+        *,
+        band: Band | None,
+        priority: int,
+    ) -> Target:
+        """Return the target of a finger that feels it in a region, or outside of all.
+
+        effect: its name.
+        """
+        return Target(
+            key,
+            self.level_db_sl,
+            allow_weaker=self.allow_weaker,
+            pulse=self.pulse,
+            band=band,
+            priority=priority,
+            content=effect,
+            is_own=region is not None and region.is_own,
+            may_share=region is not None and region.may_share,
+            modulation_hz=self.modulation_hz,
+        )
 
 
 @dataclass(frozen=True, slots=True)

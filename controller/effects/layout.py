@@ -43,12 +43,21 @@ class SurfaceLayout:
         """The highest level of all effects; infinite for what the neighbours allow."""
         levels = [effect.max_db_sl(effect.level_db_sl) for effect in self.effects.values()]
         levels += [
-            self.effects[name].max_db_sl(region.level_db_sl)
+            self.effects[name].max_db_sl(self.level_of(name, region))
             for region in self.regions
             for name in (region.on_press, region.on_move, region.on_release)
-            if region.has_level and name is not None
+            if name is not None
         ]
         return max(levels, default=-math.inf)
+
+    def level_of(self, name: str, region: Region | None) -> float | None:
+        """Return the level [dB SL] of an effect, by name, in a region or outside of all.
+
+        None for as strong as the neighbours allow.
+        """
+        if region is not None and region.has_level:
+            return region.level_db_sl
+        return self.effects[name].level_db_sl
 
     def band_of(self, name: str, region: Region | None) -> Band | None:
         """Return the band of an effect [Hz], by name, in a region or outside of all; None: any."""

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from controller.effects.effect import Sensation
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
-from controller.effects.representative import strongest_sensation
+from controller.effects.representative import strongest_target
 from controller.effects.simulated_touch import Position, SimulatedTouch, TouchSimulator
+from controller.loop.intent import Target
 from controller.loop.table_query import band_of_table
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
@@ -144,29 +144,26 @@ def _check(
     simulator: TouchSimulator,
     count: int,
 ) -> CheckedEffect:
-    effect = layout.effects[name]
-    is_own = region is not None and region.has_level
-    level = region.level_db_sl if region is not None and is_own else effect.level_db_sl
     places, area = raster(layout, region, table.plate, count)
     start = region.shape.centre if region is not None else (places[0] if places else (0.0, 0.0))
-    sensation = strongest_sensation(effect, region, level_db_sl=level, at=start)
+    target = strongest_target(layout, name, region, at=start)
     called = ELSEWHERE if region is None else region.name
-    if sensation is None or not places:
-        why = "is felt nowhere" if sensation is None else "is covered by later regions"
+    if target is None or not places:
+        why = "is felt nowhere" if target is None else "is covered by later regions"
+        level = layout.level_of(name, region)
         return CheckedEffect(called, name, on, level, (), (f"{name} {why}",))
-    band = layout.band_of(name, region)
-    is_fixed = band is not None or (sensation.pulse is not None and sensation.pulse.is_raised)
+    is_fixed = target.band is not None or (target.pulse is not None and target.pulse.is_raised)
     touches = [
-        simulator.touch(sensation, band, at, resting)
+        simulator.touch(target, at, resting)
         for number, at in enumerate(places)
         for resting in (None, _resting(table.plate, at, number))
     ]
     problems = [
-        *_silent(sensation, touches, area),
-        *_off_level(sensation, touches, area, has_margin=not is_fixed),
-        *_off_band(band, table, touches, must_be_alike=effect.is_for_motion),
+        *_silent(target, touches, area),
+        *_off_level(target.level_db_sl, touches, area, has_margin=not is_fixed),
+        *_off_band(target.band, table, touches, must_be_alike=layout.effects[name].is_for_motion),
     ]
-    return CheckedEffect(called, name, on, sensation.level_db_sl, tuple(touches), tuple(problems))
+    return CheckedEffect(called, name, on, target.level_db_sl, tuple(touches), tuple(problems))
 
 
 def raster(
@@ -204,18 +201,17 @@ def _resting(plate: Plate, at: Position, number: int) -> Position:
     return away[number % len(away)]
 
 
-def _silent(sensation: Sensation, touches: Sequence[SimulatedTouch], area: float) -> Iterator[str]:
+def _silent(target: Target, touches: Sequence[SimulatedTouch], area: float) -> Iterator[str]:
     # As strong as the neighbours allow may be nothing.
-    can_be = sensation.level_db_sl is None or sensation.allow_weaker
+    can_be = target.level_db_sl is None or target.allow_weaker
     silent = [each for each in touches if each.reason is not None and not (can_be and each.resting)]
     if silent:
         yield f"nothing is felt {_where(silent, touches, area)}: {silent[0].reason}"
 
 
 def _off_level(
-    sensation: Sensation, touches: Sequence[SimulatedTouch], area: float, *, has_margin: bool
+    promised: float | None, touches: Sequence[SimulatedTouch], area: float, *, has_margin: bool
 ) -> Iterator[str]:
-    promised = sensation.level_db_sl
     if promised is None:
         return
     above = MARGIN_TOLERANCE if has_margin else LEVEL_TOLERANCE

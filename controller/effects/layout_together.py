@@ -2,23 +2,28 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from controller.effects.layout import SurfaceLayout
 from controller.effects.layout_check import raster
 from controller.effects.region import Region
-from controller.effects.simulated_touch import Position
+from controller.effects.representative import strongest_target
+from controller.effects.simulated_touch import Position, TouchSimulator
+from controller.loop.content import HELD_BACK
 from controller.loop.intent import Target
-from controller.loop.joint_answer import requests_of
+from controller.loop.joint_answer import fingers_of, requests_of
 from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.choice import best_of
+from model.errors import InputError
 from model.table.answer import answer
-from model.table.request import MIN_CONTRAST_DB, Answer
+from model.table.modulation import with_modulation
+from model.table.pattern import IMPERCEPTIBLE_DB_SL
+from model.table.request import MIN_CONTRAST_DB, Answer, verdict_of
 from model.table.table import LocalizationTable
 
 MAX_PAIRS, MAX_TRIPLES = 150, 150
@@ -26,6 +31,8 @@ MAX_PAIRS, MAX_TRIPLES = 150, 150
 
 _POSITIONS = 4  # of a region: the middle, and those farthest from it and from each other
 _NEAREST = 0.02  # m; two fingertips side by side
+
+_Finger: TypeAlias = tuple[Contact, Target]
 
 
 @dataclass(frozen=True)
@@ -59,14 +66,19 @@ def check_together(
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Together]:
-    """Answer fingers in every two and every three regions at their worst places, effects lasting.
+    """Answer fingers in every two and every three regions at their worst places.
 
-    Worst of four places of each of two regions; of three regions where they are worst in pairs.
+    Worst, if all were steady, of four places of each of two regions; of three regions of those of
+    their pairs.
     progress: called with the number of pairs and triples answered, and of all.
     """
-    regions = [each for each in layout.regions if _effect_of(each)]
-    places = {each.name: _some_of(raster(layout, each, table.plate)[0], each) for each in regions}
-    regions = [each for each in regions if places[each.name]]
+    simulator = TouchSimulator(table)
+    targets, places = dict[str, Target](), dict[str, list[Position]]()
+    for region in layout.regions:
+        target, some = _target_in(layout, region), _some_of(layout, region, table)
+        if target is not None and some:
+            targets[region.name], places[region.name] = target, some
+    regions = [each for each in layout.regions if each.name in targets]
     pairs = _nearest(combinations(regions, 2), MAX_PAIRS)
     triples = _nearest(combinations(regions, 3), MAX_TRIPLES)
     total, found = len(pairs) + len(triples), []
@@ -81,7 +93,11 @@ def check_together(
                 or places[name][:1]
                 for name in (each.name for each in group)
             ]
-        together = _worst(layout, table, group, spots)
+        felt = [
+            replace(targets[each.name], key=ContactKey("check", at))
+            for at, each in enumerate(group)
+        ]
+        together = _worst(simulator, group, felt, spots)
         if together is None:
             continue
         found.append(together)
@@ -107,14 +123,17 @@ def matrix_of(together: Sequence[Together]) -> tuple[list[str], FloatArray]:
     return names, found
 
 
-def _effect_of(region: Region) -> str:
-    """Return the name of the effect under a finger in a region, empty for none."""
-    return region.on_press or region.on_move or ""
+def _target_in(layout: SurfaceLayout, region: Region) -> Target | None:
+    """Return what a finger in a region feels: what lasts rather than what is short."""
+    names = [name for name in (region.on_press, region.on_move) if name is not None]
+    found = [strongest_target(layout, name, region, at=region.shape.centre) for name in names]
+    felt = [each for each in found if each is not None]
+    return min(felt, key=lambda each: each.is_short, default=None)
 
 
-def _some_of(places: Sequence[Position], region: Region) -> list[Position]:
+def _some_of(layout: SurfaceLayout, region: Region, table: LocalizationTable) -> list[Position]:
     """Return a few places of a region, the middle first, then each farthest from those before."""
-    left, found = [*places], list[Position]()
+    left, found = raster(layout, region, table.plate)[0], list[Position]()
     while left and len(found) < _POSITIONS:
         if found:
             away = [min(math.dist(at, other) for other in found) for at in left]
@@ -136,58 +155,106 @@ def _nearest(groups: Iterable[tuple[Region, ...]], count: int) -> list[tuple[Reg
 
 
 def _worst(
-    layout: SurfaceLayout,
-    table: LocalizationTable,
+    simulator: TouchSimulator,
     group: Sequence[Region],
+    targets: Sequence[Target],
     spots: Sequence[Sequence[Position]],
 ) -> Together | None:
     """Answer at all combinations of places; None where no fingers fit there at once."""
-    tried: list[tuple[float, tuple[Position, ...], Answer]] = []
+    free = [replace(target, is_own=False) for target in targets]
+    steady = [replace(target, modulation_hz=None) for target in free]
+    tried: list[tuple[float, tuple[Position, ...]]] = []
     for at in product(*spots):
         if all(math.dist(*pair) >= _NEAREST for pair in combinations(at, 2)):
-            found = _answered(layout, table, group, at, is_bounded=False)
-            worst = found.promised_worst_db
-            tried.append((math.inf if worst is None else worst, at, found))
+            worst = _answered(simulator.table, _placed(steady, at), []).promised_worst_db
+            tried.append((math.inf if worst is None else worst, at))
     if not tried:
         return None
-    worst_db, at, found = tried[best_of([-worst for worst, _, _ in tried])]
-    served = _answered(layout, table, group, at, is_bounded=True)
+    _, at = tried[best_of([-worst for worst, _ in tried])]
+    protected = frozenset(
+        target.key for target, each in zip(targets, group, strict=True) if each.is_protected
+    )
+    worst_db, felt = _felt(simulator, _placed(free, at), None)
+    _, served = _felt(simulator, _placed(targets, at), protected)
     return Together(
         tuple(each.name for each in group),
         at,
-        tuple(layer.promised_contrast_db or 0.0 for layer in found.layers),
+        tuple(contrast for contrast, _ in felt),
         worst_db,
-        tuple(layer.verdict for layer in served.layers),
+        tuple(verdict for _, verdict in served),
     )
+
+
+def _placed(targets: Sequence[Target], at: Sequence[Position]) -> list[_Finger]:
+    """Return targets with their contacts."""
+    return [
+        (Contact(target.key, x, y, since=0.0), target)
+        for target, (x, y) in zip(targets, at, strict=True)
+    ]
+
+
+def _felt(
+    simulator: TouchSimulator, fingers: Sequence[_Finger], protected: frozenset[ContactKey] | None
+) -> tuple[float, list[tuple[float, str]]]:
+    """Return the contrast of the worst finger, and of each finger its contrast and verdict.
+
+    What is short plays beside what lasts, one at a time, all other fingers quiet. protected: None
+    to play all contents, whatever they reach.
+    """
+    lasting = [each for each in fingers if not each[1].is_short]
+    short = [each for each in fingers if each[1].is_short]
+    found: dict[ContactKey, tuple[float, str]] = {}
+    worst, leaks = math.inf, [-math.inf for _ in short]
+    if lasting:
+        quiet = [contact for contact, _ in short]
+        together = _answered(simulator.table, lasting, quiet, protected)
+        worst = math.inf if together.promised_worst_db is None else together.promised_worst_db
+        leaks = [each.level_db_sl for each in together.quiet]
+        for (contact, _), layer in zip(lasting, together.layers, strict=True):
+            found[contact.key] = layer.promised_contrast_db or 0.0, layer.verdict
+    for (contact, target), level in zip(short, leaks, strict=True):
+        others = [each for each, _ in fingers if each is not contact]
+        is_bounded = bool(protected and protected - {contact.key})
+        found[contact.key] = _of_short(simulator, contact, target, others, level, is_bounded)
+        worst = min(worst, found[contact.key][0])
+    return worst, [found[contact.key] for contact, _ in fingers]
+
+
+def _of_short(
+    simulator: TouchSimulator,
+    contact: Contact,
+    target: Target,
+    others: Sequence[Contact],
+    foreign_db_sl: float,
+    is_bounded: bool,
+) -> tuple[float, str]:
+    """Return contrast and verdict of a short content, beside a level of what lasts there.
+
+    is_bounded: whether another finger must not notice it.
+    """
+    try:
+        quiet = [(each.x, each.y) for each in others]
+        answered = simulator.answered(target, (contact.x, contact.y), quiet)
+    except InputError:
+        return 0.0, HELD_BACK
+    felt, contrast = answered.felt_db_sl, answered.promised_contrast_db
+    alone = math.inf if contrast is None else contrast
+    is_noticed = is_bounded and felt - alone > IMPERCEPTIBLE_DB_SL
+    together = min(alone, felt - foreign_db_sl)
+    return together, HELD_BACK if is_noticed else verdict_of(together)
 
 
 def _answered(
-    layout: SurfaceLayout,
     table: LocalizationTable,
-    group: Sequence[Region],
-    at: Sequence[Position],
-    *,
-    is_bounded: bool,
+    fingers: Sequence[_Finger],
+    quiet: Sequence[Contact],
+    protected: frozenset[ContactKey] | None = None,
 ) -> Answer:
-    """Answer fingers in regions; unless it is bounded all contents play, whatever they reach."""
-    keys = [ContactKey("check", number) for number in range(len(group))]
-    targets = []
-    for key, region, (x, y) in zip(keys, group, at, strict=True):
-        name = _effect_of(region)
-        own = layout.effects[name].level_db_sl
-        target = Target(
-            key,
-            region.level_db_sl if region.has_level else own,
-            band=layout.band_of(name, region),
-            priority=region.priority,
-            content=name,
-            is_own=region.is_own and is_bounded,
-            may_share=region.may_share,
-        )
-        targets.append((Contact(key, x, y, since=0.0), target))
-    protected = frozenset(
-        key for key, region in zip(keys, group, strict=True) if region.is_protected and is_bounded
-    )
+    """Answer fingers that feel what lasts, with its modulation; protected: as of `_felt`."""
     playable = float(table.frequencies[0]), float(table.frequencies[-1])
-    requests = requests_of(table, targets, playable, protected)
-    return answer(table, requests, min_contrast_db=MIN_CONTRAST_DB if is_bounded else -math.inf)
+    requests = requests_of(table, fingers, playable, protected or frozenset())
+    others = fingers_of(quiet, protected or frozenset())
+    least = -math.inf if protected is None else MIN_CONTRAST_DB
+    found = answer(table, requests, others, min_contrast_db=least)
+    modulations = [target.modulation_hz for _, target in fingers]
+    return with_modulation(table, requests, others, found, modulations, playable=playable)

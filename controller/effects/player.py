@@ -82,17 +82,8 @@ class EffectPlayer:
         felt.sort(key=lambda one: one[0].number)
         newest = max((play.number for play, _, _ in felt if play.is_elsewhere), default=0)
         targets = [
-            Target(
-                contact.key,
-                sensation.level_db_sl,
-                allow_weaker=sensation.allow_weaker,
-                pulse=sensation.pulse,
-                band=play.band,
-                priority=play.priority,
-                content=play.name,
-                is_own=play.region is not None and play.region.is_own,
-                may_share=play.region is not None and play.region.may_share,
-                modulation_hz=sensation.modulation_hz,
+            sensation.target(
+                contact.key, play.name, play.region, band=play.band, priority=play.priority
             )
             for play, contact, sensation in felt
             if not play.is_elsewhere or play.number == newest
@@ -220,7 +211,7 @@ class EffectPlayer:
         if region is None:
             name = self.layout.elsewhere
             if name is not None:
-                level = self.layout.effects[name].level_db_sl
+                level = self.layout.level_of(name, None)
                 self._start(finger, name, contact, now, level=level, priority=0, is_elsewhere=True)
             return
         # The effect for motion starts first: the press is felt, then the movement after it.
@@ -232,8 +223,7 @@ class EffectPlayer:
         self, finger: _Finger, region: Region, name: str, contact: Contact, now: float
     ) -> None:
         """Start an effect with the level and priority of a region."""
-        effect = self.layout.effects[name]
-        level = region.level_db_sl if region.has_level else effect.level_db_sl
+        level = self.layout.level_of(name, region)
         self._start(
             finger, name, contact, now, level=level, priority=region.priority, region=region
         )

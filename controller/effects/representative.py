@@ -4,7 +4,9 @@ import math
 from collections.abc import Iterator
 
 from controller.effects.effect import Effect, Sensation
+from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
+from controller.loop.intent import Target
 from controller.sources.contacts import Contact, ContactKey
 
 _REPORT = 0.01  # s; between two reports of the panel
@@ -15,15 +17,24 @@ _SPEEDS = (0.05, 0.2, 1.0, 5.0)  # m/s
 _TURNING_RADIUS = 0.02  # m
 
 
-def strongest_sensation(
-    effect: Effect, region: Region | None, *, level_db_sl: float | None, at: tuple[float, float]
-) -> Sensation | None:
-    """Return the strongest sensation of an effect in a region, or outside of all; None for none.
+_KEY = ContactKey("check", 1)
+
+
+def strongest_target(
+    layout: SurfaceLayout, name: str, region: Region | None, *, at: tuple[float, float]
+) -> Target | None:
+    """Return what an effect, by name, makes felt most in a region, or outside of all; or None.
 
     at [m]: where a finger comes down. An effect for motion is moved along x, y and around `at`.
     """
+    effect, level = layout.effects[name], layout.level_of(name, region)
     watch = _while_moving if effect.is_for_motion else _while_resting
-    return max(watch(effect, region, level_db_sl, at), key=_strength, default=None)
+    strongest = max(watch(effect, region, level, at), key=_strength, default=None)
+    if strongest is None:
+        return None
+    priority = 0 if region is None else region.priority
+    band = layout.band_of(name, region)
+    return strongest.target(_KEY, name, region, band=band, priority=priority)
 
 
 def _strength(sensation: Sensation) -> float:
@@ -75,4 +86,4 @@ def _along(
 
 
 def _finger(at: tuple[float, float]) -> Contact:
-    return Contact(ContactKey("check", 1), *at, since=0.0)
+    return Contact(_KEY, *at, since=0.0)

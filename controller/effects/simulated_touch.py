@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.effects.effect import Sensation
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.envelopes import RAMPS_ONLY
 from controller.loop.intent import Target
-from controller.loop.table_query import query_table
+from controller.loop.table_query import TableAnswer, query_table
 from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.drive_modes import DRIVE_MODES
@@ -61,7 +60,7 @@ class TouchSimulator:
     """
 
     def __init__(self, table: LocalizationTable) -> None:
-        self._table = table
+        self.table = table
         self._levels = EffectLevels(table)
         self._capabilities = PlaybackCapabilities(
             drive_mode=DRIVE_MODES[-1],
@@ -71,40 +70,30 @@ class TouchSimulator:
             envelope_support=RAMPS_ONLY,
         )
 
-    def touch(
-        self,
-        sensation: Sensation,
-        band: tuple[float, float] | None,
-        at: Position,
-        resting: Position | None,
-    ) -> SimulatedTouch:
-        """Play a sensation at a finger."""
-        finger, other = (ContactKey("check", number) for number in (1, 2))
-        target = Target(
-            finger,
-            sensation.level_db_sl,
-            allow_weaker=sensation.allow_weaker,
-            pulse=sensation.pulse,
-            band=band,
-        )
-        quiet = [] if resting is None else [Contact(other, *resting, since=0.0)]
+    def answered(self, target: Target, at: Position, quiet: Sequence[Position]) -> TableAnswer:
+        """Answer a target at a position [m] among quiet fingers, along plain ramps.
+
+        Raises InputError where nothing can be played.
+        """
+        finger = Contact(target.key, *at, since=0.0)
+        others = [
+            Contact(ContactKey("quiet", number), *place, since=0.0)
+            for number, place in enumerate(quiet)
+        ]
+        return query_table(self.table, finger, target, others, self._capabilities, self._levels)
+
+    def touch(self, target: Target, at: Position, resting: Position | None) -> SimulatedTouch:
+        """Play a target's content at a finger."""
         try:
-            answer = query_table(
-                self._table,
-                Contact(finger, *at, since=0.0),
-                target,
-                quiet,
-                self._capabilities,
-                self._levels,
-            )
+            answer = self.answered(target, at, [] if resting is None else [resting])
         except InputError as error:
             return SimulatedTouch(at, resting, reason=str(error))
-        pattern, pulse = answer.pattern, sensation.pulse
+        pattern, pulse = answer.pattern, target.pulse
         is_whole = pulse is not None and pulse.is_raised
         since = 0.0 if is_whole else STEADY_AFTER
         duration = pulse.duration if pulse is not None and is_whole else STEADY_FOR
         bases = [
-            (frequency, ramped_pulse(part, self._table.eras, ramp=pattern.ramp, duration=end))
+            (frequency, ramped_pulse(part, self.table.eras, ramp=pattern.ramp, duration=end))
             for end in (since + duration,)
             for frequency, part in _by_frequency(pattern.excitation)
         ]
@@ -129,7 +118,7 @@ class TouchSimulator:
 
     def _loaded_plate(self, contacts: Sequence[Position]) -> PlateInTime:
         """The table's plate in time with fingers on it, if they weigh anything."""
-        table = self._table
+        table = self.table
         if table.fingertip is None:
             return table.in_time
         loads = fingertip_loads(table.fingertip, contacts)
@@ -148,14 +137,14 @@ class TouchSimulator:
 
         Mean over a fingertip; one value for each sample at which a stretch starts.
         """
-        plate = self._table.plate
+        plate = self.table.plate
         points, weights = fingertip_points(*at, plate), fingertip_weights(*at, plate)
         power = np.zeros((round(until * SAMPLE_RATE), len(points)))
         for frequency, motion in bases:
             acceleration = transients.acceleration(motion, points, duration=until)
             power = (
                 power
-                + (acceleration / detection_threshold(np.array(frequency), self._table.threshold))
+                + (acceleration / detection_threshold(np.array(frequency), self.table.threshold))
                 ** 2
             )
         total = np.vstack([np.zeros(len(points)), np.cumsum(power, axis=0)])

@@ -53,7 +53,7 @@ def query_jointly(
     InputError for fingers that are too close.
     """
     requests = requests_of(table, targets, capabilities.frequencies, protected)
-    fingers = [Finger((each.x, each.y), each.load, _bound(each, protected)) for each in quiet]
+    fingers = fingers_of(quiet, protected)
     found = _answer(table, requests, fingers, _kept(requests, targets, before))
     modulations = _modulations(targets, capabilities.layers)
     found = with_modulation(
@@ -139,6 +139,11 @@ def requests_of(
         )
         for contact, target in targets
     ]
+
+
+def fingers_of(quiet: Sequence[Contact], protected: frozenset[ContactKey]) -> list[Finger]:
+    """Return the fingers that are to feel nothing, with what they may feel of others' contents."""
+    return [Finger((each.x, each.y), each.load, _bound(each, protected)) for each in quiet]
 
 
 def _bound(contact: Contact, protected: frozenset[ContactKey]) -> float:

@@ -23,7 +23,7 @@ from controller.effects.layout_check import CheckedEffect, check_layout
 from controller.effects.layout_file import load_layout
 from controller.effects.ramp import Ramp
 from controller.effects.region import Region
-from controller.effects.representative import strongest_sensation
+from controller.effects.representative import strongest_target
 from controller.effects.shapes import Circle, Rectangle
 from controller.effects.texture import Texture
 from model.rig.uncertainty import Uncertainty
@@ -135,12 +135,13 @@ def test_check_names_a_frequency_that_the_table_does_not_have() -> None:
         (Dial(), 20.0, 0.030),
     ],
 )
-def test_strongest_sensation_of_every_kind(
+def test_strongest_target_of_every_kind(
     effect: Effect, level: float, duration: float | None
 ) -> None:
     """What its level is reached with, at rest or along some way."""
     region = Region("knob", Circle(0.15, 0.1, 0.05))
-    felt = strongest_sensation(effect, region, level_db_sl=level, at=(0.15, 0.1))
+    layout = SurfaceLayout((region,), {"it": effect})
+    felt = strongest_target(layout, "it", region, at=(0.15, 0.1))
     assert felt is not None
     assert felt.level_db_sl == level
     assert (felt.pulse and felt.pulse.duration) == duration

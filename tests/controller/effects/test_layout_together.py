@@ -1,6 +1,8 @@
 """Regions of a layout at the same time: what fingers in two and three of them are promised."""
 
+import asyncio
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -9,11 +11,22 @@ import pytest
 
 from controller.effects import layout_together
 from controller.effects.buzz import Buzz
+from controller.effects.click import Click
+from controller.effects.effect import Effect
 from controller.effects.layout import SurfaceLayout
 from controller.effects.layout_together import check_together, matrix_of
+from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.effects.shapes import Rectangle
+from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.content import Prediction
+from controller.loop.envelopes import RAMPS_ONLY
+from controller.loop.intent import HapticIntent
+from controller.loop.selection import Selector
+from controller.sources.contacts import Contact, ContactKey
+from model.drive_modes import DRIVE_MODES
 from model.table.answer import answer
+from model.table.effect_level import EffectLevels
 from model.table.request import Request
 from several_fingers import table
 
@@ -31,6 +44,35 @@ def layout(*regions: Region) -> SurfaceLayout:
     """A layout of regions."""
     effects = {each.name: Buzz(level=14.0) for each in regions}
     return SurfaceLayout(regions, effects, elsewhere=None)
+
+
+def fingers_at(places: Sequence[tuple[float, float]]) -> list[Contact]:
+    """Fingers down at once."""
+    return [Contact(ContactKey("test", n), *at, since=0.0) for n, at in enumerate(places)]
+
+
+def promised_by_the_loop(contacts: Sequence[Contact], intent: HapticIntent) -> list[float]:
+    """Contrast that the control loop promises each finger, of amplifiers with eight layers."""
+    capabilities = PlaybackCapabilities(
+        DRIVE_MODES[-1],
+        DRIVE_MODES,
+        (40.0, 320.0),
+        {era.name: era.stroke for era in table().eras},
+        RAMPS_ONLY,
+        layers=8,
+    )
+
+    async def predicted() -> tuple[Prediction, ...]:
+        arrived = asyncio.Event()
+        selector = Selector(table(), EffectLevels(table()), arrived=arrived.set)
+        selector.select(contacts, intent, capabilities)
+        if selector.is_choosing:
+            await arrived.wait()
+        return selector.select(contacts, intent, capabilities).predictions
+
+    found = asyncio.run(predicted())
+    by_key = {each.contact.key: each.promised_contrast_db or math.nan for each in found}
+    return [by_key[each.key] for each in contacts]
 
 
 def test_mirrored_regions_are_promised_the_same() -> None:
@@ -72,6 +114,22 @@ def test_verdicts_follow_the_rule_and_what_regions_say() -> None:
         (found,) = check_together(layout(region("west", WEST), replace(said, priority=1)), table())
         assert found.verdicts[0] == "held back"
         assert (found.at, found.worst_db) == (mixed.at, mixed.worst_db)
+
+
+@pytest.mark.parametrize(
+    "effect", [Buzz(level=14.0, modulation=20.0), Click(level=14.0)], ids=["rough", "click"]
+)
+def test_what_comes_and_goes_is_promised_as_the_daemon_promises_it(effect: Effect) -> None:
+    """Side bands and short effects leak more than a steady tone, by what a selection says."""
+    steady = layout(region("west", WEST), region("north", NORTH))
+    changed = replace(steady, effects={**steady.effects, "west": effect})
+    (before,), (found,) = (check_together(each, table()) for each in (steady, changed))
+    assert found.at == before.at
+    assert found.worst_db < before.worst_db - 0.2
+    contacts, player = fingers_at(found.at), EffectPlayer(changed)
+    promised = promised_by_the_loop(contacts, player.intent(contacts, 0.0))
+    assert found.contrasts[0] == pytest.approx(promised[0], abs=0.3)
+    assert found.worst_db <= min(promised) + 0.3
 
 
 def test_matrix_has_two_below_and_three_above_the_diagonal() -> None:

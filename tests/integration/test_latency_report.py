@@ -1,21 +1,16 @@
 """Repeated attempts and the reports of benchmarks on a disturbed machine."""
 
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from benchmarks.latency.machine import busy_ticks
 from benchmarks.latency.match import Command, Matched, match, read_commands
 from benchmarks.latency.programs import Ended
 from benchmarks.latency.report import cases, flooded_lines, report
 from benchmarks.latency.run import Case, Disturbed, Failed, Found, attempt
-from benchmarks.plate.measure import Measured
 from benchmarks.plate.problem import DAMPING, PAPER, STIFFNESS, STROKE, accelerations
-from benchmarks.plate.programs import Setting, installed_peers, settings
-from benchmarks.plate.report import best
 from controller.api.schema import LatencySummary
 from drivers.codec.serial_line.frame import pack_words
 from drivers.protocol.sets import Command as ToneOnWire
@@ -88,11 +83,6 @@ def test_report_compares_growth_under_flooders_with_plain_asyncio(
     assert row.split("|")[5:7] == [f" {flooded - 3:.2f} ", " 2.00 "]
 
 
-def test_busy_ticks_excludes_idle_and_iowait() -> None:
-    """The fields of proc(5) are user nice system idle iowait irq softirq steal guest guest_nice."""
-    assert busy_ticks("cpu  100 20 30 4000 500 6 7 8 90 9") == 100 + 20 + 30 + 6 + 7 + 8
-
-
 def test_match_falls_back_to_the_touch_without_the_flood() -> None:
     """A set that matches no touch beside the flood's finger may match one without it."""
     sent = np.array([0.0, 0.001, 0.002])
@@ -158,16 +148,6 @@ def test_set_in_parts_plays_once_it_is_whole() -> None:
     assert (read.time, read.sequence, len(read.commands)) == (pytest.approx(0.002), 2, 32)
 
 
-def test_a_peer_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing fails; a sentence on each names the package."""
-    for package, module in (("ngsolve", "ngsolve_plate"), ("skfem", "scikit_fem_plate")):
-        monkeypatch.setitem(sys.modules, package, None)
-        monkeypatch.delitem(sys.modules, f"benchmarks.plate.peers.{module}", raising=False)
-    found, missing = installed_peers()
-    assert found == []
-    assert [sentence.split()[0] for sentence in missing] == ["ngsolve", "skfem"]
-
-
 def test_a_rigid_mass_on_one_era_is_an_oscillator() -> None:
     """x = (k + i omega c) s / (k + i omega c - m omega²), by hand."""
     omega, mass = PAPER.omega, 0.28
@@ -176,15 +156,3 @@ def test_a_rigid_mass_on_one_era_is_an_oscillator() -> None:
     expected = -(omega**2) * spring * STROKE / (spring - mass * omega**2)
     found = accelerations(PAPER, receptance, receptance)
     np.testing.assert_allclose(found[:, 0, 0], expected, rtol=1e-12)
-
-
-def test_the_quickest_setting_that_reaches_an_error_is_shown() -> None:
-    """A quicker one that is less accurate, and an accurate one that is slower, are not."""
-    setting: Setting = settings(PAPER, [])[0]
-    found = [
-        Measured(setting, error, error, [seconds], [seconds])
-        for error, seconds in ((0.02, 1.0), (0.009, 2.0), (0.004, 3.0))
-    ]
-    chosen = best(found, 1.0, lambda m: m.corners, lambda m: m.nothing)
-    assert chosen is found[1]
-    assert best(found, 0.1, lambda m: m.corners, lambda m: m.nothing) is None

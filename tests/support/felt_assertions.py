@@ -293,19 +293,6 @@ def response_differences(one: Played, other: Played) -> list[float]:
     ]
 
 
-def contrasts(played: Played) -> list[float]:
-    """Measured contrast [dB] of each situation with quiet fingers."""
-    return [
-        _contrast(
-            {place: felt.amplitude.sum(axis=0) for place, felt in heard.steady.items()},
-            heard.situation,
-            heard.steady[heard.situation.felt_at].weights,
-        )
-        for heard in _touched(played)
-        if heard.situation.quiet
-    ]
-
-
 def rounding(played: Played, truth: Truth) -> list[float]:
     """Bounds of the relative change by rounding every level and phase to the amplifier's steps."""
     points = np.array(list(SENSORS.values()))

@@ -350,13 +350,6 @@ def test_lease_is_renewed_by_its_token_only(token: str) -> None:
     assert caught.value.code is ErrorCode.LEASE
 
 
-def test_lease_tokens_are_random() -> None:
-    """128 bits each, no two alike."""
-    tokens = {Lease("me", 1).token for _ in range(100)}
-    assert len(tokens) == 100
-    assert all(len(bytes.fromhex(token)) == 16 for token in tokens)
-
-
 @pytest.mark.parametrize("state", DaemonState)
 @pytest.mark.parametrize("trigger", Trigger)
 def test_lease_exists_while_energised_alone(state: DaemonState, trigger: Trigger) -> None:

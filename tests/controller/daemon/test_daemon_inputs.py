@@ -31,17 +31,6 @@ def params(source: str, *places: tuple[float, float]) -> TouchParams:
     return TouchParams(source=source, touches=touches)
 
 
-async def test_touches_of_clients_become_frames_of_sources() -> None:
-    """Metres become shares of the plate, y downwards; the time is that of the arrival."""
-    frames: list[TouchFrame] = []
-    touches = ApiTouches(PLATE, frames.append)
-    touches.add("client", params("me", (0.1, 0.05), (9.0, 0.0)), client_name="7", now=12.5)
-    assert frames == []
-    await asyncio.sleep(0)
-    placed = (Touch(0, 0.25, 0.75), Touch(1, 22.5, 1.0))
-    assert frames == [TouchFrame("api:7:me", 12.5, placed, origin="api:7")]
-
-
 async def test_touches_before_a_lift_are_delivered() -> None:
     """Frames with a finger that the next one does not have come before it, in their order."""
     frames: list[TouchFrame] = []

@@ -282,15 +282,6 @@ def wait_for_writers() -> None:
         thread.join(20)
 
 
-def test_dump_is_written_once_per_second(tmp_path: Path, now: list[float]) -> None:
-    """Faults within a second of a dump are part of it."""
-    dumps = FaultDumps(MessageRecorder())
-    for now[0], files in ((0.0, 1), (0.5, 1), (1.0, 2)):
-        dumps.write(tmp_path, cause="arc", keep=5)
-        wait_for_writers()
-        assert len(list(tmp_path.glob(DUMP_PATTERN))) == files
-
-
 def test_dump_that_fails_is_only_logged(
     tmp_path: Path, now: list[float], caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -9,11 +9,10 @@ from collections.abc import Awaitable, Callable, Sequence
 import pytest
 
 from armed_group import grouped, layer, losing, tone, with_group
-from drivers.contents import Shape, Tone
+from drivers.contents import Tone
 from drivers.errors import CommandRefused, LinkDegraded, LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
-from drivers.host.members import GroupState
 from drivers.host.wire import Broken
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
@@ -71,50 +70,6 @@ async def test_refused_on_one_means_committed_on_none(group: Group, ends: list[M
 
 
 @grouped(("a",))
-async def test_set_of_many_parts_arrives_whole(group: Group, ends: list[MemoryLine]) -> None:
-    """Two channels with onsets and endings of 32 knots are four frames."""
-    shape = Shape(0.001, tuple(0.01 * n + 0j for n in range(32)))
-    tones = [tone(channel, 0.4, onset=shape, ending=shape) for channel in (0, 1)]
-    ends[0].sent.clear()
-    await group.apply({"a": [layer(0, *tones)]})
-    assert [each for _, each in ends[0].sent] == ["1:5"] * 3 + ["1:6"]
-    await asyncio.sleep(0.04)
-    assert ends[0].levels("a") == [0.4, 0.4]
-
-
-@pytest.mark.parametrize("name", ["Set", "Commit"])
-@pytest.mark.parametrize("way", ["inward", "outward"])
-@grouped(("a",))
-async def test_lost_frame_is_repeated_and_played_once(
-    group: Group, ends: list[MemoryLine], name: str, way: str
-) -> None:
-    """The request or its reply; the tone counts from the one commit."""
-    setattr(ends[0], way, losing(name))
-    await group.apply({"a": [layer(0, tone())]})
-    await asyncio.sleep(0.002)
-    assert ends[0].levels("a") == [0.5, 0.0]
-    assert ends[0].retries == 1
-    assert len(ends[0].far["a"].playback.voices_of(0)) == 1
-
-
-@pytest.mark.parametrize("way", ["inward", "outward"])
-@grouped(("a",))
-async def test_doubled_frames_are_carried_out_once(
-    group: Group, ends: list[MemoryLine], way: str
-) -> None:
-    """Of a set, a stop and all between them."""
-    setattr(ends[0], way, lambda name, data: [(0.0002, data), (0.0003, data)])
-    await group.apply({"a": [layer(0, tone())]})
-    await group.apply({"a": [layer(0, tone(level=0.4))]})
-    await group.beat()
-    await asyncio.sleep(0.01)
-    assert ends[0].levels("a") == [0.4, 0.0]
-    assert len(ends[0].far["a"].playback.voices_of(0)) == 1
-    assert (await group.stop())["a"].is_confirmed
-    assert ends[0].retries == 0
-
-
-@grouped(("a",))
 async def test_degraded_amplifier_gets_nothing_that_plays_or_feeds(
     group: Group, ends: list[MemoryLine]
 ) -> None:
@@ -129,40 +84,6 @@ async def test_degraded_amplifier_gets_nothing_that_plays_or_feeds(
     ends[0].outward = unaltered
     await host.read_status()
     await host.ping()
-
-
-@grouped(("a",), ("b",))
-async def test_amplifier_without_reply_stops_the_others(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """Once its watchdog must have silenced it; until then nothing new plays, and the others go on.
-
-    Until when it may play is told.
-    """
-    await group.apply({name: [layer(0, tone())] for name in "ab"})
-    began = ends[0].loop.time()
-    ends[1].inward = lambda name, data: []
-    with pytest.raises(LinkDegraded):
-        await group.beat()
-    assert (group.degraded, group.state) == (("b",), GroupState.ARMED)
-    with pytest.raises(LinkDegraded):
-        await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
-
-    async def go_on() -> None:
-        for _ in range(20):
-            await group.beat()
-            assert ends[0].levels("a") == [0.5, 0.0]
-            await asyncio.sleep(0.05)
-
-    with pytest.raises(LinkError):
-        await go_on()
-    assert 0.25 <= ends[0].loop.time() - began <= 0.6
-    assert ([*group.lost_by], group.state) == (["b"], GroupState.LOST)
-    stopped = await group.stop()
-    assert (stopped["a"].is_confirmed, stopped["b"].is_confirmed) == (True, False)
-    assert began + 0.25 <= stopped["b"].may_play_until <= began + 0.4
-    assert ends[0].levels("a") == [0.0, 0.0]
-    assert ends[1].levels("b") == [0.0, 0.0]
 
 
 @grouped(("a",))
@@ -223,19 +144,6 @@ async def test_mute_amplifier_is_stopped_over_its_open_line(
     await asyncio.sleep(0.01)
     assert ends[0].levels("a") == [0.0, 0.0]
     assert not (await stopping)["a"].is_confirmed
-
-
-@grouped(("a",))
-async def test_stop_between_stage_and_commit_commits_nothing(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """The staged set is dropped by the amplifier, too."""
-    (host,) = group.amplifiers.values()
-    await host.stage(9, [layer(0, tone())])
-    assert (await group.stop())["a"].is_confirmed
-    with pytest.raises(CommandRefused):
-        await host.commit(9)
-    assert ends[0].levels("a") == [0.0, 0.0]
 
 
 LIES: dict[str, Callable[[Values], Values]] = {
@@ -355,19 +263,6 @@ async def test_opening_disarms_what_an_earlier_host_left_armed(wire: str) -> Non
     await host.open()
     assert end.levels("a") == [0.0, 0.0]
     assert end.far["a"].state == "SWITCH_ON_DISABLED"
-
-
-@grouped(("a",))
-async def test_late_replies_are_credited_to_nothing(
-    group: Group, ends: list[MemoryLine], wire: str
-) -> None:
-    """A reply after 70 ms: its request was repeated, and it is counted as unexpected."""
-    (host,) = group.amplifiers.values()
-    delays = iter([0.07])
-    ends[0].outward = lambda name, data: [(next(delays, 0.0002), data)]
-    await host.ping()
-    await asyncio.sleep(0.1)
-    assert ends[0].line.wire.counters.unexpected_frames == 1
 
 
 @grouped(("a",), wire="serial")

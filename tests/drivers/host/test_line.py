@@ -7,7 +7,6 @@ import pytest
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, LinkTimeout
 from drivers.host.jobs import Job, JobQueue, Priority
-from drivers.host.sensors import read_measured
 from drivers.host.serial_wire import SerialWire
 from drivers.protocol.records import Refusal, Values
 from virtual_loop import in_virtual_time
@@ -135,23 +134,6 @@ async def test_statistics_are_those_of_the_amplifier_and_of_its_line() -> None:
     assert one.frames_out == other.frames_out == 8
     assert one.frames_in == 7
     assert one.last_round_trip == pytest.approx(0.0004)
-
-
-@in_virtual_time
-async def test_reading_gives_way_to_a_set_at_once() -> None:
-    """A reading whose reply does not come is abandoned when a set is queued, and comes again."""
-    end = MemoryLine("serial", "a")
-    (host,) = end.hosts.values()
-    await host.open()
-    await host.arm(77)
-    end.outward = lambda name, data: [(0.025 if name == "GetMeasured" else 0.0002, data)]
-    reading = asyncio.ensure_future(read_measured(host))
-    await asyncio.sleep(0.001)
-    began = end.loop.time()
-    await host.stage(5, [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)])
-    assert end.loop.time() - began < 0.001
-    assert len(await reading) == 2
-    assert Priority.READING > Priority.OTHER
 
 
 async def test_stop_supersedes_what_feeds_plays_arms_or_acknowledges() -> None:

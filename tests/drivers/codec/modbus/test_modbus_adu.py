@@ -54,33 +54,6 @@ def test_response_is_found_in_any_pieces(is_rtu: bool, cuts: list[int], garbage:
     assert accepted(answers) == [WORDS]
 
 
-@given(data=st.data())
-def test_rtu_response_with_flipped_bits_is_discarded(data: st.DataObject) -> None:
-    """One to three flipped bits anywhere, and nothing is accepted.
-
-    CRC-16 finds any three in a frame as short as this; over TCP that is TCP's task.
-    """
-    frame = bytearray(EXAMPLES[True][1])
-    bits = data.draw(st.sets(st.integers(0, 8 * len(frame) - 1), min_size=1, max_size=3))
-    for bit in bits:
-        frame[bit // 8] ^= 1 << bit % 8
-    answers, counters = read(True, bytes(frame))
-    assert accepted(answers) == []
-    assert counters.frames_in in (0, counters.unexpected_frames)
-
-
-@given(is_rtu=st.booleans(), stream=st.lists(st.binary(max_size=300), max_size=6))
-def test_any_bytes_leave_the_reader_usable(is_rtu: bool, stream: list[bytes]) -> None:
-    """No exception, and a bounded buffer."""
-    reader = ResponseReader(is_rtu=is_rtu, counters=WireCounters())
-    for piece in stream:
-        reader.feed(piece, EXAMPLES[is_rtu][0])
-    assert len(reader._buffer) <= 1024
-    reader.clear()
-    good = EXAMPLES[is_rtu][1]
-    assert accepted(reader.feed(good, EXAMPLES[is_rtu][0])) == [WORDS]
-
-
 @pytest.mark.parametrize("is_rtu", [True, False])
 def test_truncated_request_does_not_merge_with_the_next(is_rtu: bool) -> None:
     """A set that ends early, and a complete one after the longest pause within a frame."""

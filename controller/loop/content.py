@@ -100,6 +100,11 @@ class Selection:
         return self.contents[-1].question if self.contents else None
 
 
+def no_layer_free(count: int) -> str:
+    """Return why a content is held back where the layers of the amplifiers are all taken."""
+    return f"no layer is free: the amplifiers play {count} contents at once; lift a finger"
+
+
 def not_served(contact: Contact, reason: str) -> Prediction:
     """Return the prediction for a target that feels nothing of its own."""
     return Prediction(contact, None, verdict=HELD_BACK, held_back=reason)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.content import Content, Selection, not_served
+from controller.loop.content import Content, Selection, no_layer_free, not_served
 from controller.loop.intent import IntentSource
 from controller.loop.plate_set import FADE_RAMP, PlateSet, SetBuilder
 from controller.loop.routing import Drive, continues_all_tones, tones_by_era
@@ -396,7 +396,18 @@ class Decider:
             contacts, intent, self._capabilities, triggered_at=triggered_at
         )
         self._over = tuple(each for each in self._over if each in selection.contents)
-        return _held_back(selection, self._over, ENDED) if self._over else selection
+        if self._over:
+            selection = _held_back(selection, self._over, ENDED)
+        if len(selection.contents) > self._capabilities.layers:
+            selection = self._within_layers(selection)
+        return selection
+
+    def _within_layers(self, selection: Selection) -> Selection:
+        """Return a selection without the fingers of which a voice has no layer, which says so."""
+        served = [*self._numbered(selection.contents).values()]
+        keys = {each.key[0] for each in selection.contents if each not in served}
+        left = [each for each in selection.contents if each.key[0] in keys]
+        return _held_back(selection, left, no_layer_free(self._capabilities.layers))
 
     def _with_sets(self, draft: Decision, now: float) -> Decision | None:
         """Return a draft with the sets of all layers that change; None if none does."""

@@ -8,7 +8,13 @@ from dataclasses import dataclass, replace
 
 from controller.loop.answer_thread import AnswerThread
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.content import Content, Prediction, Selection, not_served
+from controller.loop.content import (
+    Content,
+    Prediction,
+    Selection,
+    no_layer_free,
+    not_served,
+)
 from controller.loop.intent import HapticIntent, Target
 from controller.loop.joint_answer import Shape, query_jointly
 from controller.loop.table_query import TableAnswer, query_table
@@ -344,14 +350,14 @@ def _within_layers(
     targets: Targets, capabilities: PlaybackCapabilities
 ) -> tuple[Targets, tuple[Prediction, ...]]:
     """Leave out targets for which there is no layer: of the lowest priority, then the earliest."""
-    count, cause = capabilities.layers, "no layer is free: the amplifiers play"
+    count, reason = capabilities.layers, no_layer_free(capabilities.layers)
     if capabilities.drive_mode != UNRESTRICTED:
-        count, cause = 1, f"the drive mode {capabilities.drive_mode} plays"
+        count = 1
+        reason = f"the drive mode {capabilities.drive_mode} plays 1 content at once; lift a finger"
     if len(targets) <= count:
         return targets, ()
     order = sorted(range(len(targets)), key=lambda at: (targets[at][1].priority, at), reverse=True)
     served = {*order[:count]}
-    reason = f"{cause} {count} contents at once; lift a finger"
     return (
         tuple(each for at, each in enumerate(targets) if at in served),
         tuple(

@@ -7,11 +7,12 @@ import numpy as np
 from scipy.signal import hilbert
 
 from controller.effects.buzz import Buzz
+from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.effects.shapes import Rectangle
 from drivers.errors import CommandRefused
-from several_fingers import LEFT, RIGHT, Fingers, fingers_on, table
+from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table
 from virtual_loop import in_virtual_time
 
 LAYOUT = SurfaceLayout(
@@ -67,6 +68,30 @@ async def test_a_modulated_content_is_steady_where_layers_are_few() -> None:
         assert len(fingers.applied[-1].contents) == 3
         # Its carrier has played before: all three start anew, or they would beat in frequency.
         assert 0.8 < depth_of(fingers, "1") < 1.3
+
+
+@in_virtual_time
+async def test_a_click_without_a_layer_is_said_until_one_is_free() -> None:
+    """Side bands and a click of 0.15 s take all four: the next click, 60 ms later, waits."""
+    regions = (
+        LAYOUT.regions[0],
+        replace(LAYOUT.regions[1], on_press="click"),
+        Region("above", Rectangle(0.0, 0.13, 0.3, 0.09), on_press="click"),
+    )
+    effects = {**LAYOUT.effects, "click": Click(level=14.0, duration=0.15)}
+    layout = replace(LAYOUT, regions=regions, effects=effects)
+    async with fingers_on(table(), layout, layers=4) as fingers:
+        fingers.at = {1: LEFT}
+        await fingers.hold(0.5)
+        fingers.at |= {2: RIGHT, 3: ABOVE}
+        await fingers.hold(0.12)
+        felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
+        assert (felt[1], felt[2]) == (None, None)
+        assert felt[3] is not None
+        assert "4 contents" in felt[3]
+        await fingers.hold(0.06)
+        felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
+        assert felt == {1: None, 3: None}
 
 
 @in_virtual_time

@@ -12,7 +12,10 @@ from model.identification.posterior import Posterior, relevant
 from model.identification.stages import Fitted, Setting
 
 UNKNOWN = 0.5
-"""Share of its standard deviation before, beyond which a measurement has not shown something."""
+"""Share of its standard deviation before, beyond which a measurement has not shown something.
+
+Of that of a plate that was not measured, where the rig states less: answers need no more.
+"""
 
 _STEP = 20.0  # Hz between the tones that are considered
 _NOISE = 0.01
@@ -46,9 +49,10 @@ def unknowns(setting: Setting, fitted: Fitted, posterior: Posterior) -> list[Unk
     """All that answers depend on and the measurement has not shown, with what would show it."""
     space, found = posterior.space, []
     prior = replace(posterior, covariance=np.diag(space.uncertain.astype(float)))
+    built = replace(prior, space=space.as_built)
     for kind, rows in relevant(space).items():
         before, after = prior.std_of(rows), posterior.std_of(rows)
-        unknown = np.flatnonzero((before > 0) & (after > UNKNOWN * before))
+        unknown = np.flatnonzero((before > 0) & (after > UNKNOWN * built.std_of(rows)))
         # Of losses and frequencies of single modes only those count that no tone has shown.
         if not len(unknown) or (kind in ("frequency", "loss") and len(unknown) < len(rows)):
             continue

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from model.identification.identify import MAX_CHI2, Identification
@@ -118,6 +118,7 @@ def as_json(found: Identification, expected: Sequence[ExpectedContrast]) -> dict
             }
             for each in estimates(found)
         ],
+        "uncertainty": asdict(found.rig.uncertainty),
         "expected_contrast": [
             {
                 "quiet": each.quiet,

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -108,6 +108,14 @@ class Space:
         for kind in kinds:
             chosen[self.groups[kind]] = True
         return chosen & self.uncertain
+
+    @cached_property
+    def as_built(self) -> "Space":
+        """The same of a plate that was not measured, where the rig states less."""
+        std = self.std.copy()
+        for kind, part in self.groups.items():
+            std[part] = np.maximum(std[part], KINDS[kind].std * self.uncertain[part])
+        return replace(self, std=std)
 
     def indices(self, kind: str) -> range:
         """Numbers of the parameters of a kind."""

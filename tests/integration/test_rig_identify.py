@@ -80,6 +80,10 @@ def test_rig_is_written_with_the_plate_that_is_there(
     found = load_rig(new)
     assert found.eras[0].stiffness == pytest.approx(truth.eras[0].stiffness, rel=0.03)
     assert found.uncertainty.stiffness < load_rig(rig).uncertainty.stiffness / 3
+    written = {key: told["uncertainty"][key] for key in ("stiffness", "field", "common_gain")}
+    assert written == pytest.approx(
+        {key: getattr(found.uncertainty, key) for key in written}, rel=1e-4
+    )
     assert "identified in place" in new.read_text("utf-8")
 
 

@@ -99,6 +99,16 @@ def test_the_same_data_again_tell_no_more_of_the_level(rig: Rig) -> None:
     assert abs(moved) < 0.1 * level
 
 
+def test_identified_rig_is_identified_again_by_few_tones(
+    found: Identification, measurement: Measurement
+) -> None:
+    """Every third tone tells little more of what is known to a fraction of what is built."""
+    few = measurement.part(measurement.rows % 3 == 0)
+    again = identify(found.rig, few, seed=1).rig.uncertainty
+    assert again.stiffness < 0.02
+    assert again.thickness < 0.005
+
+
 @pytest.mark.parametrize(
     "factors",
     [

@@ -6,7 +6,6 @@ one promises 3 dB more to the worst finger, or serves more of them.
 
 import cmath
 import math
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -17,13 +16,15 @@ from controller.loop.content import HELD_BACK, SHARED, Content, Prediction, Sele
 from controller.loop.intent import Target
 from controller.loop.table_query import playable_band, question_of
 from controller.sources.contacts import Contact, ContactKey
-from model.arrays import Complex64Array
+from model.arrays import Complex64Array, FloatArray
+from model.choice import NEARLY
 from model.finger.perception import FELT_DB_SL, decibels
 from model.table import request
 from model.table.answer import answer
-from model.table.modulation import frequency_of, with_modulation
+from model.table.contents_numpy import share_stroke
+from model.table.modulation import frequency_of, with_gains, with_modulation
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, ONSET_RAMP, Pattern
-from model.table.question import Question
+from model.table.question import MIN_LEVEL_DB_SL, Question
 from model.table.request import OWN_CONTRAST_DB, Answer, Finger, Layer, Request
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
@@ -32,6 +33,7 @@ KEPT_WITHIN = 3.0
 """How much more [dB] another frequency must promise to take the place of one that is felt."""
 
 _SIDE_BANDS = 2
+_SILENT_DB = -60.0  # a gain by which a content is not felt
 
 Shape = Callable[[Question, Pattern, bool], Pattern]
 """Adds the envelopes of a pattern; whether it continues what its layer plays, without an onset."""
@@ -55,10 +57,16 @@ def query_jointly(
     requests = requests_of(table, targets, capabilities.frequencies, protected)
     fingers = fingers_of(quiet, protected)
     found = _answer(table, requests, fingers, _kept(requests, targets, before))
-    modulations = _modulations(targets, capabilities.layers)
-    found = with_modulation(
-        table, requests, fingers, found, modulations, playable=capabilities.frequencies
-    )
+    modulations, playable = _modulations(targets, capabilities.layers), capabilities.frequencies
+    found = with_modulation(table, requests, fingers, found, modulations, playable=playable)
+    if _factor_within(found, capabilities) < 1 - NEARLY:
+        gains_db = _gains_db(requests, found, capabilities)
+        lowered = with_gains(table, requests, fingers, found, gains_db)
+        if lowered is None:  # who is lowered is not served any more: by the rule, then
+            kept = [_at_gain(*each) for each in zip(requests, found.layers, gains_db, strict=True)]
+            lowered = answer(table, kept, fingers)
+            lowered = with_modulation(table, kept, fingers, lowered, modulations, playable=playable)
+        found = lowered
     places = [each.at for each in requests]
     fields = table.unit_fields(np.array(places), contacts=places)
     factor = _factor_within(found, capabilities)
@@ -197,15 +205,63 @@ def _worst(found: Answer) -> float:
 
 def _factor_within(found: Answer, capabilities: PlaybackCapabilities) -> float:
     """The factor, 1 at most, by which all contents together are within the amplifiers' limits."""
-    full: dict[str, float] = defaultdict(float)
-    for layer in found.layers:
+    full: list[float] = _levels(found, capabilities).sum(axis=0).tolist()
+    power = sum(level**2 for level in full)
+    return 1.0 / max(1.0, *full, math.sqrt(power / capabilities.max_power))
+
+
+def _levels(found: Answer, capabilities: PlaybackCapabilities) -> FloatArray:
+    """Greatest levels of each layer at every ERA (layers, eras); none of what adds no content."""
+    names = [*capabilities.max_amplitudes]
+    full = np.zeros((len(found.layers), len(names)))
+    for row, layer in zip(full, found.layers, strict=True):
         if layer.verdict not in (HELD_BACK, SHARED):
             for tones in (layer.excitation, *layer.side_bands):
                 for name, tone in tones.items():
-                    full[name] += tone.amplitude / capabilities.max_amplitudes[name]
-    power = sum(level**2 for level in full.values())
-    highest = max(1.0, *full.values(), math.sqrt(power / capabilities.max_power))
-    return 1.0 / highest
+                    row[names.index(name)] += tone.amplitude / capabilities.max_amplitudes[name]
+    return full
+
+
+def _gains_db(
+    requests: Sequence[Request], found: Answer, capabilities: PlaybackCapabilities
+) -> list[float]:
+    """Gains on the layers of an answer by which they are within the amplifiers' limits.
+
+    As the stroke is shared: those of lower priority are lowered first, of equal ones the louder.
+    Power counts in shares of what all together would have.
+    """
+    levels = _levels(found, capabilities)
+    norms = np.linalg.norm(levels, axis=1)
+    power = norms * np.linalg.norm(levels.sum(axis=0)) / norms.sum()
+    limited = np.column_stack([levels, power / math.sqrt(capabilities.max_power)])
+    served = np.flatnonzero(norms).tolist()
+    promised = np.array([found.layers[at].promised_level_db_sl for at in served])
+    factors, _ = share_stroke(
+        np.ones(len(served)),
+        limited[served].astype(np.complex64),
+        10 ** (promised / 20),
+        [requests[at].priority for at in served],
+    )
+    gains = np.maximum(decibels(np.maximum(factors, 1e-9)), _SILENT_DB)
+    return [
+        next(
+            (
+                float(gain)
+                for at, gain in zip(served, gains, strict=True)
+                if found.layers[at].excitation == layer.excitation
+            ),
+            0.0,
+        )
+        for layer in found.layers
+    ]
+
+
+def _at_gain(request: Request, layer: Layer, gain_db: float) -> Request:
+    """A request at the frequency of its layer, at a lower level."""
+    frequency = frequency_of(layer)
+    band = request.band_hz if math.isinf(frequency) else (frequency, frequency)
+    level = max(MIN_LEVEL_DB_SL, request.level_db_sl + gain_db)
+    return replace(request, level_db_sl=level, band_hz=band)
 
 
 def _pattern(table: LocalizationTable, layer: Layer, capabilities: PlaybackCapabilities) -> Pattern:

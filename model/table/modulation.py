@@ -99,6 +99,29 @@ def with_modulation(
     return found
 
 
+def with_gains(
+    table: LocalizationTable,
+    requests: Sequence[Request],
+    fingers: Sequence[Finger],
+    found: Answer,
+    gains_db: Sequence[float],
+) -> Answer | None:
+    """Return an answer with a gain on each layer, None where a finger would not be served.
+
+    Fingers that share a content have one gain.
+    """
+    layers = [
+        replace(
+            layer,
+            excitation=_scaled(layer.excitation, gain_db),
+            side_bands=tuple(_scaled(tones, gain_db) for tones in layer.side_bands),
+        )
+        for layer, gain_db in zip(found.layers, gains_db, strict=True)
+    ]
+    promised = _promised(table, [*requests, *fingers], layers, found)
+    return promised if _is_served(promised, fingers, found.promised_worst_db) else None
+
+
 def _is_served(found: Answer, fingers: Sequence[Finger], steady_db: float | None) -> bool:
     """Whether all fingers have what they require, and no less than 6 dB unless they had less."""
     worst = found.promised_worst_db

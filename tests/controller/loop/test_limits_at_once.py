@@ -1,0 +1,111 @@
+"""Limits of amplifiers over several contents: who is lowered, and that the sum is within."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.content import Selection
+from controller.loop.envelopes import RAMPS_ONLY
+from controller.loop.intent import Target
+from controller.loop.joint_answer import query_jointly
+from controller.loop.selection import unshaped
+from controller.sources.contacts import Contact, ContactKey
+from several_fingers import LEFT, RIGHT, table
+
+CONTACTS = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
+FREE = PlaybackCapabilities(
+    "phased",
+    ("phased",),
+    (40.0, 320.0),
+    {era.name: era.stroke for era in table().eras},
+    RAMPS_ONLY,
+    layers=8,
+)
+
+
+def chosen(capabilities: PlaybackCapabilities, *targets: Target) -> Selection:
+    """What is chosen for both fingers."""
+    served = list(zip(CONTACTS, targets, strict=True))
+    return query_jointly(table(), served, (), capabilities, before={}, shape=unshaped)
+
+
+def sums(found: Selection) -> np.ndarray:
+    """Sum of the levels of all contents at each ERA (eras,)."""
+    return np.array(
+        [
+            sum(each.pattern.excitation[era.name].amplitude for each in found.contents) / era.stroke
+            for era in table().eras
+        ]
+    )
+
+
+def limited(found: Selection, what: str) -> PlaybackCapabilities:
+    """Amplifiers with 80 % of the level, or of the power's root, that contents take."""
+    if what == "power":
+        return replace(FREE, max_power=float((sums(found) ** 2).sum()) * 0.8**2)
+    most = 0.8 * sums(found).max()
+    return replace(
+        FREE, max_amplitudes={name: most * each for name, each in FREE.max_amplitudes.items()}
+    )
+
+
+def is_used(found: Selection, capabilities: PlaybackCapabilities) -> bool:
+    """Whether contents are within a limit, and take nearly all of it."""
+    (share,) = {capabilities.max_amplitudes[each.name] / each.stroke for each in table().eras}
+    of_limit = max(
+        sums(found).max() / share, np.linalg.norm(sums(found)) / np.sqrt(capabilities.max_power)
+    )
+    return bool(0.95 < of_limit < 1.0 + 1e-6)
+
+
+@pytest.mark.parametrize("what", ["level", "power"])
+@pytest.mark.parametrize("modulation", [None, 20.0])
+def test_a_higher_priority_keeps_its_level_within_a_limit(
+    what: str, modulation: float | None
+) -> None:
+    """The other is lowered alone, modulated or not, and promised with what is left."""
+    first = Target(CONTACTS[0].key, 14.0, priority=1)
+    second = Target(CONTACTS[1].key, 14.0, modulation_hz=modulation)
+    free = chosen(FREE, first, second)
+    capabilities = limited(free, what)
+    found = chosen(capabilities, first, second)
+    kept, lowered = found.predictions
+    assert kept.level_db_sl == pytest.approx(14.0, abs=0.2)
+    assert lowered.level_db_sl is not None
+    assert lowered.level_db_sl < 13.0
+    assert is_used(found, capabilities)
+    before = free.predictions[1].promised_contrast_db
+    assert before is not None
+    assert lowered.promised_contrast_db is not None
+    change = lowered.promised_contrast_db - before
+    assert change == pytest.approx(lowered.level_db_sl - 14.0, abs=1.0)
+
+
+def test_who_is_lowered_too_far_is_held_back_by_the_rule() -> None:
+    """What the first content leaves of the amplifiers' level is not enough for the second."""
+    first, second = Target(CONTACTS[0].key, 14.0, priority=1), Target(CONTACTS[1].key, 14.0)
+    content, _ = chosen(FREE, first, second).contents
+    most = max(
+        content.pattern.excitation[each.name].amplitude / each.stroke for each in table().eras
+    )
+    amplitudes = {name: 1.02 * most * each for name, each in FREE.max_amplitudes.items()}
+    found = chosen(replace(FREE, max_amplitudes=amplitudes), first, second)
+    kept, held_back = found.predictions
+    assert kept.level_db_sl == pytest.approx(14.0, abs=0.3)
+    assert held_back.verdict == "held back"
+    assert held_back.held_back
+
+
+@pytest.mark.parametrize("what", ["level", "power"])
+def test_of_equal_priority_the_louder_content_is_lowered(what: str) -> None:
+    """Max-min: the softer one keeps its level as long as the louder one is above it."""
+    targets = Target(CONTACTS[0].key, 14.0), Target(CONTACTS[1].key, 8.0)
+    capabilities = limited(chosen(FREE, *targets), what)
+    found = chosen(capabilities, *targets)
+    louder, softer = (each.level_db_sl for each in found.predictions)
+    assert softer == pytest.approx(8.0, abs=0.2)
+    assert louder is not None
+    assert 8.0 < louder < 13.5
+    assert is_used(found, capabilities)

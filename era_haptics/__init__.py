@@ -31,11 +31,13 @@ if TYPE_CHECKING:
     from era_haptics.designs import RankedLayout as RankedLayout
     from era_haptics.designs import design as design
     from era_haptics.drive import Drive as Drive
+    from era_haptics.pictures import draw_contrast_map as draw_contrast_map
     from era_haptics.pictures import draw_map as draw_map
     from era_haptics.pictures import draw_pattern as draw_pattern
     from era_haptics.pictures import draw_playback as draw_playback
     from era_haptics.solved_plate import SolvedPlate as SolvedPlate
     from era_haptics.tables import answer as answer
+    from era_haptics.tables import contrast_map as contrast_map
     from era_haptics.tables import query as query
     from era_haptics.tables import table as table
     from model.calibration.calibration_result import Calibration as Calibration
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
     from model.rig.rig import Rig as Rig
     from model.rig.uncertainty import Uncertainty as Uncertainty
     from model.structure.attachments import Fingertip as Fingertip
+    from model.table.contrast_map import ContrastMap as ContrastMap
     from model.table.file import load_table as load_table
     from model.table.file import save_table as save_table
     from model.table.pattern import Pattern as Pattern
@@ -69,10 +72,10 @@ _NAMES = {
     "era_haptics.amplifiers": "commands_for open_amplifier",
     "era_haptics.calibration": "calibrate",
     "era_haptics.drive": "Drive",
-    "era_haptics.pictures": "draw_map draw_pattern draw_playback",
+    "era_haptics.pictures": "draw_contrast_map draw_map draw_pattern draw_playback",
     "era_haptics.solved_plate": "SolvedPlate",
     "era_haptics.designs": "RankedLayout design",
-    "era_haptics.tables": "answer query table",
+    "era_haptics.tables": "answer contrast_map query table",
     "model.calibration.calibration_result": "Calibration",
     "model.errors": "InputError",
     "model.finger.grid": "Grid",
@@ -81,6 +84,7 @@ _NAMES = {
     "model.rig.rig": "Rig",
     "model.rig.uncertainty": "Uncertainty",
     "model.structure.attachments": "Fingertip",
+    "model.table.contrast_map": "ContrastMap",
     "model.table.file": "load_table save_table",
     "model.table.pattern": "Pattern",
     "model.table.request": "Answer Finger Request",

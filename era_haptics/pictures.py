@@ -11,7 +11,13 @@ from era_haptics.solved_plate import SolvedPlate
 from model.arguments import expect
 from model.arrays import FloatArray
 from model.figures.drawing import map_figure
-from model.figures.table_pictures import draw_fingertip, draw_level_scale, draw_levels
+from model.figures.table_pictures import (
+    contrast_map_figure,
+    draw_fingertip,
+    draw_level_scale,
+    draw_levels,
+)
+from model.table.contrast_map import ContrastMap
 from model.table.pattern import Pattern
 from model.table.table import LocalizationTable
 from sim.plant.fingers import Record
@@ -51,6 +57,16 @@ def draw_pattern(
         axes.set_title(title, fontsize=11, pad=20)
     draw_level_scale(figure, [axes], shrink=0.8)
     return figure
+
+
+def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> Figure:
+    """Draw promised contrast of every place to quiet fingers, drive modes side by side.
+
+    The picture of `era table map`.
+    """
+    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect(found, ContrastMap, what="found", made_by="era.contrast_map(table, quiet)")
+    return contrast_map_figure(table, found)
 
 
 def draw_playback(playback: Playback) -> Figure:

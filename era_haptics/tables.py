@@ -12,6 +12,7 @@ from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL
 from model.rig.rig import Rig
 from model.table.answer import answer as _answer
+from model.table.contrast_map import ContrastMap, map_contrast
 from model.table.pattern import Pattern
 from model.table.query import query_table
 from model.table.question import Question
@@ -105,6 +106,36 @@ def answer(
         expect(finger, Finger, what="a finger", made_by="era.Finger((0.22, 0.16))")
     expect_number(apart_hz, what="apart_hz", unit="hertz")
     return _answer(table, requests, fingers, apart_hz=apart_hz, bands_may_swap=bands_may_swap)
+
+
+def contrast_map(
+    table: LocalizationTable,
+    quiet: Positions,
+    *,
+    drive_modes: Sequence[str] = (),
+    level_db_sl: float = STRONG_DB_SL,
+    grid: Grid | None = None,
+) -> ContrastMap:
+    """Map the contrast of a finger at every place to these quiet fingers [m], as `era table map`.
+
+    drive_modes: the table's own for none, several to compare them; level_db_sl: at each place;
+    grid: places, the table's cells if None. Raises InputError for fingers off the plate, and for
+    an unknown drive mode.
+    """
+    expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
+    expect(drive_modes, Sequence, what="drive_modes", made_by="['switched', 'phased']")
+    expect_number(level_db_sl, what="level_db_sl", unit="decibels above the threshold")
+    if grid is not None:
+        expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
+    for mode in drive_modes:
+        _expect_mode(mode)
+    return map_contrast(
+        table,
+        as_points(quiet, what="quiet"),
+        drive_modes=drive_modes,
+        level_db_sl=float(level_db_sl),
+        grid=grid,
+    )
 
 
 def _expect_mode(given: object) -> None:

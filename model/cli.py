@@ -11,6 +11,7 @@ from model.commands.plate_show_cli import materials, show
 from model.commands.table_build_cli import build
 from model.commands.table_cli import query, table_app
 from model.commands.table_export_cli import export, plot
+from model.commands.table_map_cli import contrast_map
 from model.commands.table_show_cli import show as show_table
 from model.commands.table_show_cli import verify
 from model.errors import InputError
@@ -22,6 +23,7 @@ table_app.command()(build)
 table_app.command("show")(show_table)
 table_app.command()(verify)
 table_app.command()(query)
+table_app.command("map")(contrast_map)
 table_app.command()(plot)
 table_app.command()(export)
 

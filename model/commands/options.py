@@ -22,6 +22,9 @@ MeshOption = Annotated[
 FolderOption = Annotated[
     Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write into.")
 ]
+SizeOption = Annotated[
+    str | None, typer.Option("--size", metavar="WxH", help="Size of pictures in cm: 16x10.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 ContactsOption = Annotated[
     Path | None,
@@ -59,6 +62,22 @@ def seed_of_plate(*, exact: bool, seed: int | None) -> int | None:
     if exact and seed is not None:
         raise InputError("--exact and --seed exclude each other; give one")
     return None if exact else seed or 0
+
+
+def figure_size(text: str | None) -> tuple[float, float] | None:
+    """Width and height [in] of pictures from `WxH` in centimetres; None for their own.
+
+    Raises InputError for anything else, and for sizes that no page has.
+    """
+    if text is None:
+        return None
+    try:
+        width, height = (float(part) for part in text.replace("×", "x").split("x"))
+    except ValueError:
+        width = height = 0.0
+    if not (2 <= width <= 200 and 2 <= height <= 200):  # False for NaN
+        raise InputError(f"--size must be WxH in cm, 2 to 200 each, such as 16x10, got {text!r}")
+    return width / 2.54, height / 2.54
 
 
 def next_line(*words: str | Path) -> str:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from model.commands.options import JsonOption, MeshOption, RigArgument, next_line
+from model.commands.options import JsonOption, MeshOption, RigArgument, SizeOption, next_line
 
 plate_app = typer.Typer(help="Compute modes and vibration maps of a plate.")
 
@@ -84,12 +84,14 @@ def plate_map(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="MAP.png", help="Picture to draw.")
     ] = None,
+    size: SizeOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compute peak acceleration over the plate for any drive."""
     import numpy as np
 
     from model.commands.drive_option import beyond_limits, parse_drives
+    from model.commands.options import figure_size
     from model.config.points import parse_pair
     from model.files.replacing import check_picture
     from model.rig.file import load_rig
@@ -97,6 +99,7 @@ def plate_map(
     from model.vibration.excitation import G
     from model.vibration.maps import plate_map as solve
 
+    inches = figure_size(size)
     if output is not None:
         check_picture(output)
     rig = load_rig(rig_file, mesh=mesh)
@@ -113,7 +116,7 @@ def plate_map(
 
         title = ", ".join([*drive, *(["not supported"] if unsupported else [])])
         figure = map_figure(rig, solved, active=excitation.keys(), title=title)
-        save_figure(figure, output)
+        save_figure(figure, output, inches=inches)
     from model.choice import best_of
 
     row, column = divmod(best_of(solved.peak.ravel()), len(solved.x))

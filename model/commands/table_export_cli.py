@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from model.commands.options import FolderOption, JsonOption, TableArgument, next_line
+from model.commands.options import FolderOption, JsonOption, SizeOption, TableArgument, next_line
 
 
 class Format(StrEnum):
@@ -16,6 +16,14 @@ class Format(StrEnum):
 
     MAT = "mat"
     CSV = "csv"
+
+
+class Picture(StrEnum):
+    """File format of pictures."""
+
+    PNG = "png"
+    SVG = "svg"
+    PDF = "pdf"
 
 
 class Content(StrEnum):
@@ -28,15 +36,18 @@ class Content(StrEnum):
 def plot(
     table_file: TableArgument,
     output: FolderOption,
+    to: Annotated[Picture, typer.Option("--format", help="Of the pictures.")] = Picture.PNG,
+    size: SizeOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Draw weak cells, levels, contrast and an answer."""
-    from model.commands.options import progress_bar
+    from model.commands.options import figure_size, progress_bar
     from model.figures import save_figure
     from model.figures.table_pictures import table_figures
     from model.table.file import load_table
     from model.table.overview import find_overview
 
+    inches = figure_size(size)
     table = load_table(table_file)
     output.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
@@ -44,8 +55,8 @@ def plot(
     with progress_bar("cells and contact sets") as progress:
         overview = find_overview(table, progress=progress)
     for name, figure in table_figures(table, overview):
-        path = output / f"{name}.png"
-        save_figure(figure, path)
+        path = output / f"{name}.{to.value}"
+        save_figure(figure, path, inches=inches)
         files.append(str(path))
     if as_json:
         print(json.dumps({"files": files}))

@@ -110,13 +110,16 @@ def map_figure(rig: Rig, plate_map: PlateMap, *, active: Collection[str], title:
     return maps_figure([MapPanel(title, plate_map, rig.eras, active)], columns=1)
 
 
-def save_figure(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path, *, inches: tuple[float, float] | None = None) -> None:
     """Write a figure in the format of the name's ending, without a display.
 
-    Raises InputError for an ending that is not in PICTURE_ENDINGS, and OSError.
+    inches: width and height, the figure's own for None. Raises InputError for an ending that is not
+    in PICTURE_ENDINGS, and OSError.
     """
     check_picture_name(path)
     FigureCanvasAgg(figure)
+    if inches is not None:
+        figure.set_size_inches(inches)
     with whole_or_nothing(path) as stream:
         figure.savefig(stream, dpi=_DPI, format=path.suffix[1:].lower())
 

@@ -17,6 +17,7 @@ from model.figures.drawing import COLORS, draw_eras, label_plate
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, sensation_level
+from model.table.contrast_map import ContrastMap
 from model.table.overview import Overview
 from model.table.pattern import Pattern
 from model.table.question import Point, Question
@@ -94,6 +95,24 @@ def contrast_figure(table: LocalizationTable, overview: Overview) -> Figure:
     axes.grid(color="0.9")
     figure.legend(loc="outside lower center", ncols=3, fontsize=9, frameon=False)
     axes.set_title(f"Mode {table.drive_mode}: contact sets at least 5 cm apart")
+    return figure
+
+
+def contrast_map_figure(table: LocalizationTable, found: ContrastMap) -> Figure:
+    """Draw promised contrast of every place to quiet fingers, drive modes side by side."""
+    count = len(found.promised_db)
+    figure = Figure(figsize=(5.5 * count + 1.5, 4.8), layout="compressed")
+    known = np.concatenate([of[np.isfinite(of)] for of in found.promised_db.values()])
+    limits = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    panels = figure.subplots(1, count, sharey=True, squeeze=False)[0]
+    grid = Grid(len(found.x), len(found.y))
+    for axes, (mode, promised) in zip(panels, found.promised_db.items(), strict=True):
+        image = _draw_cells(axes, table, grid, promised, limits=limits)
+        for finger in found.quiet:
+            draw_fingertip(axes, finger, felt=False)
+        axes.set_title(mode)
+        axes.label_outer()
+    figure.colorbar(image, ax=list(panels), label="felt contrast of nine of ten plates / dB")
     return figure
 
 

@@ -4,12 +4,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from numbers import Real
+from typing import Any
 
 import numpy as np
 
 from model.arguments import expect_number, shown
 from model.config.points import in_metres
 from model.errors import InputError
+from model.files.frame import as_frame
 from model.finger import MAX_CONTACTS
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import STRONG_DB_SL
@@ -169,6 +171,22 @@ class Answer:
     promised_worst_db: float | None
     stroke_factor: float
     applied: tuple[str, ...] = field(default=())
+
+    def to_frame(self) -> Any:
+        """What each request's finger feels as a pandas DataFrame, a row a finger; needs pandas."""
+        at = np.array([layer.request.at for layer in self.layers])
+        tones = [next(iter(layer.excitation.values()), None) for layer in self.layers]
+        return as_frame(
+            {
+                "x_m": at[:, 0],
+                "y_m": at[:, 1],
+                "verdict": [layer.verdict for layer in self.layers],
+                "frequency_hz": [tone.frequency if tone else math.nan for tone in tones],
+                "promised_level_db_sl": [layer.promised_level_db_sl for layer in self.layers],
+                "promised_contrast_db": [layer.promised_contrast_db for layer in self.layers],
+                "foreign_level_db_sl": [layer.foreign_level_db_sl for layer in self.layers],
+            }
+        )
 
 
 def verdict_of(promised_contrast_db: float | None) -> str:

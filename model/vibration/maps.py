@@ -1,12 +1,14 @@
 """A map of the plate: peak acceleration on a regular raster, for any drive."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, lattice
 from model.counting import counted
 from model.errors import InputError
+from model.files.frame import as_frame
 from model.reduction.free_plate import FreePlate
 from model.rig.rig import Rig
 from model.vibration.excitation import Excitation, find_nulls, peak_acceleration, tone_fields
@@ -31,6 +33,11 @@ class PlateMap:
     nulls: FloatArray
     frequencies: FloatArray
     field: ComplexArray
+
+    def to_frame(self) -> Any:
+        """Points and peak acceleration as a pandas DataFrame, a row a point; needs pandas."""
+        x, y = np.meshgrid(self.x, self.y)
+        return as_frame({"x_m": x.ravel(), "y_m": y.ravel(), "peak_m_s2": self.peak.ravel()})
 
     def __repr__(self) -> str:
         return (

@@ -5,12 +5,14 @@ From rest the bases move exactly as commanded, along shaped onsets or a ramp.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from model.arrays import FloatArray
 from model.counting import counted
 from model.errors import InputError
+from model.files.frame import as_frame
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import (
     DEFAULT_THRESHOLD,
@@ -57,6 +59,16 @@ class Playback:
         driven = ", ".join(f"{frequency:g}" for frequency in self.frequencies)
         felt = f"{counted(len(self.targets), 'target')} and {len(self.quiet)} quiet"
         return f"<Playback of {driven} Hz for {self.targets[0].times[-1]:g} s at {felt}>"
+
+    def to_frame(self) -> Any:
+        """Time and mean acceleration of each fingertip as a pandas DataFrame; needs pandas."""
+        fingers = {"target": self.targets, "quiet": self.quiet}
+        means = {
+            f"{name}_{number}_m_s2": record.accelerations @ record.weights
+            for name, records in fingers.items()
+            for number, record in enumerate(records, start=1)
+        }
+        return as_frame({"time_s": self.targets[0].times, **means})
 
     @property
     def level_db_sl(self) -> float:

@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 
 import era_haptics as era
@@ -23,6 +24,10 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "table": None, "target": TARGET, "quiet": (), "level_db_sl": 20.0, "drive_mode": "phased",
         "loads": (1.5,),
     },
+    era.contrast_map: {
+        "table": None, "quiet": TARGET, "drive_modes": ["phased"], "level_db_sl": 20.0,
+        "grid": era.Grid(2, 2),
+    },
     era.answer: {
         "table": None, "requests": [era.Request(TARGET)], "fingers": [era.Finger((0.2, 0.1))],
         "apart_hz": 30.0,
@@ -39,6 +44,10 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "drive": DRIVE, "target": TARGET, "quiet": (), "loads": (1.5,), "duration": 0.3,
     },
     era.draw_map: {"plate": PLATE, "drive": DRIVE},
+    era.draw_contrast_map: {
+        "table": None,
+        "found": era.ContrastMap(*np.zeros((2, 1)), (TARGET,), {"phased": np.zeros((1, 1))}, {}),
+    },
     era.draw_pattern: {"table": None, "pattern": PATTERN, "target": TARGET, "quiet": ()},
     era.draw_playback: {"playback": None},
     era.open_amplifier: {"rig": RIG, "name": "main", "url": "sim://"},

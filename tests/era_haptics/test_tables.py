@@ -81,3 +81,18 @@ def test_query_serves_several_targets_and_a_lone_finger(table: era.LocalizationT
     assert min(levels) == pytest.approx(both.level_db_sl, abs=0.1)
     assert both.robust_level_db_sl == pytest.approx(20.0)
     assert era.query(table, TARGET).contrast_db is None
+
+
+def test_results_become_frames(table: era.LocalizationTable) -> None:
+    """A row a finger of an answer, a row a point of a map, a row a moment of a playback."""
+    answer = era.answer(table, [era.Request(TARGET), era.Request(QUIET[0])])
+    frame = answer.to_frame()
+    assert list(frame["verdict"]) == [layer.verdict for layer in answer.layers]
+    assert frame.loc[1, "x_m"] == QUIET[0][0]
+    plate = era.SolvedPlate(era.load_rig(str(era.example_rig_path()), mesh="12x9"))
+    field = plate.map({"SW": 110}, raster=(4, 3)).to_frame()
+    assert field.shape == (12, 3)
+    assert field["peak_m_s2"].min() > 0
+    felt = plate.play({"SW": 110}, TARGET, quiet=QUIET, duration=0.3).to_frame()
+    assert felt["time_s"].iloc[-1] == pytest.approx(0.3, abs=0.001)
+    assert list(felt.columns[1:]) == ["target_1_m_s2", "quiet_1_m_s2", "quiet_2_m_s2"]

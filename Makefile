@@ -11,7 +11,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --editab
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo firmware firmware-test test test-long test-busy test-kernels nightly lint format docs fuzz faults kill-test fault-test stop-test desk-test qt-test estimate-test soak bench bench-latency \
-	bench-localization bench-plant bench-promise bench-wires dist dist-platform smoke smoke-lowest sbom licences clean
+	bench-plant bench-promise dist dist-platform smoke smoke-lowest sbom licences clean
 .NOTPARALLEL:
 
 demo: .venv/installed
@@ -134,14 +134,8 @@ bench-promise: .venv/installed-peers
 	$(BIN)/python -m benchmarks.promise --report $(PROMISE)
 	$(BIN)/python -m benchmarks.promise.contents --plates 60 --report
 
-bench-localization: .venv/installed
-	$(BIN)/python -m benchmarks.localization --report
-
 bench-plant: .venv/installed
 	$(BIN)/python -m benchmarks.plant
-
-bench-wires: .venv/installed-test
-	$(BIN)/python -m benchmarks.wires
 
 # The pages as a site, with warnings as errors; nothing in it comes from elsewhere.
 docs: .venv/installed-docs
@@ -212,7 +206,6 @@ $(BIN)/python:
 	$(PIP) '.[release]'
 	touch $@ .venv/installed
 
-# Where one cannot be installed, the other is; the bench says which is missing.
 .venv/installed-peers: $(BIN)/python pyproject.toml
-	if $(PIP) '.[peers]'; then touch $@ .venv/installed; \
-	else for peer in ngsolve scikit-fem; do $(PIP) . $$peer || true; done; fi
+	$(PIP) '.[peers]'
+	touch $@ .venv/installed

@@ -1,11 +1,10 @@
-"""Runs both: `python -m benchmarks.calibration [PLATES]`."""
+"""How far a calibration's intervals hold: `python -m benchmarks.calibration [PLATES]`."""
 
 import sys
 
-from benchmarks.calibration import accuracy, intervals
+from benchmarks.calibration import intervals
 
 PLATES = 200
 
 if __name__ == "__main__":
     intervals.main(int(sys.argv[1]) if len(sys.argv) > 1 else PLATES)
-    accuracy.main()

@@ -1,7 +1,6 @@
 """The data set of the contrast benchmark: plates with their rigs, and sets of fingers on them.
 
-One JSON file, `localization-1.json` beside this module, written by
-`python -m benchmarks.localization.make_data_set`. Another version is another file.
+One JSON file, `localization-1.json` beside this module. Another version is another file.
 """
 
 import hashlib

@@ -1,48 +1,43 @@
 """Latency from a touch datagram to the last byte of the command on the wire.
 
     python -m benchmarks.latency [--seconds S] [--seed 1] [--report | --check WIRE]
-    python -m benchmarks.latency --many [RIG ...] [--seconds S] [--seed 1]
 
 The daemon, the amplifier, the panel and programs that load the machine are separate processes
-(`benchmarks.latency.run`). It takes eleven minutes on an otherwise idle machine; a trial run with
---seconds 2 takes one. A disturbed case is repeated once; if that fails, too, the others follow.
+(`benchmarks.latency.run`). It takes six minutes on an otherwise idle machine; a trial run with
+--seconds 2 takes half of one. A disturbed case is repeated once; if that fails, too, the others
+follow.
 
---report: write docs/measured/latency.md and its picture. --check: measure taps at 100 Hz only, over
-`tcp` or a `pty`, and print the result as JSON. --many: four to sixteen ERAs on one to four
-amplifiers, each on a line of its own, idle and loaded, in eight minutes.
+--report: write docs/measured/latency.md. --check: measure taps at 100 Hz only, over `tcp` or a
+`pty`, and print the result as JSON.
 """
 
 import argparse
 import json
-import os
 import sys
 import tempfile
 import time
 from functools import partial
 from pathlib import Path
 
+from benchmarks.setting import use_one_thread
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.latency", description=__doc__)
     parser.add_argument(
-        "--seconds", type=float, help="duration of the longest cases, by default 100, or 20 of many"
+        "--seconds", type=float, default=100.0, help="duration of the longest cases"
     )
     parser.add_argument("--seed", type=int, default=1)
     purpose = parser.add_mutually_exclusive_group()
     purpose.add_argument("--report", action="store_true")
     purpose.add_argument("--check", choices=("tcp", "pty"))
-    purpose.add_argument("--many", nargs="*", metavar="RIG")
     options = parser.parse_args()
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[variable] = "1"  # before numpy loads: with two threads the daemon would compete
+    use_one_thread()  # with two the daemon would compete
 
-    from benchmarks.latency import many
     from benchmarks.latency.report import (
-        DEFAULT_SECONDS,
         as_json,
         cases,
         check_case,
-        flooded_lines,
         lines,
         write_report,
     )
@@ -51,18 +46,7 @@ def main() -> None:
     from model.table.file import save_table
     from model.table.table_cache import cached_table
 
-    if options.many is not None:
-        if unknown := set(options.many) - set(many.RIGS):
-            parser.error(f"rigs must be of {', '.join(many.RIGS)}, got {', '.join(unknown)}")
-        with tempfile.TemporaryDirectory() as folder:
-            many.measure_many(
-                Path(folder),
-                seconds=options.seconds or many.DEFAULT_SECONDS,
-                seed=options.seed,
-                rigs=tuple(options.many) or many.RIGS,
-            )
-        return
-    seconds = options.seconds or DEFAULT_SECONDS
+    seconds = options.seconds
     table, _ = cached_table(load_rig(example_rig_path()))
     found: list[Found | Failed] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -79,7 +63,6 @@ def main() -> None:
         for case in cases(seconds, options.seed):
             found.append(attempt(case, partial(measure, case, file, table)))
             print(lines(found[-1:], first=len(found) == 1), flush=True)
-        print(flooded_lines(found))
         minutes = (time.monotonic() - begun) / 60
         print(f"{minutes:.1f} minutes")
     if options.report:

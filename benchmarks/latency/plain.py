@@ -14,19 +14,24 @@ import json
 import os
 import socket
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import serial
 from pythonosc.osc_packet import OscPacket
 
-from benchmarks.wires.bench import arm_values, make_sets
 from drivers.codec.serial_line.frame import Frame, encode_frame, pack_words
 from drivers.host.serial_wire import SerialWire
-from drivers.protocol.table import MESSAGES, VERSION
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
+from drivers.protocol.table import MESSAGES, QUANTITIES, VERSION
 from drivers.urls import Place
 from drivers.wires.serial_line import SerialAddress
 
-SETS = 100
+SETS, CHANNELS = 100, 4
+SESSION = 1
+WATCHDOG = 2.0  # s; the longest
+LEVEL = 0.2
 
 
 class Panel(asyncio.DatagramProtocol):
@@ -37,7 +42,7 @@ class Panel(asyncio.DatagramProtocol):
         message = MESSAGES["Set"]
         self._sets = [
             Frame(message.number, 1, 0, pack_words(message.request.pack(values)), VERSION)
-            for values in make_sets(SETS)
+            for values in _sets()
         ]
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
@@ -70,6 +75,16 @@ class Flooded(asyncio.Protocol):
                 json.loads(line)
 
 
+def _sets() -> Iterator[Values]:
+    """The values of Set messages that play at once, each at a frequency of its own."""
+    level = QUANTITIES["level"].to_wire(LEVEL)
+    for number in range(SETS):
+        frequency = QUANTITIES["frequency"].to_wire(110.0 + number % 50)
+        commands = tuple(Command(channel, frequency, level, 0) for channel in range(CHANNELS))
+        stream = pack_layers([LayerSet(0, 0, 0, commands)])
+        yield from parts(stream, session=SESSION, token=number + 1, now=True)
+
+
 def _opened(place: Place) -> serial.Serial | socket.socket:
     """Open the wire: a port, or a connection to a serial server."""
     if place.device:
@@ -84,8 +99,9 @@ async def main() -> None:
     loop = asyncio.get_running_loop()
     place = SerialAddress(sys.argv[2]).place
     with _opened(place) as port:
-        arm = SerialWire(place.baud, sequence=0).request(1, "Arm", arm_values())
-        os.write(port.fileno(), arm)
+        watchdog = QUANTITIES["watchdog"].to_wire(WATCHDOG)
+        arm: Values = {"session": SESSION, "watchdog": watchdog}
+        os.write(port.fileno(), SerialWire(place.baud, sequence=0).request(1, "Arm", arm))
         loop.add_reader(port.fileno(), os.read, port.fileno(), 4096)
         transport, _ = await loop.create_datagram_endpoint(
             lambda: Panel(port.fileno()), local_addr=("127.0.0.1", 0)

@@ -6,14 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.latency.clients import FLOODS
-from benchmarks.latency.picture import draw
 from benchmarks.latency.run import Case, Failed, Found
 from benchmarks.latency.touches import Work
 from benchmarks.page import write_parts
 
-DOCS = Path(__file__).parents[2] / "docs"
-PICTURE = "pictures/latency.png"
+PAGE = Path(__file__).parents[2] / "docs" / "measured" / "latency.md"
 TARGETS = (2.0, 5.0, 10.0)  # ms: median, 99th percentile, 99.9th
 
 FAST, CALM = 1000.0, 100.0  # Hz
@@ -37,24 +34,16 @@ def cases(seconds: float, seed: int) -> list[Case]:
     fast = Work("taps", _count(seconds, FAST), FAST, seed)
     some = Work("taps", _count(shorter, FAST), FAST, seed)
     slide = Work("slide", _count(shorter, FAST), FAST, seed)
-    few = Work("taps", _count(shorter / 2, CALM), CALM, seed)
     calm = Work("taps", _count(shorter, CALM), CALM, seed)
     return [
         Case("taps, loaded", fast, True, 0.0),
         Case("plain asyncio, loaded", fast, True, None),
         Case("taps", some, False, 0.0),
         Case("plain asyncio", some, False, None),
-        Case("taps, loaded, pseudo-terminal", some, True, 0.0, wire="pty"),
         Case("slide, loaded", slide, True, 0.0),
         Case("taps at 100 Hz, loaded", calm, True, 0.0),
-        Case("taps at 100 Hz, loaded, shaped onsets", calm, True, 30.0),
         Case("taps at 100 Hz", calm, False, 0.0),
         Case("plain asyncio at 100 Hz", calm, False, None),
-        *(
-            Case(f"{name} at 100 Hz, four flooders: {kind}", few, False, wait, flooders=kind)
-            for kind in FLOODS
-            for name, wait in (("taps", 0.0), ("plain asyncio", None))
-        ),
     ]
 
 
@@ -87,14 +76,11 @@ def lines(found: Sequence[Found | Failed], *, first: bool) -> str:
 
 
 def write_report(
-    found: Sequence[Found | Failed], *, seconds: float, seed: int, minutes: float, docs: Path = DOCS
+    found: Sequence[Found | Failed], *, seconds: float, seed: int, minutes: float
 ) -> None:
-    """Write the figures into their page below a folder, and the picture; minutes: of the run."""
+    """Write the figures into their page; minutes: of the run."""
     part = report(found, seconds=seconds, seed=seed, minutes=minutes)
-    write_parts(docs / "measured" / "latency.md", {"figures": part})
-    measured = [one for one in found if isinstance(one, Found) and is_drawn(one.case)]
-    if measured:
-        draw(measured, docs / PICTURE, targets=TARGETS)
+    write_parts(PAGE, {"figures": part})
 
 
 def report(found: Sequence[Found | Failed], *, seconds: float, seed: int, minutes: float) -> str:
@@ -110,52 +96,7 @@ def report(found: Sequence[Found | Failed], *, seconds: float, seed: int, minute
     first, second = found[:2]
     if isinstance(first, Found) and isinstance(second, Found):
         parts.append(_verdict(first, second))
-    parts.append(flooded_lines(found))
-    if any(isinstance(one, Found) and is_drawn(one.case) for one in found):
-        parts.append(f"![Histogram](../{PICTURE})")
     return "\n\n".join(parts)
-
-
-def is_drawn(case: Case) -> bool:
-    """Whether the picture includes a case."""
-    return case.work.kind == "taps" and case.work.rate == FAST
-
-
-MAX_STOP = 0.010  # s; 99th percentile under flooders
-MAX_GROWTH = 1.5  # ratio of growths of the 99th percentile, ours to plain
-
-
-def flooded_lines(found: Sequence[Found | Failed]) -> str:
-    """Table of stops under flooders, and of the delay of touches beside plain asyncio."""
-    measured = {
-        (one.case.flooders, one.case.touch_wait is None): one
-        for one in found
-        if isinstance(one, Found) and one.case.work.rate == CALM and not one.case.is_loaded
-    }
-    rows = [
-        "| four flooders | stop: median | 99th | maximum | touch to wire, 99th: more by | plain "
-        "asyncio: more by | targets |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for kind in FLOODS:
-        ours, plain = (measured.get((kind, is_plain)) for is_plain in (False, True))
-        calm, plain_calm = (measured.get((None, is_plain)) for is_plain in (False, True))
-        if not (ours and plain and calm and plain_calm and len(ours.stops)):
-            rows.append(f"| {kind} | no figures | | | | | |")
-            continue
-        median, most = np.quantile(ours.stops, [0.5, 0.99], method="inverted_cdf")
-        grown = _p99(ours) - _p99(calm)
-        plain_grown = _p99(plain) - _p99(plain_calm)
-        is_met = most < MAX_STOP and grown <= max(MAX_GROWTH * plain_grown, 0.0)
-        cells = [kind, *map(_ms, (median, most, ours.stops.max(), grown, plain_grown))]
-        rows.append(f"| {' | '.join([*cells, 'met' if is_met else '**missed**'])} |")
-    return "\n".join(rows)
-
-
-def _p99(one: Found) -> float:
-    if not len(one.matched.newest):
-        return float("inf")  # no touch was played
-    return float(np.quantile(one.matched.newest, 0.99, method="inverted_cdf"))
 
 
 def _disturbance(one: Found | Failed) -> str | None:

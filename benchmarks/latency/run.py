@@ -7,7 +7,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import astuple, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -34,30 +34,22 @@ from sim.amplifier.readings import capabilities
 FLOOD_RATE = 10_000  # Hz
 WORKERS = 2  # programs at work in the loaded case, one for each core
 ATTEMPTS = 2  # per case
-FLOODERS = 4  # of one kind
-STOPS = 300  # measured per case with flooders
 _SETTLE = 1.0  # s
 
 DAEMON: Sequence[object] = module("daemon")
-"""The program that is measured, without its arguments, unless a case has its own."""
+"""The program that is measured, without its arguments."""
 
 
 @dataclass(frozen=True)
 class Case:
     """A case: touches; whether the machine is loaded; touch_wait [ms]: longest of a touch for
-    its shaped onset, None for the baseline; wire: `tcp` or `pty`; flooders: kind of those that run
-    meanwhile, of `benchmarks.latency.clients.FLOODS`, after which stops are measured; rig: its
-    file; unmeasured: number of touches at the beginning; daemon: its program, without arguments."""
+    its shaped onset, None for the baseline; wire: `tcp` or `pty`."""
 
     name: str
     work: Work
     is_loaded: bool
     touch_wait: float | None
     wire: str = "tcp"
-    flooders: str | None = None
-    rig: Path = field(default_factory=example_rig_path)
-    unmeasured: int = 0
-    daemon: Sequence[object] | None = None
 
 
 @dataclass(frozen=True)
@@ -75,8 +67,6 @@ class Found:
     computed: float
     others: float
     is_urgent: bool
-    stops: np.ndarray = field(default_factory=lambda: np.zeros(0))  # s; from call to result
-    resting: float = 0.0  # processors that the daemon keeps busy before the first touch
 
 
 @dataclass(frozen=True)
@@ -131,7 +121,7 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
     with tempfile.TemporaryDirectory(prefix="era-latency-") as name, contextlib.ExitStack() as all_:
         folder = Path(name)
         rig_file, seen, sent_file = folder / "rig.yaml", folder / "seen.jsonl", folder / "sent.npy"
-        rig_file.write_text(case.rig.read_text("utf-8"), "utf-8")
+        rig_file.write_text(example_rig_path().read_text("utf-8"), "utf-8")
         far = Program(all_, *module("far_end"), rig_file, seen, case.wire, rank=Rank.DEVICE)
         urls = far.line().split()
         path = folder / "socket"
@@ -142,33 +132,25 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
         else:
             port = _free_port()
             arguments = (1e-3 * case.touch_wait, _daemon_file(folder, urls, table_file, port))
-            tested = Program(all_, *(case.daemon or DAEMON), *arguments, rank=Rank.SERVICE)
+            tested = Program(all_, *DAEMON, *arguments, rank=Rank.SERVICE)
             daemon = _client(all_, path, tested)
             all_.enter_context(daemon.armed("latency"))
         panel = Program(
             all_,
             *(*module("clients"), "panel", rig_file, port, sent_file),
-            *(each for each in astuple(case.work) if each is not None),
+            *astuple(case.work),
             rank=Rank.DEVICE,
         )
         panel.line()
         programs = [far, tested, panel]
-        if case.flooders is not None:
-            for _ in range(FLOODERS):
-                flooder = Program(all_, *module("clients"), "flooder", case.flooders, path)
-                flooder.line()
-                programs.append(flooder)
         if case.is_loaded:
             flood = Program(all_, *module("clients"), "flood", path, rig_file, FLOOD_RATE)
             flood.line()
             programs.append(flood)
             programs += [Program(all_, *module("clients"), "work") for _ in range(WORKERS)]
-        resting = -tested.computed()
         time.sleep(_SETTLE)
-        resting = (resting + tested.computed()) / _SETTLE
         others = Others(lambda: sum(program.computed() for program in programs))
         panel.tell("go")
-        time.sleep(case.unmeasured / case.work.rate)
         computed = -tested.computed()
         panel.line()
         computed += tested.computed()
@@ -182,13 +164,6 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
                     f"{status.state}: {status.cause}"
                 )
             own = status.latency_ms
-        stops = np.zeros(0)
-        if daemon is not None and case.flooders is not None:
-            daemon.stop()  # ends its lease
-            daemon.clear()
-            command = (*module("clients"), "stopper", path, STOPS, folder / "stops.npy")
-            Program(all_, *command, rank=Rank.DEVICE).wait(TIMEOUT)
-            stops = np.load(folder / "stops.npy")
         panel.tell("done")
         panel.wait(TIMEOUT)
         far.finish()
@@ -198,7 +173,7 @@ def measure(case: Case, table_file: Path, table: LocalizationTable) -> Found:
         commands = list(read_commands(read, rig.amplifiers))
     matched = _matched(case, commands, sent, rig, table)
     is_urgent = all(program.is_urgent for program in programs)
-    return Found(case, matched, own, len(sent), computed, busy, is_urgent, stops, resting)
+    return Found(case, matched, own, len(sent), computed, busy, is_urgent)
 
 
 def _matched(
@@ -208,9 +183,8 @@ def _matched(
     rig: Rig,
     table: LocalizationTable,
 ) -> Matched:
-    """Match the commands from the first touch on that is measured."""
-    begin = sent[case.unmeasured]
-    since = [each for each in commands if begin <= each.time <= sent[-1] + LAST]
+    """Match the commands from the first touch on."""
+    since = [each for each in commands if sent[0] <= each.time <= sent[-1] + LAST]
     if case.touch_wait is None:
         return match(
             since,

@@ -20,16 +20,12 @@ EDGE = 0.06  # of the sensor
 @dataclass(frozen=True)
 class Work:
     """Touches: `taps`, a new finger in another place in every frame, each a query of the table, or
-    `slide`, one finger that moves at 1 m/s, with a query about every ninth frame.
-
-    repeats_after: number of taps after which their places repeat, None for never.
-    """
+    `slide`, one finger that moves at 1 m/s, with a query about every ninth frame."""
 
     kind: str
     count: int
     rate: float  # Hz
     seed: int
-    repeats_after: int | None = None
 
 
 def places(work: Work, plate: Plate) -> Iterator[tuple[int, float, float]]:
@@ -38,12 +34,9 @@ def places(work: Work, plate: Plate) -> Iterator[tuple[int, float, float]]:
     x = y = 0.5
     goal = (x, y)
     step = SLIDE / work.rate
-    taps: list[tuple[float, float]] = []
     for number in range(work.count):
         if work.kind == "taps":
-            if len(taps) < (work.repeats_after or work.count):
-                taps.append(_anywhere(rng, plate))
-            yield number + 2, *taps[number % len(taps)]
+            yield number + 2, *_anywhere(rng, plate)
             continue
         while (far := _distance((x, y), goal, plate)) < step:
             goal = _anywhere(rng, plate)

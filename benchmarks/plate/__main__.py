@@ -1,9 +1,9 @@
-"""The plate model beside its peers: error and processor time of each, on one thread.
+"""The plate model beside NGSolve: error and processor time of each, on one thread.
 
     python -m benchmarks.plate [--runs 5] [--no-study] [-o docs]
 
-All programs take turns in one process. Writes measured/benchmarks.md and its picture. Needs the
-extras group `peers`; a peer that is not installed is left out, and the page says which.
+Both take turns in one process. Writes measured/benchmarks.md and its picture. Needs the extras
+group `peers`.
 """
 
 import argparse
@@ -20,10 +20,8 @@ from benchmarks.setting import ONE_THREAD, RIG, use_one_thread
 
 use_one_thread()
 
-from benchmarks.plate.live import live  # noqa: E402
-from benchmarks.plate.measure import SLOW, SLOW_ROUNDS, measure, peers_agree  # noqa: E402
-from benchmarks.plate.problem import PAPER  # noqa: E402
-from benchmarks.plate.programs import CASES, installed_peers  # noqa: E402
+from benchmarks.plate.measure import SLOW, SLOW_ROUNDS, measure  # noqa: E402
+from benchmarks.plate.programs import CASES  # noqa: E402
 from benchmarks.plate.report import write_report  # noqa: E402
 
 LAYOUTS, WORKERS, STUDIES = 10_000, 2, 3
@@ -36,27 +34,16 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path(__file__).parents[2] / "docs")
     options = parser.parse_args()
 
-    peers, notes = installed_peers()
-    for note in notes:
-        print(note, file=sys.stderr)
-    if not peers:
-        raise SystemExit("at least one peer must be installed, since it solves the reference")
-    agreement = peers_agree(PAPER, peers)
-    if agreement is not None:
-        notes.append(f"On the same mesh both peers give the same to {agreement:.0e}.")
-    notes.append(
-        f"Medians of {options.runs} runs, of {SLOW_ROUNDS} above {SLOW:g} s. "
-        f"Reference: {peers[0].NAME}."
-    )
+    note = f"Medians of {options.runs} runs, of {SLOW_ROUNDS} above {SLOW:g} s. Reference: NGSolve."
     measured = {}
     for case in CASES:
-        measured[case] = measure(case, peers, options.runs)
+        measured[case] = measure(case, options.runs)
         print(f"{case.name}: done", file=sys.stderr)
     seconds = None
     if not options.no_study:
         elapsed, processor = zip(*(study() for _ in range(STUDIES)), strict=True)
         seconds = statistics.median(elapsed), statistics.median(processor)
-    write_report(measured, live(), seconds, notes, options.output)
+    write_report(measured, seconds, note, options.output)
 
 
 def study() -> tuple[float, float]:

@@ -2,22 +2,16 @@
 
 import statistics
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from types import ModuleType
 
 import numpy as np
 
-from benchmarks.plate.peers.meshes import Elements
-from benchmarks.plate.peers.ways import Direct
 from benchmarks.plate.problem import CORNERS, OTHERS, Case, difference
 from benchmarks.plate.programs import Setting, Solved, reference, settings
 from model.arrays import FloatArray
 
 SLOW = 0.3  # s; a setting that takes longer is measured in the first rounds alone
 SLOW_ROUNDS = 3
-SAME_MESH = Elements(6, 4, 3, (0.004,))
-"""On which peers have to give the same."""
 
 
 @dataclass
@@ -46,13 +40,13 @@ class Measured:
         return statistics.median(self.all_further)
 
 
-def measure(case: Case, peers: list[ModuleType], rounds: int) -> list[Measured]:
-    """All settings of a case: errors against the reference of the first peer, and times."""
-    exact = reference(case, peers[0])
+def measure(case: Case, rounds: int) -> list[Measured]:
+    """All settings of a case: errors against the reference, and times."""
+    exact = reference(case)
     layouts = (CORNERS, *OTHERS)
     expected = exact.sweeps(layouts)
     found, solved = [], []
-    for setting in settings(case, peers):
+    for setting in settings(case):
         plate = setting.solve()
         errors = [
             difference(each, answer)
@@ -67,16 +61,6 @@ def measure(case: Case, peers: list[ModuleType], rounds: int) -> list[Measured]:
             if number < SLOW_ROUNDS or each.nothing < SLOW:
                 _run(each, plate, layout)
     return found
-
-
-def peers_agree(case: Case, peers: Sequence[ModuleType]) -> float | None:
-    """Difference of two peers on one mesh, None for a single one."""
-    if len(peers) < 2:
-        return None
-    first, second = (
-        Direct(case, peer.Matrices(case, SAME_MESH)).sweep(CORNERS) for peer in peers[:2]
-    )
-    return difference(second, first)
 
 
 def _run(measured: Measured, solved: Solved, layout: FloatArray) -> None:

@@ -1,23 +1,18 @@
 """Programs with the settings that are measured, from coarse to fine.
 
-Settings of peers were chosen by trial on the paper's plate, among orders 3 to 10, one to eight
+Settings of the peer were chosen by trial on the paper's plate, among orders 3 to 10, one to eight
 elements a side, strips of 0 to 5 mm and 12 to 60 modes.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import import_module
-from types import ModuleType
 from typing import Protocol
 
 from benchmarks.plate import ours
 from benchmarks.plate.peers.meshes import Elements
-from benchmarks.plate.peers.ways import Direct, Modes
+from benchmarks.plate.peers.ways import Direct, Matrices, Modes
 from benchmarks.plate.problem import CAR, PAPER, PAPER_ON_FEET, TABLE, Case
 from model.arrays import ComplexArray, FloatArray
-
-PEERS = {"ngsolve": "ngsolve_plate", "skfem": "scikit_fem_plate"}
-"""Modules by the package that each imports."""
 
 ACCURACIES = (2.0, 1.0, 0.5, 0.1)
 """Errors to reach, in per cent."""
@@ -68,18 +63,7 @@ class Setting:
         return f"{self.program}, {self.way}" if self.way else self.program
 
 
-def installed_peers() -> tuple[list[ModuleType], list[str]]:
-    """Modules of the peers that are installed, and a sentence on each that is not."""
-    found, missing = [], []
-    for package, module in PEERS.items():
-        try:
-            found.append(import_module(f"benchmarks.plate.peers.{module}"))
-        except ImportError as error:
-            missing.append(f"{package} is missing, so it was not measured: {error}.")
-    return found, missing
-
-
-def settings(case: Case, peers: list[ModuleType]) -> list[Setting]:
+def settings(case: Case) -> list[Setting]:
     """All that is measured on a case, ours first."""
 
     def by_us(accuracy: float) -> Setting:
@@ -89,38 +73,42 @@ def settings(case: Case, peers: list[ModuleType]) -> list[Setting]:
 
         return Setting(ours.NAME, "", f"auto {accuracy:g} %", solve)
 
-    def direct(peer: ModuleType, order: int, nx: int, ny: int, strips: tuple[int, ...]) -> Setting:
+    def direct(order: int, nx: int, ny: int, strips: tuple[int, ...]) -> Setting:
         elements = _elements(case, order, nx, ny, strips)
         return Setting(
-            peer.NAME,
+            "NGSolve",
             Direct.way,
             f"{elements}",
-            lambda: Direct(case, peer.Matrices(case, elements)),
+            lambda: Direct(case, _matrices(case, elements)),
         )
 
-    def modes(
-        peer: ModuleType, order: int, nx: int, ny: int, strips: tuple[int, ...], count: int
-    ) -> Setting:
+    def modes(order: int, nx: int, ny: int, strips: tuple[int, ...], count: int) -> Setting:
         elements = _elements(case, order, nx, ny, strips)
         return Setting(
-            peer.NAME,
+            "NGSolve",
             Modes.way,
             f"{elements}, {count} modes",
-            lambda: Modes(case, peer.Matrices(case, elements), count),
+            lambda: Modes(case, _matrices(case, elements), count),
         )
 
     like = PAPER if case is PAPER_ON_FEET else case
     found = [by_us(accuracy) for accuracy in CASES[case]]
-    for peer in peers:
-        found += [direct(peer, *each) for each in _DIRECT.get(like, [])]
-        found += [modes(peer, *each) for each in _MODES[like]]
+    found += [direct(*each) for each in _DIRECT.get(like, [])]
+    found += [modes(*each) for each in _MODES[like]]
     return found
 
 
-def reference(case: Case, peer: ModuleType) -> Direct:
-    """The graded reference, by a peer."""
+def reference(case: Case) -> Direct:
+    """The graded reference."""
     elements = _elements(case, *_REFERENCES.get(case, _REFERENCE))
-    return Direct(case, peer.Matrices(case, elements))
+    return Direct(case, _matrices(case, elements))
+
+
+def _matrices(case: Case, elements: Elements) -> Matrices:
+    """Matrices by NGSolve, which is loaded only here."""
+    from benchmarks.plate.peers import ngsolve_plate
+
+    return ngsolve_plate.Matrices(case, elements)
 
 
 def _elements(case: Case, order: int, nx: int, ny: int, strips: tuple[float, ...]) -> Elements:

@@ -17,8 +17,8 @@ from benchmarks.plate.peers.ways import Direct
 from benchmarks.plate.problem import CAR, PAPER, PAPER_ON_FEET, TABLE, Case
 from benchmarks.plate.programs import ACCURACIES, CASES
 
-PACKAGES = ("numpy", "scipy", "scikit-fem", "ngsolve")
-COLORS = {"era-haptics": "#d62728", "NGSolve": "#1f77b4", "scikit-fem": "#7f7f7f"}
+PACKAGES = ("numpy", "scipy", "ngsolve")
+COLORS = {"era-haptics": "#d62728", "NGSolve": "#1f77b4"}
 
 Read = Callable[[Measured], float]
 
@@ -32,19 +32,16 @@ TABLES: dict[str, tuple[str, Read, Read]] = {
 
 def write_report(
     measured: Mapping[Case, Sequence[Measured]],
-    live: Mapping[str, float],
     study: tuple[float, float] | None,
-    notes: Sequence[str],
+    note: str,
     folder: Path,
 ) -> None:
     """Write measured/benchmarks.md and pictures/benchmarks.png."""
-    parts = {"machine": "\n".join([_machine(), *notes])}
+    parts = {"machine": f"{_machine()}\n{note}"}
     for name in TABLES:
         parts[name] = "\n\n".join(_table(case, measured[case], name) for case in _with_errors())
     parts["goals"] = _goals(measured, study)
     parts["settings"] = _settings(measured)
-    rows = [f"| {what} | {_time(seconds)} |" for what, seconds in live.items()]
-    parts["live"] = "\n".join(["| changed | time |", "|---|---|", *rows])
     write_parts(folder / "measured" / "benchmarks.md", parts)
     figure = _picture(measured)
     FigureCanvasAgg(figure)

@@ -1,1 +1,1 @@
-"""What each wire costs beside the bare library."""
+"""What a set takes in the host."""

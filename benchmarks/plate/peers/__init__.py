@@ -1,1 +1,1 @@
-"""The same plate solved by other programs."""
+"""The same plate solved by another program."""

@@ -1,6 +1,6 @@
 """Contrast and time of answers to several contents, by number of ERAs.
 
-    python -m benchmarks.localization.contents [--only RIG ...] [--sets N] [--fingers K]
+    python -m benchmarks.contents [--only RIG ...] [--sets N] [--fingers K]
 
 The examples with four, eight, twelve and sixteen ERAs, 40 to 320 Hz in steps of 10, fingers 5 cm
 apart (8 cm on the table) with contents of 20 dB SL, 20 Hz apart; `identified`: with an uncertainty
@@ -31,7 +31,7 @@ HELD_OUT = 100  # plates for each set
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.localization.contents",
+        prog="python -m benchmarks.contents",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -1,6 +1,6 @@
 """Entries of the contrast benchmark: other methods, this program's, and an optimum in hindsight.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.localization.entries -o DIR [--methods random,paper]
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.contrast.entries -o DIR [--methods random,paper]
 
 Writes a file for each method, for `python -m benchmarks.contrast score`. All but the paper's drive
 every ERA at one frequency of the table's 47, the one where the method itself does best on the plate
@@ -215,7 +215,7 @@ def entry(name: str, plates: list[str]) -> dict[str, object]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.localization.entries")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.contrast.entries")
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--methods", default=",".join(METHODS))
     parser.add_argument("--plates", default=",".join(data_set().plates))

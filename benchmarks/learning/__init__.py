@@ -1,1 +1,0 @@
-"""How soon answers follow a measured pattern."""

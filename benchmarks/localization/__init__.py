@@ -1,1 +1,0 @@
-"""Contrast and speed of the drive modes, beside other methods and bounds."""

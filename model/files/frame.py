@@ -1,13 +1,15 @@
 """Columns of numbers as a pandas DataFrame."""
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from model.errors import InputError
-from model.files.csv_file import Columns
+
+if TYPE_CHECKING:
+    from model.files.csv_file import Columns
 
 
-def as_frame(columns: Columns) -> Any:
+def as_frame(columns: "Columns") -> Any:
     """A pandas DataFrame of columns; raises InputError where pandas is not installed."""
     try:
         pandas = import_module("pandas")

@@ -3,13 +3,10 @@
 They are refused with file, line and key, and a running daemon keeps its configuration.
 """
 
-import asyncio
 import io
 import os
 import pickle
 import random
-import signal
-import socket
 import time
 import zipfile
 from collections.abc import Callable
@@ -20,11 +17,10 @@ import numpy as np
 import pytest
 
 from controller.daemon.run import check_daemon
-from daemon_bench import ENABLED, daemon_table, far_end, holding, until, write_daemon
-from daemon_process import WATCHDOG, daemon_process, disarmed, play, run_era
-from journal import Journal, loudness
+from daemon_bench import ENABLED, daemon_table, holding, ready_daemon, write_daemon
 from model.errors import InputError
 from model.table.file import save_table
+from virtual_sockets import in_virtual_time_on_sockets
 
 MAX_TIME = 5.0  # s; an expanded bomb would take minutes, and gigabytes
 
@@ -157,61 +153,29 @@ def test_daemon_refuses_table_of_another_plate_or_with_nan(tmp_path: Path) -> No
         check_daemon(path)
 
 
-async def test_running_daemon_keeps_configuration_when_reload_is_invalid(tmp_path: Path) -> None:
-    """Each invalid file and SIGHUP: nothing is applied, not even valid changes beside it.
-
-    A start with such a file is refused with exit status 2 and sends nothing to the amplifier.
-    """
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        manager.bind(str(tmp_path / "notify"))
-        environment = {"NOTIFY_SOCKET": str(tmp_path / "notify")}
-        readies: list[float] = []
-        loop = asyncio.get_running_loop()
-
-        def receive() -> None:
-            if manager.recv(4096).startswith(b"READY=1"):
-                readies.append(loop.time())
-
-        loop.add_reader(manager, receive)
-        layout = tmp_path / "layout.yaml"
-        layout.write_text(LAYOUT, encoding="utf-8")
-        async with (
-            far_end(tmp_path) as far,
-            daemon_process(
-                tmp_path, far, "layout: layout.yaml\n", environment=environment
-            ) as daemon,
-        ):
-            journal = Journal(far)
-            config = tmp_path / "daemon.yaml"
+@in_virtual_time_on_sockets
+async def test_running_daemon_keeps_configuration_when_reload_is_invalid(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Each invalid file: nothing is applied, not even valid changes beside it; it plays on."""
+    layout, config = tmp_path / "layout.yaml", tmp_path / "daemon.yaml"
+    layout.write_text(LAYOUT, encoding="utf-8")
+    async with ready_daemon(tmp_path, "layout: layout.yaml\n") as (bench, era):
+        await era.arm("test", lease_s=60)
+        effects = await era.effects()
+        async with holding(era, far=bench.far):
             good = config.read_text("utf-8")
-            async with await daemon.client() as era, holding(era):
-                await play(era, far)
-                effects = await era.effects()
-                config.write_text(f"{good}longest_lease: 5 s\n", encoding="utf-8")
-                invalid = [each.values[0] for each in INVALID if each.values[0] is not None]
-                for content in invalid:
-                    layout.write_bytes(content)
-                    count = len(readies)
-                    os.kill(daemon.process.pid, signal.SIGHUP)
-                    await until(lambda count=count: len(readies) > count)
-                assert daemon.has_logged("reload rejected")
-                assert not daemon.has_logged("reload failed")
-                await play(era, far)
-                assert await era.effects() == effects
-                await disarmed(era)
-                await until(lambda: loudness(far) == 0)
-                await play(era, far)
-                status = await era.status()
-                assert status.state == ENABLED
-                assert status.lease_left_s is not None
-                assert status.lease_left_s > 5  # the previous limit
-            daemon.process.kill()
-            await daemon.process.wait()
-            await until(lambda: loudness(far) == 0)
-            dead = time.monotonic()
-            exit_status, _, err = await run_era("daemon", config)
-            assert exit_status == 2
-            assert str(layout) in err
-            assert "Traceback" not in err
-            assert not journal.since(dead + WATCHDOG)
-        loop.remove_reader(manager)
+            config.write_text(f"{good}longest_lease: 5 s\n", encoding="utf-8")
+            invalid = [each.values[0] for each in INVALID if each.values[0] is not None]
+            for content in invalid:
+                layout.write_bytes(content)
+                await bench.daemon.reload()
+            rejected = [one for one in caplog.messages if "reload rejected" in one]
+            assert len(rejected) == len(invalid)
+            assert not any("reload failed" in one for one in caplog.messages)
+            assert await era.effects() == effects
+            assert any(bench.far.summary().levels)
+        status = await era.status()
+        assert (status.state, (status.lease_left_s or 0) > 5) == (ENABLED, True)
+    with pytest.raises(InputError, match=r"layout\.yaml"):
+        check_daemon(config)

@@ -1,7 +1,6 @@
 """`era daemon` as a process over a pseudo-terminal: commands, locks, notices, children."""
 
 import asyncio
-import contextlib
 import json
 import signal
 import socket
@@ -93,34 +92,6 @@ async def test_commands_control_daemon(tmp_path: Path) -> None:
     status, _, err = await run_era("status", *where)
     assert status == 3
     assert str(daemon.socket) in err
-
-
-async def test_daemon_notifies_systemd(tmp_path: Path) -> None:
-    """READY=1, WATCHDOG=1, RELOADING=1 and STOPPING=1."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        manager.bind(str(tmp_path / "notify"))
-        manager.setblocking(False)
-        environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "1000000"}
-        async with (
-            far_end(tmp_path) as far,
-            daemon_process(tmp_path, far, environment=environment) as daemon,
-        ):
-            heard: list[str] = []
-
-            def has_heard(text: str) -> bool:
-                with contextlib.suppress(BlockingIOError):
-                    while True:
-                        heard.append(manager.recv(4096).decode())
-                return any(text in message for message in heard)
-
-            await until(lambda: has_heard("READY=1"))
-            await until(lambda: has_heard("WATCHDOG=1"))
-            await until(lambda: has_heard("STATUS=ready: "))
-            daemon.process.send_signal(signal.SIGHUP)
-            await until(lambda: has_heard("RELOADING=1"))
-            daemon.process.send_signal(signal.SIGTERM)
-            assert await daemon.status() == 0
-            assert has_heard("STOPPING=1")
 
 
 async def _get(port: int, path: str, *, host: str = "localhost") -> str:

@@ -7,7 +7,7 @@ it is a pseudo-terminal.
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import cache, partial
@@ -45,12 +45,12 @@ READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 
 @dataclass
 class DaemonBench:
-    """A serving daemon and its far end."""
+    """A serving daemon, its far end, and the task that runs it."""
 
     daemon: Daemon
     far: FarSide
-    folder: Path
     socket: Path
+    running: "asyncio.Task[None]"
 
     async def client(self, name: str = "test") -> AsyncClient:
         """Connect a client."""
@@ -89,18 +89,20 @@ def write_daemon(
 
 @asynccontextmanager
 async def ready_daemon(
-    folder: Path, more: str = ""
+    folder: Path, more: str = "", **options: Any
 ) -> AsyncIterator[tuple[DaemonBench, AsyncClient]]:
-    """A daemon that is ready to be armed, and a client of it."""
-    async with running_daemon(folder, more) as bench, await bench.client() as era:
+    """A daemon that is ready to be armed, and a client of it; options: as for `daemon_at`."""
+    async with running_daemon(folder, more, **options) as bench, await bench.client() as era:
         await until_state(era, READY)
         yield bench, era
 
 
 @asynccontextmanager
-async def running_daemon(folder: Path, more: str = "") -> AsyncIterator[DaemonBench]:
-    """A serving daemon; more: further lines of its file."""
-    async with far_end(folder) as far, daemon_at(far, folder, more) as bench:
+async def running_daemon(
+    folder: Path, more: str = "", **options: Any
+) -> AsyncIterator[DaemonBench]:
+    """A serving daemon; more: further lines of its file; options: as for `daemon_at`."""
+    async with far_end(folder) as far, daemon_at(far, folder, more, **options) as bench:
         yield bench
 
 
@@ -118,12 +120,20 @@ async def far_end(
 
 @asynccontextmanager
 async def daemon_at(
-    far: FarSide, folder: Path, more: str = "", *, changes: Sequence[tuple[str, str]] = ()
+    far: FarSide,
+    folder: Path,
+    more: str = "",
+    *,
+    changes: Sequence[tuple[str, str]] = (),
+    environment: Mapping[str, str] | None = None,
 ) -> AsyncIterator[DaemonBench]:
-    """A serving daemon at an existing far end; changes: replacements in the rig's text."""
+    """A serving daemon at an existing far end.
+
+    changes: replacements in the rig's text; environment: that its service manager gives it.
+    """
     config = load_daemon_config(write_daemon(folder, dict(far.urls), more, changes=changes))
-    lock = SocketLock(config.socket)
-    log = LogThread(folder / "log")
+    lock, log = SocketLock(config.socket), LogThread(folder / "log")
+    manager = ServiceManager(environment or {})
     loop = asyncio.get_running_loop()
     is_virtual = isinstance(loop, VirtualSocketsLoop)
     # Daemon, amplifier and test share a process, which a busy machine delays; in real time the
@@ -132,7 +142,7 @@ async def daemon_at(
         config,
         daemon_table(),
         log=log,
-        manager=ServiceManager({}),
+        manager=manager,
         dashboard=None,
         watchdog=WATCHDOG if is_virtual else 2.0,
     )
@@ -143,7 +153,7 @@ async def daemon_at(
         await until(lambda: config.socket.is_socket() or task.done())
         if task.done():
             task.result()
-        yield DaemonBench(daemon, far, folder, config.socket)
+        yield DaemonBench(daemon, far, config.socket, task)
     finally:
         daemon.shut_down("end of the test")
         try:
@@ -151,9 +161,11 @@ async def daemon_at(
         finally:
             logging.getLogger().removeHandler(log)
             log.close()
+            manager.close()
             lock.release()
     if witness is not None:
-        assert not witness.finish(clock.now())
+        found = witness.finish(clock.now())
+        assert not found, found[0]
         assert witness.frames
 
 

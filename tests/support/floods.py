@@ -1,13 +1,12 @@
 """Floods of a daemon, each a process: `python tests/support/floods.py KIND ...`.
 
-    tuio PORT RATE SECONDS    moving fingers, then all lifted; prints when [s] they were lifted
     idle SOCKET COUNT         silent connections
     unreading SOCKET COUNT    connections that subscribe to everything and read nothing
     garbage SOCKET SEED       invalid requests as fast as possible
     asking SOCKET COUNT       requests as fast as they are served, on several connections
     again SOCKET COUNT        subscribers that connect again when they are closed, 2000 in a second
 
-All but the first run until their standard input ends; each prints `ready` once it runs.
+They run until their standard input ends; each prints `ready` once it runs.
 """
 
 import asyncio
@@ -21,9 +20,6 @@ import sys
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
-
-from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import tuio_datagram
 
 _SUBSCRIBE = {
     "topics": ["state", "contacts", "pattern", "silence", "amplifiers", "latency", "log", "link"],
@@ -56,32 +52,6 @@ def _print(text: str) -> None:
 
 def _is_over() -> bool:
     return bool(select.select([sys.stdin], [], [], 0)[0])
-
-
-def _tuio(port: str, rate: str, seconds: str) -> None:
-    chance = random.Random(3)
-    count = 997  # distinguishable frames, repeated
-
-    def frame(number: int) -> bytes:
-        fingers = 1 + number % 3
-        touches = (Touch(n, chance.uniform(0.1, 0.9), chance.uniform(0.1, 0.9)) for n in range(3))
-        return tuio_datagram(TouchFrame("flood", 0.0, tuple(touches)[:fingers]), -1)
-
-    datagrams = [frame(number) for number in range(count)]
-    lifted = tuio_datagram(TouchFrame("flood", 0.0, ()), -1)
-    to = ("127.0.0.1", int(port))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        _print("ready")
-        begin = time.monotonic()
-        sent = 0
-        while (passed := time.monotonic() - begin) < float(seconds):
-            while sent < passed * float(rate):
-                sender.sendto(datagrams[sent % count], to)
-                sent += 1
-            time.sleep(0.0002)
-        up = time.monotonic()
-        sender.sendto(lifted, to)
-    _print(json.dumps({"up_s": up, "sent": sent}))
 
 
 def _connect(path: str) -> socket.socket:
@@ -191,7 +161,6 @@ def _again(path: str, count: str) -> None:
 
 
 _KINDS = {
-    "tuio": _tuio,
     "idle": _idle,
     "unreading": _unreading,
     "garbage": _garbage,

@@ -33,7 +33,6 @@ PROGRAMS = {
     (sys.executable, str(Path(__file__).with_name(name)))
     for name in (
         "interrupted.py",
-        "jumping_clock.py",
         "live_demonstration.py",
         "patient_daemon.py",
         "steady_host.py",

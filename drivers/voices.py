@@ -8,7 +8,7 @@ every set is played by host and far end.
 
 import cmath
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -25,15 +25,20 @@ _SAME = 1e-6  # s; ends nearer than that are one, so that rounding decides nothi
 
 def amplitude_of(level: int, phase: int) -> complex:
     """Return the complex amplitude in full levels of a level and phase of the wire."""
-    return cmath.rect(level / _PER_FULL, math.radians(phase / _PER_DEGREE))
+    return _amplitudes_at([(level, phase)])[0]
 
 
 @lru_cache(maxsize=256)  # a set names an envelope several times, and its commit again
 def amplitudes_of(envelope: Envelope | None) -> tuple[complex, ...]:
     """Return the complex amplitudes of the knots of an envelope in full levels, if there is one."""
-    if envelope is None:
-        return ()
-    return tuple([amplitude_of(*knot) for knot in envelope.knots])
+    return () if envelope is None else _amplitudes_at(envelope.knots)
+
+
+def _amplitudes_at(knots: Sequence[tuple[int, int]]) -> tuple[complex, ...]:
+    amplitudes = []
+    for level, phase in knots:
+        amplitudes.append(cmath.rect(level / _PER_FULL, math.radians(phase / _PER_DEGREE)))
+    return tuple(amplitudes)
 
 
 @dataclass(slots=True)  # frozen, each takes three times as long to make, and every set makes many
@@ -75,10 +80,10 @@ class Transition:
 
     def points(self, since: float, until: float = math.inf) -> tuple[complex, ...]:
         """Return the amplitudes at two times [s] and at the knots between: others are between."""
-        moments = (self.start + self.step * (index + 1) for index in range(len(self.knots)))
-        between = [
-            knot for moment, knot in zip(moments, self.knots, strict=True) if since < moment < until
-        ]
+        between = []
+        for number, knot in enumerate(self.knots, 1):
+            if since < self.start + self.step * number < until:
+                between.append(knot)
         return (self.at(since), *between, self.at(until))
 
     def peak(self, time: float) -> float:
@@ -91,7 +96,7 @@ class Transition:
             return 0.0
         points = (self.first, *self.knots, self.last)
         passed = int((time - self.start) / self.step) if self.knots else 0
-        return steepest(points[passed:], self.step, is_cosine=not self.knots)[1]
+        return steepest(pairwise(points[passed:]), self.step, is_cosine=not self.knots)[1]
 
 
 def along(envelope: Envelope, time: float, first: complex, last: complex) -> Transition:
@@ -109,14 +114,15 @@ def towards(command: Command, time: float, ramp: float, first: complex) -> Trans
     return along(command.onset, time, first, last)
 
 
-def steepest(points: Sequence[complex], step: float, *, is_cosine: bool) -> tuple[float, float]:
-    """Return the steepest rise of the magnitude, and the fastest change, along points.
+def steepest(
+    ways: Iterable[tuple[complex, complex]], step: float, *, is_cosine: bool
+) -> tuple[float, float]:
+    """Return the steepest rise of the magnitude, and the fastest change, of ways between points.
 
-    Both in full levels a second; the points are a step [s] apart, on straight lines or, two of
-    them, on a raised cosine.
+    Both in full levels a second; each way takes a step [s], on a straight line or a raised cosine.
     """
     rise = change = 0.0
-    for one, other in pairwise(points):
+    for one, other in ways:
         if one == other:
             continue
         fastest = abs(other - one) / step if step else math.inf

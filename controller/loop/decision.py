@@ -114,7 +114,7 @@ class Decider:
             table,
             None if timing is None else timing.levels,
             shape=self._builder.shape,
-            arrived=arrived,
+            arrived=self._note_answer,
         )
         self._selected: Selection | None = None
         self._decided: Decision | None = None  # the last one with something to send
@@ -125,6 +125,8 @@ class Decider:
         self._is_silent = False  # for certain
         self._over: tuple[Content, ...] = ()  # ended by themselves
         self._retry_at: float | None = None
+        self._is_new = True  # something has come that is not decided yet
+        self._arrived = arrived
         self._triggered_at: float | None = None
         self._played_until = -math.inf  # s; as far as known
 
@@ -173,8 +175,8 @@ class Decider:
 
         A source times out then, an intent expires, or a ledger would admit what it refused.
         """
-        moments = (self._tracker.next_expiry, self._intent_due, self._retry_at)
-        return min((moment for moment in moments if moment is not None), default=None)
+        moments = [self._tracker.next_expiry, self._intent_due, self._retry_at]
+        return min([moment for moment in moments if moment is not None], default=None)
 
     @property
     def is_choosing(self) -> bool:
@@ -194,18 +196,24 @@ class Decider:
     def update(self, frame: TouchFrame, *, keeps_taps: bool = False) -> Change:
         """Apply a touch frame to the contacts; keeps_taps: as of `ContactTracker.update`."""
         change = self._tracker.update(frame, keeps_taps=keeps_taps)
-        self._note(change, frame.time)
+        if change:
+            self._note(frame.time)
         return change
 
     def expire(self, now: float) -> Change:
         """Lift the contacts of sources that have timed out at now [s]."""
         change = self._tracker.expire(now)
-        self._note(change, now)
+        if change:
+            self._note(now)
         return change
+
+    def look_again(self) -> None:
+        """Note that the next decision may differ though no contact has changed."""
+        self._is_new = True
 
     def forget(self) -> None:
         """Discard the known playback: the next decision has a set; fingers keep their layers."""
-        self._selected, self._decided, self._retry_at = None, None, None
+        self._selected, self._decided, self._retry_at, self._is_new = None, None, None, True
         self._playing, self._over, self._is_silent = {}, (), False
 
     def only_ends(self, decision: Decision) -> Decision:
@@ -302,6 +310,8 @@ class Decider:
         """Return the sets that prolong what plays, by layer, where that is due at a time [s]."""
         due = {}
         for number, one in self._playing.items():
+            if now < one.validity.renewal_due:
+                continue
             targets = one.content.targets
             until = self._confirmed_until(one.content)
             if one.validity.is_renewal_due(now, confirmed_until=until):
@@ -355,10 +365,14 @@ class Decider:
 
     def decide(self, now: float) -> Decision | None:
         """Decide at a time [s], for the contacts as of `expire`; None if nothing changes."""
+        for each in self._playing.values():
+            if each.drive:
+                self._played_until = now
+        if not (self._is_new or _is_due(self._intent_due, now) or _is_due(self._retry_at, now)):
+            return None
         contacts = self._tracker.contacts
         triggered_at = now if self._triggered_at is None else min(self._triggered_at, now)
-        if any(each.drive for each in self._playing.values()):
-            self._played_until = now
+        self._is_new = False
         from_rest = now - self._played_until >= _RING_DOWN
         decision, has_failed = None, False
         try:
@@ -371,7 +385,7 @@ class Decider:
                 if decision is None and _why_not(selection) != _why_not(self._selected):
                     decision = draft  # said without sending
         except Exception as error:
-            has_failed = True
+            has_failed = self._is_new = True  # and tried again
             selection = Selection((), contacts, (), failure_text(error))
             is_new = selection != self._selected
             draft = Decision(contacts, selection, from_rest, triggered_at)
@@ -386,6 +400,10 @@ class Decider:
         if decision is not None and (decision.sets or selection.contents or decision.silence):
             self._decided = decision
         return decision
+
+    def _note_answer(self) -> None:
+        self._is_new = True
+        self._arrived()
 
     def _select(self, contacts: tuple[Contact, ...], now: float, triggered_at: float) -> Selection:
         """Query the intent, and the table for it."""
@@ -512,9 +530,10 @@ class Decider:
         lasts = _shortest(played.layers, number)
         return Validity.started(lasts, confirmed_until=until, now=now)
 
-    def _note(self, change: Change, time: float) -> None:
-        """Note when the first change since the last decision arrived."""
-        if change and self._triggered_at is None:
+    def _note(self, time: float) -> None:
+        """Note a change; when the first one since the last decision arrived."""
+        self._is_new = True
+        if self._triggered_at is None:
             self._triggered_at = time
 
 

@@ -294,14 +294,15 @@ class Controller:
     async def step(self) -> None:
         """Run the loop once: decide, send what changed, then the heartbeat if it is due."""
         self._wake.clear()
-        if self._decider_if_open is None:
+        decider = self._decider_if_open
+        if decider is None:
             return
         now = clock.now()
         if self._is_armed_anew:  # not amid a turn, whose set may be on the wire
             self._is_armed_anew = False
-            self._decider.forget()
-        expired = self._decider.expire(now)
-        decision = self._decider.decide(now)
+            decider.forget()
+        expired = decider.expire(now)
+        decision = decider.decide(now)
         try:
             async with self._sending:
                 if self._group.is_armed:
@@ -334,6 +335,8 @@ class Controller:
 
     def request_update(self) -> None:
         """Query the intent source again, because its intent changed without a touch."""
+        if self._decider_if_open is not None:
+            self._decider_if_open.look_again()
         self._wake.set()
 
     @property
@@ -355,10 +358,10 @@ class Controller:
             self._wake.set()
             if self._group.is_armed:
                 self._changed_at = clock.now()
-        if self._decider.is_silence_pending:
-            self._group.abort_exchange()
+            if self._decider.is_silence_pending:
+                self._group.abort_exchange()
+            self._report_change(change)
         self._schedule_expiry()
-        self._report_change(change)
 
     def _schedule_expiry(self) -> None:
         """Check for expired sources when the next one times out.

@@ -70,16 +70,15 @@ _UNCHANGED = Change()
 
 @dataclass(frozen=True, slots=True)
 class _Source:
-    """A source with contacts: the time [s] of its last frame, and its origin."""
+    """A source with contacts: the time [s] of its last frame, and its origin.
+
+    expiry [s]: when its contacts are lifted unless another frame arrives.
+    """
 
     received: float
     timeout: float
+    expiry: float
     origin: str
-
-    @property
-    def expiry(self) -> float:
-        """When [s] its contacts are lifted unless another frame arrives."""
-        return self.received + self.timeout
 
 
 class ContactTracker:
@@ -97,17 +96,11 @@ class ContactTracker:
         self._contacts: dict[ContactKey, Contact] = {}
         self._sources: dict[str, _Source] = {}
         self._taps: dict[ContactKey, float] = {}  # s; when contacts end that are lifted already
-
-    @property
-    def contacts(self) -> tuple[Contact, ...]:
+        self._newest = -math.inf  # s; time of the newest frame
+        self.contacts: tuple[Contact, ...] = ()
         """All contacts in order of arrival; the newest is the last."""
-        return tuple(self._contacts.values())
-
-    @property
-    def next_expiry(self) -> float | None:
+        self.next_expiry: float | None = None
         """When [s] the first contacts are lifted unless a frame of their source arrives."""
-        ends = [source.expiry for source in self._sources.values()]
-        return min([*ends, *self._taps.values()], default=None)
 
     def expiry_of(self, key: ContactKey) -> float:
         """Return when [s] a contact is lifted unless a frame arrives; -inf for none of that key."""
@@ -128,11 +121,11 @@ class ContactTracker:
             rejected.append("no_time")
         if keeps_taps:
             self._keep_taps(frame)
-        up = self._lift(
-            key
-            for key in self._contacts
-            if key.source == frame.source and (key in touches) == (key in self._taps)
-        )
+        gone = []
+        for key in self._contacts:
+            if key.source == frame.source and (key in touches) == (key in self._taps):
+                gone.append(key)
+        up = self._lift(gone) if gone else ()
         self._sources[frame.source] = _source_of(frame)
         down: list[Contact] = []
         moved: list[Contact] = []
@@ -152,22 +145,23 @@ class ContactTracker:
                 moved.append(contact)
             elif known.load != contact.load:
                 pressed.append(contact)
-        self._forget_sources()
+        self._note_next()
         return Change(tuple(down), tuple(moved), tuple(pressed), up, tuple(rejected))
 
     def expire(self, now: float) -> Change:
         """Lift the contacts of all sources that have timed out at now [s]."""
-        # Same expression as next_expiry, so both round alike. Frames dated in the future are
-        # treated as received now.
+        if self._newest <= now and (self.next_expiry is None or now < self.next_expiry):
+            return _UNCHANGED
+        # Frames dated in the future are treated as received now.
         expired = [name for name, source in self._sources.items() if source.expiry <= now]
         ended = [key for key, end in self._taps.items() if end <= now]
         up: tuple[Contact, ...] = ()
         if expired or ended:
             up = self._lift(key for key in self._contacts if key.source in expired or key in ended)
-            self._forget_sources()
         for name, source in self._sources.items():
             if source.received > now:
-                self._sources[name] = replace(source, received=now)
+                self._sources[name] = replace(source, received=now, expiry=now + source.timeout)
+        self._note_next()
         return Change(up=up) if up else _UNCHANGED
 
     def _contact(
@@ -220,10 +214,17 @@ class ContactTracker:
             self._taps.pop(contact.key, None)
         return lifted
 
-    def _forget_sources(self) -> None:
-        """Forget sources without contacts."""
-        names = {key.source for key in self._contacts}
-        self._sources = {name: self._sources[name] for name in self._sources if name in names}
+    def _note_next(self) -> None:
+        """Forget sources without contacts, and note when the others expire."""
+        sources, ends = {}, [*self._taps.values()]
+        for key in self._contacts:
+            sources[key.source] = self._sources[key.source]
+        self._newest = -math.inf
+        for source in sources.values():
+            ends.append(source.expiry)
+            self._newest = max(self._newest, source.received)
+        self._sources, self.contacts = sources, tuple(self._contacts.values())
+        self.next_expiry = min(ends, default=None)
 
 
 def _load(known: Contact, touch: Touch, time: float) -> float:
@@ -241,7 +242,7 @@ def _source_of(frame: TouchFrame) -> _Source:
     if timeout is None or not 0 < timeout <= MAX_CONTACT_TIMEOUT:  # NaN is not
         timeout = CONTACT_TIMEOUT
     origin = frame.source if frame.origin is None else frame.origin
-    return _Source(frame.time, timeout, origin)
+    return _Source(frame.time, timeout, frame.time + timeout, origin)
 
 
 def _valid_touches(frame: TouchFrame, rejected: list[str]) -> dict[ContactKey, Touch]:

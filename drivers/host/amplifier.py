@@ -194,14 +194,15 @@ class Amplifier(Dialogue):
 
     async def ping(self) -> Values:
         """Feed the watchdog; returns the status. Raises CommandRefused if it is not armed."""
-        status = await self.request("Ping", {"session": self.session}, Priority.HEARTBEAT)
+        values = {"session": self.session}
+        status = await self.line.submit(self, Priority.HEARTBEAT, "Ping", values)
         if status["state"] != ENABLED:
             raise self.disarmed(status)
         return status
 
     async def read_status(self, priority: Priority = Priority.OTHER) -> Values:
         """Read the status, which feeds nothing."""
-        return await self.request("GetStatus", {}, priority)
+        return await self.line.submit(self, priority, "GetStatus", {})
 
     async def clear(self, latch: int | None = None) -> Values:
         """Acknowledge the stop or fault with this latch, None for the newest that was shown.

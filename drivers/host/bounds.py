@@ -8,7 +8,7 @@ largest where each transition is at one of its points.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import starmap
+from itertools import chain, pairwise, product, starmap
 
 from drivers.playback import Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
@@ -178,8 +178,8 @@ class ChannelBounds:
 
     def _note(self, frequency: float, *ways: tuple[float, float]) -> None:
         """Note the steepest rise and the fastest change of a voice, by one of some ways."""
-        worst_way = max(rise for rise, _ in ways), max(change for _, change in ways)
-        self._rises.setdefault(frequency, []).append(worst_way)
+        rises, changes = zip(*ways, strict=True)
+        self._rises.setdefault(frequency, []).append((max(rises), max(changes)))
 
 
 def worst(channels: Sequence[ChannelBounds]) -> tuple[list[float], float]:
@@ -220,7 +220,10 @@ def all_bounds(
 
 
 def _command_of(one: LayerSet, channel: int) -> Command | None:
-    return next((each for each in one.commands if each.channel == channel), None)
+    for each in one.commands:
+        if each.channel == channel:
+            return each
+    return None
 
 
 def _steepest_from(
@@ -230,9 +233,10 @@ def _steepest_from(
 
     Along an envelope, or a ramp [s] without one.
     """
-    knots, step = amplitudes_of(envelope), _step_of(envelope, ramp)
-    ways = [steepest((start, *knots, last), step, is_cosine=not knots) for start in starts]
-    return max(rise for rise, _ in ways), max(change for _, change in ways)
+    knots = amplitudes_of(envelope)
+    course = (*knots, last)
+    ways = chain(product(starts, course[:1]), pairwise(course))
+    return steepest(ways, _step_of(envelope, ramp), is_cosine=not knots)
 
 
 def _step_of(envelope: Envelope | None, ramp: float) -> float:

@@ -172,11 +172,11 @@ class Ledger:
                 else:
                     highest += max(abs(transition.first), abs(transition.last))
             high = round(min(highest, 1.0) * _LEVEL.per_unit)
-            low = (
-                round(min(playback.level(channel, now), 1.0) * _LEVEL.per_unit) if is_settled else 0
-            )
-            if low - tolerance <= level <= high + tolerance:  # nearly always
+            if is_settled and high - tolerance <= level <= high + tolerance:  # nearly always
                 continue
+            low = 0
+            if is_settled:
+                low = round(min(playback.level(channel, now), 1.0) * _LEVEL.per_unit)
             if has_feature(self.capabilities, "levels_measured"):
                 error = round(_MEASURING_ERROR * _LEVEL.per_unit)
                 low -= min(error, round(_WEAK * low))

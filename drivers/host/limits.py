@@ -186,25 +186,25 @@ class Rounding:
         return _refused(channel, f"{name} must be 0 to {self._level_max:g}, got {level!r}")
 
     def _envelope(self, shape: Shape, channel: int) -> Envelope:
-        can = self._can
-        low, high = (
-            _STEP.from_wire(can[name]) for name in ("envelope_step_min", "envelope_step_max")
-        )
+        can, limits = self._can, self._limits
+        low, high = map(_STEP.from_wire, (can["envelope_step_min"], can["envelope_step_max"]))
         if not low <= shape.step <= high:
             text = f"step of an envelope must be {low:g} to {high:g} s, got {shape.step!r} s"
             raise _refused(channel, text)
         if len(shape.knots) > can["knots"]:
             text = f"knots of an envelope must be at most {can['knots']}, got {len(shape.knots)}"
             raise _refused(channel, text)
-        knots = tuple(self._knot(knot, channel) for knot in shape.knots)
-        return Envelope(math.ceil(shape.step * _STEP.per_unit - _SLACK), knots)
-
-    def _knot(self, knot: complex, channel: int) -> tuple[int, int]:
-        level = abs(knot)
-        if not 0 <= level <= self._level_max * TOLERANCE:
-            raise self._level_refused(channel, "level of a knot", level)
-        phase = _PHASE.to_wire(math.degrees(math.atan2(knot.imag, knot.real)))
-        return min(round(level * _LEVEL.per_unit), self._limits.level), phase
+        knots: list[tuple[int, int]] = []
+        for knot in shape.knots:
+            level = abs(knot)
+            if not 0 <= level <= self._level_max * TOLERANCE:
+                raise self._level_refused(channel, "level of a knot", level)
+            degrees = math.degrees(math.atan2(knot.imag, knot.real))
+            phase = round(degrees * _PHASE.per_unit)
+            if not _PHASE.minimum <= phase <= _PHASE.maximum:
+                phase = _PHASE.to_wire(degrees)
+            knots.append((min(round(level * _LEVEL.per_unit), limits.level), phase))
+        return Envelope(math.ceil(shape.step * _STEP.per_unit - _SLACK), tuple(knots))
 
 
 def _refused(channel: int, text: str) -> CommandRefused:

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 from drivers.errors import CommandError, FrameError
@@ -217,8 +218,7 @@ class Rows:
         count = self.count if isinstance(self.count, int) else values[self.count]
         if len(rows) != count:
             raise ValueError(f"{self.name} must have {count} rows, got {len(rows)}")
-        for row in rows:
-            self.record.append(row, words)
+        self.record.append(words, *rows)
 
     def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
         """Read all records."""
@@ -258,12 +258,12 @@ class Record:
         for field in fields:
             self.names += dict(field.parts) if isinstance(field, Bits) else [field.name]
 
-    def append(self, values: Mapping[str, Any], words: list[int]) -> None:
-        """Append the words of values; ValueError for one out of range, KeyError for no number.
+    def append(self, words: list[int], *rows: Mapping[str, Any]) -> None:
+        """Append the words of values, by row; ValueError for one out of range, KeyError for none.
 
         Numbers and shared words, nearly all, without a call: every set has dozens of them.
         """
-        for field in self.fields:
+        for values, field in product(rows, self.fields):
             if isinstance(field, Number):
                 quantity, value = field.quantity, values[field.name]
                 if not quantity.minimum <= value <= quantity.maximum:
@@ -285,7 +285,7 @@ class Record:
     def pack(self, values: Mapping[str, Any]) -> list[int]:
         """Return the words of values."""
         words: list[int] = []
-        self.append(values, words)
+        self.append(words, values)
         return words
 
     def read(self, words: Sequence[int], at: int = 0) -> tuple[Values, int]:

@@ -95,7 +95,7 @@ def pack_layers(layers: Iterable[LayerSet]) -> list[int]:
             "ramp": layer.ramp,
             "valid_for": layer.valid_for,
         }
-        LAYER.append(head, words)
+        LAYER.append(words, head)
         for command in layer.commands:
             values = {
                 "channel": command.channel,
@@ -107,13 +107,13 @@ def pack_layers(layers: Iterable[LayerSet]) -> list[int]:
                 "level": command.level,
                 "phase": command.phase,
             }
-            COMMAND.append(values, words)
+            COMMAND.append(words, values)
             for shape in (command.onset, command.ending):
                 if shape is None:
                     continue
-                ENVELOPE.append({"knots": len(shape.knots), "step": shape.step}, words)
-                for level, phase in shape.knots:
-                    KNOT.append({"level": level, "phase": phase}, words)
+                ENVELOPE.append(words, {"knots": len(shape.knots), "step": shape.step})
+                rows = [{"level": level, "phase": phase} for level, phase in shape.knots]
+                KNOT.append(words, *rows)
     return words
 
 

@@ -153,7 +153,7 @@ class BaseEnvelope:
         """Refuse envelopes that no amplifier can play."""
         if not 1 <= len(self.knots) <= MAX_KNOTS:
             raise InputError(f"envelope: knots must be 1 to {MAX_KNOTS}, got {len(self.knots)}")
-        if not all(cmath.isfinite(value) for value in (self.start, *self.knots)):
+        if not all(map(cmath.isfinite, (self.start, *self.knots))):
             raise InputError("envelope: knots must be finite numbers")
         if not (0 < self.step < math.inf and 0 < self.frequency < math.inf):
             raise InputError(
@@ -169,7 +169,7 @@ class BaseEnvelope:
     @property
     def largest(self) -> float:
         """The largest amplitude [m]."""
-        return max(abs(value) for value in (self.start, *self.knots))
+        return max(map(abs, (self.start, *self.knots)))
 
     def amplitude(self, times: FloatArray) -> ComplexArray:
         """Complex amplitude a [m] at times [s] (n,)."""

@@ -228,7 +228,7 @@ class Sensing:
                     }
                     for each in phasors
                 ]
-                record.append({"flags": int(is_overloaded), "tones": rows}, words)
+                record.append(words, {"flags": int(is_overloaded), "tones": rows})
         start = min(reader.offset, _Q["window_start"].high)
         return {
             **{"reading": reader.measurement.number, "state": READING_STATES[state]},

@@ -263,6 +263,7 @@ async def test_others_feel_no_change_after_a_click_of_one_finger() -> None:
         player, contact = fingers.controller._intent_source, fingers.applied[-1].contacts[0]
         assert isinstance(player, EffectPlayer)
         player.play("tick", contact, asyncio.get_running_loop().time(), level_db_sl=None)
+        fingers.controller.request_update()
         await fingers.hold(0.4)
         changed = [layers for _, _, layers in fingers.committed[count:] if not layers[0].renew]
         assert [[one.layer for one in each] for each in changed] == [[layers[1]]] * 2

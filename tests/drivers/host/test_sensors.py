@@ -44,7 +44,7 @@ class Sensors:
         tones = [{"amplitude": float(each + 1), "phase": -9000} for each in range(self._tones)]
         words: list[int] = []
         for _ in range(count):
-            sensor_reading(self._tones).append({"flags": 1, "tones": tones}, words)
+            sensor_reading(self._tones).append(words, {"flags": 1, "tones": tones})
         done = {"state": READING_STATES["COMPLETE"], "window_left": 0}
         return {**head, **done, "count": count, "sensors": words}
 

@@ -181,15 +181,22 @@ def touch(
     positions = [parse_point(text, what="era touch") for text in at or ()]
     with _client(socket) as era:
         _check_positions(positions, era.hello("era").rig)
-        era.touch(positions, source="era touch")
-        end = time.monotonic() + duration
-        time.sleep(min(duration, 2 * _REPEAT_INTERVAL))
-        status = era.status()
-        while (left := end - time.monotonic()) > 0:
-            era.touch(positions, source="era touch")
-            time.sleep(min(left, _REPEAT_INTERVAL))
+        begin = time.monotonic()
+        _hold(era, positions, begin + duration / 2)
+        status = era.status()  # right after a touch, whose contact lasts for 150 ms
+        _hold(era, positions, begin + duration)
         era.touch([], source="era touch")
     typer.echo(status.model_dump_json() if as_json else show_status(status))
+
+
+def _hold(era: "Client", positions: list[tuple[float, float]], end: float) -> None:
+    """Repeat fingers until a time [s] of time.monotonic(), and there once more."""
+    while True:
+        era.touch(positions, source="era touch")
+        left = end - time.monotonic()
+        if left <= 0:
+            return
+        time.sleep(min(left, _REPEAT_INTERVAL))
 
 
 @app.command()

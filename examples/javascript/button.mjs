@@ -17,16 +17,16 @@ era.on("lost", fail);
 process.on("SIGINT", () => era.stop().then(() => process.exit(130), fail));
 
 const played = new Promise((resolve) => era.on("pattern", resolve));
-const second = () => new Promise((resolve) => setTimeout(resolve, 1000));
+const seconds = (count) => new Promise((resolve) => setTimeout(resolve, 1000 * count).unref());
 await era.subscribe("pattern");
 await era.arm().catch(fail);
 await era.touch(places);
-const pattern = await Promise.race([played, second()]);
+const pattern = await Promise.race([played, seconds(5)]);
 if (pattern) {
   const contrast = pattern.predicted_felt_contrast_db;
   console.log(`ERAs ${Object.keys(pattern.drive).sort().join(", ")}`);
   console.log(contrast === null ? "one finger" : `felt contrast ${contrast.toFixed(1)} dB`);
-  await second();
+  await seconds(1);
 } else {
   const { silence_reason, cause } = await era.status();
   console.log(`silent: ${silence_reason ?? cause}`);

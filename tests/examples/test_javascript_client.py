@@ -16,6 +16,12 @@ TARGET, QUIET = "0.08,0.06", "0.22,0.16"
 pytestmark = pytest.mark.real_time
 
 
+@pytest.fixture(autouse=True)
+def resting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fingers that stay until they lift: a busy machine may repeat their frames too late."""
+    monkeypatch.setattr("controller.sources.contacts.CONTACT_TIMEOUT", 60.0)
+
+
 async def started(bench: DaemonBench | None, *places: str) -> asyncio.subprocess.Process:
     """The program with fingers at places, at a daemon if there is one."""
     socket = "nosuch.sock" if bench is None else str(bench.socket)

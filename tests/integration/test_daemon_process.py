@@ -17,7 +17,7 @@ from daemon_process import (
     playing,
     run_era,
 )
-from patient_daemon import PROGRAM
+from patient_daemon import PROGRAM, RESTING
 
 pytestmark = pytest.mark.real_time
 
@@ -49,7 +49,10 @@ async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> 
 
 async def test_commands_control_daemon(tmp_path: Path) -> None:
     """status, arm, touch, stop, clear and disarm with their exit statuses and JSON."""
-    async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
+    async with (
+        far_end(tmp_path) as far,
+        daemon_process(tmp_path, far, program=RESTING) as daemon,
+    ):
         where = ("--socket", daemon.socket)
         status, out, _ = await run_era("status", *where, "--json")
         shown = json.loads(out)
@@ -57,7 +60,7 @@ async def test_commands_control_daemon(tmp_path: Path) -> None:
         status, _, err = await run_era("clear", *where)
         assert (status, err) == (0, "")
         arming = await asyncio.create_subprocess_exec(
-            *(ERA, "arm", "--lease", "2", *map(str, where)), stdout=asyncio.subprocess.PIPE
+            *(ERA, "arm", "--lease", "30", *map(str, where)), stdout=asyncio.subprocess.PIPE
         )
         assert arming.stdout is not None
         assert await asyncio.wait_for(arming.stdout.readline(), PATIENCE)
@@ -78,7 +81,7 @@ async def test_commands_control_daemon(tmp_path: Path) -> None:
         assert (status, out.partition(":")[0]) == (0, "ready")
         assert far.summary().state == "SWITCH_ON_DISABLED"
         arming = await asyncio.create_subprocess_exec(
-            *(ERA, "arm", "--lease", "1", *map(str, where)),
+            *(ERA, "arm", "--lease", "3", *map(str, where)),
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
         )

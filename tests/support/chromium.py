@@ -30,8 +30,8 @@ FLAGS = (
     "--remote-debugging-port=0",
     "about:blank",
 )
-STARTING = 60.0  # s; a loaded machine takes its time
-WAITING = 60.0  # s; for anything that should be seen
+STARTING = 180.0  # s; a loaded machine takes its time
+WAITING = 180.0  # s; for anything that should be seen
 
 
 class Navigated(Exception):

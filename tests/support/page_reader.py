@@ -13,6 +13,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from patient_daemon import RESTING
 from preloaded import ERA
 from printed import difference
 from typed_page import Edited, Interrupted, PageError, Seen, Step, Typed, Written
@@ -198,12 +199,18 @@ class Reader:
 
 
 def _commands(fence: str) -> list[list[str]]:
-    """What runs a fence: each line by itself where all are plain commands, else a shell."""
+    """What runs a fence: each line by itself where all are plain commands, else a shell.
+
+    A daemon waits for a busy machine, see `patient_daemon`.
+    """
     plain = re.fullmatch(r"((era|pip|python|cp) [^|&;<>$`*?~#\\\n]+\n)+", fence)
     if plain is None:
         return [["bash", "-e", "-c", fence]]
     lines = [shlex.split(line) for line in fence.splitlines()]
-    return [[ERA, *words[1:]] if words[0] == "era" else words for words in lines]
+    era = {"daemon": RESTING}
+    return [
+        [*era.get(words[1], (ERA,)), *words[1:]] if words[0] == "era" else words for words in lines
+    ]
 
 
 def _compare(line: int, shown: str | None, printed: str) -> None:

@@ -23,7 +23,7 @@ RESTING = (*PROGRAM, "--resting")
 LOADING = (*PROGRAM, "--loading")
 REPLY_TIMEOUT = 5.0  # s; in place of 30 ms
 WATCHDOG = 2.0  # s; in place of 0.25 s, the longest of the protocol
-CONTACT_TIMEOUT = 5.0  # s; in place of 0.15 s
+CONTACT_TIMEOUT = 3.0  # s; in place of 0.15 s, no longer than that of TUIO
 
 
 def wait_long(patch: pytest.MonkeyPatch) -> None:

@@ -222,13 +222,6 @@ elsewhere: null
 ON_PAD, ON_QUIET = (0.1, 0.1), (0.25, 0.1)
 
 
-@pytest.fixture
-def resting(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fingers that stay until they lift: a busy machine may repeat their frames too late."""
-    monkeypatch.setattr("controller.sources.contacts.CONTACT_TIMEOUT", 60.0)
-
-
-@pytest.mark.usefixtures("resting")
 @in_virtual_time_on_sockets
 async def test_daemon_plays_effects_by_region_and_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

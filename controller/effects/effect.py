@@ -14,7 +14,7 @@ from controller.sources.contacts import Contact, ContactKey
 from model.config.sections import Quantity
 from model.config.units import FREQUENCY, RATIO
 from model.finger.perception import STRONG_DB_SL
-from model.table.modulation import MAX_MODULATION, MIN_MODULATION
+from model.table.request import MAX_MODULATION, MIN_MODULATION
 
 NEIGHBOURS: Literal["neighbours"] = "neighbours"
 """The level `as strong as the neighbours allow`."""

@@ -16,7 +16,7 @@ from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL
 from model.table.question import Point, Question
 from model.table.table import LocalizationTable
-from model.table.weak_cells import ask_once
+from model.table.weak_cells import contrasts_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +91,9 @@ def map_contrast(
         for row, mode in enumerate(modes)
     }
     found = np.full((len(modes), 2, grid.cell_count), np.nan)
-    ask = ask_once(table)
     for done, ((row, cell), question) in enumerate(questions.items(), start=1):
         question.check_on(table.plate)
-        found[row, :, cell] = ask(question) or np.nan
+        found[row, :, cell] = contrasts_of(table, question) or np.nan
         progress(done, len(questions))
     fields = found.reshape(len(modes), 2, grid.ny, grid.nx)
     return ContrastMap(

@@ -31,9 +31,6 @@ from model.table.request import (
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
 
-MIN_MODULATION, MAX_MODULATION = 10.0, 30.0
-"""Modulations that side bands play [Hz]; slower ones are changes of level."""
-
 _SIDE = 0.5  # amplitude of a side band to the carrier's
 _ALL_DB = 10 * math.log10(1 + 2 * _SIDE**2)  # of all three above the carrier
 _NEAR = 2  # carriers tried on each side of the steady one, by frequencies of the table

@@ -26,6 +26,9 @@ APART_HZ = 30.0
 MIN_CONTRAST_DB, OWN_CONTRAST_DB = 6.0, 12.0
 """Promised contrast from which a content is served, and from which it is a finger's own."""
 
+MIN_MODULATION, MAX_MODULATION = 10.0, 30.0
+"""Modulations that side bands play [Hz]; slower ones are changes of level."""
+
 ANY_BAND = (0.0, math.inf)
 
 

@@ -181,13 +181,14 @@ def ask_once(table: LocalizationTable) -> Ask:
     def ask(question: Question) -> Contrasts | None:
         first = _first_image(question, table, images)
         if first not in known:
-            known[first] = _contrasts(table, first)
+            known[first] = contrasts_of(table, first)
         return known[first]
 
     return ask
 
 
-def _contrasts(table: LocalizationTable, question: Question) -> Contrasts | None:
+def contrasts_of(table: LocalizationTable, question: Question) -> Contrasts | None:
+    """Robust and nominal felt contrast [dB] of a question, None where the level is not reached."""
     try:
         found = table.query(question)
     except InputError:

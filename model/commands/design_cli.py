@@ -102,10 +102,7 @@ def design(
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find or rank places of ERAs for the best robust felt contrast.
-
-    Resume an interrupted design.
-    """
+    """Find or rank places of ERAs for the best robust felt contrast."""
     from model.commands.options import progress_bar
     from model.config.document import read_document
     from model.config.units import LENGTH
@@ -148,21 +145,14 @@ def design(
     ]
     given = supported_layouts(layouts, problems) if layouts else {}
     output.mkdir(parents=True, exist_ok=True)
-    runner = Runner(output, machines, progress_bar)
-    try:
-        if given:
-            found = rank_layouts(given, finalists=finalists, runner=runner)
-        else:
-            if worth > 0:  # by the first start, which has a layout for each number
-                fewer = worthwhile_count(search_layouts(problems, starts=1, runner=runner), worth)
-                problems = [replace(each, count=fewer) for each in problems]
-            found = search_layouts(problems, starts=starts, runner=runner)
-    except KeyboardInterrupt:
-        typer.echo(
-            f"era: interrupted; what is finished is in {output}; run the same command to resume",
-            err=True,
-        )
-        raise
+    runner = Runner(machines, progress_bar)
+    if given:
+        found = rank_layouts(given, finalists=finalists, runner=runner)
+    else:
+        if worth > 0:  # by the first start, which has a layout for each number
+            fewer = worthwhile_count(search_layouts(problems, starts=1, runner=runner), worth)
+            problems = [replace(each, count=fewer) for each in problems]
+        found = search_layouts(problems, starts=starts, runner=runner)
     files = [str(path) for path in write_design(output, found, document.data)]
     result = {**summary(found), "time_s": time.perf_counter() - started, "files": files}
     if as_json:
@@ -255,10 +245,7 @@ def _stiffnesses(text: str) -> list[float] | list[None]:
 def _show(result: dict[str, Any], *, own_count: int) -> None:
     """Print places, contrast, starts, and what each ERA buys; own_count: ERAs of the rig."""
     own = f"the rig's own {counted(own_count, 'ERA')}"
-    kept = "starts" if result["starts_db"] else "chunks of layouts"
-    print(
-        f"{len(result['eras'])} ERAs in {result['time_s']:.1f} s, {result['resumed']} {kept} kept"
-    )
+    print(f"{len(result['eras'])} ERAs in {result['time_s']:.1f} s")
     print("name      x / mm   y / mm   dB per mm   load / N")
     for name, era in result["eras"].items():
         x, y = (1000 * each for each in era["at_m"])

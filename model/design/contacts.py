@@ -46,7 +46,7 @@ class ContactRule:
     """Distribution of contact sets: anywhere, in regions, or those given.
 
     quiet: fewest and most quiet fingers; apart [m]: between fingers; draw: of places; given: sets
-    of contacts (fingers, 2) [m], which replace all that; text: identifies the rule; contents: how
+    of contacts (fingers, 2) [m], which replace all that; contents: how
     many fingers of a set, its first ones, feel a content of their own.
     """
 
@@ -54,7 +54,6 @@ class ContactRule:
     apart: float
     draw: Draw
     given: tuple[FloatArray, ...] = ()
-    text: str = "anywhere"
     contents: int = 1
 
     def sets(self, count: int, *, seed: int) -> list[FloatArray]:
@@ -175,7 +174,7 @@ def contact_rule(path: Path | None, plate: Plate, contents: int = 1) -> ContactR
         raise InputError(f"{document.source}: {problems[0]}")
     shapes = [_shape(region) for region in section.regions.values()]
     draw = partial(_drawn, shapes, plate)
-    return ContactRule((low, high), section.apart, draw, given, document.text, contents)
+    return ContactRule((low, high), section.apart, draw, given, contents)
 
 
 @dataclass(frozen=True, eq=False)

@@ -138,7 +138,6 @@ def summary(design: Design) -> dict[str, Any]:
         "lowest_rigid_body_hz": lowest,
         "contents": problem.contacts.contents,
         "sets": len(design.sets),
-        "resumed": design.resumed_count,
     }
 
 

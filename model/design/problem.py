@@ -3,7 +3,6 @@
 A layout supports the plate by its lowest rigid-body mode, and with weight on every ERA.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,7 +17,6 @@ from model.rig.rig import Rig
 from model.structure.attachments import Era
 from model.structure.support import rigid_body_frequencies, static_loads
 from model.table.table import default_drive_frequencies
-from model.version import NUMERICS_VERSION
 
 DEFAULT_LOWEST = 20.0
 """Lowest natural frequency [Hz] of the plate on its ERAs: it sags by 0.6 mm under its weight."""
@@ -83,26 +81,6 @@ class DesignProblem:
                 f"--eras must be at least {MIN_SUPPORTING - self.supports} to support the plate, "
                 f"got {self.count}"
             )
-
-    @property
-    def text(self) -> str:
-        """All that scores and answers depend on."""
-        rig = self.rig
-        parts = [
-            rig.fingerprint,
-            rig.mesh.to_dict(),
-            list(self.kept),
-            [rig.limits.frequency_min, rig.limits.frequency_max],
-            self.area.text,
-            [self.contacts.text, self.contacts.contents],
-            self.apart,
-            self.lowest,
-            self.count,
-            self.seed,
-            self.stiffness,
-            [NUMERICS_VERSION, JUDGED_SETS, *CANDIDATES.values()],
-        ]
-        return json.dumps(parts, sort_keys=True)
 
     @property
     def supports(self) -> int:

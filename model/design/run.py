@@ -1,11 +1,9 @@
-"""Running a design: layouts searched or given, judged on processes, finished parts kept."""
+"""Running a design: layouts searched or given, judged on processes."""
 
-import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -17,7 +15,6 @@ from model.design.layouts import NamedLayouts
 from model.design.problem import DesignProblem
 from model.design.search import Found, LayoutSearch
 from model.errors import InputError
-from model.files.array_file import Arrays, keep_arrays, kept_arrays
 from model.processes import on_processes
 from model.structure.support import support_problem
 
@@ -34,9 +31,6 @@ Machines: TypeAlias = Callable[..., Iterator[tuple[int, Any]]]
 """Solves tasks: `model.processes.on_processes` or `model.cluster.on_cluster` somewhere."""
 
 _HERE: Machines = partial(on_processes, 1)
-
-_FOUND = {"positions": "<f8", "scores": "<f8", "counts": "<i8"}
-_JUDGED = {"quiet": "<i8", "contrast_db": "<f8", "level_db_sl": "<f8"}
 
 _search_of = lru_cache(maxsize=4)(LayoutSearch)
 
@@ -78,8 +72,7 @@ class Design:
     these the ends of the searches of the best one's problem, none if layouts were given; by_count:
     the best judged for each number of ERAs of that problem; by_stiffness: the best for each
     stiffness [N/m] tried; sensitivities (n,): change of the score [dB/m] with the place of each
-    ERA of the best; own: the rig's own layout, None if it does not support the plate;
-    resumed_count: of starts, or chunks of layouts.
+    ERA of the best; own: the rig's own layout, None if it does not support the plate.
     """
 
     layouts: tuple[Layout, ...]
@@ -89,7 +82,6 @@ class Design:
     sensitivities: FloatArray
     own: Judged | None
     sets: list[FloatArray]
-    resumed_count: int
 
     @property
     def best(self) -> Layout:
@@ -113,50 +105,27 @@ def _unseen(what: str) -> Iterator[Callable[[int, int], None]]:
     yield lambda done, total: None
 
 
-@dataclass
+@dataclass(frozen=True)
 class Runner:
-    """Solves tasks on machines; what is finished is in files of a folder, None to keep nothing.
+    """Solves tasks on machines.
 
-    progress: shows what is being done; yields an update(done, total). resumed: how many tasks were
-    finished before, by what they are.
+    progress: shows what is being done; yields an update(done, total).
     """
 
-    folder: Path | None = None
     machines: Machines = _HERE
     progress: Callable[[str], AbstractContextManager[Callable[[int, int], None]]] = _unseen
-    resumed: dict[str, int] = field(default_factory=dict)
 
     def run(
-        self,
-        what: str,
-        solve: Callable[[Any, Any], Arrays],
-        shared: object,
-        tasks: Mapping[str, Any],
-        types: Mapping[str, str],
-    ) -> list[Arrays]:
-        """Arrays (of types) of tasks by the text that says all they depend on, in their order."""
-        paths = {text: self._path(what, text) for text in tasks}
-        done: dict[str, Arrays] = {}
-        for text, path in paths.items():
-            kept = None if path is None else kept_arrays(path, text, types)
-            if kept is not None:
-                done[text] = kept
-        self.resumed[what] = len(done)
-        missing = {number: text for number, text in enumerate(tasks) if text not in done}
-        given = {number: tasks[text] for number, text in missing.items()}
+        self, what: str, solve: Callable[[Any, Any], Any], shared: object, tasks: Sequence[Any]
+    ) -> list[Any]:
+        """Results of tasks, in their order."""
+        done: dict[int, Any] = {}
         with self.progress(what) as update:
-            update(len(done), len(tasks))
-            for number, arrays in self.machines(solve, shared, given) if given else ():
-                path = paths[missing[number]]
-                if path is not None:
-                    keep_arrays(path, missing[number], arrays)
-                done[missing[number]] = arrays
+            update(0, len(tasks))
+            for number, result in self.machines(solve, shared, dict(enumerate(tasks))):
+                done[number] = result
                 update(len(done), len(tasks))
-        return [done[text] for text in tasks]
-
-    def _path(self, what: str, text: str) -> Path | None:
-        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-        return None if self.folder is None else self.folder / f"{what}-{digest}.npz"
+        return [done[number] for number in range(len(tasks))]
 
 
 def search_layouts(problems: Sequence[DesignProblem], *, starts: int, runner: Runner) -> Design:
@@ -166,16 +135,13 @@ def search_layouts(problems: Sequence[DesignProblem], *, starts: int, runner: Ru
     begin at random. Raises InputError for an area without room, and where no layout supports the
     plate.
     """
-    tasks = {
-        f"{problem.text} {start}": (number, start)
-        for number, problem in enumerate(problems)
-        for start in range(starts)
-    }
-    solved = runner.run("starts", _start, problems, tasks, _FOUND)
+    tasks = [(number, start) for number in range(len(problems)) for start in range(starts)]
     layouts = [
-        Layout(problems[number], f"start {start}", found)
-        for (number, start), arrays in zip(tasks.values(), solved, strict=True)
-        for found in _found(arrays)
+        Layout(problems[number], f"start {start}", each)
+        for (number, start), found in zip(
+            tasks, runner.run("starts", _start, problems, tasks), strict=True
+        )
+        for each in found
     ]
     for problem in problems:
         ends = [each for each in layouts if each.problem is problem and each.count == problem.count]
@@ -204,18 +170,12 @@ def rank_layouts(
         for number, problem in enumerate(problems)
         for at in range(0, len(given[problem]), CHUNK)
     ]
-    tasks = {
-        f"{problems[number].text} {[[n, p.tolist()] for n, p in chunk.items()]}": (
-            number,
-            list(chunk.values()),
-        )
-        for number, chunk in chunks
-    }
-    solved = runner.run("chunks", _score, problems, tasks, _FOUND)
+    tasks = [(number, list(chunk.values())) for number, chunk in chunks]
+    scored = runner.run("chunks", _score, problems, tasks)
     layouts = [
-        Layout(problems[number], name, found)
-        for (number, chunk), arrays in zip(chunks, solved, strict=True)
-        for name, found in zip(chunk, _found(arrays), strict=True)
+        Layout(problems[number], name, each)
+        for (number, chunk), found in zip(chunks, scored, strict=True)
+        for name, each in zip(chunk, found, strict=True)
     ]
     order = best_first([each.found.score_db for each in layouts]).tolist()
     ranked = [layouts[each] for each in order]
@@ -254,10 +214,7 @@ def _design(best: Layout, layouts: list[Layout], starts: list[Layout], runner: R
     own = None
     rig = problem.rig
     if support_problem(rig.plate, rig.eras, loads=rig.masses) is None:
-        (answers,) = runner.run(
-            "answers", _answers, [problem], {f"{problem.text} own": (0, None)}, _JUDGED
-        )
-        own = Judged(**answers)
+        (own,) = runner.run("answers", _answers, [problem], [(0, None)])
     return Design(
         (best, *dict.fromkeys(rest)),
         tuple(starts),
@@ -266,61 +223,39 @@ def _design(best: Layout, layouts: list[Layout], starts: list[Layout], runner: R
         _search_of(problem).sensitivities(best.found.positions, step=SENSITIVITY_STEP),
         own,
         problem.judged_sets(),
-        runner.resumed.get("starts", 0) + runner.resumed.get("chunks", 0),
     )
 
 
 def _judged(layouts: Sequence[Layout], runner: Runner) -> list[Layout]:
-    """The layouts with their answers."""
+    """The layouts with their answers; those of several starts that end in one are found once."""
     problems = list(dict.fromkeys(each.problem for each in layouts))
-    texts = [f"{each.problem.text} {each.found.positions.tolist()}" for each in layouts]
-    tasks = {
-        text: (problems.index(each.problem), each.found.positions)
-        for text, each in zip(texts, layouts, strict=True)
-    }
-    solved = runner.run("answers", _answers, problems, tasks, _JUDGED)
-    answers = dict(zip(tasks, solved, strict=True))
-    return [
-        replace(each, judged=Judged(**answers[text]))
-        for text, each in zip(texts, layouts, strict=True)
-    ]
+    keys = [(problems.index(each.problem), each.found.positions.tobytes()) for each in layouts]
+    different = dict(zip(keys, layouts, strict=True))
+    tasks = [(number, each.found.positions) for (number, _), each in different.items()]
+    answers = dict(zip(different, runner.run("answers", _answers, problems, tasks), strict=True))
+    return [replace(each, judged=answers[key]) for key, each in zip(keys, layouts, strict=True)]
 
 
-def _start(problems: Sequence[DesignProblem], task: tuple[int, int]) -> Arrays:
+def _start(problems: Sequence[DesignProblem], task: tuple[int, int]) -> list[Found]:
     """Layouts of one start of one problem, the last of the number of ERAs that is sought."""
     number, start = task
     problem = problems[number]
     search = _search_of(problem)
     if start == 0:
-        return _arrays([each for each in search.path() if each.is_supported])
-    found = search.from_random(np.random.default_rng([problem.seed, start]))
-    return _arrays([found] if found.is_supported else [])
+        found = list(search.path())
+    else:
+        found = [search.from_random(np.random.default_rng([problem.seed, start]))]
+    return [each for each in found if each.is_supported]
 
 
-def _score(problems: Sequence[DesignProblem], task: tuple[int, list[FloatArray]]) -> Arrays:
+def _score(problems: Sequence[DesignProblem], task: tuple[int, list[FloatArray]]) -> list[Found]:
     """Scores of given layouts of one problem."""
     number, layouts = task
-    return _arrays(_search_of(problems[number]).scored(layouts))
+    return _search_of(problems[number]).scored(layouts)
 
 
-def _answers(problems: Sequence[DesignProblem], task: tuple[int, FloatArray | None]) -> Arrays:
+def _answers(problems: Sequence[DesignProblem], task: tuple[int, FloatArray | None]) -> Judged:
     """What positions of ERAs, None for the rig's own, give on fresh contact sets."""
     problem, positions = problems[task[0]], task[1]
     rig = problem.rig if positions is None else problem.rig_with(positions)
-    return vars(judge(rig, problem.judged_sets(), contents=problem.contacts.contents))
-
-
-def _arrays(layouts: Sequence[Found]) -> Arrays:
-    positions = [each.positions for each in layouts]
-    return {
-        "positions": np.vstack([np.empty((0, 2)), *positions]),
-        "scores": np.array([each.score_db for each in layouts], dtype=float),
-        "counts": np.array([len(each) for each in positions], dtype=np.int64),
-    }
-
-
-def _found(arrays: Arrays) -> Iterator[Found]:
-    ends = np.cumsum(arrays["counts"])
-    parts = np.split(arrays["positions"], ends)[:-1]
-    for positions, score in zip(parts, arrays["scores"].tolist(), strict=True):
-        yield Found(positions, score)
+    return judge(rig, problem.judged_sets(), contents=problem.contacts.contents)

@@ -1,6 +1,5 @@
-"""Designs on several machines, resumed from what was finished."""
+"""Designs on several machines."""
 
-import logging
 from dataclasses import replace
 from functools import partial
 
@@ -10,6 +9,7 @@ import pytest
 from model.cluster import on_cluster
 from model.design.area import area_of
 from model.design.contacts import anywhere
+from model.design.judge import judge
 from model.design.layouts import layouts_of
 from model.design.problem import DesignProblem
 from model.design.run import Design, Runner, rank_layouts
@@ -27,7 +27,7 @@ def ranked(runner: Runner, *, seed: int = 0) -> Design:
     """Ten layouts of four ERAs, two of them judged by three contact sets."""
     rig = make_paper_rig(12, 9)
     few = tuple(anywhere(rig.plate).sets(3, seed=1))
-    contacts = replace(anywhere(rig.plate), given=few, text="few")
+    contacts = replace(anywhere(rig.plate), given=few)
     some = DesignProblem(rig, 4, area_of("edge", rig.plate), contacts, seed=seed)
     return rank_layouts({some: layouts_of("random:10", some)}, finalists=2, runner=runner)
 
@@ -57,37 +57,15 @@ def test_processes_and_a_cluster_find_the_same_to_the_bit() -> None:
         assert figures(ranked(there)) == here
 
 
-def test_an_interrupted_design_resumes(tmp_path) -> None:
-    """Ctrl-C after the first of three chunks: the second run solves two, the third nothing."""
-
-    def interrupted(solve, shared, tasks):
-        yield next(on_processes(1, solve, shared, tasks))
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        ranked(Runner(tmp_path, interrupted))
-    second, third = Runner(tmp_path), Runner(tmp_path)
-    assert figures(ranked(second)) == figures(ranked(third)) == figures(ranked(Runner()))
-    assert second.resumed["chunks"] == 1
-    assert third.resumed["chunks"] == 3
-    other = Runner(tmp_path)
-    ranked(other, seed=1)
-    assert other.resumed["chunks"] == 0
-
-
-def test_damaged_files_are_ignored_logged_and_written_anew(tmp_path, caplog) -> None:
-    """A file cut short, one with a bit turned, and one renamed to that of another chunk."""
-    whole = figures(ranked(Runner(tmp_path)))
-    cut, turned, *_ = paths = sorted(tmp_path.glob("chunks-*.npz"))
-    contents = [path.read_bytes() for path in paths]
-    cut.write_bytes(contents[0][: len(contents[0]) // 2])
-    middle = contents[1].index(b"\x93NUMPY") + 130  # in an array
-    flipped = bytes([contents[1][middle] ^ 1])
-    turned.write_bytes(contents[1][:middle] + flipped + contents[1][middle + 1 :])
-    paths[2].write_bytes(contents[1])
-    again = Runner(tmp_path)
-    with caplog.at_level(logging.WARNING):
-        assert figures(ranked(again)) == whole
-    assert again.resumed["chunks"] == 0
-    assert len(caplog.records) == 3
-    assert [path.read_bytes() for path in paths] == contents
+def test_a_layout_is_judged_with_the_eras_of_its_problem(tmp_path) -> None:
+    """The same places with ERAs of two stiffnesses: each has the answers of its own rig."""
+    rig = make_paper_rig(12, 9)
+    few = tuple(anywhere(rig.plate).sets(3, seed=1))
+    contacts = replace(anywhere(rig.plate), given=few)
+    area = area_of("edge", rig.plate)
+    soft, stiff = (DesignProblem(rig, 4, area, contacts, stiffness=each) for each in (1e4, 3e4))
+    corners = {"corners": soft.own_positions}
+    found = rank_layouts({soft: corners, stiff: corners}, finalists=1, runner=Runner())
+    for each in found.layouts:
+        alone = judge(each.problem.rig_with(soft.own_positions), few)
+        assert sorted(each.answers.contrast_db) == pytest.approx(sorted(alone.contrast_db))

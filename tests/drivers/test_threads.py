@@ -11,19 +11,6 @@ import pytest
 from drivers.threads import in_thread
 
 
-async def test_in_thread_returns_and_raises_as_its_work() -> None:
-    """Result or exception, from a thread of that name."""
-    assert await in_thread(lambda: threading.current_thread().name, name="opening") == "opening"
-    problem = OSError("no such port")
-
-    def fail() -> None:
-        raise problem
-
-    with pytest.raises(OSError, match="no such port") as raised:
-        await in_thread(fail, name="opening")
-    assert raised.value is problem
-
-
 async def test_cancelled_work_is_undone_once() -> None:
     """The task ends at once; a device opened afterwards is closed by its thread."""
     may_open, closed, closings = threading.Event(), threading.Event(), []

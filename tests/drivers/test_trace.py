@@ -1,7 +1,6 @@
 """The trace of wires."""
 
 import io
-import logging
 import os
 import re
 import stat
@@ -39,18 +38,6 @@ def test_trace_has_time_direction_bytes_and_meaning(tmp_path: Path) -> None:
         "request Ping() -> 'Status' in 12.3 ms",
     ]
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-
-
-def test_tracing_ends_beside_handlers_of_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Frames cost nothing afterwards, although somebody else handles records of the trace."""
-    monkeypatch.setattr(trace._root, "handlers", [logging.NullHandler()])
-    with tracing(tmp_path / "outer.txt"):
-        with tracing(tmp_path / "inner.txt"):
-            pass
-        assert trace.is_active()
-    assert not trace.is_active()
 
 
 class SlowFile(io.StringIO):

@@ -15,12 +15,10 @@ import era_haptics
 from drivers.conformance import CheckResult, judge, of_kind
 from drivers.conformance.check import run_checks
 from drivers.conformance.serial_frames import SerialClient
-from drivers.contents import Layer, Shape, Tone
-from drivers.errors import CommandRefused
+from drivers.contents import Tone
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
-from drivers.protocol.table import FAULTS, STATES
 from long_form import shortly
 from registry.limits import GuardLimits
 from virtual_loop import run_virtual
@@ -166,59 +164,3 @@ def test_source_is_small() -> None:
     lines = SOURCE.read_text(encoding="utf-8").splitlines()
     assert len(lines) <= 500
     assert max(map(len, lines)) <= 100
-
-
-async def test_layers_play_as_the_host_reckons(program: Path) -> None:
-    """Levels, tokens and achieved of two layers with an onset of many knots and an ending."""
-
-    async def test(group: Group, host: Amplifier) -> None:
-        shape = Shape(0.001, tuple(0.01 * n + 0.005j * n for n in range(32)))
-        first = Layer(0, (tone(0, 0.5, onset=shape, ending=shape), tone(1, 0.25)), 0.005)
-        await group.apply({"smallest": [first]})
-        await group.apply({"smallest": [Layer(3, (tone(0, 0.2, 150.0),), 0.005)]})
-        await asyncio.sleep(0.06)
-        status = await host.read_status()
-        assert status["levels"] == [7000, 2500]
-        assert [bool(token) for token in status["tokens"]] == [True, False, False, True]
-        kept = Layer(0, (tone(0, 0.6, keep_phase=True),), 0.005)
-        await group.apply({"smallest": [kept, Layer(3, renew=True, valid_for=0.05)]})
-        await asyncio.sleep(0.1)
-        assert (await host.read_status())["levels"] == [6000, 0]
-        await group.silence(0.01)
-        await asyncio.sleep(0.03)
-        status = await host.read_status()
-        assert (status["levels"], status["state"]) == ([0, 0], STATES["OPERATION_ENABLED"])
-
-    await played(program, test)
-
-
-async def test_stop_is_confirmed_and_cleared_by_its_latch(program: Path) -> None:
-    """Amid a tone; a clear of another latch is refused, then it arms again."""
-
-    async def test(group: Group, host: Amplifier) -> None:
-        await group.apply({"smallest": [Layer(0, (tone(0, 1.0),), 0.0)]})
-        assert (await group.stop())["smallest"].is_confirmed
-        assert host.latch is not None
-        with pytest.raises(CommandRefused):
-            await host.clear(host.latch + 1)
-        await group.clear()
-        group._draw = lambda low, high: host.session + 1
-        await group.arm()
-        await group.apply({"smallest": [Layer(0, (tone(1, 0.5),), 0.0)]})
-        assert (await host.read_status())["levels"] == [0, 5000]
-
-    await played(program, test)
-
-
-async def test_watchdog_silences_in_its_own_time(program: Path) -> None:
-    """0.1 s after the last request that feeds it is in a fault, which is listed, and silent."""
-
-    async def test(group: Group, host: Amplifier) -> None:
-        await host.arm(host.session, 0.1)
-        await group.apply({"smallest": [Layer(0, (tone(0, 0.5),), 0.0)]})
-        await asyncio.sleep(0.3)
-        status = await host.read_status()
-        assert (status["state"], status["fault"]) == (STATES["FAULT"], FAULTS["WATCHDOG"])
-        assert status["levels"] == [0, 0]
-
-    await played(program, test)

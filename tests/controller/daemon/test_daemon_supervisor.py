@@ -252,29 +252,6 @@ async def test_close_ends_handling_of_loss() -> None:
 
 
 @in_virtual_time
-async def test_lost_link_is_retried_with_growing_pauses() -> None:
-    """From 0.1 s up to 5 s; once it is back nothing is armed."""
-    async with watched() as daemon:
-        await daemon.handle(ARM)
-        daemon.cut()
-        daemon.far_end.attempts.clear()
-        await asyncio.sleep(30)
-        assert daemon.state is DaemonState.COMM_LOST
-        attempts = daemon.far_end.attempts[-9:]
-        pauses = [round(b - a, 3) for a, b in itertools.pairwise(attempts)]
-        assert pauses[-2:] == [5.0, 5.0]
-        assert pauses[0] < 1
-        assert daemon.links[0] == "lost"
-        assert set(daemon.links[1:]) == {"retry"}
-        daemon.obey()
-        await asyncio.sleep(6)
-        assert daemon.state is DaemonState.FAULT
-        assert not daemon.far_end.requests("Arm", "Set")
-        await daemon.handle(CLEAR)
-        assert daemon.state is DaemonState.READY_TO_SWITCH_ON
-
-
-@in_virtual_time
 async def test_lease_that_is_not_renewed_ends() -> None:
     """A renewal prolongs it; then the plate is disarmed at its end."""
     async with watched() as daemon:

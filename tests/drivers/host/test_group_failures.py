@@ -27,21 +27,6 @@ def altered(
     far.handle = lambda name, values, now: change(name, values, now, handle)  # type: ignore[method-assign]
 
 
-@pytest.mark.parametrize("wire", ["serial", "can"])
-@grouped(("a",), ("b",))
-async def test_set_refused_by_one_that_has_tripped_stops_the_others(
-    group: Group, ends: list[MemoryLine]
-) -> None:
-    """Not only at the next heartbeat: a refusal of the ledger leaves others playing, this not."""
-    await group.apply({name: [layer(0, tone())] for name in "ab"})
-    ends[1].far["b"].trip("OVER_VOLTAGE", ends[1].loop.time())
-    with pytest.raises(CommandRefused):
-        await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
-    assert not group.is_armed
-    await asyncio.sleep(0.01)
-    assert ends[0].levels("a") == [0.0, 0.0]
-
-
 @grouped(("a",), ("b",), wire="serial")
 async def test_nothing_is_sent_to_play_behind_a_status_that_shows_a_fault(
     group: Group, ends: list[MemoryLine]

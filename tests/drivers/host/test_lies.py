@@ -14,7 +14,7 @@ import pytest
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames
 from drivers.contents import Layer, Tone
-from drivers.errors import CommandRefused, DriverError, LinkDegraded
+from drivers.errors import DriverError, LinkDegraded
 from drivers.host.group import Group
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import MESSAGES
@@ -119,19 +119,6 @@ async def test_status_that_cannot_be_ends_in_silence(
     await stops_truthfully(group, end)
 
 
-@in_virtual_time
-async def test_status_without_the_layer_of_a_set_does_not_confirm_it(
-    wire: str, altered: Callable[[str, int, int], None]
-) -> None:
-    """Seven layers of eight, and the set is of the last one: all is stopped."""
-    group, end = await armed(wire)
-    altered("GetStatus", *STATUS["layers"])
-    with pytest.raises(CommandRefused, match="token of layer 7 must be"):
-        await group.apply({"a": [Layer(7, (Tone(0, 100.0, 0.5),), 0.001)]})
-    assert not group.is_armed
-    await stops_truthfully(group, end)
-
-
 @pytest.mark.parametrize("text", ["vendor\n", "a\x1b[2J"])
 @in_virtual_time
 async def test_name_with_control_characters_is_refused(wire: str, text: str) -> None:
@@ -142,41 +129,9 @@ async def test_name_with_control_characters_is_refused(wire: str, text: str) -> 
         await end.hosts["a"].open()
 
 
-def ignored(name: str, values: Values) -> Values | None:
-    """A reply as if it had been carried out: the status."""
-    return None
-
-
 def refused(name: str, values: Values) -> Values | None:
     """A refusal."""
     raise Refusal("not now", "WRONG_STATE")
-
-
-@pytest.mark.parametrize("reply", [ignored, refused])
-@in_virtual_time
-async def test_stop_that_is_not_carried_out_is_not_confirmed_while_it_plays(
-    wire: str, reply: Callable[[str, Values], Values | None]
-) -> None:
-    """Stop and Disarm are ignored or refused: it plays until its watchdog has passed."""
-    group, end = await armed(wire)
-    await group.apply({"a": [LOUD]})
-    far = end.far["a"]
-    handle = far.handle
-
-    def lying(name: str, values: Values, now: float) -> Values:
-        if name in ("Stop", "Disarm"):
-            return reply(name, values) or handle("GetStatus", {}, now)
-        return handle(name, values, now)
-
-    far.handle = lying  # type: ignore[method-assign]
-    began = end.loop.time()
-    stopping = asyncio.ensure_future(group.stop())
-    await asyncio.sleep(0.24)
-    assert end.levels("a") == [0.5, 0.0]
-    assert not stopping.done()
-    await stopping
-    assert end.loop.time() - began < 1.0
-    await stops_truthfully(group, end)
 
 
 def late(kind: str) -> Alter:

@@ -87,25 +87,6 @@ def test_bench_record_is_independent_of_when_it_is_read(coarse_rig: Rig) -> None
         np.testing.assert_allclose(listener.accelerations, centre, atol=1e-6 * peak)
 
 
-def test_bench_frequencies_of_a_window(coarse_rig: Rig) -> None:
-    """A tone counts while it fades in and out, not before or after."""
-    bench = Bench(coarse_rig, now=0.0)
-    bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
-    arm(bench, 2.0, now=0.0)
-    play(bench, Tone(0, 110.0, 1.0), Tone(1, 200.0, 0.0), now=0.1, token=1, ramp=0.02)
-    play(bench, Tone(0, 150.0, 1.0), now=0.5, token=2, ramp=0.02)
-    bench.advance(1.0)
-
-    def frequencies(since: float, until: float) -> tuple[float, ...]:
-        return bench.felt(since, until)["a"].frequencies
-
-    assert frequencies(0.0, 0.09) == ()
-    assert frequencies(0.2, 0.4) == (110.0,)
-    assert frequencies(0.2, 0.6) == (110.0, 150.0)
-    assert frequencies(0.51, 0.6) == (110.0, 150.0)
-    assert frequencies(0.53, 0.6) == (150.0,)
-
-
 def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
     """A process that was paused for a day comes back to a silent plate, ten seconds recorded."""
     bench = Bench(coarse_rig, now=0.0)
@@ -118,17 +99,7 @@ def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
     assert bench.fingers.felt(0.0, 86_400.0)["a"].times[0] >= 86_390.0
 
 
-def test_bench_ignores_an_earlier_time(coarse_rig: Rig) -> None:
-    """A request stamped before the present is taken now."""
-    bench = Bench(coarse_rig, now=10.0)
-    arm(bench, 0.25, now=10.0)
-    play(bench, Tone(1, 110.0, 1.0), now=9.0, token=1, ramp=0.02)
-    assert bench.time == 10.0
-    assert bench.amplifiers["main"].summary(10.02).levels[1] == pytest.approx(1.0)
-
-
 A, B = (0.1, 0.07), (0.29, 0.2)
-PLACES = {"a": A, "b": B}
 FREQUENCY = 210.0
 FULL_STROKE = Tone(1, FREQUENCY, 1.0)
 
@@ -139,27 +110,6 @@ def expected(rig: Rig, loads: tuple[FingertipLoad, ...]) -> FloatArray:
     matrices = assemble(rig.plate, rig.mesh)
     answer = direct_acceleration(matrices, rig.eras, np.array([FREQUENCY]), points, loads=loads)
     return np.asarray(np.abs(answer[0, 1]))
-
-
-def test_bench_fingers_load_the_plate(coarse_rig: Rig) -> None:
-    """What A feels alone, after B came and pressed twice as hard, and pressing half itself.
-
-    Each once the plate has settled.
-    """
-    tip = Fingertip(2000.0, 3.0, 0.005)
-    bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
-    bench.place_fingers({"a": A}, now=0.0)
-    play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
-    truths = []
-    for loads in ({"a": 1.0}, {"a": 1.0, "b": 2.0}, {"a": 0.5}):
-        placed = {name: PLACES[name] for name in loads}
-        bench.place_fingers(placed, now=bench.time, loads=loads)
-        keep_alive(bench, bench.time + 4)
-        fingers = [FingertipLoad(*PLACES[name], tip.scaled(loads[name])) for name in loads]
-        truths.append(expected(coarse_rig, tuple(fingers)))
-        (amplitude,) = bench.felt(bench.time - 0.5, bench.time)["a"].amplitude
-        assert apart(amplitude, truths[-1]) < 0.005
-    assert apart(truths[0], truths[1]) > 0.02
 
 
 def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:

@@ -41,35 +41,6 @@ async def ask(bench: Bench, now: float, **request: Any) -> dict[str, Any]:
     return await carry_out(SimulationContext(bench), json.dumps(request).encode(), now=now)
 
 
-async def test_control_places_fingers_and_returns_felt_and_state(coarse_rig: Rig) -> None:
-    """Responses have the documented keys and shapes."""
-    bench = Bench(coarse_rig, now=5.0)
-    placed = await ask(bench, 5.1, op="fingers", fingers={"7": [0.1, 0.08], "x": [0, 0]})
-    assert placed == {"ok": True, "time_s": 5.1}
-    play(bench, Tone(0, 110.0, 0.5), now=5.2, token=9, watchdog=2.0)
-    felt = (await ask(bench, 6.0, op="felt", since_s=5.5, until_s=6.0))["fingers"]
-    assert felt.keys() == {"7", "x"}
-    assert felt["7"]["frequencies_hz"] == [110.0]
-    assert len(felt["7"]["points_m"]) == 21
-    assert felt["7"]["points_m"][0] == [0.1, 0.08]
-    assert len(felt["7"]["amplitude_m_s2"][0]) == len(felt["7"]["peak_m_s2"]) == 21
-    assert min(felt["7"]["peak_m_s2"]) > 0
-    state = await ask(bench, 6.5, op="state")
-    assert state == {
-        "time_s": 6.5,
-        "fingers": {"7": [0.1, 0.08], "x": [0.0, 0.0]},
-        "amplifiers": {
-            "main": {
-                "state": "OPERATION_ENABLED",
-                "fault": "NONE",
-                "token": 9,
-                "high_voltage": True,
-                "levels": [0.5, 0.0, 0.0, 0.0],
-            }
-        },
-    }
-
-
 async def test_control_keeps_loads_of_fingers(coarse_rig: Rig) -> None:
     """Until they lift or get another one; a finger that touches has 1 where none is given."""
     bench = Bench(coarse_rig, now=0.0)

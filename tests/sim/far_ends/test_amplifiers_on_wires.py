@@ -4,7 +4,6 @@ import asyncio
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from drivers import clock
@@ -12,11 +11,7 @@ from drivers.errors import CommandRefused, LinkError
 from drivers.protocol.table import FAULTS, STATES
 from memory_machine import live_in_memory
 from model.errors import InputError
-from model.fem.plate import assemble, direct_acceleration
-from model.finger.fingertip import fingertip_points
 from model.rig.rig import Rig
-from model.structure.attachments import Fingertip, FingertipLoad
-from plate_in_time import apart
 from sim.far_ends.wires import Wire, assign_wires
 from sim.faults.fault_window import FaultKind, FaultWindow
 from virtual_loop import VirtualLoop, in_virtual_time
@@ -97,49 +92,6 @@ def wire(request: pytest.FixtureRequest) -> Wire:
     """Each wire, in its own time where it has one."""
     found = WIRES[request.param]
     return replace(found, speed=SPEEDS.get(found.kind))
-
-
-@in_virtual_time
-async def test_finger_feels_over_every_wire_what_the_model_says(
-    coarse_rig: Rig, wire: Wire
-) -> None:
-    """Layers on two amplifiers of a group, against the sparse direct solve: 1 %."""
-    live_in_memory()
-    at = (0.08, 0.06)
-    async with rig_on_wire(on_two_amplifiers(coarse_rig), replace(wire, shared=True)) as rig:
-        rig.bench.place_fingers({"a": at}, now=clock.now())
-        await rig.group.arm()
-        await rig.group.apply(
-            {
-                "east": [layer((0, 110.0, 1.0)), layer((1, 110.0, 0.5), number=3)],
-                "west": [layer((1, 230.0, 0.7), number=1)],
-            }
-        )
-        starts = {
-            voice.origin
-            for one in rig.bench.amplifiers.values()
-            for output in one.outputs
-            for voice in output
-        }
-        await rig.beat_until(clock.now() + 4.0)
-        end = clock.now()
-        rig.bench.advance(end)
-        felt = rig.bench.felt(end - 0.5, end)["a"]
-        stopped = await rig.group.stop()
-        assert all(each.is_confirmed for each in stopped.values())
-        assert not any((*rig.levels("east"), *rig.levels("west")))
-    assert max(starts) - min(starts) < 0.001
-    unit = direct_acceleration(
-        assemble(coarse_rig.plate, coarse_rig.mesh),
-        coarse_rig.eras,
-        np.array([110.0, 230.0]),
-        fingertip_points(*at, coarse_rig.plate),
-        loads=[FingertipLoad(*at, Fingertip())],
-    )
-    # ERAs 0 and 2 start with one layer of east: their phases differ by nothing.
-    expected = np.abs([unit[0, 0] + 0.5 * unit[0, 2], 0.7 * unit[1, 3]])
-    assert felt.frequencies == (110.0, 230.0)
-    assert apart(felt.amplitude, expected) < 0.01
 
 
 @in_virtual_time
@@ -234,30 +186,6 @@ def test_fault_silences_and_its_amplifier_is_found_again(
             await rig.group.arm()
             await rig.group.apply({"main": [layer((0, 110.0, 0.5))]})
             await rig.group.disarm()
-
-    run()
-
-
-@pytest.mark.parametrize("kind", ["drop", "corrupt", "truncate", "duplicate", "delay"])
-def test_damaged_frames_are_sent_again(coarse_rig: Rig, wire: Wire, kind: FaultKind) -> None:
-    """One in twenty each way for two seconds: the tone lasts, and its changes are played.
-
-    On CAN, where a request is several frames, and on a slow line, where a set that is sent three
-    times is too late, one in a hundred and sixty.
-    """
-
-    @in_virtual_time
-    async def run() -> None:
-        live_in_memory()
-        async with rig_on_wire(coarse_rig, wire, watchdog=2.0) as rig:
-            await rig.group.arm()
-            share = 0.05 / (1 if wire.kind in ("serial", "modbus-tcp") else 8)
-            rig.devices["main"].inject_fault(FaultWindow(kind, share=share, delay=0.005))
-            for number in range(20):
-                level = 0.5 + 0.02 * number
-                await rig.group.apply({"main": [layer((0, 110.0, level))]})
-                await rig.beat_until(clock.now() + 0.1)
-                assert rig.levels("main")[0] == pytest.approx(level)
 
     run()
 

@@ -1,7 +1,6 @@
 """The plate in time, against a linear system on straight lines, and its continuity."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -46,63 +45,6 @@ MESH = Mesh(16, 12, PLATE.length, PLATE.width)
 def reduced() -> ReducedPlate:
     """The paper's plate on a coarse mesh."""
     return reduce_plate(PLATE, MESH, np.array(CORNERS))
-
-
-def knotted(knots: list[tuple[float, float]]) -> list[Term]:
-    """Terms of a base that moves along straight lines through (time [s], displacement [m])."""
-    return [
-        Term(start, end, 0.0, 1j * y0, 1j * (y1 - y0) / (end - start))
-        for (start, y0), (end, y1) in pairwise(knots)
-    ]
-
-
-def linear_acceleration(
-    small: ReducedPlate, bases: FloatArray, times: FloatArray, points: FloatArray
-) -> FloatArray:
-    """Accelerations (n, p) by lsim for bases (n, 2) of two ERAs on springs, on straight lines."""
-    M, C, K = modal_matrices(small, eras(damping=0.0))
-    inverse, r = np.linalg.inv(M), len(M)
-    by_base = inverse @ (small.at(np.array(CORNERS)) * 17000.0).T[:, [0, 2]]
-    A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
-    B = np.vstack([np.zeros((r, 2)), by_base])
-    _, expected, _ = lsim((A, B, points @ A[r:], points @ by_base), bases, times)
-    return np.asarray(expected)
-
-
-@pytest.mark.parametrize(("precision", "share"), [(np.float64, 1e-9), (np.float32, 1e-6)])
-def test_plant_with_many_changes_agrees_with_a_linear_system(
-    precision: type[np.floating], share: float
-) -> None:
-    """Thirty knots, half of them set ahead one by one, then free vibration that dies away.
-
-    share: of the peak; in single precision a millionth of it, also of what is left at the end.
-    """
-    small = reduce_plate(
-        PLATE, Mesh(8, 6, PLATE.length, PLATE.width), np.array(CORNERS), frequency_max=100.0
-    )
-    rate, end = 2000.0, 0.6
-    heights = np.random.default_rng(5).uniform(-STROKE, STROKE, (2, 14))
-    knots = [
-        [(0.0, 0.0), *zip(np.linspace(*span, 14).tolist(), row.tolist(), strict=True)]
-        for span, row in zip([(0.005, 0.07), (0.0025, 0.0675)], heights, strict=True)
-    ]
-    for era in (0, 1):
-        knots[era].append((0.08, 0.0))
-    points = small.at(MESH.nodes[::7])
-    plant = Plant(small, eras(damping=0.0))
-    for since, until in pairwise(knots[0]):
-        (line,) = knotted([since, until])  # goes on until the next one is set
-        lasting = line if until[0] == 0.08 else line._replace(end=1.0)
-        plant.set_input(0, [lasting], since=since[0])
-    plant.set_input(2, knotted(knots[1]))
-    times, felt = plant.advance(end, sample_rate=rate, shapes=points, precision=precision)
-    assert felt.dtype == precision
-    grid = np.concatenate([[0.0], times])
-    bases = np.column_stack([np.interp(grid, *np.transpose(each)) for each in knots])
-    expected = linear_acceleration(small, bases, grid, points)
-    for part in (times > 0, times > 0.4):
-        peak = np.abs(expected[1:][part]).max()
-        np.testing.assert_allclose(felt[part], expected[1:][part], rtol=0, atol=share * peak)
 
 
 def test_plant_structural_damping_is_passive(reduced: ReducedPlate) -> None:

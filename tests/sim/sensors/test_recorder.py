@@ -10,15 +10,10 @@ from bench_driving import play
 from drivers.contents import Tone
 from full_disk import full_disk
 from model.errors import InputError
-from model.reduction.free_plate import solve_free_plate
-from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
-from model.structure.attachments import footprints_of
-from model.transients.base_motion import Term
 from recordings import read_recording
 from sim.bench.bench import Bench
-from sim.plant.accelerometer import Accelerometer, positions, readings
-from sim.plant.plant import Plant
+from sim.plant.accelerometer import Accelerometer, readings
 from sim.sensors.recorder import Recorder
 from sim.sensors.recording import Recording, write_recording
 
@@ -58,24 +53,6 @@ def test_tones_are_told_apart_with_their_phases() -> None:
     np.testing.assert_allclose(found[:, 0], [2 * np.exp(0.7j), 0.3 * np.exp(-2j)], atol=1e-6)
     with pytest.raises(InputError, match="4"):
         recording(signal[:4, None]).tones([110.0, 120.0])
-
-
-def test_tones_on_the_plate_are_those_of_the_model(coarse_rig: Rig) -> None:
-    """From noisy readings, once settled, as the steady state in frequency within 1 %."""
-    rig, at = coarse_rig, ((0.08, 0.06), (0.21, 0.17))
-    sensors = [
-        Accelerometer("", *each, noise_density=1e-3, reach=500.0, resolution=1e-3) for each in at
-    ]
-    reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras))
-    plant = Plant(reduced, rig.eras)
-    plant.set_input(0, [Term(0.0, math.inf, 2 * math.pi * 130.0, rig.eras[0].stroke + 0j)])
-    plant.skip(2.5)
-    times, truth = plant.advance(3.0, sample_rate=RATE, shapes=reduced.at(positions(sensors)))
-    read = readings(sensors, truth, sample_rate=RATE, rng=np.random.default_rng(0))
-    found = recording(read, start=float(times[0])).tones([130.0])[0]
-    free = solve_free_plate(rig.plate, rig.mesh)
-    expected = free.acceleration(rig.eras, np.array([130.0]), np.array(at))[0, 0]
-    np.testing.assert_allclose(np.abs(found), np.abs(expected), rtol=0.01)
 
 
 def test_sensors_and_recordings_refuse_invalid_values() -> None:

@@ -88,6 +88,8 @@ class Daemon:
             alive=lambda: manager.alive(clock.now()),
         )
         self._layout = ActiveLayout(config.effective_layout)
+        self._frequencies = table.frequencies
+        self._warn_of_bands(config)
         self._publisher = EventPublisher(
             machine=lambda: self._supervisor.machine,
             amplifiers=lambda: amplifier_statuses(
@@ -215,6 +217,10 @@ class Daemon:
                 _logger.exception("config: reload failed")
             self._manager.ready(self._status_line())
 
+    def _warn_of_bands(self, config: DaemonConfig) -> None:
+        for problem in config.effective_layout.band_problems(self._frequencies):
+            _logger.warning("layout: %s", problem)
+
     def _apply(self, new: DaemonConfig, changed: list[str], *, differs: bool) -> None:
         is_armed = self._supervisor.machine.state in ENERGISED
         problem = reload_problem(self._config, new, changed, is_armed=is_armed)
@@ -223,6 +229,7 @@ class Daemon:
             return
         if differs:
             self._layout.replace(new.effective_layout)
+            self._warn_of_bands(new)
             self._publisher.layout_changed(new.layout)
             self._controller.request_update()
         self._config = new

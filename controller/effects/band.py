@@ -4,11 +4,26 @@ from typing import Annotated, Self, TypeAlias
 
 from pydantic import Strict, model_validator
 
+from controller.loop.table_query import band_of_table
+from model.arrays import FloatArray
 from model.config.sections import Quantity, Section
 from model.config.units import FREQUENCY
 
 Band: TypeAlias = tuple[float, float]
 """Lowest and highest frequency [Hz]; equal ones stand for the nearest that a table has."""
+
+_TOLERANCE = 0.05  # of a frequency; less than anyone tells apart
+
+
+def band_problem(band: Band, frequencies: FloatArray) -> str | None:
+    """Return what a table with these frequencies [Hz] plays instead of a band that it lacks."""
+    low, high = band
+    nearest = band_of_table(band, frequencies)[0]
+    if low * (1 - _TOLERANCE) <= nearest <= high * (1 + _TOLERANCE):
+        return None
+    given = f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
+    return f"frequency {given} is not in the table, which plays {nearest:g} Hz instead"
+
 
 _FREQUENCY = Annotated[float, Quantity(FREQUENCY, at_least=10, at_most=1000)]
 

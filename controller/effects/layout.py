@@ -5,11 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from controller.effects.band import Band
+from controller.effects.band import Band, band_problem
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.effect import Effect
 from controller.effects.region import Region
+from model.arrays import FloatArray
 from model.finger.perception import STRONG_DB_SL
 
 BUZZ = "buzz"
@@ -63,6 +64,21 @@ class SurfaceLayout:
         """Return the band of an effect [Hz], by name, in a region or outside of all; None: any."""
         own = None if region is None else region.band
         return self.effects[name].tuned_band if own is None else own
+
+    def band_problems(self, frequencies: FloatArray) -> list[str]:
+        """Return what a table of frequencies [Hz] plays instead of bands that it lacks."""
+        uses = [
+            (region.name, self.band_of(name, region))
+            for region in self.regions
+            for name in (region.on_press, region.on_move, region.on_release)
+            if name is not None
+        ]
+        if self.elsewhere is not None:
+            uses.append(("elsewhere", self.band_of(self.elsewhere, None)))
+        problems = [
+            (where, band_problem(band, frequencies)) for where, band in uses if band is not None
+        ]
+        return [*dict.fromkeys(f"{where}: {problem}" for where, problem in problems if problem)]
 
     def as_json(self) -> dict[str, Any]:
         """Return it as the API describes it."""

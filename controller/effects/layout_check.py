@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from controller.effects.band import band_problem
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.effects.representative import strongest_target
 from controller.effects.simulated_touch import Position, SimulatedTouch, TouchSimulator
 from controller.loop.intent import Target
-from controller.loop.table_query import band_of_table
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 
@@ -22,7 +22,6 @@ ELSEWHERE = "elsewhere"
 LEVEL_TOLERANCE, MARGIN_TOLERANCE = 2.0, 4.0
 """How far [dB] a level may be off, and above where it is promised on nine of ten plates."""
 
-_BAND_TOLERANCE = 0.05  # of a frequency; less than anyone tells apart
 _ALIKE = 1.25  # ratio of frequencies that hardly differ in feel
 
 MAX_TOUCHES, MAX_POSITIONS = 30, 120  # of one region, of all
@@ -245,11 +244,9 @@ def _off_band(
                 "a frequency or a band"
             )
         return
-    low, high = band
-    nearest = band_of_table(band, table.frequencies)[0]
-    if not low * (1 - _BAND_TOLERANCE) <= nearest <= high * (1 + _BAND_TOLERANCE):
-        given = f"{low:g} Hz" if low == high else f"{low:g} to {high:g} Hz"
-        yield f"frequency {given} is not in the table, which plays {nearest:g} Hz instead"
+    problem = band_problem(band, table.frequencies)
+    if problem is not None:
+        yield problem
 
 
 def _where(some: Sequence[SimulatedTouch], touches: Sequence[SimulatedTouch], area: float) -> str:

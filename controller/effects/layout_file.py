@@ -154,15 +154,12 @@ def _check_region(
             "at its south-west corner",
         )
     uses = [region.on_press, region.on_move, region.on_release]
-    if uses == [None, None, None] and region.level is not None:
-        validation.add(
-            (*path, "level"), "has no effect to apply to; add an effect or remove the level"
-        )
-    if uses == [None, None, None] and region.tuned_band is not None:
-        key = "band" if region.frequency is None else "frequency"
-        validation.add(
-            (*path, key), f"has no effect to apply to; add an effect or remove the {key}"
-        )
+    if uses == [None, None, None]:
+        for key in ("level", "band", "frequency", "own", "may_share"):
+            if getattr(region, key) not in (None, False):
+                validation.add(
+                    (*path, key), f"has no effect to apply to; add an effect or remove the {key}"
+                )
     if region.own and region.may_share:
         validation.add(
             (*path, "may_share"), "must not be true beside own: its content is shared; remove one"

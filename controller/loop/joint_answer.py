@@ -332,14 +332,21 @@ def _changed(level_db_sl: float | None, change_db: float) -> float | None:
 def _held_back(contact: Contact, layer: Layer) -> Prediction:
     """What is said of a finger whose content is held back, and by how much."""
     had = layer.promised_contrast_db
-    figure = "" if had is None or not math.isfinite(had) else f", only {had:.1f} dB"
-    reason = (
-        "a protected finger would notice it; lower its level, or lift that finger"
-        if layer.is_disturbing
-        else "too many contents for this plate: beside the others it would not have had "
-        f"{max(request.MIN_CONTRAST_DB, layer.request.min_contrast_db):g} dB of contrast{figure}; "
-        "lift a finger, or move it away"
-    )
+    least = max(request.MIN_CONTRAST_DB, layer.request.min_contrast_db)
+    if layer.is_disturbing:
+        reason = "a protected finger would notice it; lower its level, or lift that finger"
+    elif had is not None and had >= least:
+        reason = (
+            "too many contents for this plate: beside it another finger would not have had the "
+            f"{request.MIN_CONTRAST_DB:g} dB of contrast, or more, that it requires; lift a "
+            "finger, move it away, or widen its band"
+        )
+    else:
+        figure = "" if had is None or not math.isfinite(had) else f", only {had:.1f} dB"
+        reason = (
+            f"too many contents for this plate: beside the others it would not have had {least:g} "
+            f"dB of contrast{figure}; lift a finger, move it away, or widen its band"
+        )
     return replace(
         not_served(contact, reason),
         promised_contrast_db=had,

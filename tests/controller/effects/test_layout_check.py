@@ -122,6 +122,9 @@ def test_check_names_a_frequency_that_the_table_does_not_have() -> None:
         region = Region("button", BUTTON, on_press="it", band=(frequency, frequency))
         (problem,) = checked(region, Click()).problems
         assert f"{frequency:g} Hz" in problem
+        # The daemon logs the same of all regions.
+        layout = SurfaceLayout((region,), {"it": Click(frequency=60.0)}, elsewhere="it")
+        assert layout.band_problems(table().frequencies) == [f"button: {problem}"]
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def test_load_layout_reads_the_example() -> None:
 
 def test_a_region_says_how_its_fingers_are_to_be_served(tmp_path: Path) -> None:
     """Each key alone; what is a finger's own is not shared."""
-    shape = "rectangle: {start: [0, 0], end: [0.1, 0.1]}"
+    shape = "rectangle: {start: [0, 0], end: [0.1, 0.1]}, on_press: buzz"
     path = tmp_path / "layout.yaml"
     path.write_text(
         f"regions: {{a: {{{shape}, own: true, protected: true}}, b: {{{shape}, may_share: true}}}}",
@@ -79,8 +79,6 @@ def test_a_region_says_how_its_fingers_are_to_be_served(tmp_path: Path) -> None:
         "may_share": False,
         "protected": True,
     }
-    both = f"regions: {{a: {{{shape}, own: true, may_share: true}}}}"
-    assert "regions.a.may_share" in refused(path, both)
 
 
 def test_region_at_returns_the_later_region_where_two_overlap(tmp_path: Path) -> None:
@@ -120,6 +118,12 @@ AT = "circle: {at: [0.1, 0.1], radius: 1 cm}"
             "remove one",
         ),
         (f"regions: {{a: {{{AT}, frequency: 100}}}}", "1: regions.a.frequency:", "add an effect"),
+        (f"regions:\n a:\n  {AT}\n  own: true", "4: regions.a.own:", "add an effect"),
+        (
+            f"regions: {{a: {{{AT}, on_press: buzz, own: true, may_share: true}}}}",
+            "1: regions.a.may_share:",
+            "remove one",
+        ),
         ("effects: {dial: {}}\nelsewhere: dial", "2: elsewhere:", "on_move"),
         (f"effects: {{dial: {{}}}}\nregions: {{a: {{{AT}, on_press: dial}}}}", "2: ", "on_move"),
     ],

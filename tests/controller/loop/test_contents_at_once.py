@@ -564,11 +564,9 @@ async def test_status_says_what_each_finger_feels() -> None:
         assert len({contact.frequency_hz for contact in event.contacts}) == 3
 
 
-def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
-    """As it moves by 1 cm and another joins, at its new place; by the fields of the table."""
-    contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
-    targets = [(each, Target(each.key, 14.0)) for each in contacts]
-    capabilities = PlaybackCapabilities(
+def capabilities() -> PlaybackCapabilities:
+    """Amplifiers of four layers with ramps alone."""
+    return PlaybackCapabilities(
         "phased",
         ("phased",),
         (40.0, 320.0),
@@ -576,12 +574,33 @@ def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
         RAMPS_ONLY,
         layers=4,
     )
-    first = query_jointly(table(), targets, (), capabilities, before={}, shape=unshaped)
+
+
+def test_a_content_whose_own_contrast_is_not_why_it_is_held_back_says_so() -> None:
+    """Both in one narrow band: the first would have had 3 dB beside it, it 16 itself."""
+    contacts = [
+        Contact(ContactKey("a", n), *at, since=0.0)
+        for n, at in enumerate(((0.06, 0.06), (0.2, 0.1)))
+    ]
+    targets = [(each, Target(each.key, 20.0, band=(99.0, 101.0))) for each in contacts]
+    found = query_jointly(table(), targets, (), capabilities(), before={}, shape=unshaped)
+    (held_back,) = found.not_served
+    assert held_back.promised_contrast_db is not None
+    assert held_back.promised_contrast_db > 12
+    assert held_back.held_back is not None
+    assert "another finger" in held_back.held_back
+
+
+def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
+    """As it moves by 1 cm and another joins, at its new place; by the fields of the table."""
+    contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
+    targets = [(each, Target(each.key, 14.0)) for each in contacts]
+    first = query_jointly(table(), targets, (), capabilities(), before={}, shape=unshaped)
     before = {each.key: each for each in first.contents}
     moved = replace(contacts[0], x=contacts[0].x + 0.01)
     third = Contact(ContactKey("a", 2), *ABOVE, since=0.0)
     joined = [(moved, targets[0][1]), targets[1], (third, Target(third.key, 14.0))]
-    second = query_jointly(table(), joined, (), capabilities, before=before, shape=unshaped)
+    second = query_jointly(table(), joined, (), capabilities(), before=before, shape=unshaped)
     places = [(each.x, each.y) for each, _ in joined]
     fields = table().unit_fields(np.array(places), contacts=places)
     kept = 0

@@ -29,6 +29,7 @@ from drivers import clock
 from drivers.host.amplifier import WATCHDOG
 from memory_machine import live_in_memory
 from model.rig.file import load_rig
+from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from rig_files import write_rig
 from rig_on_wire import FarSide, far_side
@@ -126,10 +127,12 @@ async def daemon_at(
     *,
     changes: Sequence[tuple[str, str]] = (),
     environment: Mapping[str, str] | None = None,
+    table: Callable[[Rig], LocalizationTable] = lambda rig: daemon_table(),
 ) -> AsyncIterator[DaemonBench]:
     """A serving daemon at an existing far end.
 
-    changes: replacements in the rig's text; environment: that its service manager gives it.
+    changes: replacements in the rig's text; environment: that its service manager gives it; table:
+    that of its rig.
     """
     config = load_daemon_config(write_daemon(folder, dict(far.urls), more, changes=changes))
     lock, log = SocketLock(config.socket), LogThread(folder / "log")
@@ -140,7 +143,7 @@ async def daemon_at(
     # watchdog is the longest of the protocol, since no test of this bench lets it expire.
     daemon = Daemon(
         config,
-        daemon_table(),
+        table(config.rig),
         log=log,
         manager=manager,
         dashboard=None,
@@ -157,7 +160,7 @@ async def daemon_at(
     finally:
         daemon.shut_down("end of the test")
         try:
-            await asyncio.wait_for(task, PATIENCE)
+            await asyncio.wait_for(task, None if is_virtual else PATIENCE)
         finally:
             logging.getLogger().removeHandler(log)
             log.close()

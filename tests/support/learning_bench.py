@@ -1,4 +1,4 @@
-"""A daemon that learns, in virtual time over a real wire to a simulated plate that can change.
+"""A daemon that learns, in virtual time, over a line to a simulated plate that can change.
 
 The estimator is a real process, which works in real time: the virtual clock stands still meanwhile,
 unless a test lets it run.
@@ -18,25 +18,18 @@ import pytest
 
 from controller.api.async_client import AsyncClient
 from controller.api.schema import LearningSummary
-from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
-from controller.daemon.log import LogThread
-from controller.daemon.service_manager import ServiceManager
-from controller.daemon.socket_lock import SocketLock
 from controller.demo.touch_row import FingerVibration, steady_contrast_db
 from controller.learning.estimator_process import EstimatorTimeouts
 from controller.learning.learning import Learning
 from controller.learning.learning_status import LearningState
-from daemon_bench import READY, until, until_state, write_daemon
+from daemon_bench import READY, daemon_at, far_end, until_state
 from drivers import clock
-from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
-from rig_files import write_rig
-from rig_on_wire import FarSide, far_side
+from rig_on_wire import FarSide
 from virtual_sockets import VirtualSocketsLoop
-from wires import WIRES
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -144,44 +137,28 @@ class LearningBench:
 
 @asynccontextmanager
 async def learning_bench(
-    folder: Path,
-    *,
-    uncertainty: str = IDENTIFIED,
-    timeouts: EstimatorTimeouts = NO_TIMEOUTS,
-    wire: str = "modbus+tcp",
+    folder: Path, *, uncertainty: str = IDENTIFIED, timeouts: EstimatorTimeouts = NO_TIMEOUTS
 ) -> AsyncIterator[LearningBench]:
     """A daemon that learns of a plate; uncertainty: in its rig's text."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, _StandingLoop)
-    patch = pytest.MonkeyPatch()
-    patch.setitem(Learning.__init__.__kwdefaults__, "timeouts", timeouts)  # type: ignore[arg-type]
-    bench_file = write_rig(folder / "bench.yaml")
-    bench_file.write_text(bench_file.read_text("utf-8") + uncertainty, encoding="utf-8")
-    async with far_side(WIRES[wire], load_rig(bench_file)) as far:
-        file = write_daemon(folder, dict(far.urls), "learn: learned.npz\n")
-        rig_file = folder / "rig.yaml"
-        rig_file.write_text(rig_file.read_text("utf-8") + uncertainty, encoding="utf-8")
-        config = load_daemon_config(file)
-        lock, log = SocketLock(config.socket), LogThread(folder / "log")
-        table = _table(config.rig)
-        daemon = Daemon(config, table, log=log, manager=ServiceManager({}), dashboard=None)
-        task = asyncio.create_task(daemon.run(lock))
-        try:
-            await until(lambda: config.socket.is_socket() or task.done())
-            async with await AsyncClient.connect(config.socket, name="test", timeout=1e9) as era:
-                await until_state(era, READY)
-                async with era.armed("test", lease_s=60):
-                    rng = np.random.default_rng(0)
-                    bench = LearningBench(far, era, folder / "learned.npz", daemon, rng)
-                    loop.stands = bench.is_estimating
-                    yield bench
-        finally:
-            loop.stands = _never
-            daemon.shut_down("end of the test")
-            await task
-            log.close()
-            lock.release()
-            patch.undo()
+    changes = [("\nplate:", f"\n{uncertainty}plate:")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(Learning.__init__.__kwdefaults__, "timeouts", timeouts)  # type: ignore[arg-type]
+        async with (
+            far_end(folder, changes=changes) as far,
+            daemon_at(far, folder, "learn: learned.npz\n", changes=changes, table=_table) as bench,
+            await bench.client() as era,
+        ):
+            await until_state(era, READY)
+            async with era.armed("test", lease_s=60):
+                rng = np.random.default_rng(0)
+                learning = LearningBench(far, era, folder / "learned.npz", bench.daemon, rng)
+                loop.stands = learning.is_estimating
+                try:
+                    yield learning
+                finally:
+                    loop.stands = _never
 
 
 def _table(rig: Rig) -> LocalizationTable:

@@ -75,7 +75,6 @@ class ApiService:
         layout: ActiveLayout,
         learning: Learning | None,
     ) -> None:
-        self.longest_lease = config.section.longest_lease
         self._config = config
         self._table = table
         self._controller = controller
@@ -154,7 +153,7 @@ class ApiService:
             raise _armed_already(machine)
         if machine.state is not DaemonState.READY_TO_SWITCH_ON:
             raise _wrong_state(machine)
-        lease = Lease(params.owner, min(params.lease_s, self.longest_lease))
+        lease = Lease(params.owner, params.lease_s)
         cause = f"armed by {params.owner!a}"
         try:
             await self._supervisor.handle(

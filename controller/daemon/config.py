@@ -241,11 +241,8 @@ def _touch(
 
 
 def _calibration(section: CalibrationSection, rig: Rig | None) -> TouchCalibration:
-    is_turned = bool(section.turned or section.mirror)
-    if is_turned + (section.matrix is not None) + (section.points is not None) > 1:
-        raise InputError("must have only one of turned and mirror, matrix, points")
-    if section.matrix is not None:
-        return TouchCalibration(section.matrix)
+    if section.points is not None and (section.turned or section.mirror):
+        raise InputError("must have only one of turned and mirror, points")
     if section.points is None or rig is None:  # an invalid rig is reported already
         return turned(section.turned, mirror=section.mirror)
     plate = rig.plate

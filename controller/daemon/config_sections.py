@@ -5,18 +5,14 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, Strict
 
-from controller.api.schema import MAX_LEASE, MIN_LEASE
 from model.config.sections import Quantity, Section
-from model.config.units import LENGTH, RATIO, TIME
+from model.config.units import LENGTH, RATIO
 from model.drive_modes import DRIVE_MODES
 from model.finger.perception import STRONG_DB_SL
 from model.rig.sections import Identifier
 
-_NUMBER = Annotated[float, Quantity(RATIO, at_least=-10, at_most=10)]
-_ROW = Annotated[tuple[_NUMBER, _NUMBER, _NUMBER], Strict(strict=False)]  # a list in the file
-
 _LENGTH = Annotated[float, Quantity(LENGTH, at_least=-10, at_most=10)]
-_POINT = Annotated[tuple[_LENGTH, _LENGTH], Strict(strict=False)]
+_POINT = Annotated[tuple[_LENGTH, _LENGTH], Strict(strict=False)]  # a list in the file
 
 
 def _mode(text: str) -> str:
@@ -54,11 +50,10 @@ class CalibrationPoint(Section):
 
 
 class CalibrationSection(Section):
-    """The sensor's orientation: turned clockwise, then mirrored; a matrix; or touched points."""
+    """The sensor's orientation: turned clockwise, then mirrored; or touched points."""
 
     turned: Literal[0, 90, 180, 270] = 0
     mirror: Literal["x", "y"] | None = None
-    matrix: Annotated[tuple[_ROW, _ROW], Strict(strict=False)] | None = None
     points: Annotated[list[CalibrationPoint], Field(min_length=3, max_length=64)] | None = None
 
 
@@ -78,10 +73,9 @@ class LogSection(Section):
 
 
 class DumpSection(Section):
-    """Folder of fault dumps, and how many are kept."""
+    """Folder of fault dumps."""
 
     folder: File
-    keep: Annotated[int, Field(ge=1, le=1000)] = 20
 
 
 class DaemonSection(Section):
@@ -95,9 +89,6 @@ class DaemonSection(Section):
     layout: File | None = None
     touch: Annotated[list[TouchSection], Field(max_length=16, default_factory=list)]
     serial_numbers: Annotated[dict[Identifier, str], Field(max_length=64, default_factory=dict)]
-    longest_lease: Annotated[float, Quantity(TIME, at_least=MIN_LEASE, at_most=MAX_LEASE)] = (
-        MAX_LEASE
-    )
     socket: File | None = None
     log: LogSection = LogSection()
     dumps: DumpSection | None = None

@@ -289,9 +289,9 @@ class Daemon:
             DaemonState.FAULT,
             DaemonState.COMM_LOST,
         )
-        folder, dumps = self._config.dump_folder, self._config.section.dumps
-        if is_fault and folder is not None and dumps is not None:
-            self._dumps.write(folder, cause=new.cause, keep=dumps.keep)
+        folder = self._config.dump_folder
+        if is_fault and folder is not None:
+            self._dumps.write(folder, cause=new.cause)
 
     def _follow_state(self, old: StateMachine, new: StateMachine) -> None:
         """Learn of the plate from when all amplifiers are open."""

@@ -14,6 +14,7 @@ from drivers import clock
 DUMP_PATTERN = "era-fault-*.jsonl"
 """File names of dumps."""
 
+MAX_DUMPS = 20  # files in a folder; the oldest are deleted
 _MIN_INTERVAL = 1.0  # s; one dump for faults that come together
 
 _logger = logging.getLogger(__name__)
@@ -30,8 +31,8 @@ class FaultDumps:
         self._written_at = float("-inf")
         self._writer: threading.Thread | None = None
 
-    def write(self, folder: Path, *, cause: str, keep: int) -> None:
-        """Write a dump unless one was written within the last second; keep the newest `keep`."""
+    def write(self, folder: Path, *, cause: str) -> None:
+        """Write a dump unless one was written within the last second."""
         if clock.now() - self._written_at < _MIN_INTERVAL:
             return
         self._written_at = clock.now()
@@ -42,7 +43,7 @@ class FaultDumps:
 
         def write() -> None:
             try:
-                path = write_dump(folder, records, cause=cause, keep=keep)
+                path = write_dump(folder, records, cause=cause)
                 _logger.info("dump: wrote %s", path)
             except OSError as error:
                 _logger.warning("dump in %s failed: %s", folder, error)
@@ -51,8 +52,8 @@ class FaultDumps:
         self._writer.start()
 
 
-def write_dump(folder: Path, records: Iterable[MessageRecord], *, cause: str, keep: int) -> Path:
-    """Write records to a new file and delete the oldest dumps beyond `keep`; raises OSError.
+def write_dump(folder: Path, records: Iterable[MessageRecord], *, cause: str) -> Path:
+    """Write records to a new file; keep the newest `MAX_DUMPS`; raises OSError.
 
     A file that cannot be written completely is deleted.
     """
@@ -70,7 +71,7 @@ def write_dump(folder: Path, records: Iterable[MessageRecord], *, cause: str, ke
         raise
     # The new file may sort first: boards without a battery start in 1970.
     others = sorted(each for each in folder.glob(DUMP_PATTERN) if each != path)
-    for old in others[: max(0, len(others) + 1 - keep)]:
+    for old in others[: max(0, len(others) + 1 - MAX_DUMPS)]:
         old.unlink(missing_ok=True)
     return path
 

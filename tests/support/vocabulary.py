@@ -86,7 +86,6 @@ CONTACT_PACKAGES = ("controller/sources/", "controller/loop/", "sim/")
 
 ALLOWED = {
     "answers": "JSON of `era table verify` and `era amp discover`: not modal ones",
-    "longest_lease": "a key of the configuration file",
     "hold": "a parameter of the effect `ramp`: the last level is held",
     "places": "JSON of `era amp discover`",
     "begin_armed": "a method of the public client",

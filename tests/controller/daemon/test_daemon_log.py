@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.daemon.fault_dumps import DUMP_PATTERN, FaultDumps, write_dump
+from controller.daemon.fault_dumps import DUMP_PATTERN, MAX_DUMPS, FaultDumps, write_dump
 from controller.daemon.latency import LatencyStatistics
 from controller.daemon.log import JsonFormatter, LogThread, RateLimitFilter
 from controller.daemon.message_recorder import MessageRecord, MessageRecorder
@@ -219,8 +219,8 @@ def test_dump_is_json_lines_for_owner_only(tmp_path: Path) -> None:
         MessageRecord(1.6, "main", "in", "Reply", {"state": 6, "levels": [5000, 0]}),
         MessageRecord(1.7, "main", "none", "no reply"),
     ]
-    for _ in range(4):
-        path = write_dump(folder, records, cause="arc\nx", keep=2)
+    for _ in range(MAX_DUMPS + 2):
+        path = write_dump(folder, records, cause="arc\nx")
     assert path.stat().st_mode & 0o777 == 0o600
     head, *lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
     assert head["cause"] == "arc\nx"
@@ -228,7 +228,7 @@ def test_dump_is_json_lines_for_owner_only(tmp_path: Path) -> None:
     assert lines[0] == {**where, "message": "Arm", "content": {"watchdog": 250, "session": 9}}
     assert lines[1]["content"] == {"state": 6, "levels": [5000, 0]}
     assert (lines[2]["way"], lines[2]["message"]) == ("none", "no reply")
-    assert len(list(folder.iterdir())) == 2
+    assert len(list(folder.iterdir())) == 20
 
 
 def test_latency_percentiles_are_values_that_occurred() -> None:
@@ -287,7 +287,7 @@ def test_dump_that_fails_is_only_logged(
 ) -> None:
     """A file in place of the folder raises nothing at the daemon."""
     (tmp_path / "dumps").write_text("in the way", "utf-8")
-    FaultDumps(MessageRecorder()).write(tmp_path / "dumps", cause="arc", keep=5)
+    FaultDumps(MessageRecorder()).write(tmp_path / "dumps", cause="arc")
     wait_for_writers()
     (warning,) = caplog.messages
     assert str(tmp_path / "dumps") in warning
@@ -311,13 +311,13 @@ def test_dumps_use_one_thread_when_disk_hangs(
     with monkeypatch.context() as patched, caplog.at_level(logging.WARNING):
         patched.setattr("controller.daemon.fault_dumps.write_dump", hang)
         for now[0] in (0.0, 10.0, 20.0):
-            dumps.write(tmp_path, cause="arc", keep=5)
+            dumps.write(tmp_path, cause="arc")
         assert hangs.wait(20)
         assert len(_writers()) == 1
         assert len(caplog.messages) == 2
         released.set()
         wait_for_writers()
     now[0] = 30.0
-    dumps.write(tmp_path, cause="arc", keep=5)
+    dumps.write(tmp_path, cause="arc")
     wait_for_writers()
     assert len(list(tmp_path.glob(DUMP_PATTERN))) == 1

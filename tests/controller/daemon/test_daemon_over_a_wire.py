@@ -164,7 +164,7 @@ async def test_fault_stops_is_dumped_and_must_be_cleared(tmp_path: Path) -> None
 @in_virtual_time_on_sockets
 async def test_reload_applies_a_layout_alone(tmp_path: Path) -> None:
     """While armed a lower level; no higher one, invalid one or one beside another change."""
-    async with ready_daemon(tmp_path, "level_db_sl: 20\nlongest_lease: 60 s\n") as (bench, era):
+    async with ready_daemon(tmp_path, "level_db_sl: 20\n# more\n") as (bench, era):
         await era.arm("me", lease_s=30)
         path = tmp_path / "daemon.yaml"
         original = path.read_text("utf-8")
@@ -188,7 +188,7 @@ async def test_reload_applies_a_layout_alone(tmp_path: Path) -> None:
         assert await reload((f"{level}20", f"{level}21")) == 10
         assert await reload((f"{level}20", f"{level}loud")) == 10
         assert await reload(("rig: rig", "rig: bench"), (f"{level}20", f"{level}5")) == 10
-        assert await reload(("60 s", "20 s"), (f"{level}20", f"{level}5")) == 10
+        assert await reload(("# more", "dashboard: 127.0.0.1:1"), (f"{level}20", f"{level}5")) == 10
         await era.disarm()
         await until_state(era, READY)
         assert await reload((f"{level}20", f"{level}21")) == 21

@@ -69,7 +69,6 @@ DEFAULTS = {
     "rig": "rig.yaml",
     "level_db_sl": "20",
     "touch": '[{name: a, url: "tuio:3333"}]',
-    "longest_lease": "60 s",
     "log": "{level: info}",
     "socket": "s",
 }
@@ -118,7 +117,6 @@ def test_reload_applies_a_layout(folder: Path, change: dict[str, str], is_armed:
         ("mode", "switched"),
         ("serial_numbers", "{main: A1}"),
         ("touch", "[]"),
-        ("longest_lease", "5 s"),
         ("log", "{level: debug}"),
         ("dumps", "{folder: d}"),
         ("socket", "t"),

@@ -353,10 +353,10 @@ def wait_for(condition: Callable[[], object], *, timeout: float = PATIENCE) -> N
 def wait_for_state(era: Client, *states: str) -> str:
     """Wait until the daemon is in one of these states, and return it."""
     end = time.monotonic() + PATIENCE
-    while (state := era.status().state) not in states:
-        assert time.monotonic() < end, f"the daemon stays in {state}"
+    while (status := era.status()).state not in states:
+        assert time.monotonic() < end, f"the daemon stays in {status.state}: {status.cause}"
         time.sleep(0.01)
-    return state
+    return status.state
 
 
 ARM = b'{"owner": "me", "lease_s": 5}'

@@ -6,7 +6,11 @@ Messages are by docs/decisions/0061-protocol-3.md, rules by docs/reference/witne
 from typing import Any
 
 import hand_written as hand
-from hand_written_talk import HALF, Broken, Talk, breaking
+from hand_written_talk import HALF, Broken, Talk
+
+LOUD = hand.layer(0, hand.tone(0, 100, 0.5))
+ABOVE: dict[str, Any] = {"token": 6, "tokens": (5, 6, 0, 0)}
+"""Layers of 0.7 each at one channel."""
 
 BROKEN: Broken = {
     "state_that_is_none": ("garbage", lambda: Talk().armed().says(9)),
@@ -65,174 +69,207 @@ BROKEN: Broken = {
         "high_voltage",
         lambda: Talk().armed().says(hand.FAULT, fault=hand.ARC, latch=1, high_voltage=True),
     ),
+    "staged_before_all_parts": (
+        "commit",
+        lambda: Talk().armed().exchange(hand.SET, hand.part(5, LOUD[:4], parts=2), hand.taken(5)),
+    ),
+    "played_before_its_commit": (
+        "commit",
+        lambda: (
+            Talk()
+            .armed()
+            .exchange(
+                hand.SET,
+                hand.part(5, hand.layer(0)),
+                hand.taken(5, staged=False, played=True),
+            )
+        ),
+    ),
+    "whole_and_not_staged": (
+        "commit",
+        lambda: (
+            Talk()
+            .armed()
+            .exchange(hand.SET, hand.part(5, hand.layer(0)), hand.taken(5, staged=False))
+        ),
+    ),
+    "broadcast_commit_ignored": (
+        "commit",
+        lambda: (
+            Talk()
+            .armed()
+            .staged(5, LOUD)
+            .sends(hand.COMMIT, (9, 5), address=0)
+            .says(kind=hand.GET_STATUS)
+        ),
+    ),
+    "plays_as_before": (
+        "commit",
+        lambda: (
+            Talk()
+            .armed()
+            .playing()
+            .staged(6, hand.layer(0, hand.tone(0, 100, 0.3)))
+            .committed(6, levels=(5000, 0), tokens=(6, 0, 0, 0))
+            .rest(0.03)
+            .says(**HALF | {"token": 6, "tokens": (6, 0, 0, 0)})
+        ),
+    ),
+    "ended_by_itself_too_late": (
+        "token",
+        lambda: (
+            Talk()
+            .armed()
+            .staged(5, hand.layer(0, hand.tone(0, 100, 0.0005), valid_for=50))
+            .committed(5, tokens=(5, 0, 0, 0))
+            .rest(0.1)
+            .says(token=5, tokens=(5, 0, 0, 0))
+        ),
+    ),
+    "commit_of_a_set_of_long_ago": (
+        "token",
+        lambda: Talk().armed().staged(5, hand.layer(0)).fed(6).committed(5),
+    ),
+    "older_set_accepted": (
+        "token",
+        lambda: (
+            Talk()
+            .armed()
+            .playing()
+            .told("faults", "a", are_on=True)  # which excuses the host alone
+            .numbered(99)
+            .host_bytes(hand.frame(hand.SET, hand.part(4, hand.layer(0)), sequence=99))
+            .rest(0.001)
+            .replies(hand.SET, hand.taken(4))
+        ),
+    ),
+    "broadcast_stop_ignored": (
+        "stop",
+        lambda: Talk().armed().sends(hand.STOP, (5,), address=0).says(kind=hand.GET_STATUS),
+    ),
+    "reply_twice": ("credit", lambda: Talk().armed().says().replies(hand.PING, hand.status())),
+    "no_reply": ("answer", lambda: Talk().armed().sends(hand.GET_STATUS).rest(0.04)),
+    "watchdog_too_early": (
+        "watchdog",
+        lambda: (
+            Talk()
+            .armed()
+            .rest(0.2)
+            .says(hand.FAULT, kind=hand.GET_STATUS, fault=hand.WATCHDOG, latch=1)
+        ),
+    ),
+    "stop_ends_by_itself": (
+        "latched",
+        lambda: (
+            Talk()
+            .armed()
+            .exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
+            .rest(0.1)
+            .says(hand.SWITCHED_OFF, kind=hand.GET_STATUS, latch=1)
+        ),
+    ),
+    "cleared_by_another_latch": (
+        "latched",
+        lambda: (
+            Talk()
+            .armed()
+            .exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
+            .rest(0.1)
+            .exchange(hand.CLEAR, (7,), hand.status(hand.SWITCHED_OFF, latch=1))
+        ),
+    ),
+    "armed_in_a_fault": (
+        "latched",
+        lambda: (
+            Talk()
+            .armed()
+            .says(hand.FAULT, fault=hand.ARC, latch=1)
+            .exchange(hand.ARM, (8, 250), hand.status(latch=1))
+        ),
+    ),
+    "without_a_ramp": (
+        "ramp",
+        lambda: (
+            Talk()
+            .armed()
+            .staged(5, hand.layer(0, hand.tone(0, 100, 0.5), ramp=100))
+            .committed(5, levels=(5000, 0), tokens=(5, 0, 0, 0))
+        ),
+    ),
+    "another_frequency_in_achieved": (
+        "plays",
+        lambda: (
+            Talk()
+            .armed()
+            .playing()
+            .exchange(hand.GET_ACHIEVED, (0,), [5, *hand.layer(0, hand.tone(0, 50, 0.5))])
+        ),
+    ),
+    "another_channel_in_achieved": (
+        "commit",
+        lambda: (
+            Talk()
+            .armed()
+            .playing()
+            .exchange(hand.GET_ACHIEVED, (0,), [5, *hand.layer(0, hand.tone(1, 100, 0.5))])
+        ),
+    ),
+    "not_exact_without_a_reason": (
+        "plays",
+        lambda: Talk().armed().exchange(hand.SET, hand.part(5, LOUD), hand.taken(5, exact=False)),
+    ),
+    "not_limited_above_full_level": (
+        "plays",
+        lambda: (
+            Talk(level=1.5)
+            .armed()
+            .playing(level=0.7)
+            .staged(6, hand.layer(1, hand.tone(0, 150, 0.7)))
+            .exchange(hand.COMMIT, (9, 6), hand.status(levels=(7000, 0), **ABOVE))
+            .rest(0.03)
+            .says(levels=(10000, 0), **ABOVE)
+        ),
+    ),
+    "plays_on_after_silence": (
+        "silent",
+        lambda: (
+            Talk()
+            .armed()
+            .playing()
+            .exchange(hand.SILENCE, (9, 10), hand.status(token=5, levels=(5000, 0)))
+            .rest(0.02)
+            .says(token=5, levels=(5000, 0))
+        ),
+    ),
+    "fault_not_listed": (
+        "faults",
+        lambda: (
+            Talk()
+            .armed()
+            .says(hand.FAULT, fault=hand.ARC, latch=1)
+            .exchange(hand.GET_FAULTS, (), (0,))
+        ),
+    ),
+    "fault_five_seconds_old": (
+        "faults",
+        lambda: (
+            Talk()
+            .armed()
+            .says(hand.FAULT, fault=hand.ARC, latch=1)
+            .exchange(hand.GET_FAULTS, (), (1, hand.ARC, 255, 0, 5000))
+        ),
+    ),
+    "damaged_frame_carried_out": (
+        "damage",
+        lambda: (
+            Talk()
+            .armed()
+            .told("faults", "a", are_on=True)
+            .numbered(77)
+            .host_bytes(hand.frame(hand.PING, (9,), sequence=77), flipped=-3)
+            .rest(0.001)
+            .replies(hand.PING, hand.status())
+        ),
+    ),
 }
-"""Conversations by what is wrong, each with the rule that it breaks; more are below."""
-breaks = breaking(BROKEN)
-
-
-@breaks("commit")
-def _staged_before_all_parts() -> Talk:
-    stream = hand.layer(0, hand.tone(0, 100, 0.5))
-    talk = Talk().armed()
-    return talk.exchange(hand.SET, hand.part(5, stream[:4], parts=2), hand.taken(5))
-
-
-@breaks("commit")
-def _played_before_its_commit() -> Talk:
-    words = hand.part(5, hand.layer(0))
-    return Talk().armed().exchange(hand.SET, words, hand.taken(5, staged=False, played=True))
-
-
-@breaks("commit")
-def _whole_and_not_staged() -> Talk:
-    words = hand.part(5, hand.layer(0))
-    return Talk().armed().exchange(hand.SET, words, hand.taken(5, staged=False))
-
-
-@breaks("commit")
-def _broadcast_commit_ignored() -> Talk:
-    talk = Talk().armed().staged(5, hand.layer(0, hand.tone(0, 100, 0.5)))
-    talk.sends(hand.COMMIT, (9, 5), address=0)
-    return talk.says(kind=hand.GET_STATUS)
-
-
-@breaks("commit")
-def _plays_as_before() -> Talk:
-    talk = Talk().armed().playing().staged(6, hand.layer(0, hand.tone(0, 100, 0.3)))
-    talk.committed(6, levels=(5000, 0), tokens=(6, 0, 0, 0)).rest(0.03)
-    return talk.says(**HALF | {"token": 6, "tokens": (6, 0, 0, 0)})
-
-
-@breaks("token")
-def _ended_by_itself_too_late() -> Talk:
-    talk = Talk().armed()
-    talk.staged(5, hand.layer(0, hand.tone(0, 100, 0.0005), valid_for=50))
-    return talk.committed(5, tokens=(5, 0, 0, 0)).rest(0.1).says(token=5, tokens=(5, 0, 0, 0))
-
-
-@breaks("token")
-def _commit_of_a_set_of_long_ago() -> Talk:
-    talk = Talk().armed().staged(5, hand.layer(0))
-    for _ in range(6):
-        talk.rest(0.2).says()
-    return talk.committed(5)
-
-
-@breaks("stop")
-def _broadcast_stop_ignored() -> Talk:
-    talk = Talk().armed()
-    talk.sends(hand.STOP, (5,), address=0)
-    return talk.says(kind=hand.GET_STATUS)
-
-
-@breaks("credit")
-def _reply_twice() -> Talk:
-    talk = Talk().armed().says()
-    talk.replies(hand.PING, hand.status())
-    return talk
-
-
-@breaks("answer")
-def _no_reply() -> Talk:
-    talk = Talk().armed()
-    talk.sends(hand.GET_STATUS)
-    return talk.rest(0.04)
-
-
-@breaks("watchdog")
-def _watchdog_too_early() -> Talk:
-    talk = Talk().armed().rest(0.2)
-    return talk.says(hand.FAULT, kind=hand.GET_STATUS, fault=hand.WATCHDOG, latch=1)
-
-
-@breaks("latched")
-def _stop_ends_by_itself() -> Talk:
-    talk = Talk().armed().exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
-    return talk.rest(0.1).says(hand.SWITCHED_OFF, kind=hand.GET_STATUS, latch=1)
-
-
-@breaks("latched")
-def _cleared_by_another_latch() -> Talk:
-    talk = Talk().armed().exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
-    return talk.rest(0.1).exchange(hand.CLEAR, (7,), hand.status(hand.SWITCHED_OFF, latch=1))
-
-
-@breaks("latched")
-def _armed_in_a_fault() -> Talk:
-    talk = Talk().armed().says(hand.FAULT, fault=hand.ARC, latch=1)
-    return talk.exchange(hand.ARM, (8, 250), hand.status(latch=1))
-
-
-@breaks("ramp")
-def _without_a_ramp() -> Talk:
-    talk = Talk().armed().staged(5, hand.layer(0, hand.tone(0, 100, 0.5), ramp=100))
-    return talk.committed(5, levels=(5000, 0), tokens=(5, 0, 0, 0))
-
-
-@breaks("plays")
-def _another_frequency_in_achieved() -> Talk:
-    reply = [5, *hand.layer(0, hand.tone(0, 50, 0.5))]
-    return Talk().armed().playing().exchange(hand.GET_ACHIEVED, (0,), reply)
-
-
-@breaks("commit")
-def _another_channel_in_achieved() -> Talk:
-    reply = [5, *hand.layer(0, hand.tone(1, 100, 0.5))]
-    return Talk().armed().playing().exchange(hand.GET_ACHIEVED, (0,), reply)
-
-
-@breaks("plays")
-def _not_exact_without_a_reason() -> Talk:
-    words = hand.part(5, hand.layer(0, hand.tone(0, 100, 0.5)))
-    return Talk().armed().exchange(hand.SET, words, hand.taken(5, exact=False))
-
-
-@breaks("plays")
-def _not_limited_above_full_level() -> Talk:
-    talk = Talk(level=1.5).armed().playing(level=0.7)
-    talk.staged(6, hand.layer(1, hand.tone(0, 150, 0.7)))
-    above: dict[str, Any] = {"token": 6, "tokens": (5, 6, 0, 0)}
-    talk.exchange(hand.COMMIT, (9, 6), hand.status(levels=(7000, 0), **above)).rest(0.03)
-    return talk.says(levels=(10000, 0), **above)
-
-
-@breaks("silent")
-def _plays_on_after_silence() -> Talk:
-    talk = Talk().armed().playing()
-    silent: dict[str, Any] = {"token": 5, "levels": (5000, 0)}
-    return talk.exchange(hand.SILENCE, (9, 10), hand.status(**silent)).rest(0.02).says(**silent)
-
-
-@breaks("faults")
-def _fault_not_listed() -> Talk:
-    talk = Talk().armed().says(hand.FAULT, fault=hand.ARC, latch=1)
-    return talk.exchange(hand.GET_FAULTS, (), (0,))
-
-
-@breaks("faults")
-def _fault_five_seconds_old() -> Talk:
-    talk = Talk().armed().says(hand.FAULT, fault=hand.ARC, latch=1)
-    return talk.exchange(hand.GET_FAULTS, (), (1, hand.ARC, 255, 0, 5000))
-
-
-@breaks("damage")
-def _damaged_frame_carried_out() -> Talk:
-    talk = Talk().armed()
-    talk.witness.faults(talk.time, "a", are_on=True)
-    data = bytearray(hand.frame(hand.PING, (9,), sequence=77))
-    data[-3] ^= 1
-    talk.host_bytes(bytes(data))
-    talk.sequence = 77
-    talk.rest(0.001).replies(hand.PING, hand.status())
-    return talk
-
-
-@breaks("token")
-def _older_set_accepted() -> Talk:
-    talk = Talk().armed().playing()
-    talk.witness.faults(talk.time, "a", are_on=True)  # which excuses the host alone
-    stale = hand.frame(hand.SET, hand.part(4, hand.layer(0)), sequence=99)
-    talk.sequence = 99
-    talk.host_bytes(stale)
-    talk.rest(0.001).replies(hand.SET, hand.taken(4))
-    return talk
+"""Conversations by what is wrong, each with the rule that it breaks."""

@@ -14,10 +14,17 @@ HALF: dict[str, Any] = {"token": 5, "levels": (5000, 0), "tokens": (5, 0, 0, 0)}
 class Talk:
     """Requests and replies of one or two amplifiers; time [s], one clock for all.
 
-    limits: of the channels; times: as in the configuration of a witness.
+    limits: of the channels; expected: what every pattern of the first must be on its channel 0.
     """
 
-    def __init__(self, *, names: Sequence[str] = ("m",), power: float = 9.0, **limits: Any) -> None:
+    def __init__(
+        self,
+        *,
+        names: Sequence[str] = ("m",),
+        power: float = 9.0,
+        expected: Sequence[tuple[float, float, float]] | None = None,
+        **limits: Any,
+    ) -> None:
         limits = {"frequency_hz": [40, 500], "level": 0.8} | limits
         amplifiers = {
             name: {
@@ -30,6 +37,8 @@ class Talk:
         self.config = {"wires": {"a": "serial"}, "amplifiers": amplifiers, "times_s": times}
         self.capture: list[str] = []
         self.witness = Witness(self.config, record=self.capture.append)
+        if expected is not None:
+            self.witness.expect({names[0]: {0: list(expected)}})
         self.time = 1.0
         self.sequence = 0
         self.latch = 0
@@ -44,22 +53,42 @@ class Talk:
         self.time += seconds
         return self
 
-    def sends(self, kind: int, words: Sequence[int] = (), *, address: int = 1) -> None:
+    def told(self, what: str, *arguments: Any, **named: Any) -> "Talk":
+        """Let the witness be told something by a method of its own, now."""
+        getattr(self.witness, what)(self.time, *arguments, **named)
+        return self
+
+    def opened(self) -> "Talk":
+        """Let the host open the wire, whose amplifiers it does not know then."""
+        self.witness.opened("a", self.time)
+        return self
+
+    def numbered(self, sequence: int) -> "Talk":
+        """Let what comes next belong to the request of this number."""
+        self.sequence = sequence
+        return self
+
+    def sends(self, kind: int, words: Sequence[int] = (), *, address: int = 1) -> "Talk":
         """Let the host send a request now."""
         self.sequence += 1
         version = 0 if kind == hand.HELLO else hand.VERSION
-        self.host_bytes(
+        return self.host_bytes(
             hand.frame(kind, words, sequence=self.sequence, address=address, version=version)
         )
 
-    def replies(self, kind: int, words: Sequence[int] = (), *, address: int = 1) -> None:
+    def replies(self, kind: int, words: Sequence[int] = (), *, address: int = 1) -> "Talk":
         """Let the amplifier reply to the last request now."""
         data = hand.frame(kind | hand.REPLY, words, sequence=self.sequence, address=address)
         self.amplifier_bytes(data)
+        return self
 
-    def host_bytes(self, data: bytes) -> None:
-        """Let bytes pass toward the amplifier."""
-        self.witness.record_bytes("a", "amplifier", self.time, data)
+    def host_bytes(self, data: bytes, *, flipped: int | None = None) -> "Talk":
+        """Let bytes pass toward the amplifier; flipped: the byte whose lowest bit is another."""
+        damaged = bytearray(data)
+        if flipped is not None:
+            damaged[flipped] ^= 1
+        self.witness.record_bytes("a", "amplifier", self.time, bytes(damaged))
+        return self
 
     def amplifier_bytes(self, data: bytes) -> None:
         """Let bytes pass toward the host."""
@@ -114,6 +143,12 @@ class Talk:
         self.committed(token, tokens=(token, 0, 0, 0))
         return self.rest(0.03)
 
+    def fed(self, beats: int) -> "Talk":
+        """Let so many heartbeats pass, 0.2 s apart."""
+        for _ in range(beats):
+            self.rest(0.2).says()
+        return self
+
     def says(self, state: int = hand.ENABLED, *, kind: int = hand.PING, **status: Any) -> "Talk":
         """Let it be asked, by Ping unless told otherwise, and say how it is."""
         words = (9,) if kind == hand.PING else ()
@@ -122,15 +157,3 @@ class Talk:
 
 Broken: TypeAlias = dict[str, tuple[str, Callable[[], Talk]]]
 """Conversations by name, each with the one rule that it breaks."""
-
-
-def breaking(broken: Broken) -> Callable[[str], Callable[[Callable[[], Talk]], None]]:
-    """Return a decorator that adds a conversation to these, with the rule that it breaks."""
-
-    def breaks(rule: str) -> Callable[[Callable[[], Talk]], None]:
-        def note(talk: Callable[[], Talk]) -> None:
-            broken[talk.__name__.lstrip("_")] = rule, talk
-
-        return note
-
-    return breaks

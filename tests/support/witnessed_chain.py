@@ -11,13 +11,14 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
+import hand_written as hand
 from chain import Chain
 from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
 from drivers.host.amplifier import Amplifier
 from model.vibration.excitation import Excitation, Tone
 from registry.limits import GuardLimits
-from set_table import SetTable, make_rig
+from set_table import STROKE, SetTable, make_rig
 from sim.far_ends.wires import Wire
 from sim.witness.capture import Violation
 from sim.witness.witness import OperatorCommand
@@ -131,10 +132,34 @@ class Scene(Chain):
         await self.rest(0.150)
         self.witness.contacts(clock.now(), ())
 
-    def inject(self, data: bytes) -> None:
-        """Inject bytes toward the amplifier on the first wire."""
-        link = self.witness.wires[0]
+    def inject(self, kind: int, words: Sequence[int]) -> None:
+        """Inject a request of another program toward the amplifier on the first wire."""
+        link, data = self.witness.wires[0], hand.frame(kind, words, sequence=999)
         self.machine.deliver(link, "amplifier", data, self.machine._terminals[link].inward)
+
+    async def poll(self, times: int) -> None:
+        """Read the status of the amplifier every 20 ms."""
+        for _ in range(times):
+            await self.rest(0.02)
+            await self.amplifier.read_status()
+
+    async def ask(self, name: str) -> None:
+        """Ask the amplifier something."""
+        await self.amplifier.request(name, {})
+
+    async def identify(self) -> None:
+        """Identify the amplifier again."""
+        await self.amplifier.identify()
+
+    def delayed(self, seconds: float) -> None:
+        """Delay what goes to the host from now on."""
+        self.delay = seconds
+
+    async def touch_for(self, frequency: float, level: float, phase: float = 0.0) -> None:
+        """Touch where the table has this tone for one ERA, which may not be played."""
+        self.table.excitation = {**ALONE, "NE": Tone(frequency, level * STROKE, phase)}
+        await self.touch(1, answerable=False)
+        self.witness.expect(None)
 
     async def close(self) -> None:
         """Lift what is down, disarm and close all."""
@@ -160,13 +185,16 @@ class Scene(Chain):
             await asyncio.sleep(SENSED_EVERY)
 
 
-Scenario = Callable[[Scene], Awaitable[None]]
-
-
 def play(
-    wire: str, scenario: Scenario, *, amplifiers: Sequence[str] = ("main",)
+    wire: str, scenario: Sequence[Callable[[Scene], Any]], *, amplifiers: Sequence[str] = ("main",)
 ) -> tuple[Scene, list[Violation]]:
-    """Play a scenario to its end on a wire of this kind; returns what the witness found."""
+    """Play the steps of a scenario on a wire of this kind; returns what the witness found."""
+
+    async def steps(scene: Scene) -> None:
+        for step in scenario:
+            done = step(scene)
+            if done is not None:
+                await done
 
     async def run() -> tuple[Scene, list[Violation]]:
         rig = make_rig(amplifiers, GuardLimits(40.0, 500.0, 0.5))
@@ -180,7 +208,7 @@ def play(
             if not scene.errors:
                 with suppress(TimeoutError):
                     async with asyncio.timeout(_LONGEST):
-                        await scene.tried(scenario(scene))
+                        await scene.tried(steps(scene))
             await scene.close()
             sensing.cancel()
             return scene, scene.witness.finish(clock.now())

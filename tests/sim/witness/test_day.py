@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import inspect
 import random
 import re
 from pathlib import Path
@@ -10,7 +9,6 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-import witness_scenarios
 from drivers.contents import Layer, Shape, Tone
 from drivers.errors import CommandRefused, Preempted
 from drivers.host.group import Group
@@ -20,7 +18,8 @@ from long_form import in_turn, shortly
 from random_group import RandomGroup
 from sim.witness.capture import Violation
 from virtual_loop import run_virtual
-from witnessed_chain import WITNESSED, Scenario, play
+from witness_scenarios import SCENARIOS
+from witnessed_chain import WITNESSED, play
 from words_line import KINDS
 
 SWELL = Shape(0.01, (0.1 + 0j, 0.3 + 0j, 0.1 + 0j))
@@ -175,8 +174,6 @@ def test_witness_excuses_lost_and_doubled_frames(kind: str, lines: str, seed: in
 
 
 ROOT = Path(__file__).parents[3]
-SCENARIOS: dict[str, Scenario]
-SCENARIOS = dict(inspect.getmembers(witness_scenarios, inspect.iscoroutinefunction))
 # Over RTU an answer begins within 10 ms, and nothing may be sent before it: 25 ms are a fault, and
 # the stop that follows a fault is still under way when the operator clears.
 # A finger that comes again before a set was carried out changes nothing.

@@ -12,6 +12,7 @@ import pytest
 
 from benchmarks.latency.daemon import run_daemon
 from controller.cli.main import main
+from controller.daemon.daemon import Daemon
 from controller.loop.loop import Controller
 from controller.sources import contacts
 from drivers.host.amplifier import Amplifier
@@ -31,7 +32,7 @@ def wait_long(patch: pytest.MonkeyPatch) -> None:
     for method in (Line.submit, Amplifier.request):
         patch.setitem(method.__kwdefaults__, "timeout", REPLY_TIMEOUT)  # type: ignore[arg-type]
     patch.setattr("drivers.host.dialogue.COMMIT_DELAY", REPLY_TIMEOUT)
-    for made in (Controller, Group):
+    for made in (Daemon, Controller, Group):
         patch.setitem(made.__init__.__kwdefaults__, "watchdog", WATCHDOG)  # type: ignore[arg-type]
 
 

@@ -19,8 +19,8 @@ from controller.api.topics import (
 )
 from controller.daemon.api_views import PlateView, learning_summary, plate_event
 from controller.daemon.latency import LatencyStatistics
+from controller.daemon.plate_actions import LinkChange
 from controller.daemon.states import DaemonState, StateMachine
-from controller.daemon.supervisor import LinkChange
 from controller.effects.layout import SurfaceLayout
 from controller.learning.learning_status import LearningStatus
 from controller.loop.observer import Applied, Observer, Silenced

@@ -8,6 +8,7 @@ import logging
 import math
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.content import Content, Selection, no_layer_free, not_served
@@ -100,7 +101,8 @@ class Decider:
         self._rig = rig
         self._table = table
         self._timing = timing
-        self._capabilities = capabilities
+        self.capabilities = capabilities
+        """Of the amplifiers together."""
         self._tracker = tracker
         self._intent_source = intent_source
         self._intent_due: float | None = None  # when the intent may change without a touch
@@ -118,7 +120,8 @@ class Decider:
         )
         self._selected: Selection | None = None
         self._decided: Decision | None = None  # the last one with something to send
-        self._playing: Mapping[int, PlayedContent] = {}
+        self.playing: Mapping[int, PlayedContent] = {}
+        """The contents that play, by layer."""
         # By finger and voice, also where what plays is unknown.
         self._layer_of: Mapping[tuple[ContactKey, int], int] = {}
         self._may_play: frozenset[int] = frozenset()  # layers, since all were silent
@@ -129,11 +132,6 @@ class Decider:
         self._arrived = arrived
         self._triggered_at: float | None = None
         self._played_until = -math.inf  # s; as far as known
-
-    @property
-    def capabilities(self) -> PlaybackCapabilities:
-        """Capabilities of the amplifiers together."""
-        return self._capabilities
 
     def replace_answers(self, table: LocalizationTable, timing: Timing | None) -> None:
         """Answer by another table of this plate from now on; what plays stays until it changes."""
@@ -147,18 +145,18 @@ class Decider:
 
         Raises InputError for a table that has no pattern for these amplifiers.
         """
-        self._table.prepare(self._capabilities.drive_mode)
+        self._table.prepare(self.capabilities.drive_mode)
         if self._timing is None:
             return
         self._timing.prepare(self._table.frequencies.tolist())
-        plate, support = self._table.plate, self._capabilities.envelope_support
+        plate, support = self._table.plate, self.capabilities.envelope_support
         question = Question(
             ((plate.length / 2, plate.width / 2),),
             ((0.0, 0.0),),
             level_db_sl=-100.0,
-            drive_mode=self._capabilities.drive_mode,
-            playable=self._capabilities.playable,
-            frequencies=self._capabilities.frequencies,
+            drive_mode=self.capabilities.drive_mode,
+            playable=self.capabilities.playable,
+            frequencies=self.capabilities.frequencies,
             envelopes=support.onset_knots > 0,
         )
         pattern = self._timing.with_envelopes(
@@ -188,11 +186,6 @@ class Decider:
         """Whether the last contact has lifted and silence has not been commanded yet."""
         return not self._tracker.contacts and not self._is_silent
 
-    @property
-    def playing(self) -> Mapping[int, PlayedContent]:
-        """The contents that play, by layer."""
-        return self._playing
-
     def update(self, frame: TouchFrame, *, keeps_taps: bool = False) -> Change:
         """Apply a touch frame to the contacts; keeps_taps: as of `ContactTracker.update`."""
         change = self._tracker.update(frame, keeps_taps=keeps_taps)
@@ -214,7 +207,7 @@ class Decider:
     def forget(self) -> None:
         """Discard the known playback: the next decision has a set; fingers keep their layers."""
         self._selected, self._decided, self._retry_at, self._is_new = None, None, None, True
-        self._playing, self._over, self._is_silent = {}, (), False
+        self.playing, self._over, self._is_silent = {}, (), False
 
     def only_ends(self, decision: Decision) -> Decision:
         """Return the last decision without what it starts, which is decided again later."""
@@ -232,47 +225,47 @@ class Decider:
         Pulses start when the last commit was sent.
         """
         self._may_play = self._may_play.difference(decision.sets).union(decision.started)
-        playing = dict(self._playing)
         for number in decision.started:
-            one = playing[number]
+            one = self.playing[number]
             for _, target in one.content.targets:
                 if target.pulse is not None and target.pulse.started_at is None:
                     target.pulse.started_at = played.sent_at
                     self._intent_due = min(self._intent_due or math.inf, target.pulse.end)
-            playing[number] = replace(
-                one,
+            self._change(
+                number,
                 drive=tones_by_era(played.layers, self._rig, number),
                 settled_at=now + one.set.settled_after,
                 validity=self._validity(played, number, one.content, now),
             )
-        self._playing = playing
 
-    def without_shapes(self, decision: Decision) -> Decision | None:
-        """Return the last decision along its plain ramps; None where it has no shapes."""
-        if not any(each.plain for each in decision.sets.values()):
-            return None
+    def _change(self, number: int, **values: Any) -> None:
+        """Give what plays in a layer other values of its fields."""
+        self.playing = {**self.playing, number: replace(self.playing[number], **values)}
+
+    def _without_shapes(self, decision: Decision) -> Decision:
+        """Return the last decision along its plain ramps."""
         sets = {number: each.plain or each for number, each in decision.sets.items()}
         decision = self._decided = replace(decision, sets=sets)
-        playing = dict(self._playing)
         for number in decision.started:
-            one = playing[number]
-            pattern = replace(one.pattern, onset=None, ending=None)
-            playing[number] = replace(one, set=sets[number], pattern=pattern)
-        self._playing = playing
+            pattern = replace(self.playing[number].pattern, onset=None, ending=None)
+            self._change(number, set=sets[number], pattern=pattern)
         return decision
 
     def refused(self, decision: Decision, error: CommandRefused) -> Decision:
-        """Return the last decision without its newest content, since a ledger has refused it.
+        """Return the last decision along its plain ramps, since a ledger has refused it.
 
-        Silence where no other content is left.
+        Without its newest content where it has no other shapes, and silence where none is left.
         """
+        if any(each.plain for each in decision.sets.values()):
+            _logger.info("loop: plain ramps instead of envelopes: %s", error)
+            return self._without_shapes(decision)
         self._retry_at = error.until
         newest = max(decision.started, key=self._requested_at, default=None)
         if newest is not None:
             ends = self._voices_beside(newest)
-            if len(ends) < len(self._playing):
+            if len(ends) < len(self.playing):
                 return self._without(ends, decision, str(error))
-        self._playing, self._is_silent = {}, True
+        self.playing, self._is_silent = {}, True
         self._decided = replace(
             decision,
             sets={},
@@ -284,18 +277,18 @@ class Decider:
 
     def _requested_at(self, number: int) -> float:
         """Return when [s] what plays in a layer was requested, by its pulse or its contact."""
-        contact, target = self._playing[number].content.targets[0]
+        contact, target = self.playing[number].content.targets[0]
         return contact.since if target.pulse is None else target.pulse.requested_at
 
     def _voices_beside(self, number: int) -> frozenset[int]:
         """Return the layers that play for the same finger as one, itself included."""
-        key, _ = self._playing[number].content.key
-        return frozenset(n for n, one in self._playing.items() if one.content.key[0] == key)
+        key, _ = self.playing[number].content.key
+        return frozenset(n for n, one in self.playing.items() if one.content.key[0] == key)
 
     def _without(self, numbers: frozenset[int], decision: Decision, reason: str) -> Decision:
         """Return the last decision with layers that end instead of what it starts there."""
-        contents = [self._playing[number].content for number in numbers]
-        self._playing = {n: one for n, one in self._playing.items() if n not in numbers}
+        contents = [self.playing[number].content for number in numbers]
+        self.playing = {n: one for n, one in self.playing.items() if n not in numbers}
         ends = {number: self._builder.build_end(number, has_endings=False) for number in numbers}
         self._decided = replace(
             decision,
@@ -309,7 +302,7 @@ class Decider:
     def renewal(self, now: float) -> dict[int, PlateSet]:
         """Return the sets that prolong what plays, by layer, where that is due at a time [s]."""
         due = {}
-        for number, one in self._playing.items():
+        for number, one in self.playing.items():
             if now < one.validity.renewal_due:
                 continue
             targets = one.content.targets
@@ -319,22 +312,17 @@ class Decider:
                 due[number] = self._builder.build_renewal(one.set, valid_for=lasts)
         return due
 
-    def confirm_renewal(self, numbers: Iterable[int], played: Played, *, now: float) -> None:
-        """Note that the amplifiers have accepted a renewal of layers."""
-        playing = dict(self._playing)
+    def renewed(
+        self, numbers: Iterable[int], played: Played | CommandRefused, *, now: float
+    ) -> None:
+        """Note what became of a renewal of layers; one refused for good lets them end."""
         for number in numbers:
-            validity = self._validity(played, number, playing[number].content, now)
-            playing[number] = replace(playing[number], validity=validity)
-        self._playing = playing
-
-    def refuse_renewal(self, numbers: Iterable[int], until: float | None) -> None:
-        """Note that a ledger has refused a renewal until a time [s], None: the playback ends."""
-        due = math.inf if until is None else until
-        playing = dict(self._playing)
-        for number in numbers:
-            validity = replace(playing[number].validity, renewal_due=due)
-            playing[number] = replace(playing[number], validity=validity)
-        self._playing = playing
+            one = self.playing[number]
+            if isinstance(played, CommandRefused):
+                due = math.inf if played.until is None else played.until
+                self._change(number, validity=replace(one.validity, renewal_due=due))
+            else:
+                self._change(number, validity=self._validity(played, number, one.content, now))
 
     def ended(self, now: float) -> Decision | None:
         """Return the ends of contents that have come by themselves at a time [s], once; else None.
@@ -343,12 +331,12 @@ class Decider:
         """
         over = {
             number: replace(one, drive={})
-            for number, one in self._playing.items()
+            for number, one in self.playing.items()
             if one.drive and now >= one.validity.ends_at
         }
         if not over or self._decided is None:
             return None
-        self._playing = {**self._playing, **over}
+        self.playing = {**self.playing, **over}
         contents = tuple(one.content for one in over.values())
         self._over = (*self._over, *contents)
         if self._selected is not None:
@@ -365,7 +353,7 @@ class Decider:
 
     def decide(self, now: float) -> Decision | None:
         """Decide at a time [s], for the contacts as of `expire`; None if nothing changes."""
-        for each in self._playing.values():
+        for each in self.playing.values():
             if each.drive:
                 self._played_until = now
         if not (self._is_new or _is_due(self._intent_due, now) or _is_due(self._retry_at, now)):
@@ -411,12 +399,12 @@ class Decider:
         intent = self._intent_source.intent(contacts, now)
         self._intent_due = intent.due(now)
         selection = self._selector.select(
-            contacts, intent, self._capabilities, triggered_at=triggered_at
+            contacts, intent, self.capabilities, triggered_at=triggered_at
         )
         self._over = tuple(each for each in self._over if each in selection.contents)
         if self._over:
             selection = _held_back(selection, self._over, ENDED)
-        if len(selection.contents) > self._capabilities.layers:
+        if len(selection.contents) > self.capabilities.layers:
             selection = self._within_layers(selection)
         return selection
 
@@ -425,14 +413,14 @@ class Decider:
         served = [*self._numbered(selection.contents).values()]
         keys = {each.key[0] for each in selection.contents if each not in served}
         left = [each for each in selection.contents if each.key[0] in keys]
-        return _held_back(selection, left, no_layer_free(self._capabilities.layers))
+        return _held_back(selection, left, no_layer_free(self.capabilities.layers))
 
     def _with_sets(self, draft: Decision, now: float) -> Decision | None:
         """Return a draft with the sets of all layers that change; None if none does."""
         numbers = self._numbered(draft.selection.contents)
         playing = {
             number: before
-            for number, before in self._playing.items()
+            for number, before in self.playing.items()
             if before.content == numbers.get(number)
         }
         restarting = self._restarting(numbers, playing)
@@ -442,7 +430,7 @@ class Decider:
         changed = {n: content for n, content in numbers.items() if n not in playing}
         sets: dict[int, PlateSet] = {}
         for number, content in changed.items():
-            before = self._playing.get(number)
+            before = self.playing.get(number)
             targets, until = content.targets, self._confirmed_until(content)
             sets[number], pattern = self._builder.build_pattern(
                 number,
@@ -462,7 +450,7 @@ class Decider:
             sets[number] = self._builder.build_end(number, has_endings=has_endings)
         if not sets:
             return None
-        self._playing, self._is_silent = playing, False
+        self.playing, self._is_silent = playing, False
         self._layer_of = {each.key: number for number, each in numbers.items()}
         self._may_play |= started
         return replace(draft, sets=sets, started=started)
@@ -477,7 +465,7 @@ class Decider:
         voiced = {content.key[0] for content in numbers.values() if content.voice}
         found = set()
         for number, content in numbers.items():
-            before = self._playing.get(number)
+            before = self.playing.get(number)
             drive = {} if before is None else before.drive
             is_continued = continues_all_tones(content.pattern.excitation, drive)
             if content.key[0] in voiced and number not in unchanged and not is_continued:
@@ -494,14 +482,14 @@ class Decider:
                 new.append(content)
             else:
                 numbers[number] = content
-        every = range(self._capabilities.layers)
+        every = range(self.capabilities.layers)
         free = [number for number in every if number not in numbers]
         free.sort(key=lambda number: number not in self._may_play)
         return {**numbers, **dict(zip(free, new, strict=False))}
 
     def _may_end_shaped(self, number: int, now: float) -> bool:
         """Whether a layer has settled, so that its endings lead from what plays."""
-        one = self._playing.get(number)
+        one = self.playing.get(number)
         return one is not None and one.set.has_endings and now >= one.settled_at
 
     def _ended(self, draft: Decision, now: float, *, has_failed: bool) -> Decision:
@@ -512,9 +500,9 @@ class Decider:
         is_shaped = bool(numbers) and not has_failed and bool(draft.contacts)
         if is_shaped and all(self._may_end_shaped(number, now) for number in numbers):
             ends = {n: self._builder.build_end(n, has_endings=True) for n in sorted(numbers)}
-            self._playing = {}
+            self.playing = {}
             return replace(draft, sets=ends)
-        self._playing, self._is_silent = {}, True
+        self.playing, self._is_silent = {}, True
         if not draft.contacts:
             return replace(draft, silence=RELEASE_RAMP)
         return replace(draft, silence=FADE_RAMP)

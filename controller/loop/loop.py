@@ -73,7 +73,8 @@ class Controller:
         watchdog: float = WATCHDOG,
     ) -> None:
         self._rig = rig
-        self._table = table
+        self.table = table
+        """The table that answers."""
         self._urls = dict(rig.amplifiers if urls is None else urls)
         if self._urls.keys() != rig.amplifiers.keys():
             raise InputError(
@@ -84,9 +85,11 @@ class Controller:
         self._lines_if_open: Lines | None = None
         self._serial_numbers = dict(serial_numbers or {})
         self._connected = connected
-        self._watchdog = watchdog
+        self.watchdog = watchdog
+        """Watchdog of armed amplifiers [s]."""
         self._group = Group({}, watchdog=watchdog)
-        self._missing: frozenset[str] = frozenset()
+        self.missing: frozenset[str] = frozenset()
+        """Names of amplifiers whose loss, or absence, has closed all others."""
         self._known: dict[str, Amplifier] = {}
         self.observers = [observer]
         self._intent_source = intent_source
@@ -114,11 +117,6 @@ class Controller:
         return self._group
 
     @property
-    def watchdog(self) -> float:
-        """Watchdog of armed amplifiers [s]."""
-        return self._watchdog
-
-    @property
     def is_open(self) -> bool:
         """Whether all amplifiers are open together, armed or not, and none was lost."""
         return self._group.is_open
@@ -132,11 +130,6 @@ class Controller:
     def degraded(self) -> tuple[str, ...]:
         """Names of amplifiers that do not reply but may still play; nothing new is played then."""
         return self._group.degraded
-
-    @property
-    def missing(self) -> frozenset[str]:
-        """Names of amplifiers whose loss, or absence, has closed all others."""
-        return self._missing
 
     @property
     def is_preparing(self) -> bool:
@@ -158,11 +151,6 @@ class Controller:
         return self._drive_mode or DRIVE_MODES[-1]
 
     @property
-    def table(self) -> LocalizationTable:
-        """The table that answers."""
-        return self._table
-
-    @property
     def rejected_touches(self) -> Mapping[str, int]:
         """Number of touches that could not be contacts, by reason."""
         return self._rejects.counts
@@ -173,7 +161,7 @@ class Controller:
         What plays stays until its contacts change. Prepared by the caller: nothing is computed
         here.
         """
-        self._table, self._timing = table, timing
+        self.table, self._timing = table, timing
         if self._decider_if_open is not None:
             self._decider_if_open.replace_answers(table, timing)
 
@@ -190,7 +178,7 @@ class Controller:
             amplifiers = {name: await self._amplifier(lines, name) for name in self._urls}
             self._connected(amplifiers)
             async with self._sending:  # to those of before
-                self._group = Group(amplifiers, watchdog=self._watchdog)  # a stop reaches them now
+                self._group = Group(amplifiers, watchdog=self.watchdog)  # a stop reaches them now
             await self._group.open()
             for name, amplifier in amplifiers.items():
                 self._serial_numbers[name] = amplifier.identity["serial_number"]
@@ -199,7 +187,7 @@ class Controller:
                 self._known[name] = amplifier
             decider = Decider(
                 self._rig,
-                self._table,
+                self.table,
                 tracker=self._tracker,
                 capabilities=playback_capabilities(
                     self._rig, amplifiers, drive_mode=self._drive_mode
@@ -212,7 +200,7 @@ class Controller:
         except BaseException:
             await self.release()
             raise
-        self._missing = frozenset()
+        self.missing = frozenset()
         self._decider_if_open = decider
 
     async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
@@ -226,7 +214,7 @@ class Controller:
                 is_output=name in self._rig.outputs,
             )
         except LinkError:
-            self._missing = frozenset({name})
+            self.missing = frozenset({name})
             raise
 
     async def arm(self) -> None:
@@ -268,7 +256,7 @@ class Controller:
     async def release(self) -> None:
         """Ramp to zero in 50 ms, confirm it by reading back, disarm and close all lines."""
         if self._lines_if_open is not None and self._group.lost_by:
-            self._missing = frozenset(self._group.lost_by)
+            self.missing = frozenset(self._group.lost_by)
         lines = self._lines_if_open  # those of now: others may be opened meanwhile
         try:
             await self._group.close(CLOSING_RAMP)
@@ -400,30 +388,22 @@ class Controller:
         """Send a decision that only ends layers, unreported; raises DriverError."""
         if decision.sets:
             played = await self._play(decision.sets)
+            if isinstance(played, CommandRefused):
+                raise played
             self._decider.confirm(decision, played, now=clock.now())
 
     async def _execute(self, decision: Decision) -> None:
         """Send the sets of a decision and report the outcome; raises DriverError."""
         sent_at = None
-        try:
-            if decision.silence is not None:
-                sent_at = await self._silence(decision.silence)
-            elif decision.sets:
-                played = await self._play(decision.sets)
-                sent_at = played.sent_at
-                self._decider.confirm(decision, played, now=clock.now())
-        except Preempted:
-            raise
-        except CommandRefused as error:
-            if not self._group.is_armed:
-                raise
-            plain = self._decider.without_shapes(decision)
-            if plain is not None:
-                _logger.info("loop: plain ramps instead of envelopes: %s", error)
-                await self._execute(plain)
-            else:
-                await self._execute(self._decider.refused(decision, error))
-            return
+        if decision.silence is not None:
+            sent_at = await self._silence(decision.silence)
+        elif decision.sets:
+            played = await self._play(decision.sets)
+            if isinstance(played, CommandRefused):
+                await self._execute(self._decider.refused(decision, played))
+                return
+            sent_at = played.sent_at
+            self._decider.confirm(decision, played, now=clock.now())
         refusal = decision.refusal
         if refusal is not None:
             self._report(lambda each: each.refused(refusal))
@@ -447,50 +427,37 @@ class Controller:
     async def _renew(self, now: float) -> None:
         """Prolong the layers that are due; raises DriverError."""
         due = self._decider.renewal(now)
-        if not due:
-            return
-        try:
-            played = await self._play(due)
-        except Preempted:
-            raise
-        except CommandRefused as error:
-            if not self._group.is_armed:
-                raise
-            _logger.debug("loop: vibration not renewed: %s", error)
-            self._decider.refuse_renewal(due, error.until)
-        else:
-            self._decider.confirm_renewal(due, played, now=clock.now())
+        if due:
+            self._decider.renewed(due, await self._play(due), now=clock.now())
 
     async def _silence(self, ramp: float) -> float:
         """Silence all layers of all amplifiers; returns when [s] that was sent."""
-        is_known = False
         try:
             sent_at = await self._group.silence(ramp)
-            is_known = True
-        finally:
-            if not is_known:
-                self._decider.forget()
+        except BaseException:
+            self._decider.forget()
+            raise
         self._decider.confirm_silence()
         return sent_at
 
-    async def _play(self, sets: Mapping[int, PlateSet]) -> Played:
-        """Play the sets of layers on all amplifiers, from one moment on."""
-        is_known = False
+    async def _play(self, sets: Mapping[int, PlateSet]) -> Played | CommandRefused:
+        """Play the sets of layers on all amplifiers, from one moment on, or say why not.
+
+        Whatever is raised instead leaves it unknown what plays.
+        """
         try:
             if self._group.is_set_incomplete:
                 await self._group.silence(RELEASE_RAMP)  # before the next pattern
             layers = {
                 name: [each.layers[name] for each in sets.values()] for name in self._rig.amplifiers
             }
-            played = await self._group.apply(layers)
-            is_known = True
-            return played
-        except CommandRefused as error:
-            is_known = self._group.is_armed and not isinstance(error, Preempted)
+            return await self._group.apply(layers)
+        except BaseException as error:
+            is_overtaken = isinstance(error, Preempted) or not self._group.is_armed
+            if isinstance(error, CommandRefused) and not is_overtaken:
+                return error
+            self._decider.forget()
             raise
-        finally:
-            if not is_known:
-                self._decider.forget()
 
     async def _wait_for_event(self) -> None:
         """Wait for a change, a heartbeat, the timeout of a source or the expiry of an intent."""

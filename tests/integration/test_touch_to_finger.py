@@ -1,4 +1,4 @@
-"""From a touch stream to what each finger felt, over every wire, by the same checks.
+"""From a touch stream to what each finger felt, over every wire and over two, by the same checks.
 
 In virtual time, so that times are asserted as well as what is felt.
 """
@@ -6,6 +6,7 @@ In virtual time, so that times are asserted as well as what is felt.
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from model.finger.grid import Grid
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import build_table
-from rig_files import write_rig
+from rig_files import TWO_AMPLIFIERS, write_rig
 from touch_stream import Stream
 
 PLACES = {
@@ -44,6 +45,18 @@ STREAM = Stream(
 SHORT = Stream(PLACES, [*STREAM.changes[:1], (0.8, {}), (1.1, {})])
 """Stream for the other wires, since the daemon's decisions do not depend on the wire."""
 
+TURNS = Stream(
+    {"A": (0.16, 0.20), "B": (0.25, 0.09), "C": (0.15, 0.05)},
+    [
+        (0.1, {1: "B", 2: "C"}),  # SW and SE, on one amplifier
+        (1.0, {}),
+        (1.3, {3: "A"}),  # NE and NW, on the other
+        (2.0, {}),
+        (2.5, {}),
+    ],
+)
+"""Commits on two wires are apart by what the lines make of them: each pattern is of one of them."""
+
 # In 10 ms Modbus RTU at 115 200 baud carries some 47 words and CAN at 500 kbit/s some 109. Four
 # channels with an onset and room for an ending need 38 words, and 8 more for each knot.
 KNOTS = {"modbus-rtu": 1, "slcan": 8, "socketcand": 8}
@@ -51,12 +64,17 @@ WIRES = ("serial", "modbus-tcp", "modbus-rtu", "slcan", "socketcand")
 SHORTLY = ("serial", "modbus-rtu", "socketcand")
 
 
+def truth_of(folder: Path, stream: Stream, *changes: tuple[str, str], **options: str) -> Truth:
+    """The true rig and its table, without the chain; changes: in the rig's text."""
+    rig = load_rig(write_rig(folder / "truth.yaml", *changes, mesh="auto"))
+    table = build_table(rig, frequencies=np.arange(80.0, 321.0, 40.0), grid=Grid(4, 3))
+    return Truth(rig, table, stream, **options)
+
+
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
-    """The true rig and its table, without the chain."""
-    rig = load_rig(write_rig(tmp_path_factory.mktemp("truth") / "rig.yaml", mesh="auto"))
-    table = build_table(rig, frequencies=np.arange(80.0, 321.0, 40.0), grid=Grid(4, 3))
-    return Truth(rig, table, STREAM)
+    """That of one amplifier."""
+    return truth_of(tmp_path_factory.mktemp("truth"), STREAM)
 
 
 @pytest.fixture(scope="module")
@@ -120,3 +138,31 @@ def test_checks_detect_another_wiring(truth: Truth, rig: Rig) -> None:
         except AssertionError:
             failed.add(name)
     assert failed >= {"plate_response_matches_model", "localization_matches_prediction"}
+
+
+@pytest.fixture(scope="module")
+def turns(tmp_path_factory: pytest.TempPathFactory) -> tuple[Played, Truth]:
+    """What came of two amplifiers on two wires that take turns."""
+    folder = tmp_path_factory.mktemp("turns")
+    truth = truth_of(folder, TURNS, *TWO_AMPLIFIERS, drive_mode="switched")
+    rig = load_rig(write_rig(folder / "rig.yaml", *TWO_AMPLIFIERS))
+    wires = {"main": "serial", "side": "modbus-tcp"}
+    return play_stream(TURNS, wires, rig, truth.table, drive_mode="switched"), truth
+
+
+def test_amplifiers_take_turns(turns: tuple[Played, Truth]) -> None:
+    """Two ERAs of one amplifier, then two of the other one."""
+    played, truth = turns
+    patterns = [pattern for heard in played.heard for pattern in heard.patterns]
+    assert [
+        {truth.rig.wiring[era].amplifier for era in pattern["drive"]} for pattern in patterns
+    ] == [{"main"}, {"side"}]
+    assert all(len(pattern["drive"]) == 2 for pattern in patterns)
+
+
+@pytest.mark.parametrize("check", CHECKS)
+def test_fingers_feel_the_commanded_pattern_over_two_wires(
+    turns: tuple[Played, Truth], check: str
+) -> None:
+    """What holds over one wire holds where two amplifiers on two wires play together."""
+    CHECKS[check](*turns)

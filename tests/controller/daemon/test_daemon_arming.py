@@ -110,12 +110,7 @@ async def test_lease_lasts_from_armed_state_when_arming_takes_longer(
     async with ready_daemon(tmp_path) as (bench, era):
         supervisor = bench.daemon._supervisor
 
-        def expire() -> None:
-            assert supervisor.machine.lease is not None
-            lease = replace(supervisor.machine.lease, expires_at=0.0)
-            supervisor.machine = replace(supervisor.machine, lease=lease)
-
-        released = delay_arming(bench.daemon, monkeypatch, then=expire)
+        released = delay_arming(bench.daemon, monkeypatch, then=lambda: expire(supervisor))
         arming = asyncio.ensure_future(era.arm("me", lease_s=1))
         await until_state(era, "SWITCHED_ON")
         async with await bench.client("other") as other:
@@ -306,14 +301,7 @@ async def test_arming_that_is_cancelled_leaves_nothing_armed_without_a_lease(
 ) -> None:
     """Its lease ends with the transition to disarmed, before another client may arm."""
     async with ready_daemon(tmp_path) as (bench, era):
-        api, controller, released = bench.daemon._api, bench.daemon._controller, asyncio.Event()
-        arm = controller.arm
-
-        async def slow() -> None:
-            await released.wait()
-            await arm()
-
-        monkeypatch.setattr(controller, "arm", slow)
+        api, released = bench.daemon._api, delay_arming(bench.daemon, monkeypatch)
         client = SimpleNamespace(has_left=False)
         arming = asyncio.create_task(api._arm(client, ArmParams(owner="me", lease_s=60)))  # type: ignore[arg-type]
         await until_state(era, "SWITCHED_ON")

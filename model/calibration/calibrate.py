@@ -30,13 +30,12 @@ from model.calibration.fitted_rig import (
 )
 from model.calibration.form_errors import SENSOR_SCALE, SIDE, form_model
 from model.calibration.held_out import hold_out, initial_responses, relative_error
-from model.calibration.parameters import parameters_of, responses_at, starts
 from model.calibration.responses import Responses
+from model.calibration.sensed_plate import STARTS, Parameters, sensed_plate
 from model.calibration.variable_projection import modal_assurance, row_rms
 from model.choice import best_by, best_of, ranked_by
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.vibration.parametric_plate import parametric_plate
 
 _STARTS = 2  # those with the least misfit of shapes
 _WRONG_SCALE = 0.02  # common tolerance of sensors
@@ -54,12 +53,13 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
     values = responses.values.copy()
     values[:, dead_eras] = np.nan
     check_enough_sensors(alive, responses)
+    parameters = Parameters.of(rig)
     problem = Problem(
         rig,
         form_model(rig, responses.points, responses.frequencies),
-        parameters_of(rig),
+        parameters,
         values,
-        np.ones(len(parameters_of(rig)), dtype=bool),
+        np.ones(len(parameters.rows), dtype=bool),
         np.ones(len(alive), dtype=bool),
     )
 
@@ -103,33 +103,30 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
 
 def _first_fit(problem: Problem, points: FloatArray, frequencies: FloatArray) -> Fit:
     """Fit from several starts, since a fit finds only the nearest minimum; return the best."""
-    rig, parameters = problem.rig, problem.parameters
-    plate = parametric_plate(rig, points, frequencies)
+    parameters = problem.parameters
+    plate = sensed_plate(problem.rig, points, frequencies)
 
     def misfit(model: ComplexArray) -> float:
         return float(np.nanmedian(1 - modal_assurance(problem.values, model)))
 
-    nearest = ranked_by(
-        starts(parameters), lambda x: -misfit(responses_at(plate, rig, parameters, x))
-    )
+    starts = [parameters.moved(*start) for start in STARTS]
+    nearest = ranked_by(starts, lambda x: -misfit(plate.responses(x)))
     fits = [first_fit(problem, x) for x in nearest[:_STARTS]]
     return best_by(fits, lambda fit: -misfit(fit.predicted))
 
 
 def _identified(problem: Problem, start: Fit) -> tuple[Problem, Fit]:
     """Hold parameters that the data determine less than their prior does, and fit again."""
-    prior = np.array([parameter.prior_std for parameter in problem.parameters])
-    own = np.array([parameter.start for parameter in problem.parameters])
     fit = solve(problem, start)
     while True:
-        excess = np.where(problem.free, fit.x_error / prior, 0)
+        excess = np.where(problem.free, fit.x_error, 0)
         # Values of a plate that does not fit are meaningless.
         if not excess.max() > 1 or _fit_error(problem, fit) > MAX_FIT_ERROR:
             return problem, fit
         free = problem.free.copy()
         free[best_of(excess)] = False
         problem = replace(problem, free=free)
-        fit = solve(problem, replace(fit, x=np.where(free, fit.x, own)))
+        fit = solve(problem, replace(fit, x=np.where(free, fit.x, 0.0)))
 
 
 def _fit_error(problem: Problem, fit: Fit) -> float:
@@ -195,15 +192,23 @@ def _report(
         replace(era, gains=gain_rows(gains[:, number], frequencies) or era.gains)
         for number, era in enumerate(rig.eras)
     )
+    fitted = problem.parameters
+    at_bound = np.abs(fitted.bounds - fit.x).min(axis=0) < 1e-6
     parameters = tuple(
         FittedParameter(
-            parameter,
-            parameter.value(float(x)),
-            standard_error(before, parameter, float(x), float(error)) if free else None,
-            bool(free and min(x - parameter.lower, parameter.upper - x) < 1e-6),
+            row,
+            row.of(before),
+            float(value),
+            standard_error(before, row, float(value), float(error)) if free else None,
+            bool(free and bound),
         )
-        for parameter, x, error, free in zip(
-            problem.parameters, fit.x, fit.x_error, problem.free, strict=True
+        for row, value, error, free, bound in zip(
+            fitted.rows,
+            fitted.values(fit.x),
+            fitted.slopes(fit.x) * fit.x_error,
+            problem.free,
+            at_bound,
+            strict=True,
         )
     )
     held_out = hold_out(problem, fit, points, names)

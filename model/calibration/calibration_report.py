@@ -91,7 +91,7 @@ def as_json(calibration: Calibration, before: Rig, files: list[str]) -> dict[str
                 "era": fitted.parameter.era or None,
                 "kind": fitted.parameter.kind,
                 "unit": fitted.parameter.unit,
-                "before": fitted.parameter.prior,
+                "before": fitted.before,
                 "after": fitted.value,
                 "standard_error": fitted.standard_error,
                 "identified": fitted.is_identified,
@@ -156,10 +156,10 @@ def _known(errors: np.ndarray[Any, np.dtype[np.float64]]) -> list[float]:
 
 def _change(fitted: FittedParameter) -> str:
     parameter = fitted.parameter
-    before = in_display_unit(parameter.prior, parameter.unit, digits=5)
+    before = in_display_unit(fitted.before, parameter.unit, digits=5)
     if fitted.standard_error is None:
         return f"{before}  (not identified)"
     note = "  (at its bound)" if fitted.at_bound else ""
     after = with_error(fitted.value, fitted.standard_error, parameter.unit)
-    share = f" ({100 * (fitted.value / parameter.prior - 1):+.1f} %)" if parameter.prior else ""
+    share = f" ({100 * (fitted.value / fitted.before - 1):+.1f} %)" if fitted.before else ""
     return f"{before} -> {after}{share}{note}"

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.parameters import Parameter
+from model.calibration.sensed_plate import Parameter
 from model.rig.rig import Rig
 
 MAX_FIT_ERROR = 0.25
@@ -15,12 +15,13 @@ MAX_OUTLIERS = 0.1
 
 @dataclass(frozen=True)
 class FittedParameter:
-    """A parameter with its value and standard error.
+    """A parameter with the rig's value, the fitted one and its standard error.
 
     One that is not identified has the rig's value and no standard error.
     """
 
     parameter: Parameter
+    before: float
     value: float
     standard_error: float | None
     at_bound: bool

@@ -26,9 +26,9 @@ from scipy.optimize import nnls
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.form_errors import SENSOR_SCALE, FormModel
-from model.calibration.least_squares import Loss, search
-from model.calibration.parameters import Parameter, bounds_of
+from model.calibration.sensed_plate import Parameters
 from model.calibration.variable_projection import project_gains, projection_slopes, row_rms
+from model.identification.least_squares import Loss, search
 from model.rig.rig import Rig
 
 _MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
@@ -50,7 +50,7 @@ class Problem:
 
     rig: Rig
     model: FormModel
-    parameters: tuple[Parameter, ...]
+    parameters: Parameters
     values: ComplexArray
     free: NDArray[np.bool_]
     free_scales: NDArray[np.bool_]
@@ -73,7 +73,7 @@ class Problem:
 
     def split(self, z: FloatArray) -> list[FloatArray]:
         """Parameters x, scales and form errors of z."""
-        n = len(self.parameters)
+        n = len(self.free)
         return np.split(z, [n, n + len(self.free_scales)])
 
     def responses(self, z: FloatArray) -> tuple[ComplexArray, ComplexArray]:
@@ -86,7 +86,7 @@ class Problem:
 
     def tolerances(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rows (m, z) that hold scales and form errors, in tolerances, and their targets (m,)."""
-        n, s, t = len(self.parameters), len(self.free_scales), len(self.model.std)
+        n, s, t = len(self.free), len(self.free_scales), len(self.model.std)
         scales = np.where(self.free_scales, 0, 1 / SENSOR_SCALE)
         size = np.concatenate([np.zeros(n), scales, np.full(t, float(self.has_form))])
         rows = np.diag(size)[size > 0]
@@ -209,7 +209,7 @@ def _search(
         )
 
     bounds = np.full((2, len(start)), [[-np.inf], [np.inf]])
-    bounds[:, : len(problem.parameters)] = bounds_of(problem.parameters)
+    bounds[:, : len(problem.free)] = problem.parameters.bounds
     found = search(linearised, start[searched], bounds[:, searched], loss=loss)
     return _Found(full(found.x), np.asarray(found.jac), np.asarray(found.fun))
 

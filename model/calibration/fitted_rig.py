@@ -12,12 +12,11 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import FittedParameter, HeldOut, MovedEra
 from model.calibration.fit import Fit, Problem
 from model.calibration.form_errors import mass_scale_error
-from model.calibration.parameters import Parameter, rig_with
+from model.calibration.sensed_plate import Parameter, sensed_plate
 from model.calibration.variable_projection import project_gains
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import Gain
-from model.vibration.parametric_plate import parametric_plate
 
 _CLEAR = 3.0  # standard errors of a place
 _LEAST = 1e-4  # of an uncertainty; no fit is exact
@@ -30,7 +29,7 @@ _MODEL_ERROR = 2e-3
 
 def rig_of_fit(problem: Problem, fit: Fit) -> Rig:
     """Rig with fitted values, and ERAs at the places where they clearly are; gains unchanged."""
-    rig = rig_with(problem.rig, problem.parameters, fit.x)
+    rig = problem.parameters.rig_at(fit.x)
     moves = {moved.name: moved.after for moved in moved_eras(problem, fit)}
     eras = tuple(
         replace(era, x=moves[era.name][0], y=moves[era.name][1]) if era.name in moves else era
@@ -63,7 +62,7 @@ def predicted_by(
     rig: Rig, problem: Problem, points: FloatArray, fit: Fit
 ) -> tuple[ComplexArray, ComplexArray]:
     """Responses (f, e, s) of a rig at points (s, 2) [m], and its gains (f, e) that fit best."""
-    model = parametric_plate(rig, points, problem.model.frequencies).responses(rig)
+    model = sensed_plate(rig, points, problem.model.frequencies).responses()
     weight = fit.used / fit.noise[:, :, None]
     gains, _ = project_gains(model * fit.scales, problem.values, weight)
     return model, gains
@@ -78,12 +77,12 @@ def gain_rows(gains: ComplexArray, frequencies: FloatArray) -> tuple[Gain, ...]:
     )
 
 
-def standard_error(rig: Rig, parameter: Parameter, x: float, error: float) -> float:
-    """Standard error of a value: of the fit, of the model, and of the mass it is relative to."""
+def standard_error(rig: Rig, parameter: Parameter, value: float, error: float) -> float:
+    """Standard error of a value by that of a fit, by the model's, and of the mass it goes by."""
     share = _MODEL_ERROR
     if parameter.kind != "loss_factor":
         share = math.hypot(share, mass_scale_error(rig))
-    return math.hypot(parameter.standard_error(x, error), share * parameter.value(x))
+    return math.hypot(error, share * value)
 
 
 def uncertainty_of(
@@ -102,13 +101,12 @@ def uncertainty_of(
     express, and at least the median error at held-out sensors, which is that of the field. What is
     not identified keeps the value of the rig before.
     """
+    errors = problem.parameters.slopes(fit.x) * fit.x_error
     relative = {
         kind: [
-            math.hypot(parameter.standard_error(float(x), float(error)) / one.value, _MODEL_ERROR)
-            for one, parameter, x, error in zip(
-                parameters, problem.parameters, fit.x, fit.x_error, strict=True
-            )
-            if parameter.kind == kind and one.is_identified and one.value > 0
+            math.hypot(float(error) / one.value, _MODEL_ERROR)
+            for one, error in zip(parameters, errors, strict=True)
+            if one.parameter.kind == kind and one.is_identified and one.value > 0
         ]
         for kind in ("modulus", "loss_factor", "stiffness", "damping")
     }

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray, lattice
-from model.calibration.parameters import Parameter
+from model.calibration.sensed_plate import Parameters
 from model.fem.mesh import Mesh
 from model.fem.plate import element_slopes
 from model.reduction.place_slopes import place_slopes
@@ -113,7 +113,7 @@ class FormModel:
 
     def responses(
         self,
-        parameters: Sequence[Parameter],
+        parameters: Parameters,
         x: FloatArray,
         form: FloatArray,
         *,
@@ -124,7 +124,7 @@ class FormModel:
         form: in their tolerances; without has_form derivatives are by x alone (n, ...).
         """
         era_count, sensor_count = len(self.era_shapes), len(self.sensor_shapes)
-        values = np.array([p.value(float(at)) for p, at in zip(parameters, x, strict=True)])
+        values, slope = parameters.values(x), parameters.slopes(x)
         ends = np.cumsum(self._counts)[:-1]
         places, sensor_places, masses, bent, shifts = np.split(self.std * form, ends)
         masses = masses - masses.mean()
@@ -170,7 +170,6 @@ class FormModel:
         def bent_by(stiffness: ComplexArray) -> ComplexArray:
             return np.asarray(np.swapaxes(seen_modes @ (stiffness @ q), 1, 2))
 
-        slope = [p.slope(float(at)) for p, at in zip(parameters, x, strict=True)]
         found = [
             -bent_by(bending) * slope[0] / values[0],
             -1j * bent_by(self.loss_ratios * elastic) * slope[1],

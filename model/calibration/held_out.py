@@ -53,7 +53,7 @@ def hold_out(
 def initial_responses(problem: Problem) -> ComplexArray:
     """Responses (f, e, s) of the rig before the fit, with its gains."""
     gains = np.column_stack([era.gain(problem.model.frequencies) for era in problem.rig.eras])
-    start = np.array([parameter.start for parameter in problem.parameters])
+    start = np.zeros(len(problem.free))
     none = np.zeros(len(problem.model.std))
     responses, _ = problem.model.responses(problem.parameters, start, none)
     return np.asarray(gains[:, :, None] * responses)

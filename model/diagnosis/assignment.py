@@ -9,11 +9,9 @@ import numpy as np
 from scipy.special import stdtr
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.parameters import parameters_of, responses_at, starts
+from model.calibration.sensed_plate import STARTS, SensedPlate
 from model.calibration.variable_projection import modal_assurance
 from model.choice import best_of
-from model.rig.rig import Rig
-from model.vibration.parametric_plate import ParametricPlate
 
 _LEAST_MISFIT = 0.02  # below it sensors' errors dominate
 
@@ -57,20 +55,17 @@ class ShapeMatch:
         return float(stdtr(len(gain) - 1, t))
 
 
-def match_shapes(rig: Rig, plate: ParametricPlate, values: ComplexArray) -> ShapeMatch:
+def match_shapes(plate: SensedPlate, values: ComplexArray) -> ShapeMatch:
     """Compare values (f, e, s) with a rig's ERAs on plates of other modulus and stiffnesses."""
-    parameters = parameters_of(rig)
-    own = np.array([parameter.start for parameter in parameters])
     best: tuple[float, ShapeMatch] | None = None
-    for x in [own, *starts(parameters)]:
-        shift = {p.kind: float(a - b) for p, a, b in zip(parameters, x, own, strict=True)}
-        mac = _mac(values, responses_at(plate, rig, parameters, x))
-        found = ShapeMatch(mac, (shift["modulus"], shift["stiffness"]))
+    for start in [(0.0, 0.0), *STARTS]:
+        mac = _mac(values, plate.responses(plate.parameters.moved(*start)))
+        found = ShapeMatch(mac, start)
         score = float(
             sum(_typical(mac[:, i, j]) for i, j in enumerate(found.nearest) if _driven(mac, i))
         )
         # Values far from the rig's must be clearly better.
-        score -= 0.05 * (abs(shift["modulus"]) + abs(shift["stiffness"])) * len(rig.eras)
+        score -= 0.05 * sum(map(abs, start)) * values.shape[1]
         if best is None or score > best[0]:
             best = (score, found)
     assert best is not None  # noqa: S101  the rig's own values are tried at least

@@ -15,13 +15,13 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from model.arrays import ComplexArray, FloatArray
+from model.calibration.sensed_plate import SensedPlate, sensed_plate
 from model.calibration.variable_projection import modal_assurance
 from model.choice import best_by, ranked_by
 from model.diagnosis.plate_match import Match, match_plate
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.spectral.mesh import stretched
-from model.vibration.parametric_plate import ParametricPlate, parametric_plate
 
 _SIZES = (0.6, 0.67, 0.75, 0.82, 0.88, 0.94, 1.06, 1.13, 1.21, 1.33, 1.5, 1.67)
 _STIFFNESSES = (0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
@@ -89,8 +89,7 @@ def causes_of(rig: Rig) -> list[Cause]:
 
 
 def explain(
-    rig: Rig,
-    plate: ParametricPlate,
+    plate: SensedPlate,
     points: FloatArray,
     frequencies: FloatArray,
     values: ComplexArray,
@@ -100,30 +99,31 @@ def explain(
 ) -> list[Explanation]:
     """Find what explains values (f, e, s) best, most likely first; see `match_plate`."""
 
-    def solved(cause: Cause, factor: float) -> tuple[Rig, ParametricPlate] | None:
+    rig = plate.parameters.rig
+
+    def solved(cause: Cause, factor: float) -> SensedPlate | None:
         try:
             other = cause.scaled(rig, factor)
         except InputError:
             return None
         if not cause.is_geometry:
-            return other, plate
+            return plate.of(other)
         # A sensor that would be off the plate counts as at its edge.
         on_plate = np.clip(points, 0, [other.plate.length, other.plate.width])
-        return other, parametric_plate(other, on_plate, frequencies)
+        return sensed_plate(other, on_plate, frequencies)
 
     def matched(cause: Cause, factor: float) -> Match | None:
         found = solved(cause, factor)
         if found is None:
             return None
-        return match_plate(*found, values, drives=drives, model_error=model_error)
+        return match_plate(found, values, drives=drives, model_error=model_error)
 
     scores = []
     for cause in causes_of(rig):
         tried = []
         for factor in cause.factors:
             if found := solved(cause, factor):
-                other, other_plate = found
-                model = other_plate.responses(other)[:, list(drives)]
+                model = found.responses()[:, list(drives)]
                 tried.append((_misfit(values, model), factor))
         if tried:
             scores.append((*best_by(tried, lambda each: -each[0]), cause))

@@ -19,8 +19,8 @@ from model.calibration.calibration_screening import (
     silent_eras,
     silent_sensors,
 )
-from model.calibration.parameters import parameters_of, responses_at
 from model.calibration.responses import Responses
+from model.calibration.sensed_plate import SensedPlate, sensed_plate
 from model.calibration.variable_projection import project_gains, row_rms
 from model.choice import best_by
 from model.diagnosis.assignment import ShapeMatch, match_shapes
@@ -29,7 +29,6 @@ from model.diagnosis.verdict import Verdict, diagnose
 from model.errors import InputError
 from model.quantities import in_display_unit
 from model.rig.rig import Rig
-from model.vibration.parametric_plate import ParametricPlate, parametric_plate
 
 GRAVITY = 9.80665  # m/s², standard
 _MAX_GAIN = 3.0  # of all channels together; a factor either way is another quantity or unit
@@ -84,10 +83,10 @@ def check_consistency(rig: Rig, responses: Responses) -> Verdict:
     silent = silent_sensors(responses)
     check_enough_sensors(~silent, responses)
     heard = observation.without(silent)
-    plate = parametric_plate(rig, heard.points, heard.frequencies)
-    shapes = match_shapes(rig, plate, heard.values)
-    _check_quantity(rig, plate, shapes, heard)
-    _check_phases_and_places(rig, plate, shapes, heard)
+    plate = sensed_plate(rig, heard.points, heard.frequencies)
+    shapes = match_shapes(plate, heard.values)
+    _check_quantity(plate, shapes, heard)
+    _check_phases_and_places(plate, shapes, heard)
     # Values of the plate that are off are what a calibration is for.
     verdict = diagnose(rig, observation, max_deviation=math.inf)
     _check_wiring(verdict)
@@ -95,14 +94,10 @@ def check_consistency(rig: Rig, responses: Responses) -> Verdict:
     return verdict
 
 
-def _check_quantity(
-    rig: Rig, plate: ParametricPlate, shapes: ShapeMatch, observation: Responses
-) -> None:
+def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, observation: Responses) -> None:
     """Raise InputError where gains of all channels are those of another quantity or unit."""
-    parameters = parameters_of(rig)
-    moves = dict(zip(("modulus", "stiffness"), shapes.start, strict=True))
-    x = np.array([p.start + moves.get(p.kind, 0.0) for p in parameters])
-    model = responses_at(plate, rig, parameters, x)[:, list(shapes.nearest)]
+    x = plate.parameters.moved(*shapes.start)
+    model = plate.responses(x)[:, list(shapes.nearest)]
     weight = np.isfinite(observation.values) / row_rms(observation.values)[:, :, None]
     gains, _ = project_gains(model, observation.values, weight)
     size = np.log(row_rms(observation.values) / row_rms(model))
@@ -134,15 +129,15 @@ def _check_quantity(
 
 
 def _check_phases_and_places(
-    rig: Rig, plate: ParametricPlate, shapes: ShapeMatch, observation: Responses
+    plate: SensedPlate, shapes: ShapeMatch, observation: Responses
 ) -> None:
     """Raise InputError for conjugated phases, and for sensors at each other's places."""
     starts = tuple(dict.fromkeys([(0.0, 0.0), shapes.start]))
-    own = tuple(range(len(rig.eras)))
+    own = tuple(range(observation.values.shape[1]))
 
     def best(values: ComplexArray) -> tuple[Match, tuple[int, ...]]:
         found: list[tuple[Match, tuple[int, ...]]] = [
-            (match_plate(rig, plate, values, drives=drives, starts=starts), drives)
+            (match_plate(plate, values, drives=drives, starts=starts), drives)
             for drives in dict.fromkeys([own, shapes.nearest])
         ]
         return best_by(found, lambda each: -each[0].cost)

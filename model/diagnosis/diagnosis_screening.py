@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray
 from model.calibration.calibration_screening import check_enough_sensors, silent_sensors
 from model.calibration.responses import Responses
+from model.calibration.sensed_plate import SensedPlate
 from model.diagnosis.assignment import match_shapes
 from model.diagnosis.plate_match import MAX_FIT_ERROR, Match
-from model.rig.rig import Rig
-from model.vibration.parametric_plate import ParametricPlate
 
 _DEAD = 0.03  # of the response that the rig predicts
 _FAINT = 0.3  # of it: dead if its shape is not that of an ERA either
@@ -19,23 +18,20 @@ _NO_SHAPE = 0.6  # MAC
 _SENSOR_SCALE = (0.7, 1.4)
 
 
-def dead_channels(rig: Rig, plate: ParametricPlate, observation: Responses) -> NDArray[np.bool_]:
+def dead_channels(plate: SensedPlate, observation: Responses) -> NDArray[np.bool_]:
     """Mask (e,) of driven channels with a response far below the model's."""
-    share = np.abs(observation.values / plate.responses(rig))
-    dead = np.zeros(len(rig.eras), dtype=bool)
+    share = np.abs(observation.values / plate.responses())
+    dead = np.zeros(observation.values.shape[1], dtype=bool)
     for channel in np.flatnonzero(observation.measured):
         dead[channel] = np.nanmedian(share[:, channel]) < _DEAD
     return dead
 
 
-def shapeless_channels(
-    rig: Rig, plate: ParametricPlate, observation: Responses
-) -> NDArray[np.bool_]:
+def shapeless_channels(plate: SensedPlate, observation: Responses) -> NDArray[np.bool_]:
     """Mask of weak channels without the shape of an ERA, whose response is noise (e,)."""
-    model = plate.responses(rig)
-    share = np.abs(observation.values) / np.abs(model)
-    mac = match_shapes(rig, plate, observation.values).mac
-    found = np.zeros(len(rig.eras), dtype=bool)
+    share = np.abs(observation.values / plate.responses())
+    mac = match_shapes(plate, observation.values).mac
+    found = np.zeros(observation.values.shape[1], dtype=bool)
     for channel in np.flatnonzero(observation.measured):
         faint = np.nanmedian(share[:, channel]) < _FAINT
         found[channel] = faint and np.nanmax(np.nanmedian(mac[:, channel], axis=0)) < _NO_SHAPE

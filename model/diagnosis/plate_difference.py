@@ -38,9 +38,9 @@ def plate_difference(rig: Rig, rig_responses: ComplexArray, match: Match) -> Pla
     changes = {}
     for kind in kinds:
         found = [
-            parameter.value(parameter.start + z * parameter.prior_std) / parameter.prior - 1
-            for parameter, z in zip(match.parameters, match.z, strict=True)
-            if parameter.kind == kind and parameter.prior
+            row.of(match.rig) / row.of(rig) - 1
+            for row in match.parameters.rows
+            if row.kind == kind and row.of(rig)
         ]
         if found:
             changes[kind] = float(np.mean(found))

@@ -17,19 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.least_squares import search
-from model.calibration.parameters import (
-    Parameter,
-    bounds_of,
-    parameters_of,
-    response_slopes,
-    responses_at,
-    rig_with,
-)
+from model.calibration.sensed_plate import Parameters, SensedPlate
 from model.calibration.variable_projection import project_gains, projection_slopes, row_rms
 from model.choice import best_by
+from model.identification.least_squares import search
 from model.rig.rig import Rig
-from model.vibration.parametric_plate import ParametricPlate
 
 _GAIN_STD = 1.0  # of the logarithm of a channel's gain
 _GAIN_TOLERANCE = 0.08  # standard deviation over frequency, of itself
@@ -52,7 +44,7 @@ class Match:
     """
 
     rig: Rig
-    parameters: tuple[Parameter, ...]
+    parameters: Parameters
     z: FloatArray
     gains: FloatArray
     cost: float
@@ -68,35 +60,32 @@ class Match:
 
 
 def match_plate(
-    rig: Rig,
-    plate: ParametricPlate,
+    plate: SensedPlate,
     values: ComplexArray,
     *,
     drives: Sequence[int],
     model_error: float = MODEL_ERROR,
     starts: tuple[tuple[float, float], ...] = ((0.0, 0.0),),
 ) -> Match:
-    """Fit the rig's plate to values (f, e, s) of channels.
+    """Fit a rig's plate at sensors to values (f, e, s) of channels.
 
-    plate: of the rig at those points and frequencies; drives (e,): index of the ERA that each
+    drives (e,): index of the ERA that each
     channel drives; model_error: relative to a row's rms; starts: logarithms of factors on the
     modulus and on all stiffnesses from which to search.
     """
-    parameters = parameters_of(rig)
-    center = np.array([parameter.start for parameter in parameters])
-    std = np.array([parameter.prior_std for parameter in parameters])
+    parameters = plate.parameters
     rows: NDArray[np.bool_] = np.asarray(np.isfinite(values).any(axis=2))
     used = np.flatnonzero(rows.any(axis=0))
     size = row_rms(values)
     weight = np.isfinite(values) / (model_error * size[:, :, None])
-    count = len(parameters)
+    count = len(parameters.rows)
     inside, driven = weight > 0, list(drives)
 
     def linearised(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        model, by_x = response_slopes(plate, rig, parameters, center + std * z[:count])
+        model, by_x = plate.slopes(z[:count])
         model = model[:, driven]
         slopes = np.zeros((len(z), *model.shape), dtype=complex)
-        slopes[:count] = by_x[:, :, driven] * std[:, None, None, None]
+        slopes[:count] = by_x[:, :, driven]
         gains, by_gains = np.ones(values.shape[1]), np.zeros((len(z), values.shape[1]))
         gains[used] = np.exp(_GAIN_STD * z[count:])
         by_gains[count:, used] = np.diag(_GAIN_STD * gains[used])
@@ -124,35 +113,33 @@ def match_plate(
             np.hstack([by_data.real, by_data.imag, of_wander, np.eye(len(z))]).T,
         )
 
-    bounds = (bounds_of(parameters) - center) / std
-    bounds = np.hstack([bounds, np.tile([[-8.0], [8.0]], len(used))])
+    bounds = np.hstack([parameters.bounds, np.tile([[-8.0], [8.0]], len(used))])
     found = []
-    for modulus, stiffness in starts:
-        moves = {"modulus": modulus, "stiffness": stiffness}
-        shift = np.array([moves.get(parameter.kind, 0.0) for parameter in parameters])
-        model = responses_at(plate, rig, parameters, center + shift)[:, driven]
+    for start in starts:
+        moved = parameters.moved(*start)
+        model = plate.responses(moved)[:, driven]
         ratio = np.log(np.maximum(size / row_rms(np.where(rows[:, :, None], model, np.nan)), 1e-6))
         levels = [np.median(ratio[rows[:, e], e]) for e in used]
-        found.append(search(linearised, np.concatenate([shift / std, levels]), bounds))
+        found.append(search(linearised, np.concatenate([moved, levels]), bounds))
     best = best_by(found, lambda each: -float(each.cost))
-    x = center + std * best.x[:count]
+    z = best.x[:count]
     gains = np.full(values.shape[1], np.nan)
     gains[used] = np.exp(_GAIN_STD * best.x[count:])
-    fitted = rig_with(rig, parameters, x)
-    model = responses_at(plate, rig, parameters, x)[:, driven]
+    responses = plate.responses(z)
+    model = responses[:, driven]
     _, residual = project_gains(
         model, values, weight, expected=np.nan_to_num(gains, nan=1.0), tolerance=_GAIN_TOLERANCE
     )
     share = (model_error * np.abs(residual))[inside]
     return Match(
-        fitted,
+        parameters.rig_at(z),
         parameters,
-        best.x[:count],
+        z,
         gains,
         float(best.cost),
         math.sqrt(float((share**2).mean())) if len(share) else math.inf,
         float(np.median(share)) if len(share) else math.inf,
-        plate.responses(fitted),
+        responses,
         np.asarray(model * gains[:, None]),
     )
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_screening import LEAST_SENSORS
 from model.calibration.responses import Responses
+from model.calibration.sensed_plate import SensedPlate, sensed_plate
 from model.choice import best_by
 from model.diagnosis.assignment import ShapeMatch, match_responses, match_shapes
 from model.diagnosis.causes import Explanation, explain
@@ -24,7 +25,6 @@ from model.diagnosis.plate_match import MAX_FIT_ERROR, MODEL_ERROR, Match, match
 from model.diagnosis.polarity import ChannelPhase, phases_of_drive
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
-from model.vibration.parametric_plate import ParametricPlate, parametric_plate
 
 WEAK, STRONG = 0.7, 1.4  # gain of a channel: 3 dB either way
 MAX_DEVIATION = 3.0  # standard deviations of a parameter's prior
@@ -103,13 +103,13 @@ def diagnose(rig: Rig, observation: Responses, *, max_deviation: float = MAX_DEV
             f"a diagnosis needs at least {_LEAST_FREQUENCIES} frequencies, got "
             f"{len(observation.frequencies)}"
         )
-    plate = parametric_plate(rig, observation.points, observation.frequencies)
-    dead = dead_channels(rig, plate, observation)
+    plate = sensed_plate(rig, observation.points, observation.frequencies)
+    dead = dead_channels(plate, observation)
     sensors = observation.sensors
     observation, removed = usable_sensors(observation, dead)
-    plate = plate.at(np.isin(sensors, observation.sensors))
+    plate = plate.at_some(np.isin(sensors, observation.sensors))
     values = observation.values.copy()
-    dead = dead | shapeless_channels(rig, plate, observation)
+    dead = dead | shapeless_channels(plate, observation)
     values[:, dead] = np.nan
     if not np.isfinite(values).any():
         channels = tuple(
@@ -127,8 +127,8 @@ def diagnose(rig: Rig, observation: Responses, *, max_deviation: float = MAX_DEV
             len(observation.sensors),
             observation.frequencies,
         )
-    shape_match = match_shapes(rig, plate, values)
-    match, drives, error = _best_match(rig, plate, values, shape_match)
+    shape_match = match_shapes(plate, values)
+    match, drives, error = _best_match(plate, values, shape_match)
     off = off_scale(observation, values, match)
     if off and len(observation.sensors) - len(off) >= LEAST_SENSORS:
         wrong = np.isin(observation.sensors, [name for name, _ in off])
@@ -139,7 +139,6 @@ def diagnose(rig: Rig, observation: Responses, *, max_deviation: float = MAX_DEV
     fitted = match
     if not matches:
         explanations = explain(
-            rig,
             plate,
             observation.points,
             observation.frequencies,
@@ -164,33 +163,23 @@ def diagnose(rig: Rig, observation: Responses, *, max_deviation: float = MAX_DEV
         tuple(explanations),
         removed,
         _cycles(rig, drives, dead),
-        plate_difference(rig, plate.responses(rig), match)
-        if match.error <= MAX_FIT_ERROR
-        else None,
+        plate_difference(rig, plate.responses(), match) if match.error <= MAX_FIT_ERROR else None,
         len(observation.sensors),
         observation.frequencies,
     )
 
 
 def _best_match(
-    rig: Rig,
-    plate: ParametricPlate,
+    plate: SensedPlate,
     values: ComplexArray,
     shape_match: ShapeMatch,
 ) -> tuple[Match, tuple[int, ...], float]:
     """Best plate, wiring and model error; the rig's wiring unless another is clearly better."""
-    own = tuple(range(len(rig.eras)))
+    own = tuple(range(values.shape[1]))
     starts = tuple(dict.fromkeys([(0.0, 0.0), shape_match.start]))
 
     def matched(drives: Sequence[int], error: float) -> Match:
-        return match_plate(
-            rig,
-            plate,
-            values,
-            drives=drives,
-            model_error=error,
-            starts=starts,
-        )
+        return match_plate(plate, values, drives=drives, model_error=error, starts=starts)
 
     nearest = tuple(
         era if era == i or shape_match.confidence(i, era, i) >= _MIN_CONFIDENCE else i

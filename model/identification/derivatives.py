@@ -5,13 +5,14 @@ T of the plate on its attachments by L dA L^T - T dZ T: a mode, a place or an at
 of one or two (`model.identification.forward`).
 """
 
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.identification.forward import PlateAt
+from model.identification.forward import LEAST_LOSS, PlateAt
 from model.identification.free_receptance import between, combined
 from model.structure.plate import LOSS_FREQUENCY
 
@@ -22,7 +23,9 @@ def jacobian(plate: PlateAt) -> ComplexArray:
     """Derivatives of the responses of a plate by x, (f, s, n, p)."""
     space = plate.model.space
     found = np.zeros((*plate.responses.shape, space.size), dtype=complex)
-    for group in (_by_plate, _by_modes, _by_places, _by_attachments, _by_gains):
+    for group, kinds in _GROUPS.items():
+        if not space.of(*kinds).any():
+            continue
         for kind, columns in group(plate).items():
             found[..., space.groups[kind]] = columns * space.std[space.groups[kind]]
     return found
@@ -55,6 +58,7 @@ def _by_plate(plate: PlateAt) -> Columns:
         "thickness": 2 * by_stiffness - responses(functions.receptance),
         "modulus": by_stiffness,
         "loss": by_loss,
+        "loss_added": by_loss / max(plate.values.loss_factor, LEAST_LOSS),
         "loss_exponent": powers * by_loss,
     }
 
@@ -97,13 +101,15 @@ def _by_attachments(plate: PlateAt) -> Columns:
     model, values, Y = plate.model, plate.values, plate.responses
     n, eras = plate.base.shape[1], np.arange(plate.base.shape[1])
     found: Columns = {}
+    by_damping = np.broadcast_to(1j * model.omega[:, None], plate.base.shape)
     for kind, change in (
         ("stiffness", np.broadcast_to(values.stiffness, plate.base.shape)),
-        ("damping_each", 1j * model.omega[:, None] * values.damping),
+        ("damping_added", by_damping),
     ):
         found[kind] = _held(plate, eras, change)
         # The base moves through spring and damper.
         found[kind][:, :, eras, eras] += Y * (change / plate.base)[:, None]
+    found["damping_each"] = found["damping_added"] * values.damping
     found["damping"] = found["damping_each"].sum(axis=-1, keepdims=True)
     found["bolt_mass"] = _held(plate, eras, -_per_frequency(plate, n))
     first = n + len(model.rig.masses) + model.mass_count
@@ -129,6 +135,22 @@ def _by_gains(plate: PlateAt) -> Columns:
         "sensor_gain": by_sensor,
         "sensor_phase": 1j * by_sensor,
     }
+
+
+_GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {
+    _by_plate: ("thickness", "modulus", "loss", "loss_added", "loss_exponent"),
+    _by_modes: ("mode_shifts", "mode_losses"),
+    _by_places: ("place", "masses"),
+    _by_attachments: (
+        "stiffness",
+        "damping",
+        "damping_each",
+        "damping_added",
+        "bolt_mass",
+        "fingers",
+    ),
+    _by_gains: ("gain", "phase", "inertia", "drag", "sensor_gain", "sensor_phase"),
+}
 
 
 def _per_frequency(plate: PlateAt, count: int) -> FloatArray:

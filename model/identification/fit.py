@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray
-from model.calibration.least_squares import search
 from model.identification.derivatives import jacobian
 from model.identification.forward import ForwardModel
+from model.identification.least_squares import search
 from model.identification.measurement import Measurement
 
 _CONVERGED = 1e-7  # of the cost, whose changes by one standard deviation are 1

@@ -29,6 +29,9 @@ from model.structure.attachments import Fingertip, attached_stiffness, footprint
 from model.structure.modal_elasticity import ModalElasticity, lowest_elastic
 from model.structure.plate import LOSS_FREQUENCY
 
+LEAST_LOSS = 1e-9
+"""Loss factor that counts for none, so that there are derivatives by its logarithm."""
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -120,6 +123,8 @@ class ForwardModel:
     @cached_property
     def movable(self) -> IntArray:
         """Numbers of the attachments that may move: ERAs and additional masses."""
+        if not self.space.of("place", "masses").any():
+            return np.array([], dtype=int)
         first = len(self.rig.eras) + len(self.rig.masses)
         movable = [*range(len(self.rig.eras)), *range(first, first + self.mass_count)]
         return np.array(movable, dtype=int)
@@ -169,8 +174,13 @@ class PlateAt:
         ]
         self.stiffness = Z = np.concatenate(held, axis=1)
         A = combined(self.functions.receptance, self.located.products)
-        self.left = np.linalg.inv(np.eye(Z.shape[1]) + A * Z[:, None])
-        self.receptance = self.left @ A
+        # Nothing holds the plate at the sensors, the last ones.
+        count = Z.shape[1] - len(model.pads)
+        reaction = A[:, :, :count] * Z[:, None, :count]
+        reaction = reaction @ np.linalg.inv(np.eye(count) + reaction[:, :count])
+        self.left = np.repeat(np.eye(Z.shape[1], dtype=complex)[None], len(w), axis=0)
+        self.left[:, :, :count] -= reaction
+        self.receptance = A - reaction @ A[:, :count]
 
     @cached_property
     def lag(self) -> ComplexArray:
@@ -197,7 +207,10 @@ class PlateAt:
     def _functions(self) -> FrequencyFunctions:
         model, values = self.model, self.values
         modes, theory = model.shifted_modes, model.elasticity
-        eta = values.loss_factor * (model.frequencies / LOSS_FREQUENCY) ** values.loss_exponent
+        eta = (
+            max(values.loss_factor, LEAST_LOSS)
+            * (model.frequencies / LOSS_FREQUENCY) ** values.loss_exponent
+        )
         eigenvalues, relative = theory.eigenvalues.copy(), theory.relative_loss.copy()
         eigenvalues[modes] *= np.exp(values.mode_shifts)
         relative[modes] *= np.exp(values.mode_losses)

@@ -70,6 +70,8 @@ def _gains(era: Era, rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
 
     Over the rig's frequencies where the drive lags.
     """
+    if values.drive_gains[number] == 1 and not (values.inertia[number] or values.drag[number]):
+        return era.gains
     before = era.gains or ((LOSS_FREQUENCY, 1.0, 0.0),)
     if values.inertia[number] or values.drag[number]:
         low, high = rig.limits.frequency_min, rig.limits.frequency_max

@@ -55,6 +55,9 @@ KINDS = {
     # Of one ERA beside that of all.
     "damping_each": Kind(0.2, drift=0.07, drifts_to=math.log(_BUILT.damping)),
     "loss": Kind(math.log(_BUILT.damping), drift=0.1),
+    # Beside those of the rig, which may have none.
+    "damping_added": Kind(0.0, "N s/m", "N s/m", 1.0),
+    "loss_added": Kind(0.0, "", "", 1.0),
     # The power of frequency that the loss factor follows.
     "loss_exponent": Kind(0.3, "", "", 1.0),
     "gain": Kind(_BUILT.gain, drift=0.01),
@@ -162,8 +165,10 @@ def space_of(
         [f"damping {name}" for name in eras],
         KINDS["damping_each"].std * np.array(damped),
     )
+    add("damping_added", [f"further damping {name}" for name in eras])
     lossy = float(damping > 0 and plate.loss_factor > 0)
     add("loss", ["loss factor"], damping * lossy)
+    add("loss_added", ["further loss factor"])
     exponents = np.array([-MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT]) - plate.loss_exponent
     exponent = KINDS["loss_exponent"].std
     low, high = exponents / exponent

@@ -55,10 +55,10 @@ class Values:
         return cls(
             thickness=float(np.exp(own("thickness")[0])),
             modulus=float(np.exp(own("modulus")[0])),
-            loss_factor=float(plate.loss_factor * np.exp(own("loss")[0])),
+            loss_factor=float(plate.loss_factor * np.exp(own("loss")[0]) + own("loss_added")[0]),
             loss_exponent=float(plate.loss_exponent + own("loss_exponent")[0]),
             stiffness=k * np.exp(own("stiffness")),
-            damping=c * np.exp(own("damping") + own("damping_each")),
+            damping=c * np.exp(own("damping") + own("damping_each")) + own("damping_added"),
             bolt_mass=m + own("bolt_mass"),
             places=np.clip(at + own("place").reshape(n, 2), 0, sides),
             masses=masses,

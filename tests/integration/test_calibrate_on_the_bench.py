@@ -11,11 +11,11 @@ from typer.testing import CliRunner
 
 from examples.make_measured import record_responses, scanning_grid
 from model.calibration.responses_file import write_responses_csv, write_responses_uff
+from model.calibration.sensed_plate import sensed_plate
 from model.cli import app
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
-from model.vibration.parametric_plate import parametric_plate
 from perturbed_plate import FREQUENCIES, perturbed
 from sim.plant.accelerometer import Accelerometer
 
@@ -64,7 +64,7 @@ def test_bench_measurement_agrees_with_the_model(rig: Rig) -> None:
     frequencies = FREQUENCIES[:-1:4] + 0.37  # no whole number of periods between two of them
     found = record_responses(truth, sensors, frequencies)
     gains = np.column_stack([era.gain(frequencies) for era in truth.eras])
-    exact = parametric_plate(truth, found.points, frequencies).responses(truth)
+    exact = sensed_plate(truth, found.points, frequencies).responses()
     exact *= gains[:, :, None]
     wrong = np.linalg.norm(found.values - exact, axis=2) / np.linalg.norm(exact, axis=2)
     assert np.median(wrong) < 0.005

@@ -9,8 +9,8 @@ import pytest
 from drivers.host.group import Group
 from drivers.opening import Lines
 from far_end_process import FarEndProcess, far_end_process
+from model.calibration.sensed_plate import sensed_plate
 from model.rig.file import load_rig
-from model.vibration.parametric_plate import parametric_plate
 from patient_daemon import wait_long
 from registry.limits import GuardLimits
 from rig_files import TWO_AMPLIFIERS, write_rig
@@ -72,7 +72,7 @@ def predicted(file: Path) -> np.ndarray:
     drawn = draw_imperfections(rig)
     real = drawn.plate.realised(rig)
     points = np.array(list(SENSORS.values()))
-    responses = parametric_plate(real, points, np.array([FREQUENCY])).responses(real)[0]
+    responses = sensed_plate(real, points, np.array([FREQUENCY])).responses()[0]
     bases = []
     for era in rig.eras:
         level, degrees = DRIVE[era.name]

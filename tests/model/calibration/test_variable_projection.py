@@ -9,12 +9,12 @@ import pytest
 
 from extrapolated import extrapolated_slopes
 from model.arrays import ComplexArray, FloatArray
-from model.calibration import fit, least_squares
+from model.calibration import fit
 from model.calibration.form_errors import form_model
-from model.calibration.parameters import parameters_of
+from model.calibration.sensed_plate import Parameters, sensed_plate
 from model.diagnosis import plate_match
+from model.identification import least_squares
 from model.rig.rig import Rig
-from model.vibration.parametric_plate import parametric_plate
 from paper_plate import make_paper_rig
 
 RIG = make_paper_rig(12, 9)
@@ -25,7 +25,7 @@ FREQUENCIES = np.array([70.0, 130.0, 260.0, 410.0])
 def measured(rig: Rig) -> ComplexArray:
     """Responses (f, e, s) of the rig with other gains, noise, and one value left out."""
     rng = np.random.default_rng(3)
-    values = parametric_plate(rig, POINTS, FREQUENCIES).responses(rig)
+    values = sensed_plate(rig, POINTS, FREQUENCIES).responses()
     values = values * rng.uniform(0.8, 1.2, (*values.shape[:2], 1))
     values = values * (1 + 0.1 * rng.standard_normal(values.shape))
     values[1, 2, 3] = np.nan
@@ -36,17 +36,16 @@ def fit_a_rig(*, has_form: bool) -> None:
     """Search without form errors and with all sensor scales free, or with all but one held."""
     free_scales = np.ones(len(POINTS), dtype=bool)
     free_scales[1:] = not has_form
-    parameters = parameters_of(RIG)
+    parameters = Parameters.of(RIG)
     problem = fit.Problem(
         RIG,
         form_model(RIG, POINTS, FREQUENCIES),
         parameters,
         measured(RIG),
-        np.ones(len(parameters), dtype=bool),
+        np.ones(len(parameters.rows), dtype=bool),
         free_scales,
     )
-    start = np.array([p.start for p in parameters])
-    found = fit.first_fit(problem, start)
+    found = fit.first_fit(problem, np.zeros(len(parameters.rows)))
     if has_form:
         fit.solve(problem, replace(found, scales=np.ones(len(POINTS))))
 
@@ -55,8 +54,8 @@ def match_a_plate() -> None:
     """Search for a plate with one channel that was not driven."""
     values = measured(replace(RIG, plate=RIG.plate.scaled(modulus=1.1)))
     values[:, 1] = np.nan
-    plate = parametric_plate(RIG, POINTS, FREQUENCIES)
-    plate_match.match_plate(RIG, plate, values, drives=[0, 2, 1, 3])
+    plate = sensed_plate(RIG, POINTS, FREQUENCIES)
+    plate_match.match_plate(plate, values, drives=[0, 2, 1, 3])
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import pytest
 
 from long_form import shortly
 from model.calibration.responses import Responses
+from model.calibration.sensed_plate import sensed_plate
 from model.diagnosis import causes
 from model.diagnosis.diagnosis_report import as_json, channel_table, verdict_rows
 from model.diagnosis.verdict import Verdict, diagnose
@@ -20,7 +21,6 @@ from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.fem.plate import assemble, direct_acceleration
 from model.rig.rig import Rig
-from model.vibration.parametric_plate import parametric_plate
 
 FREQUENCIES = np.linspace(57.0, 487.0, 10)
 NX, NY = 4, 2
@@ -90,11 +90,11 @@ def solved_once():
     def solve(rig, points, frequencies):
         key = (rig.plate, rig.mesh, points.tobytes(), frequencies.tobytes())
         if key not in solved:
-            solved[key] = parametric_plate(rig, points, frequencies)
+            solved[key] = sensed_plate(rig, points, frequencies)
         return solved[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(causes, "parametric_plate", solve)
+        patch.setattr(causes, "sensed_plate", solve)
         yield
 
 

@@ -120,7 +120,7 @@ def test_derivatives_are_the_slopes_of_the_responses(model: ForwardModel, is_lay
     model = of_a_laminate(model) if is_layered else model
     x, step = somewhere(model.space, 2), 1e-4
     found = jacobian(model.at(x))
-    for number, name in enumerate(model.space.names):
+    for number in np.flatnonzero(model.space.uncertain):
         sides = []
         for sign in (1, -1):
             moved = x.copy()
@@ -128,7 +128,7 @@ def test_derivatives_are_the_slopes_of_the_responses(model: ForwardModel, is_lay
             sides.append(model.at(moved).responses)
         slope = (sides[0] - sides[1]) / (2 * step)
         error = np.abs(found[..., number] - slope).max() / np.abs(slope).max()
-        assert error < 1e-4, name
+        assert error < 1e-4, model.space.names[number]
 
 
 def test_drive_lags_as_an_actuator_with_a_resonance(model: ForwardModel) -> None:

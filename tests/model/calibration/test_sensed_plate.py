@@ -1,0 +1,94 @@
+"""Responses of a plate with other values, without solving it again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model.calibration.sensed_plate import SensedPlate, sensed_plate
+from model.rig.rig import Rig
+from model.spectral.mesh import SpectralMesh
+from model.structure.attachments import PointLoad
+from paper_plate import make_paper_rig
+
+FINGER = PointLoad(0.1, 0.08, stiffness=500.0, damping=2.0, mass=0.003)
+PAPER = make_paper_rig(12, 9)
+RIG = replace(
+    PAPER,
+    mesh=SpectralMesh(12, 9, PAPER.plate.length, PAPER.plate.width),
+    masses=(FINGER,),
+)
+FREQUENCIES = np.arange(60.0, 321.0, 10.0)
+POINTS = np.random.default_rng(0).uniform(0.01, 0.2, (30, 2))
+FACTOR = 1.2  # of frequencies
+
+
+@pytest.fixture(scope="module")
+def plate() -> SensedPlate:
+    """Solved at the frequencies, and at those times the factor."""
+    return sensed_plate(RIG, POINTS, np.concatenate([FREQUENCIES, FACTOR * FREQUENCIES]))
+
+
+def _with(rig: Rig, *, modulus: float = 1.0, thickness: float = 1.0, loss: float = 1.0) -> Rig:
+    """Rig with factors on values of its plate."""
+    of = rig.plate
+    material = replace(of.material, E=modulus * of.material.E)
+    return replace(
+        rig,
+        plate=replace(
+            of,
+            material=material,
+            thickness=thickness * of.thickness,
+            loss_factor=loss * of.loss_factor,
+        ),
+    )
+
+
+def _mounted(rig: Rig, *, stiffness: float, damping: float, mass: float) -> Rig:
+    """Rig with factors on the values of its ERAs and fingers."""
+
+    def factors(stiffness_of: float, damping_of: float) -> dict[str, float]:
+        return {"stiffness": stiffness * stiffness_of, "damping": damping * damping_of}
+
+    eras = tuple(
+        replace(era, **factors(era.stiffness, era.damping), bolt_mass=mass * era.bolt_mass)
+        for era in rig.eras
+    )
+    masses = tuple(
+        replace(load, **factors(load.stiffness, load.damping), mass=mass * load.mass)
+        for load in rig.masses
+    )
+    return replace(rig, eras=eras, masses=masses)
+
+
+@pytest.mark.parametrize(
+    ("other", "within"),
+    [
+        (_with(RIG, modulus=1.15, loss=3.0), 1e-4),
+        (_mounted(RIG, stiffness=0.7, damping=2.0, mass=1.5), 1e-4),
+        (_with(RIG, thickness=1.01), 1e-3),
+        (_with(RIG, thickness=0.95), 5e-3),
+    ],
+    ids=["modulus and loss", "ERAs and finger", "1 % thicker", "5 % thinner"],
+)
+def test_responses_are_those_of_a_new_solve(plate, other, within):
+    """Relative L2 over frequencies, ERAs and points; shear and rotary inertia limit thickness."""
+    found = plate.of(other).responses()[: len(FREQUENCIES)]
+    exact = sensed_plate(other, POINTS, FREQUENCIES).responses()
+    assert np.linalg.norm(found - exact) / np.linalg.norm(exact) < within
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        _mounted(_with(RIG, modulus=FACTOR**2), stiffness=FACTOR**2, damping=FACTOR, mass=1.0),
+        _mounted(_with(RIG, thickness=FACTOR), stiffness=FACTOR**3, damping=FACTOR**2, mass=FACTOR),
+    ],
+    ids=["modulus", "thickness"],
+)
+def test_responses_scale_with_stiffness_and_mass(plate, other):
+    """All stiffness times s² over all mass scales frequencies by s, and accelerations by s²."""
+    at, at_scaled = np.split(plate.responses(), 2)
+    _, scaled = np.split(plate.of(other).responses(), 2)
+    np.testing.assert_allclose(scaled, FACTOR**2 * at, rtol=1e-9, atol=1e-9 * np.abs(at).max())
+    assert np.abs(at_scaled - scaled).max() > 0.1 * np.abs(at).max()

@@ -15,7 +15,6 @@ from matplotlib.patches import Polygon as Outline
 from controller.effects.layout import SurfaceLayout
 from controller.effects.layout_check import CheckedEffect
 from controller.effects.layout_together import Together, matrix_of
-from controller.effects.shapes import Circle, Rectangle, Shape
 from controller.effects.simulated_touch import Position, SimulatedTouch
 from model.arrays import FloatArray
 from model.figures.drawing import draw_eras, label_plate
@@ -25,7 +24,6 @@ from model.table.table import LocalizationTable
 _LEVEL_EDGES = [-12.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 12.0]  # dB
 _MAX_CONTRAST = 30.0  # dB
 _NO_PROMISE = "#bbbbbb"
-_CIRCLE_CORNERS = 60
 _MAX_JOINED = 12  # fingers at once that are drawn joined, of each count
 _BRIGHT = 0.6  # of a scale of colours, from which black is read better than white
 _SIZES = (90.0, 36.0, 10.0)  # of marks; those of a region's further effects lie within
@@ -123,7 +121,7 @@ def _draw_layout(axes: Axes, layout: SurfaceLayout, table: LocalizationTable) ->
     length, width = 100 * table.plate.length, 100 * table.plate.width
     axes.add_patch(Outline([(0, 0), (length, 0), (length, width), (0, width)], fill=False))
     for region in layout.regions:
-        corners = 100 * np.array(_outline(region.shape))
+        corners = 100 * np.array(region.shape.corners())
         axes.add_patch(Outline(corners, facecolor="#f2f2f2", edgecolor="#555555", lw=1))
         top = corners[corners[:, 1] >= corners[:, 1].max() - 1e-6]
         axes.annotate(
@@ -169,17 +167,3 @@ def _draw_touches(
 def _columns(places: Iterable[Position]) -> FloatArray:
     """Return positions [m] as rows x and y [cm], (2, n)."""
     return 100 * np.array([*places], dtype=float).reshape(-1, 2).T
-
-
-def _outline(shape: Shape) -> Sequence[tuple[float, float]]:
-    """Return the corners of a shape [m], many for a circle."""
-    if isinstance(shape, Circle):
-        angles = 2 * math.pi * np.arange(_CIRCLE_CORNERS) / _CIRCLE_CORNERS
-        return [
-            (shape.x + shape.radius * math.cos(angle), shape.y + shape.radius * math.sin(angle))
-            for angle in angles
-        ]
-    if isinstance(shape, Rectangle):
-        (x0, y0), (x1, y1) = shape.corners()
-        return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
-    return shape.corners()

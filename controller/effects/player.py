@@ -28,10 +28,7 @@ _MAX_WAIT = 0.125
 
 @dataclass
 class _Play:
-    """A run of an effect at one finger, numbered in order of start.
-
-    is_elsewhere: whether it is the effect outside of all regions.
-    """
+    """A run of an effect at one finger, numbered in order of start."""
 
     name: str
     run: EffectRun
@@ -39,7 +36,11 @@ class _Play:
     priority: int
     band: Band | None
     region: Region | None
-    is_elsewhere: bool
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether it is the effect outside of all regions."""
+        return self.region is None and self.priority != REQUESTED_PRIORITY
 
 
 @dataclass
@@ -129,7 +130,8 @@ class EffectPlayer:
             for play in finger.plays
             if (play.name, play.priority) != (name, REQUESTED_PRIORITY)
         ]
-        self._start(finger, name, contact, now, level=level, priority=REQUESTED_PRIORITY)
+        requested = REQUESTED_PRIORITY
+        self._start(finger, finger.region, name, contact, now, level=level, priority=requested)
 
     def _waits(self, target: Target, now: float, ends: list[float]) -> bool:
         """Whether a short pulse must wait at a time [s] for its turn after those of others."""
@@ -208,47 +210,39 @@ class EffectPlayer:
     def _enter(self, finger: _Finger, contact: Contact, now: float) -> None:
         """Start the effects of the region that a finger enters, or those outside of all."""
         region = finger.region
-        if region is None:
-            name = self.layout.elsewhere
-            if name is not None:
-                level = self.layout.level_of(name, None)
-                self._start(finger, name, contact, now, level=level, priority=0, is_elsewhere=True)
-            return
         # The effect for motion starts first: the press is felt, then the movement after it.
-        for name in (region.on_move, region.on_press):
+        names = (region.on_move, region.on_press) if region else (self.layout.elsewhere,)
+        for name in names:
             if name is not None:
                 self._start_in(finger, region, name, contact, now)
 
     def _start_in(
-        self, finger: _Finger, region: Region, name: str, contact: Contact, now: float
+        self, finger: _Finger, region: Region | None, name: str, contact: Contact, now: float
     ) -> None:
-        """Start an effect with the level and priority of a region."""
+        """Start an effect of a region, or that outside of all."""
         level = self.layout.level_of(name, region)
-        self._start(
-            finger, name, contact, now, level=level, priority=region.priority, region=region
-        )
+        priority = 0 if region is None else region.priority
+        self._start(finger, region, name, contact, now, level=level, priority=priority)
 
     def _start(
         self,
         finger: _Finger,
+        region: Region | None,
         name: str,
         contact: Contact,
         now: float,
         *,
         level: float | None,
         priority: int,
-        region: Region | None = None,
-        is_elsewhere: bool = False,
     ) -> None:
-        """Start an effect in a region, by default the one that the finger is in."""
+        """Start an effect in a region, or outside of all."""
         self._number += 1
         effect = self.layout.effects[name]
-        region = finger.region if region is None else region
         run = effect.start_in(region, contact, now, level_db_sl=level)
         if not isinstance(run, EffectRun):
             raise WrongResultError(effect, run, EffectRun)
         band = self.layout.band_of(name, region)
-        finger.plays.append(_Play(name, run, self._number, priority, band, region, is_elsewhere))
+        finger.plays.append(_Play(name, run, self._number, priority, band, region))
 
     def _current_sensation(
         self, contact: Contact, now: float, ends: list[float]

@@ -8,6 +8,7 @@ from typing import Any, Protocol, TypeAlias
 
 Point: TypeAlias = tuple[float, float]
 
+_CIRCLE_CORNERS = 60  # a multiple of 4
 _TOLERANCE = 1e-9  # m; a point this close to a side lies on it
 
 
@@ -22,7 +23,7 @@ class Shape(Protocol):
         """Its centre of area."""
 
     def corners(self) -> Sequence[Point]:
-        """Return points whose bounding box contains it."""
+        """Return its corners in order; those of a circle are many, four of them at its box."""
 
     def as_json(self) -> dict[str, Any]:
         """Return `shape` and its dimensions; every key has its unit."""
@@ -47,8 +48,9 @@ class Rectangle:
         return (self.x + self.width / 2, self.y + self.height / 2)
 
     def corners(self) -> Sequence[Point]:
-        """Return two opposite corners."""
-        return ((self.x, self.y), (self.x + self.width, self.y + self.height))
+        """Return all four."""
+        east, north = self.x + self.width, self.y + self.height
+        return ((self.x, self.y), (east, self.y), (east, north), (self.x, north))
 
     def as_json(self) -> dict[str, Any]:
         """Return it as the API describes it."""
@@ -79,11 +81,12 @@ class Circle:
         return (self.x, self.y)
 
     def corners(self) -> Sequence[Point]:
-        """Return two opposite corners of its bounding box."""
-        return (
-            (self.x - self.radius, self.y - self.radius),
-            (self.x + self.radius, self.y + self.radius),
-        )
+        """Return points around it, among them those farthest along x and y."""
+        angles = [2 * math.pi * number / _CIRCLE_CORNERS for number in range(_CIRCLE_CORNERS)]
+        return [
+            (self.x + self.radius * math.cos(angle), self.y + self.radius * math.sin(angle))
+            for angle in angles
+        ]
 
     def as_json(self) -> dict[str, Any]:
         """Return it as the API describes it."""
@@ -122,17 +125,14 @@ class Polygon:
     @property
     def centre(self) -> Point:
         """The centre of area, or the mean of the corners where sides cross out the area."""
+        following = (*self.points[1:], self.points[0])
         cross = [
-            x0 * y1 - x1 * y0
-            for (x0, y0), (x1, y1) in zip(
-                self.points, (*self.points[1:], self.points[0]), strict=True
-            )
+            x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in zip(self.points, following, strict=True)
         ]
         area = sum(cross) / 2
         if abs(area) < _TOLERANCE:
             xs, ys = zip(*self.points, strict=True)
             return (sum(xs) / len(xs), sum(ys) / len(ys))
-        following = (*self.points[1:], self.points[0])
         pairs = list(zip(self.points, following, cross, strict=True))
         return (
             sum((one[0] + other[0]) * each for one, other, each in pairs) / (6 * area),

@@ -1,6 +1,7 @@
 """Contrast and time of answers to several contents, by number of ERAs.
 
     python -m benchmarks.contents [--only RIG ...] [--sets N] [--fingers K] [--modulation HZ]
+                                 [--distortion PERCENT]
 
 The examples with four, eight, twelve and sixteen ERAs, 40 to 320 Hz in steps of 10, fingers 5 cm
 apart (8 cm on the table) with contents of 20 dB SL, 20 Hz apart; `identified`: with an uncertainty
@@ -9,7 +10,9 @@ nine of ten plates promise: median over the sets (and their worst tenth); share 
 plates that keep the promise (`model.table.exact_plates`); processor time of an answer on one
 thread, median. With --fingers so many fingers in all, 3 cm apart, for the times. With --modulation
 contents 30 Hz apart, of which the first comes and goes so often: what that costs the worst finger
-where it is served, median over the sets (and the most).
+where it is served, median over the sets (and the most). With --distortion amplifiers whose second
+harmonic is so much of full level: contents above all second harmonics, sums and differences up to
+500 Hz at their fingers [dB], median (and least), and above those nearer than 30 Hz.
 """
 
 import argparse
@@ -21,6 +24,8 @@ from typing import TYPE_CHECKING
 from benchmarks.setting import random_contacts, use_one_thread
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from model.arrays import FloatArray
     from model.table.request import Answer
     from model.table.table import LocalizationTable
@@ -41,6 +46,7 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=24)
     parser.add_argument("--fingers", type=int, metavar="K", help="in all, one to four contents")
     parser.add_argument("--modulation", type=float, metavar="HZ", help="of the first content")
+    parser.add_argument("--distortion", type=float, metavar="PERCENT", help="of full level")
     options = parser.parse_args()
     use_one_thread()
     import numpy as np
@@ -53,24 +59,40 @@ def main() -> None:
         gain=0.015, phase_deg=1.5, thickness=0.002, stiffness=0.01, damping=1.1, fingertip=0.5
     )
     sets = [(k, options.fingers - k) for k in range(1, 5)] if options.fingers else SETS
-    figures = "cost [dB]" if options.modulation else "kept    time"
-    print(f"{'rig':12} {'uncertainty':11} {'fingers':>7} {'worst finger [dB]':>18} {figures}")
+    column = "above products" if options.distortion else "worst finger [dB]"
+    figures = "" if options.distortion else "cost [dB]" if options.modulation else "kept    time"
+    print(f"{'rig':12} {'uncertainty':11} {'fingers':>7} {column:>18} {figures}")
     for name in options.only or PLATES:
         rig = load_rig(EXAMPLES / f"{name}.yaml")
         for label, uncertainty in (("default", rig.uncertainty), ("identified", identified)):
             table = build_table(
                 replace(rig, uncertainty=uncertainty),
                 drive_mode="phased",
-                frequencies=np.arange(40.0, 321.0, 10.0),
+                frequencies=np.arange(40.0, 501.0 if options.distortion else 321.0, 10.0),
             )
             table.prepare(with_ringing=False)
             for contents, quiet in sets:
                 apart = (0.08 if name == "table" else 0.05) * (0.6 if options.fingers else 1)
                 row = (name, label), table, contents, quiet
-                if options.modulation:
+                if options.distortion:
+                    _print_distorted(*row, options.distortion, options.sets, apart=apart)
+                elif options.modulation:
                     _print_modulated(*row, options.modulation, options.sets, apart=apart)
                 else:
                     _print_row(*row, count=options.sets, apart=apart)
+
+
+def _sets(
+    table: "LocalizationTable", contents: int, quiet: int, *, count: int, apart: float
+) -> "Iterator[list[tuple[float, float]]]":
+    """Places [m] of fingers, those with contents first."""
+    import numpy as np
+
+    rng = np.random.default_rng([contents, quiet])
+    size = (table.plate.length, table.plate.width)
+    for _ in range(count):
+        drawn = random_contacts(rng, contents + quiet, size, apart=apart)
+        yield [(float(x), float(y)) for x, y in drawn]
 
 
 def _print_row(
@@ -87,12 +109,8 @@ def _print_row(
     from model.table.answer import answer
     from model.table.request import Finger, Request
 
-    rng = np.random.default_rng([contents, quiet])
     worst, kept, times = [], [], []
-    size = (table.plate.length, table.plate.width)
-    for number in range(count):
-        drawn = random_contacts(rng, contents + quiet, size, apart=apart)
-        places = [(float(x), float(y)) for x, y in drawn]
+    for number, places in enumerate(_sets(table, contents, quiet, count=count, apart=apart)):
         requests = [Request(at) for at in places[:contents]]
         fingers = [Finger(at) for at in places[contents:]]
         started = time.process_time()
@@ -126,12 +144,8 @@ def _print_modulated(
     from model.table.modulation import with_modulation
     from model.table.request import Finger, Request
 
-    rng = np.random.default_rng([contents, quiet])
     steady, cost = [], []
-    size = (table.plate.length, table.plate.width)
-    for _ in range(count):
-        drawn = random_contacts(rng, contents + quiet, size, apart=apart)
-        places = [(float(x), float(y)) for x, y in drawn]
+    for places in _sets(table, contents, quiet, count=count, apart=apart):
         requests = [Request(at) for at in places[:contents]]
         fingers = [Finger(at) for at in places[contents:]]
         plain = answer(table, requests, fingers)
@@ -148,6 +162,59 @@ def _print_modulated(
             f"        {np.median(cost):5.1f} ({np.max(cost):.1f}), {len(cost)} of {count} served",
             flush=True,
         )
+
+
+def _print_distorted(
+    names: tuple[str, str],
+    table: "LocalizationTable",
+    contents: int,
+    quiet: int,
+    percent: float,
+    count: int,
+    *,
+    apart: float,
+) -> None:
+    """Print how far each content is above the second harmonics, sums and differences there."""
+    import numpy as np
+
+    from model.table.answer import answer
+    from model.table.request import APART_HZ, Finger, Request
+    from model.vibration.excitation import base_amplitudes
+
+    above, near = [], []
+    strokes = np.array([era.stroke for era in table.eras])
+    for places in _sets(table, contents, quiet, count=count, apart=apart):
+        requests = [Request(at, (40.0, 320.0)) for at in places[:contents]]
+        fingers = [Finger(at) for at in places[contents:]]
+        found = answer(table, requests, fingers, min_contrast_db=-np.inf)
+        tones = []
+        for layer in found.layers:
+            frequencies, bases = base_amplitudes(layer.excitation, table.eras)
+            tones.append((float(frequencies[0]), bases[0] / strokes))
+        products = []
+        for number, (f, weights) in enumerate(tones):
+            products.append((2 * f, weights**2))
+            for low, other in tones[:number]:
+                difference = weights * other.conj() if f >= low else other * weights.conj()
+                products += [(f + low, 2 * weights * other), (abs(f - low), 2 * difference)]
+        fields = table.unit_fields(np.array(places), contacts=places)
+        for finger, layer in enumerate(found.layers):
+            own, total = 10 ** (layer.promised_level_db_sl / 20), 1e-20
+            for f, weights in products:
+                (rows,) = np.nonzero(np.isclose(table.frequencies, f))
+                for row in rows:
+                    felt = abs((percent / 100 * weights * fields[row, :, finger]).sum())
+                    sensed = float(felt / table.thresholds[row])
+                    total += sensed**2
+                    if abs(f - tones[finger][0]) < APART_HZ:
+                        near.append(20 * np.log10(own / sensed))
+            above.append(20 * np.log10(own / np.sqrt(total)))
+    print(
+        f"{names[0]:12} {names[1]:11} {contents:4d}+{quiet:<2d} {np.median(above):10.1f} "
+        f"({np.min(above):.1f})"
+        + (f", near a content {np.median(near):.1f} ({np.min(near):.1f})" if near else ""),
+        flush=True,
+    )
 
 
 def _kept(

@@ -181,10 +181,10 @@ def touch(
     positions = [parse_point(text, what="era touch") for text in at or ()]
     with _client(socket) as era:
         _check_positions(positions, era.hello("era").rig)
-        begin = time.monotonic()
-        _hold(era, positions, begin + duration / 2)
+        started_at = time.monotonic()
+        _hold(era, positions, started_at + duration / 2)
         status = era.status()  # right after a touch, whose contact lasts for 150 ms
-        _hold(era, positions, begin + duration)
+        _hold(era, positions, started_at + duration)
         era.touch([], source="era touch")
     typer.echo(status.model_dump_json() if as_json else show_status(status))
 

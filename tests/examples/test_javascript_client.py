@@ -7,7 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from daemon_bench import ENABLED, PATIENCE, READY, DaemonBench, ready_daemon, until_state
+from daemon_bench import (
+    ENABLED,
+    PATIENCE,
+    READY,
+    DaemonBench,
+    next_event,
+    ready_daemon,
+    until_state,
+)
 from installed_program import installed_program
 
 BUTTON = Path(__file__).parents[2] / "examples" / "javascript" / "button.mjs"
@@ -46,15 +54,13 @@ async def test_button_is_felt_and_disarmed(tmp_path: Path) -> None:
     async with ready_daemon(tmp_path) as (bench, era):
         await era.subscribe("pattern")
         process = await started(bench, QUIET, TARGET)
-        promised = None
-        async for event in era.events():
-            if len(event.data["contacts"]) == 2:
-                promised = event.data["predicted_felt_contrast_db"]
-                break
+        pattern = (await next_event(era, "pattern")).data
+        while len(pattern["contacts"]) < 2:
+            pattern = (await next_event(era, "pattern")).data
         status, out, err = await ended(process)
         assert (status, err) == (0, "")
         (shown,) = re.findall(r"felt contrast (\S+) dB", out)
-        assert float(shown) == pytest.approx(promised, abs=0.05)
+        assert float(shown) == pytest.approx(pattern["predicted_felt_contrast_db"], abs=0.05)
         assert await until_state(era, READY) == READY
         assert not (await era.status()).contacts
 
@@ -75,10 +81,10 @@ async def test_killed_client_lifts_its_fingers(tmp_path: Path) -> None:
     async with ready_daemon(tmp_path) as (bench, era):
         await era.subscribe("pattern", "silence")
         process = await started(bench, QUIET, TARGET)
-        await anext(event async for event in era.events() if event.topic == "pattern")
+        await next_event(era, "pattern")
         process.kill()
         await ended(process)
-        await anext(event async for event in era.events() if event.topic == "silence")
+        await next_event(era, "silence")
         assert not (await era.status()).contacts
 
 

@@ -123,34 +123,31 @@ def touches_of(
 
 
 def test_evdev_source_follows_fingers() -> None:
-    """Each report is a frame, in shares of the panel's axes, y downwards as the kernel counts."""
-    panel = PipePanel()
+    """Each report is a frame, in shares of the panel's axes, y downwards as the kernel counts.
 
-    async def play() -> None:
-        for words in ("id 7 x 250 y 100", "slot 1 id 8 x 1000 y 500", "slot 0 x 300", "id -1"):
-            os.write(panel.into, raw(words))
-            await asyncio.sleep(0.01)
-
-    assert touches_of([panel], play) == [
-        {},
-        {7: (0.25, 0.2)},
-        {7: (0.25, 0.2), 8: (1.0, 1.0)},
-        {7: (0.3, 0.2), 8: (1.0, 1.0)},
-        {8: (1.0, 1.0)},
-    ]
-
-
-def test_evdev_source_starts_from_the_state_of_the_kernel() -> None:
-    """Fingers on the panel when it is opened are delivered at once."""
+    Fingers on the panel when it is opened are delivered at once, with the slot of the next event;
+    after SYN_DROPPED the kernel's state counts, as its documentation demands.
+    """
     panel = PipePanel()
     panel.state = {0: EMPTY, 1: SlotState(5, 500, 250)}
     panel.current_slot = 1
 
     async def play() -> None:
-        os.write(panel.into, raw("x 600"))
+        for words in ("x 600", "slot 0 id 7 x 250 y 100", "x 300", "slot 1 id -1"):
+            os.write(panel.into, raw(words))
+            await asyncio.sleep(0.01)
+        panel.state = {0: EMPTY, 1: SlotState(9, 1000, 0)}
+        os.write(panel.into, raw("slot 0 x 900", dropped=True))
         await asyncio.sleep(0.01)
 
-    assert touches_of([panel], play) == [{5: (0.5, 0.5)}, {5: (0.6, 0.5)}]
+    assert touches_of([panel], play) == [
+        {5: (0.5, 0.5)},
+        {5: (0.6, 0.5)},
+        {5: (0.6, 0.5), 7: (0.25, 0.2)},
+        {5: (0.6, 0.5), 7: (0.3, 0.2)},
+        {7: (0.3, 0.2)},
+        {9: (1.0, 0.0)},
+    ]
 
 
 def test_evdev_source_repeats_resting_fingers() -> None:
@@ -175,20 +172,6 @@ def test_evdev_source_repeats_resting_fingers() -> None:
         (0.1, {7: (0.0, 0.0)}),
         (0.15, {}),
     ]
-
-
-def test_evdev_source_resyncs_after_lost_events() -> None:
-    """After SYN_DROPPED the kernel's state counts, as its documentation demands."""
-    panel = PipePanel()
-
-    async def play() -> None:
-        os.write(panel.into, raw("id 7 x 100 y 100"))
-        await asyncio.sleep(0.01)
-        panel.state = {0: EMPTY, 1: SlotState(9, 1000, 0)}
-        os.write(panel.into, raw("x 900", dropped=True))
-        await asyncio.sleep(0.01)
-
-    assert touches_of([panel], play)[-1] == {9: (1.0, 0.0)}
 
 
 def test_evdev_source_lifts_a_finger_that_becomes_a_palm() -> None:

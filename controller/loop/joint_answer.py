@@ -59,8 +59,9 @@ def query_jointly(
     found = _answer(table, requests, fingers, _kept(requests, targets, before))
     modulations, playable = _modulations(targets, capabilities.layers), capabilities.frequencies
     found = with_modulation(table, requests, fingers, found, modulations, playable=playable)
-    if _factor_within(found, capabilities) < 1 - NEARLY:
-        gains_db = _gains_db(requests, found, capabilities)
+    strokes = {era.name: era.stroke for era in table.eras}
+    if _factor_within(found, capabilities, strokes) < 1 - NEARLY:
+        gains_db = _gains_db(requests, found, capabilities, strokes)
         lowered = with_gains(table, requests, fingers, found, gains_db)
         if lowered is None:  # who is lowered is not served any more: by the rule, then
             kept = [_at_gain(*each) for each in zip(requests, found.layers, gains_db, strict=True)]
@@ -69,7 +70,7 @@ def query_jointly(
         found = lowered
     places = [each.at for each in requests]
     fields = table.unit_fields(np.array(places), contacts=places)
-    factor = _factor_within(found, capabilities)
+    factor = _factor_within(found, capabilities, strokes)
     contents: list[Content] = []
     skipped: list[Prediction] = []
     for number, ((contact, target), layer) in enumerate(zip(targets, found.layers, strict=True)):
@@ -203,37 +204,43 @@ def _worst(found: Answer) -> float:
     return math.inf if found.promised_worst_db is None else found.promised_worst_db
 
 
-def _factor_within(found: Answer, capabilities: PlaybackCapabilities) -> float:
+def _factor_within(
+    found: Answer, capabilities: PlaybackCapabilities, strokes: Mapping[str, float]
+) -> float:
     """The factor, 1 at most, by which all contents together are within the amplifiers' limits."""
-    full: list[float] = _levels(found, capabilities).sum(axis=0).tolist()
-    power = sum(level**2 for level in full)
+    full: list[float] = _shares(found, capabilities.max_amplitudes).sum(axis=0).tolist()
+    power = sum(level**2 for level in _shares(found, strokes).sum(axis=0).tolist())
     return 1.0 / max(1.0, *full, math.sqrt(power / capabilities.max_power))
 
 
-def _levels(found: Answer, capabilities: PlaybackCapabilities) -> FloatArray:
-    """Greatest levels of each layer at every ERA (layers, eras); none of what adds no content."""
-    names = [*capabilities.max_amplitudes]
+def _shares(found: Answer, amplitudes: Mapping[str, float]) -> FloatArray:
+    """Each layer's greatest shares of amplitudes [m] by ERA (layers, eras), 0 of no content."""
+    names = [*amplitudes]
     full = np.zeros((len(found.layers), len(names)))
     for row, layer in zip(full, found.layers, strict=True):
         if layer.verdict not in (HELD_BACK, SHARED):
             for tones in (layer.excitation, *layer.side_bands):
                 for name, tone in tones.items():
-                    row[names.index(name)] += tone.amplitude / capabilities.max_amplitudes[name]
+                    row[names.index(name)] += tone.amplitude / amplitudes[name]
     return full
 
 
 def _gains_db(
-    requests: Sequence[Request], found: Answer, capabilities: PlaybackCapabilities
+    requests: Sequence[Request],
+    found: Answer,
+    capabilities: PlaybackCapabilities,
+    strokes: Mapping[str, float],
 ) -> list[float]:
     """Gains on the layers of an answer by which they are within the amplifiers' limits.
 
     As the stroke is shared: those of lower priority are lowered first, of equal ones the louder.
     Power counts in shares of what all together would have.
     """
-    levels = _levels(found, capabilities)
+    levels = _shares(found, strokes)
     norms = np.linalg.norm(levels, axis=1)
     power = norms * np.linalg.norm(levels.sum(axis=0)) / norms.sum()
-    limited = np.column_stack([levels, power / math.sqrt(capabilities.max_power)])
+    full = _shares(found, capabilities.max_amplitudes)
+    limited = np.column_stack([full, power / math.sqrt(capabilities.max_power)])
     served = np.flatnonzero(norms).tolist()
     promised = np.array([found.layers[at].promised_level_db_sl for at in served])
     factors, _ = share_stroke(

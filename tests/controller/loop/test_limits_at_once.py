@@ -42,9 +42,14 @@ def sums(found: Selection) -> np.ndarray:
 
 
 def limited(found: Selection, what: str) -> PlaybackCapabilities:
-    """Amplifiers with 80 % of the level, or of the power's root, that contents take."""
+    """Amplifiers with 80 % of the level, or of the power's root, that contents take.
+
+    Those of power play up to half of the level, too.
+    """
     if what == "power":
-        return replace(FREE, max_power=float((sums(found) ** 2).sum()) * 0.8**2)
+        half = {name: 0.5 * each for name, each in FREE.max_amplitudes.items()}
+        power = float((sums(found) ** 2).sum()) * 0.8**2  # of levels of full stroke
+        return replace(FREE, max_amplitudes=half, max_power=power)
     most = 0.8 * sums(found).max()
     return replace(
         FREE, max_amplitudes={name: most * each for name, each in FREE.max_amplitudes.items()}

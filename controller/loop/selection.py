@@ -379,6 +379,20 @@ def _left_by(
     return replace(capabilities, max_amplitudes=left)
 
 
+def _power_left(
+    table: LocalizationTable, pattern: Pattern, contents: Sequence[Content], max_power: float
+) -> float:
+    """Return the factor on a pattern for the power that contents leave, their peaks together."""
+    strokes = {era.name: era.stroke for era in table.eras}
+    taken = dict.fromkeys(strokes, 0.0)
+    for content in contents:
+        for name, tone in content.pattern.excitation.items():
+            taken[name] += tone.amplitude / strokes[name]
+    own = [tone.amplitude / strokes[name] for name, tone in pattern.excitation.items()]
+    left = math.sqrt(max_power) - math.hypot(*taken.values())
+    return max(left, 1e-9) / max(math.hypot(*own), 1e-12)
+
+
 def _lasting_of(
     table: LocalizationTable,
     levels: EffectLevels | None,
@@ -433,6 +447,8 @@ def _alone(
             for name, tone in pattern.excitation.items()
             if tone.amplitude > 0
         ]
+        if math.isfinite(capabilities.max_power):
+            left.append(_power_left(table, pattern, beside.contents, capabilities.max_power))
         change = min(0.0, float(decibels(min(left, default=1.0))))
         if change < 0 and answer.felt_db_sl + change < 0:
             reason = "the contents of other fingers use the whole stroke; lift a finger"

@@ -8,10 +8,11 @@ import pytest
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.content import Selection
 from controller.loop.envelopes import RAMPS_ONLY
-from controller.loop.intent import Target
+from controller.loop.intent import HapticIntent, Pulse, Target
 from controller.loop.joint_answer import query_jointly
-from controller.loop.selection import unshaped
+from controller.loop.selection import Selector, unshaped
 from controller.sources.contacts import Contact, ContactKey
+from model.table.effect_level import EffectLevels
 from several_fingers import LEFT, RIGHT, table
 
 CONTACTS = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
@@ -114,3 +115,21 @@ def test_of_equal_priority_the_louder_content_is_lowered(what: str) -> None:
     assert louder is not None
     assert 8.0 < louder < 13.5
     assert is_used(found, capabilities)
+
+
+def test_a_click_is_within_the_power_that_what_lasts_leaves() -> None:
+    """Both at once take no more than the limit; with hardly any left it is held back."""
+    click = Target(CONTACTS[1].key, 20.0, pulse=Pulse(0.04, requested_at=0.0))
+    intent = HapticIntent((Target(CONTACTS[0].key, 20.0), click))
+    selector = Selector(table(), EffectLevels(table()))
+    free = selector.select(CONTACTS, intent, FREE)
+    lasting = np.linalg.norm(sums(replace(free, contents=free.contents[:1])))
+    for share, count in ((1.3, 2), (1.001, 1)):
+        capabilities = replace(FREE, max_power=(share * lasting) ** 2)
+        found = Selector(table(), EffectLevels(table())).select(CONTACTS, intent, capabilities)
+        assert len(found.contents) == count
+        assert (
+            np.linalg.norm(sums(found)) <= share * lasting * (1 + 1e-6) < np.linalg.norm(sums(free))
+        )
+    (held_back,) = found.not_served
+    assert "lift a finger" in str(held_back.held_back)

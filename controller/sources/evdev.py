@@ -1,6 +1,7 @@
 """Touch panels of a Linux machine, read from the kernel's input devices."""
 
 import asyncio
+import contextlib
 import errno
 import logging
 from collections.abc import Callable
@@ -25,7 +26,7 @@ class EvdevSource(TouchSource):
 
     A panel is silent while fingers rest, so the kernel's slots are polled every 50 ms, which also
     detects an unplugged panel at once. It is reopened when it is back. Raises InputError for any
-    other URL, and in `open` or `run` if there is no panel.
+    other URL, and in `run` if there is no panel.
     """
 
     def __init__(self, url: str, *, open_panel: Callable[..., InputDevice] = InputDevice) -> None:
@@ -41,37 +42,31 @@ class EvdevSource(TouchSource):
         self._path = path
         self._grab = bool(grab)
         self._open = open_panel
-        self._panel: InputDevice | None = None
-
-    async def open(self) -> None:
-        """Open the device if it is not open; `run` does so too. Raises InputError."""
-        if self._panel is None:
-            self._panel = self._open(self._path, grab=self._grab)
 
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver a frame per report until cancelled."""
-        await self.open()
+        panel = self._open(self._path, grab=self._grab)
+        while True:
+            try:
+                await self._follow(panel, deliver)
+            except OSError as error:
+                if error.errno != errno.ENODEV:
+                    raise
+                self._deliver(deliver, ())
+                _logger.warning("%s: unplugged, lifting its touches", self._name)
+            finally:
+                panel.close()
+            panel = await self._reopened()
+            _logger.warning("%s: reconnected", self._name)
+
+    async def _reopened(self) -> InputDevice:
+        """Open the panel as soon as it is plugged in again."""
         pause = _FIRST_PAUSE
         while True:
-            if self._panel is not None:
-                pause = _FIRST_PAUSE
-                try:
-                    await self._follow(self._panel, deliver)
-                except OSError as error:
-                    if error.errno != errno.ENODEV:
-                        raise
-                    self._deliver(deliver, ())
-                    _logger.warning("%s: unplugged, lifting its touches", self._name)
-                finally:
-                    self._panel.close()
-                    self._panel = None
             await asyncio.sleep(pause)
+            with contextlib.suppress(InputError):
+                return self._open(self._path, grab=self._grab)
             pause = min(2 * pause, _MAX_PAUSE)
-            try:
-                self._panel = self._open(self._path, grab=self._grab)
-            except InputError:
-                continue  # not plugged in again yet
-            _logger.warning("%s: reconnected", self._name)
 
     async def _follow(self, panel: InputDevice, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver the frames of a panel until it is unplugged; raises OSError then."""

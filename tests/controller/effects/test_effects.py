@@ -64,45 +64,29 @@ def test_buzz_lasts_while_the_finger_stays() -> None:
     assert wanted(player, [finger(1)], 102.0) == {1: 20.0}
 
 
-def test_ramp_rises_in_steps() -> None:
-    """From 6 to 20 dB in 2 dB steps are eight levels, each for an eighth of 0.8 s; then no more."""
-    course = Ramp(start_level=6.0, level=20.0, duration=0.8).start(finger(1), 5.0, level_db_sl=20.0)
-    levels = []
-    now: float | None = 5.0
-    while now is not None:
-        felt = course.feel(finger(1), now + 1e-9)
-        if felt is None:
-            break
-        assert isinstance(felt, Sensation)
-        levels.append((round(now - 5.0, 6), felt.level_db_sl))
-        now = felt.until
-    assert levels == [(round(0.1 * step, 6), 6.0 + 2 * step) for step in range(8)]
-
-
-def test_ramp_steps_are_no_shorter_than_the_plate_response() -> None:
-    """40 dB in 0.1 s would be twenty steps: five levels of 20 ms, the least that is felt."""
-    course = Ramp(start_level=6.0, duration=0.1).start(finger(1), 0.0, level_db_sl=46.0)
-    felt = [course.feel(finger(1), 0.02 * step + 1e-9) for step in range(6)]
-    assert [getattr(one, "level_db_sl", None) for one in felt] == [
-        6.0,
-        16.0,
-        26.0,
-        36.0,
-        46.0,
-        None,
-    ]
-
-
-def test_ramp_holds_its_last_level() -> None:
-    """It stays at the last level, or as strong as the neighbours allow if that is the level."""
-    course = Ramp(start_level=8.0, duration=0.3, hold=True).start(finger(1), 0.0, level_db_sl=12.0)
-    felt = [course.feel(finger(1), now) for now in (0.0, 0.11, 0.21, 9.0)]
-    assert [getattr(one, "level_db_sl", None) for one in felt] == [8.0, 10.0, 12.0, 12.0]
-    assert [getattr(one, "until", 0) for one in felt][2:] == [None, None]
-    ramp = Ramp(start_level=6.0, duration=0.8, hold=True)
-    for level in (20.0, None):
-        felt = ramp.start(finger(1), 0.0, level_db_sl=level).feel(finger(1), 60.0)
-        assert felt == Sensation(level, allow_weaker=True)
+@pytest.mark.parametrize(
+    ("ramp", "level", "step", "levels"),
+    [
+        # From 6 to 20 dB in 2 dB steps are eight levels, each for an eighth of 0.8 s; then none.
+        (Ramp(start_level=6.0, duration=0.8), 20.0, 0.1, [*range(6, 21, 2), None]),
+        # 40 dB in 0.1 s would be twenty steps: five levels of 20 ms, the least that is felt.
+        (Ramp(start_level=6.0, duration=0.1), 46.0, 0.02, [6.0, 16.0, 26.0, 36.0, 46.0, None]),
+        (Ramp(start_level=8.0, duration=0.3, hold=True), 12.0, 0.1, [8.0, 10.0, 12.0, 12.0, 12.0]),
+        (Ramp(start_level=6.0, duration=0.8, hold=True), None, 0.1, [*range(6, 19, 2), None]),
+    ],
+)
+def test_ramp_rises_in_steps(
+    ramp: Ramp, level: float | None, step: float, levels: list[float | None]
+) -> None:
+    """Over its duration; then it holds the last level, or as strong as the neighbours allow."""
+    course = ramp.start(finger(1), 5.0, level_db_sl=level)
+    felt = [course.feel(finger(1), 5.0 + step * number + 1e-9) for number in range(len(levels))]
+    assert [getattr(one, "level_db_sl", None) for one in felt] == levels
+    for one, number in zip(felt, range(1, len(levels)), strict=False):
+        until = getattr(one, "until", None)
+        assert until is None or until == pytest.approx(5.0 + step * number)
+    last = Sensation(level, allow_weaker=True) if ramp.hold else None
+    assert felt[-1] == last
 
 
 def test_texture_level_follows_speed() -> None:

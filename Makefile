@@ -128,11 +128,10 @@ bench: .venv/installed-peers
 bench-latency: .venv/installed-test
 	$(BIN)/python -m benchmarks.latency --report
 
-# Half an hour: contrast on plates that deviate, by NGSolve, beside an independent optimum.
-# Others: make bench-promise PROMISE='--sets 20'
-bench-promise: .venv/installed-peers
+# Half an hour: what fingers feel of several contents, beside what they were promised.
+# Others: make bench-promise PROMISE='--plates 8'
+bench-promise: .venv/installed
 	$(BIN)/python -m benchmarks.promise --report $(PROMISE)
-	$(BIN)/python -m benchmarks.promise.contents --plates 60 --report
 
 bench-plant: .venv/installed
 	$(BIN)/python -m benchmarks.plant

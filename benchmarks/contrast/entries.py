@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.contrast.data_set import VERSION, ContactSet, DataSet, data_set
-from benchmarks.promise.optimum import optimum
+from benchmarks.contrast.optimum import optimum
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.rig.uncertainty import Uncertainty

@@ -1,124 +1,101 @@
-"""What is compared: cases of what a rig says of itself and what its plate does."""
+"""Which contents are measured on which plates, with what is to be reached; a row for each case."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 
-from benchmarks.promise.optimum import Drive, contrasts_db, optimum
-from benchmarks.promise.plate import (
-    LENGTH,
-    WIDTH,
-    Fingers,
-    FreePlate,
-    Plates,
-    Spread,
-    fingers_on,
+from model.rig.file import load_rig
+from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
+from model.table.answer import answer
+from model.table.build import build_table
+from model.table.request import ANY_BAND, Request
+from model.table.table import LocalizationTable
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+LEVEL_DB_SL = 14.0
+IDENTIFIED = Uncertainty(
+    gain=0.015, phase_deg=1.5, thickness=0.002, stiffness=0.01, damping=1.1, fingertip=0.5
 )
-from benchmarks.promise.product import FREQUENCIES, answer, table_for
-from benchmarks.setting import random_contacts
-from model.arrays import FloatArray
-from model.finger.perception import detection_threshold
+JOINS, CHANGES, LEAVES, MOVES = "joins", "changes", "leaves", "moves"
 
-SCENARIOS, JUDGES = 240, 200
-"""Plates that the optimum is climbed on, and fresh ones that both answers are judged on."""
-
-ANY_LEVEL = 0.0  # dB SL
-RADIUS = 0.013  # m, of a fingertip
+Band = tuple[float, float]
+Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Case:
-    """A case of figures: spread of the rig and its plates, fingers, ERAs.
+    """Fingers with contents, then quiet ones, on a plate of its kind.
 
-    level_db_sl: that the target must reach in nine of ten plates.
+    goal_db: of the promise at the worst finger, median. bands [Hz]: of the contents in order, any
+    without; may_swap: in any order. modulation_hz: of the last content. events: what the last
+    finger with a content does, one after the other, once all have been felt together.
     """
 
     name: str
-    spread: Spread
-    loaded: bool
-    eras: int = 4
-    level_db_sl: float = ANY_LEVEL
+    goal_db: float | None
+    rig_name: str = "paper_plate"
+    contents: int = 2
+    quiet: int = 0
+    is_identified: bool = False
+    bands: tuple[Band, ...] = ()
+    may_swap: bool = False
+    modulation_hz: float | None = None
+    events: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """What is measured, in words."""
+        uncertainty = "identified" if self.is_identified else "default"
+        return f"{self.name}, {len(self.rig.eras)} ERAs {uncertainty}"
+
+    @property
+    def rig(self) -> Rig:
+        """The rig with its uncertainty."""
+        rig = load_rig(EXAMPLES / f"{self.rig_name}.yaml")
+        return replace(rig, uncertainty=IDENTIFIED) if self.is_identified else rig
+
+    @property
+    def table(self) -> LocalizationTable:
+        """The table of the rig."""
+        return _table(self.rig_name, self.is_identified)
+
+    def bands_for(self, places: list[Point]) -> list[Band]:
+        """The band of each content, by the best order where they may swap."""
+        bands = [*self.bands] or [ANY_BAND] * self.contents
+        if self.may_swap:
+            requests = [
+                Request(at, band, LEVEL_DB_SL) for at, band in zip(places, bands, strict=True)
+            ]
+            found = answer(self.table, requests, bands_may_swap=True, min_contrast_db=-np.inf)
+            played = [next(iter(each.excitation.values())).frequency for each in found.layers]
+            bands = [next(b for b in bands if b[0] <= each <= b[1]) for each in played]
+        return bands
 
 
-ALL = Spread(gain=0.05, phase_deg=5, thickness=0.02, stiffness=0.1, damping=1.5, fingertip=0.5)
-CASES = {
-    "A": Case("drives 5 %, 5°; weightless fingers", Spread(0.05, 5), loaded=False),
-    "B": Case("drives 1 %, 1°; weightless fingers", Spread(0.01, 1), loaded=False),
-    "C": Case("drives 1 %, 1°; loaded fingers", Spread(0.01, 1), loaded=True),
-    "D": Case("all defaults", ALL, loaded=True),
-    "D8": Case(
-        "all defaults, eight ERAs, 20 dB SL",
-        ALL,
-        loaded=True,
-        eras=8,
-        level_db_sl=20,
-    ),
-}
+@cache
+def _table(rig_name: str, is_identified: bool) -> LocalizationTable:
+    rig = Case("", None, rig_name, is_identified=is_identified).rig
+    grid = np.arange(40.0, 321.0, 10.0)
+    return build_table(rig, drive_mode="phased", frequencies=grid)
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """One contact set: contrast [dB] of the model's answer and of optima, and the promise.
-
-    Median and tenth percentile over the judging plates, each optimum climbed on its own; kept:
-    share of them that give at least the promise; answer_level, optimum_level [dB SL]: the tenth
-    percentile at full stroke.
-    """
-
-    answer_median: float
-    optimum_median: float
-    answer_tenth: float
-    optimum_tenth: float
-    promise: float
-    kept: float
-    answer_level: float
-    optimum_level: float
-
-
-def outcomes(key: str, quiet: int, sets: int, seed: int) -> list[Outcome]:
-    """Judge contact sets of a case with a number of quiet fingers."""
-    case, free = CASES[key], FreePlate()
-    table = table_for(case.eras, case.spread, loaded=case.loaded)
-    least = detection_threshold(FREQUENCIES) * 10 ** (case.level_db_sl / 20)
-    if case.level_db_sl == ANY_LEVEL:
-        least = np.zeros_like(least)
-    found = []
-    for number in range(sets):
-        rng = np.random.default_rng([seed, quiet, number])
-        places = random_contacts(rng, quiet + 1, (LENGTH, WIDTH))
-        fingers = fingers_on(free, places, eras=case.eras, loaded=case.loaded, radius=RADIUS)
-        scenarios, judges = (
-            Plates.draw(case.spread, count, eras=case.eras, fingers=len(places), rng=rng)
-            for count in (SCENARIOS, JUDGES)
-        )
-        drive, pattern = answer(table, places, level_db_sl=case.level_db_sl)
-        ours, level = _judged(fingers, drive, judges)
-        best = {
-            percentile: optimum(fingers, FREQUENCIES, scenarios, percentile=percentile, least=least)
-            for percentile in (50, 10)
-        }
-        typical, _ = _judged(fingers, best[50], judges)
-        safe, optimum_level = _judged(fingers, best[10], judges)
-        promise = pattern.robust_contrast_db
-        promised = np.nan if promise is None else promise
-        found.append(
-            Outcome(
-                answer_median=float(np.percentile(ours, 50)),
-                optimum_median=float(np.percentile(typical, 50)),
-                answer_tenth=float(np.percentile(ours, 10)),
-                optimum_tenth=float(np.percentile(safe, 10)),
-                promise=promised,
-                kept=float((ours >= promised).mean()),
-                answer_level=level,
-                optimum_level=optimum_level,
-            )
-        )
-    return found
-
-
-def _judged(fingers: Fingers, drive: Drive, plates: Plates) -> tuple[FloatArray, float]:
-    """Contrast [dB] of a drive on each plate, and its level [dB SL] on nine of ten."""
-    fields = fingers.accelerations(drive.frequency, plates)
-    contrast, target = contrasts_db(fingers, fields, drive.weights)
-    threshold = float(detection_threshold(np.array([drive.frequency]))[0])
-    return contrast, float(20 * np.log10(np.percentile(target, 10) / threshold))
+_EVENTS = (LEAVES, JOINS, CHANGES)
+_TWO, _THREE = ((40.0, 110.0), (140.0, 190.0)), ((40.0, 110.0), (140.0, 190.0), (230.0, 320.0))
+CASES = (
+    Case("one content, two quiet fingers", None, contents=1, quiet=2),
+    Case("two contents", 14.9, events=(*_EVENTS, MOVES)),
+    Case("two contents", 23.5, is_identified=True, events=(*_EVENTS, MOVES)),
+    Case("three contents", 8.0, contents=3, events=_EVENTS),
+    Case("three contents", 11.6, contents=3, is_identified=True, events=_EVENTS),
+    Case("four contents", 17.8, "car_display", 4, is_identified=True, events=_EVENTS),
+    Case("two contents, bands given", 11.1, bands=_TWO),
+    Case("two contents, bands in any order", 13.5, bands=_TWO, may_swap=True),
+    Case("three contents, bands given", 4.4, contents=3, bands=_THREE),
+    Case("three contents, bands in any order", 6.4, contents=3, bands=_THREE, may_swap=True),
+    Case("two contents, bands given", 21.2, "car_display", bands=_TWO),
+    Case("three contents, bands given", 11.5, "car_display", contents=3, bands=_THREE),
+    Case("texture of 20 Hz beside a steady content", 22.0, is_identified=True, modulation_hz=20.0),
+)

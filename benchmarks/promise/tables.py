@@ -1,61 +1,54 @@
-"""Tables of the outcomes of contact sets."""
+"""Tables of what was promised and felt: contrasts of cases, and their events."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from benchmarks.promise.cases import CASES, Outcome
+from benchmarks.promise.cases import Case
+from benchmarks.promise.session import Outcome
 
-Found = Mapping[tuple[str, int], Sequence[Outcome]]
-"""Outcomes by case and number of quiet fingers."""
+Found = Mapping[Case, Sequence[Outcome]]
 
 
 def as_markdown(found: Found) -> str:
-    """Contrast beside the optimum, and how far promises are kept."""
-    keys = list(dict.fromkeys(key for key, _ in found))
-    counts = sorted({quiet for _, quiet in found})
-    heads = " / ".join(str(count) for count in counts)
+    """A table of steady contrasts, and one of what happens in events."""
     lines = [
-        f"## Contrast [dB], median over the sets, {heads} quiet fingers",
-        "",
-        "| | median plate: answer | optimum | nine of ten plates: answer | optimum | mean loss |",
-        "|---|---|---|---|---|---|",
+        "| | plates | goal | promised [dB] (10 %) | felt [dB] (10 %) | served | promise kept |",
+        "|---|---|---|---|---|---|---|",
     ]
-    for key in keys:
-        rows = [found[key, count] for count in counts]
-        loss = [_values(row, "optimum_tenth") - _values(row, "answer_tenth") for row in rows]
-        columns = ("answer_median", "optimum_median", "answer_tenth", "optimum_tenth")
-        cells = " | ".join(_medians(rows, name) for name in columns)
+    for case, each in found.items():
+        promised, felt = np.array([one.worst for one in each]).T
+        fingers = sum(len(one.fingers) for one in each)
         lines.append(
-            f"| {key}. {CASES[key].name} | {cells} | {_joined([each.mean() for each in loss], 2)} |"
+            f"| {case.title} | {len(each)} | {'-' if case.goal_db is None else case.goal_db} | "
+            f"{_shown(promised)} | {_shown(felt)} | "
+            f"{100 * np.mean([one.served for one in each]):.0f} % | "
+            f"{100 * kept(each):.0f} % of {fingers} |"
         )
-    lines += [
-        "",
-        "## Promise and level, the same sets",
-        "",
-        "| | promise [dB] | plates that keep it | sets kept by fewer than 80 % | "
-        "level of nine of ten plates, answer [dB SL] | optimum |",
-        "|---|---|---|---|---|---|",
-    ]
-    for key in keys:
-        rows = [found[key, count] for count in counts]
-        kept = [_values(row, "kept") for row in rows]
-        lines.append(
-            f"| {key} | {_medians(rows, 'promise')} | "
-            f"{_joined([100 * each.mean() for each in kept], 1)} % | "
-            f"{_joined([100 * (each < 0.8).mean() for each in kept], 0)} % | "
-            f"{_medians(rows, 'answer_level')} | {_medians(rows, 'optimum_level')} |"
-        )
+    names = list(dict.fromkeys(n for each in found.values() for one in each for n in one.events))
+    lines += ["", f"| | {' | '.join(names)} |", "|---|" + "---|" * len(names)]
+    for case, each in found.items():
+        columns = [[value for one in each for value in one.events.get(name, [])] for name in names]
+        if any(columns):
+            cells = [
+                _shown(values, worst=_WORST.get(name, 90))
+                for name, values in zip(names, columns, strict=True)
+            ]
+            lines.append(f"| {case.title} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
-def _values(row: Sequence[Outcome], name: str) -> np.ndarray:
-    return np.array([getattr(each, name) for each in row], dtype=float)
+_WORST = {"moves": 10, "first 100 ms, joining": 10, "first 100 ms, beside": 10}
+"""Percentile that is the worst tenth, where that is not the 90th."""
 
 
-def _medians(rows: Sequence[Sequence[Outcome]], name: str) -> str:
-    return _joined([float(np.median(_values(row, name))) for row in rows], 1)
+def kept(found: Sequence[Outcome]) -> float:
+    """Share of the promises that are kept."""
+    return float(np.mean([felt >= promised for one in found for promised, felt in one.fingers]))
 
 
-def _joined(values: Sequence[float], digits: int) -> str:
-    return " / ".join(f"{value:.{digits}f}" for value in values)
+def _shown(values: Sequence[float] | np.ndarray, *, worst: float = 10) -> str:
+    """Median, and the worst tenth in brackets."""
+    if not len(values):
+        return "-"
+    return f"{np.median(values):.1f} ({np.percentile(values, worst):.1f})"

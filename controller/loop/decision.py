@@ -171,9 +171,15 @@ class Decider:
     def due(self) -> float | None:
         """When [s] to decide next even if nothing arrives.
 
-        A source times out then, an intent expires, or a ledger would admit what it refused.
+        A source times out then, an intent expires, a ledger would admit what it refused, or a
+        finger that moved rests.
         """
-        moments = [self._tracker.next_expiry, self._intent_due, self._retry_at]
+        moments = [
+            self._tracker.next_expiry,
+            self._intent_due,
+            self._retry_at,
+            self._selector.due,
+        ]
         return min([moment for moment in moments if moment is not None], default=None)
 
     @property
@@ -356,7 +362,8 @@ class Decider:
         for each in self.playing.values():
             if each.drive:
                 self._played_until = now
-        if not (self._is_new or _is_due(self._intent_due, now) or _is_due(self._retry_at, now)):
+        dues = (self._intent_due, self._retry_at, self._selector.due)
+        if not (self._is_new or any(_is_due(each, now) for each in dues)):
             return None
         contacts = self._tracker.contacts
         triggered_at = now if self._triggered_at is None else min(self._triggered_at, now)
@@ -374,6 +381,7 @@ class Decider:
                     decision = draft  # said without sending
         except Exception as error:
             has_failed = self._is_new = True  # and tried again
+            self._selector.due = None
             selection = Selection((), contacts, (), failure_text(error))
             is_new = selection != self._selected
             draft = Decision(contacts, selection, from_rest, triggered_at)

@@ -1,7 +1,8 @@
 """Several contents at once: the requests of all fingers, one answer, and a layer for each content.
 
 A frequency that a finger feels is content: it is kept, and its phase at that finger, unless another
-one promises 3 dB more to the worst finger, or serves more of them.
+one promises 3 dB more to the worst finger, or serves more of them. While a finger moves, only the
+latter counts: another frequency begins with an onset, for which the next place does not wait.
 """
 
 import cmath
@@ -48,15 +49,18 @@ def query_jointly(
     before: Mapping[tuple[ContactKey, int], Content],
     shape: Shape,
     protected: frozenset[ContactKey] = frozenset(),
+    is_moving: bool = False,
 ) -> Selection:
     """Answer the requests of several targets with a content for each; takes some 20 ms.
 
-    before: what fingers feel now; protected: those that must not notice others' contents. Raises
-    InputError for fingers that are too close.
+    before: what fingers feel now; protected: those that must not notice others' contents;
+    is_moving: whether only their places have changed. Raises InputError for fingers that are too
+    close.
     """
     requests = requests_of(table, targets, capabilities.frequencies, protected)
     fingers = fingers_of(quiet, protected)
-    found = _answer(table, requests, fingers, _kept(requests, targets, before))
+    kept = _kept(requests, targets, before)
+    found = _answer(table, requests, fingers, kept, math.inf if is_moving else KEPT_WITHIN)
     modulations, playable = _modulations(targets, capabilities.layers), capabilities.frequencies
     found = with_modulation(table, requests, fingers, found, modulations, playable=playable)
     strokes = {era.name: era.stroke for era in table.eras}
@@ -64,9 +68,13 @@ def query_jointly(
         gains_db = _gains_db(requests, found, capabilities, strokes)
         lowered = with_gains(table, requests, fingers, found, gains_db)
         if lowered is None:  # who is lowered is not served any more: by the rule, then
-            kept = [_at_gain(*each) for each in zip(requests, found.layers, gains_db, strict=True)]
-            lowered = answer(table, kept, fingers)
-            lowered = with_modulation(table, kept, fingers, lowered, modulations, playable=playable)
+            softer = [
+                _at_gain(*each) for each in zip(requests, found.layers, gains_db, strict=True)
+            ]
+            lowered = answer(table, softer, fingers)
+            lowered = with_modulation(
+                table, softer, fingers, lowered, modulations, playable=playable
+            )
         found = lowered
     places = [each.at for each in requests]
     fields = table.unit_fields(np.array(places), contacts=places)
@@ -183,16 +191,18 @@ def _answer(
     requests: Sequence[Request],
     fingers: Sequence[Finger],
     kept: Sequence[Request],
+    kept_within: float,
 ) -> Answer:
-    """Answer with the kept frequencies, or with any where that is so much better."""
+    """Answer with the kept frequencies, or with any where that is so much better [dB]."""
     found = answer(table, kept, fingers)
     worst, served = found.promised_worst_db, _served(found)
-    is_good = served == len(requests) and (worst is None or worst >= OWN_CONTRAST_DB)
+    least = OWN_CONTRAST_DB if math.isfinite(kept_within) else -math.inf
+    is_good = served == len(requests) and (worst is None or worst >= least)
     if is_good or list(kept) == list(requests):
         return found
     other = answer(table, requests, fingers)
     gain = _worst(other) - _worst(found)
-    is_better = _served(other) > served or (_served(other) == served and gain >= KEPT_WITHIN)
+    is_better = _served(other) > served or (_served(other) == served and gain >= kept_within)
     return other if is_better else found
 
 

@@ -33,6 +33,9 @@ from registry.plugins import failure_text
 # radius is still within the disc that the pattern was chosen for.
 MOVE_TOLERANCE = 0.008
 
+# s; a finger that has not moved further for so long rests, and contents are chosen anew for it.
+_RESTS_AFTER = 0.1
+
 # A step of a ramp or texture may be this far [dB] below its level before its frequency changes.
 _STEP_SHORT_OF = 1.0
 
@@ -53,12 +56,14 @@ def unshaped(question: Question, pattern: Pattern, is_continued: bool) -> Patter
 class _Chosen:
     """What lasts, chosen together, and each short pulse that began with it.
 
-    lasting: None where what lasts was kept; triggered_at [s]: when the change arrived.
+    lasting: None where what lasts was kept; triggered_at [s]: when the change arrived; is_rested:
+    whether what plays would do, too, but kept its frequencies while a finger moved.
     """
 
     lasting: Selection | None
     short: Mapping[ContactKey, Selection]
     triggered_at: float
+    is_rested: bool = False
 
 
 class Selector:
@@ -89,6 +94,8 @@ class Selector:
         self._current = _NOTHING
         self.triggered_at = math.inf
         """When [s] the change arrived whose answer of the thread the last selection has."""
+        self.due: float | None = None
+        """When [s] to select anew though no contact changes, since a finger that moved rests."""
         self._requested: tuple[Selection, Targets] = (_NOTHING, ())
         self._protected: frozenset[ContactKey] = frozenset()
 
@@ -135,14 +142,19 @@ class Selector:
         }
         new = tuple(each for each in short if each[0].key not in self._short)
         is_kept = not lasting or self._fits(self._lasting, lasting, contacts)
-        if new or not is_kept:
+        is_due = self.due is not None and triggered_at >= self.due
+        is_rested = bool(lasting) and is_due and is_kept and not self._thread.is_busy
+        if is_due:
+            self.due = triggered_at + _RESTS_AFTER if lasting and not is_rested else None
+        if new or is_rested or not is_kept:
             self._choose(
-                None if is_kept else lasting,
+                lasting if is_rested or not is_kept else None,
                 new,
                 tuple(contacts),
                 capabilities,
                 pulses,
                 triggered_at,
+                is_rested=is_rested,
             )
         found = self._together(contacts, targets, skipped, intent.reason)
         if found != self._current:
@@ -164,7 +176,7 @@ class Selector:
             # What plays may do again, since a finger that came has lifted meanwhile.
             is_kept = self._fits(self._lasting, lasting, contacts)
             if (
-                not is_kept
+                (chosen.is_rested or not is_kept)
                 and is_for_all
                 and self._protected <= chosen.lasting.protected
                 and {each.key for each, _ in lasting} <= {each.key for each, _ in targets}
@@ -197,6 +209,8 @@ class Selector:
         capabilities: PlaybackCapabilities,
         pulses: Mapping[ContactKey, Selection],
         triggered_at: float,
+        *,
+        is_rested: bool,
     ) -> None:
         """Choose for what lasts, None where it is kept, and for new short pulses.
 
@@ -209,12 +223,23 @@ class Selector:
             return
         table, levels, shape = self._table, self._levels, self._shape
         before, protected = self._lasting, self._protected
+        is_moving = lasting is not None and not is_rested and self._has_moved(lasting, contacts)
+        if lasting is not None:
+            self.due = triggered_at + _RESTS_AFTER if is_moving else None
 
         def chosen() -> _Chosen:
             found = None
             if lasting is not None:
                 found = self._chosen_last = _lasting_of(
-                    table, levels, shape, lasting, contacts, capabilities, before, protected
+                    table,
+                    levels,
+                    shape,
+                    lasting,
+                    contacts,
+                    capabilities,
+                    before,
+                    protected,
+                    is_moving=is_moving,
                 )
             beside = self._chosen_last if _is_for(self._chosen_last, contacts) else before
             new = {
@@ -231,7 +256,7 @@ class Selector:
                 )
                 for contact, target in short
             }
-            return _Chosen(found, new, triggered_at)
+            return _Chosen(found, new, triggered_at, is_rested)
 
         if not self._thread.is_busy:
             self._chosen_last = _NOTHING
@@ -282,6 +307,16 @@ class Selector:
                 for each in quiet
             },
         )
+
+    def _has_moved(self, lasting: Targets, contacts: Sequence[Contact]) -> bool:
+        """Whether those that felt several contents feel them still, in other places."""
+        if _is_quick(lasting, self._protected) or not _is_for(self._lasting, contacts):
+            return False
+        of_any_level = [
+            {replace(target, level_db_sl=None) for target in _intents(targets)}
+            for targets in (lasting, self._lasting.targets)
+        ]
+        return of_any_level[0] == of_any_level[1]
 
     def _fits(self, chosen: Selection, lasting: Targets, contacts: Sequence[Contact]) -> bool:
         """Whether what was chosen also serves these targets among these contacts."""
@@ -402,6 +437,8 @@ def _lasting_of(
     capabilities: PlaybackCapabilities,
     before: Selection,
     protected: frozenset[ContactKey],
+    *,
+    is_moving: bool,
 ) -> Selection:
     """Choose for all targets that last; any failure is their reason for silence."""
     keys = {contact.key for contact, _ in lasting}
@@ -411,7 +448,14 @@ def _lasting_of(
     felt = {content.key: content for content in before.contents}
     try:
         return query_jointly(
-            table, lasting, quiet, capabilities, before=felt, shape=shape, protected=protected
+            table,
+            lasting,
+            quiet,
+            capabilities,
+            before=felt,
+            shape=shape,
+            protected=protected,
+            is_moving=is_moving,
         )
     except Exception as error:
         return _failed(lasting, quiet, error)

@@ -20,6 +20,7 @@ from controller.loop.decision import ENDED, Decider, PlayedContent
 from controller.loop.envelopes import RAMPS_ONLY
 from controller.loop.intent import Target
 from controller.loop.joint_answer import query_jointly
+from controller.loop.observer import Applied
 from controller.loop.plate_set import PlateSet
 from controller.loop.selection import unshaped
 from controller.sources.contacts import Contact, ContactKey
@@ -141,6 +142,29 @@ async def test_a_slide_keeps_the_content_and_its_layer() -> None:
         assert all(len(each.targets) == 2 for each in fingers.applied[applied:])
         for _, _, layers in fingers.committed[count:]:
             assert all(one.renew or any(c.level for c in one.commands) for one in layers)
+
+
+@in_virtual_time
+async def test_a_slide_keeps_its_frequencies_until_the_finger_rests() -> None:
+    """On a way along which others promise 3 dB more: they play within 0.2 s of rest, once."""
+    async with fingers_on(table(), LAYOUT) as fingers:
+        fingers.at = {1: (0.12, 0.10), 2: RIGHT}
+        await fingers.hold(0.5)
+        before, count = _frequencies(fingers.applied[-1]), len(fingers.applied)
+
+        def slide(since: float) -> None:
+            fingers.at[1] = (0.12 - 0.2 * since, 0.10 - 0.175 * since)
+
+        await fingers.hold(0.4, slide)
+        sliding = fingers.applied[count:]
+        assert len(sliding) >= 5
+        assert {_frequencies(each) for each in sliding} == {before}
+        slid = asyncio.get_running_loop().time()
+        await fingers.hold(0.8)
+        (rested,) = fingers.applied[count + len(sliding) :]
+        assert rested.time - slid <= 0.2
+        assert _frequencies(rested) != before
+        assert _worst(rested) >= _worst(sliding[-1]) + 3
 
 
 @in_virtual_time
@@ -625,6 +649,14 @@ def _felt(pattern: Pattern, fields: Complex64Array) -> complex:
             for name, tone in pattern.excitation.items()
         )
     )
+
+
+def _frequencies(applied: Applied) -> tuple[float | None, ...]:
+    return tuple(one.content.frequency for one in applied.contents.values())
+
+
+def _worst(applied: Applied) -> float:
+    return min(each.promised_contrast_db or 0.0 for each in applied.targets)
 
 
 def _id(one: PlayedContent) -> int:

@@ -5,18 +5,38 @@ gradient steps (Adam) on the percentile itself from several starts at the best f
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 
-if TYPE_CHECKING:
-    from benchmarks.promise.plate import Fingers, Plates
-
 STARTS, STEPS, RATE = 8, 120, 0.05
 NEAR = 0.05
 """Scenarios whose rank is within this share of the percentile's have a say in its gradient."""
+
+
+class Fingers(Protocol):
+    """Fingers on plates, the first of them the target.
+
+    finger (p,): whose point; weights (p,): of the mean over its disc.
+    """
+
+    finger: FloatArray
+    weights: FloatArray
+    finger_count: int
+
+    def accelerations(self, frequency: float, plates: Any) -> ComplexArray:
+        """Acceleration [m/s²] at the points of each ERA at full stroke, (m, p, eras)."""
+        ...
+
+
+class Plates(Protocol):
+    """Plates that deviate."""
+
+    def first(self, count: int) -> "Plates":
+        """The first of them."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +48,7 @@ class Drive:
 
 
 def contrasts_db(
-    fingers: "Fingers", fields: ComplexArray, weights: ComplexArray
+    fingers: Fingers, fields: ComplexArray, weights: ComplexArray
 ) -> tuple[FloatArray, FloatArray]:
     """Contrast [dB] and acceleration of the target [m/s²] on each plate, (m,) both.
 
@@ -41,9 +61,9 @@ def contrasts_db(
 
 
 def optimum(
-    fingers: "Fingers",
+    fingers: Fingers,
     frequencies: FloatArray,
-    plates: "Plates",
+    plates: Plates,
     *,
     percentile: float,
     least: FloatArray,
@@ -75,7 +95,7 @@ def optimum(
 
 
 def _worth(
-    fingers: "Fingers", fields: ComplexArray, weights: ComplexArray, percentile: float, least: float
+    fingers: Fingers, fields: ComplexArray, weights: ComplexArray, percentile: float, least: float
 ) -> float:
     """The percentile, less two decibels for every one that the level falls short of."""
     contrast, target = contrasts_db(fingers, fields, weights / np.abs(weights).max())
@@ -86,7 +106,7 @@ def _worth(
     return worth
 
 
-def _starts(fingers: "Fingers", fields: ComplexArray) -> list[ComplexArray]:
+def _starts(fingers: Fingers, fields: ComplexArray) -> list[ComplexArray]:
     """Weights of the least mean power at the quiet fingers, for several weightings of them."""
     target = fields[:, fingers.finger == 0].mean(axis=(0, 1))
     forms = []
@@ -106,7 +126,7 @@ def _starts(fingers: "Fingers", fields: ComplexArray) -> list[ComplexArray]:
 
 
 def _climb(
-    fingers: "Fingers", fields: ComplexArray, weights: ComplexArray, percentile: float, least: float
+    fingers: Fingers, fields: ComplexArray, weights: ComplexArray, percentile: float, least: float
 ) -> ComplexArray:
     """Adam on the mean of the contrasts whose rank is near the percentile."""
     is_target = fingers.finger == 0

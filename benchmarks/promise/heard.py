@@ -1,0 +1,118 @@
+"""What a finger feels of its own content and of all others, each above its threshold.
+
+Everything that moved the bases in a session is played once more on the same plate under the same
+fingers: only the voices of a finger's own layers, or only those of all others. Voices are divided
+by the threshold at their frequency, so that accelerations are levels of sensation.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from drivers.playback import Voice
+from model.arrays import FloatArray
+from model.finger.perception import detection_threshold
+from model.rig.rig import Rig
+from sim.bench.bench import Bench
+from sim.plant.imperfections import Imperfections, realised
+from sim.plant.loaded_plates import Placement
+from sim.plant.voiced_base import motion_of
+
+STRONGEST = 0.040  # s
+
+Span = tuple[float, float]
+
+
+class _Part(Bench):
+    """A bench whose ERAs play only some voices; owners: fingers by layer."""
+
+    def __init__(
+        self, rig: Rig, drawn: Imperfections, now: float, is_heard: Callable[[int | None], bool]
+    ) -> None:
+        super().__init__(rig, now=now, imperfections=drawn)
+        self.is_heard = is_heard
+        self.owners: Mapping[int, int] = {}
+
+    def _motion(self, index: int, playing: Sequence[Voice]) -> Any:
+        errors, terms = self._errors[index], []
+        for voice in playing:
+            if self.is_heard(self.owners.get(voice.layer)):
+                threshold = float(detection_threshold(np.array([voice.frequency]))[0])
+                motion = motion_of([voice], stroke=self.rig.eras[index].stroke)
+                terms += realised(motion, replace(errors, gain=errors.gain / threshold))
+        return tuple(terms)
+
+
+@dataclass
+class Log:
+    """What happened on a bench, by time [s]: fingers, voices, and whose layers are whose."""
+
+    rig: Rig
+    drawn: Imperfections
+    start: float
+    steps: list[tuple[float, Callable[[_Part], None]]] = field(default_factory=list)
+
+    def watch(self, bench: Any) -> None:
+        """Note the voices of a bench from now on, and its fingers, with the plate under them."""
+        apply, place = bench._apply, bench._place
+
+        def applied(index: int, playing: tuple[Voice, ...]) -> None:
+            self.steps.append((bench.time, lambda part: part._apply(index, playing)))
+            apply(index, playing)
+
+        def placed(placement: Placement) -> None:
+            self.steps.append((placement.time, lambda part: part._place(placement)))
+            place(placement)
+
+        bench._apply, bench._place = applied, placed
+
+    def own(self, owners: Mapping[int, int], time: float) -> None:
+        """Note whose content each layer has from a time [s] on."""
+        self.steps.append((time, lambda part: setattr(part, "owners", {**part.owners, **owners})))
+
+    def replayed(self, is_heard: Callable[[int | None], bool], until: float) -> Bench:
+        """A bench on which some voices have been played up to a time [s]."""
+        part = _Part(self.rig, self.drawn, self.start, is_heard)
+        for time, change in sorted(self.steps, key=lambda each: each[0]):
+            part.advance(time)
+            change(part)
+        part.advance(until)
+        return part
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What a finger felt in a session, of its own and of others'."""
+
+    finger: int
+    own: Bench
+    foreign: Bench
+
+    @classmethod
+    def by(cls, finger: int, log: Log, until: float) -> "Heard":
+        """By a finger up to a time [s]."""
+        own = log.replayed(lambda owner: owner == finger, until)
+        return cls(finger, own, log.replayed(lambda owner: owner != finger, until))
+
+    def own_db_sl(self, *spans: Span, strongest: bool = False) -> float:
+        """Level of its own content, mean over the fingertip, in spans of time [s] together."""
+        return self._level(self.own, spans, strongest, is_mean=True)
+
+    def foreign_db_sl(self, *spans: Span, strongest: bool = False) -> float:
+        """Level of all others' at the loudest point; strongest: of 40 ms."""
+        return self._level(self.foreign, spans, strongest, is_mean=False)
+
+    def contrast_db(self, *spans: Span) -> float:
+        """Own above foreign level in spans of time [s]."""
+        return self.own_db_sl(*spans) - self.foreign_db_sl(*spans)
+
+    def _level(self, bench: Bench, spans: Sequence[Span], strongest: bool, is_mean: bool) -> float:
+        records = [bench.fingers.felt(*span)[str(self.finger)] for span in spans]
+        squares = np.cumsum(np.concatenate([each.accelerations for each in records]) ** 2, axis=0)
+        count = round(STRONGEST * bench.sample_rate) if strongest else len(squares) - 1
+        powers: FloatArray = 2 * (squares[count:] - squares[:-count]) / count
+        if not is_mean:
+            return float(10 * np.log10(powers.max() + 1e-12))
+        return float(20 * np.log10((np.sqrt(powers) @ records[0].weights).max() + 1e-6))

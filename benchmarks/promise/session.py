@@ -1,0 +1,297 @@
+"""One session of a case on a plate of its own: what its fingers were promised, and what they felt.
+
+Control loop, serial lines and amplifiers run in virtual time, the plate in time under the fingers;
+a witness reads every byte.
+"""
+
+import asyncio
+import math
+import sys
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.promise.cases import CASES, CHANGES, JOINS, LEAVES, LEVEL_DB_SL, MOVES, Case, Point
+from benchmarks.promise.heard import Heard, Log
+from benchmarks.setting import random_contacts
+from controller.loop.content import Prediction
+from controller.loop.intent import HapticIntent, Target
+from controller.loop.observer import Applied
+from drivers import clock
+from model.finger.fingertip import FINGERTIP_RADIUS
+from model.table.timing import Timing
+from sim.far_ends.wires import Wire
+from sim.plant.imperfections import draw_imperfections
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))  # the chain
+_chain: Any = import_module("chain").Chain
+_run_virtual: Any = import_module("virtual_loop").run_virtual
+
+SETTLING, STEADY, FIRST = 1.2, 0.25, 0.100  # s
+SPEED, WAY = 0.2, 0.1  # m/s, m; of the finger that moves
+STEP, REPORTED = 0.0025, 4
+"""Steps [s] of the finger that moves, and lifts: longer ones would be taps on the plate. The panel
+reports every fourth."""
+LIFTING = np.arange(0.875, 0, -0.125)  # load of the finger, until the panel reports that it is off
+
+
+@dataclass
+class Outcome:
+    """Of one session [dB].
+
+    worst: promise and contrast of the worst finger when all contents are felt; fingers: promise and
+    contrast of each finger that is served, after every event, too; served: share of the contents.
+    events: figures by name.
+    """
+
+    worst: tuple[float, float]
+    served: float
+    fingers: list[tuple[float, float]] = field(default_factory=list)
+    events: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+
+
+@dataclass(frozen=True)
+class _Steady:
+    """What has been promised to each finger, and the time [s] when it is measured."""
+
+    applied: Applied
+    until: float
+
+    @property
+    def span(self) -> tuple[float, float]:
+        return self.until - STEADY, self.until
+
+    @property
+    def promised(self) -> Mapping[int, Prediction]:
+        return {each.contact.key.id: each for each in self.applied.targets}
+
+    @property
+    def served(self) -> list[int]:
+        return [id for id, each in self.promised.items() if each.verdict in ("own", "mixed")]
+
+
+@dataclass(frozen=True)
+class _Event:
+    """What the last finger with a content has done; time [s]: when its answer was commanded."""
+
+    name: str
+    time: float
+    before: _Steady
+    first: Applied
+    after: _Steady
+    path: tuple[tuple[float, float], ...] = ()
+
+
+class _Wanted:
+    """Contents that fingers are to feel."""
+
+    def __init__(self) -> None:
+        self.targets: dict[int, dict[str, Any]] = {}
+
+    def intent(self, contacts: Any, now: float) -> HapticIntent:
+        """Return the intent for contacts."""
+        targets = [
+            Target(each.key, LEVEL_DB_SL, content=str(each.key), **self.targets[each.key.id])
+            for each in contacts
+            if each.key.id in self.targets
+        ]
+        return HapticIntent(tuple(targets))
+
+
+@cache
+def _timing(number: int) -> Timing:
+    return Timing(CASES[number].table)
+
+
+def outcome(number: int, seed: int) -> Outcome:
+    """Run a case by its number on the plate of a seed."""
+    case = CASES[number]
+    return _run_virtual(_Session(case, _timing(number), seed).run())  # type: ignore[no-any-return]
+
+
+class _Session:
+    def __init__(self, case: Case, timing: Timing, seed: int) -> None:
+        self._case, self._timing, self._rig = case, timing, case.rig
+        plate = self._rig.plate
+        drawn = random_contacts(
+            np.random.default_rng([seed, 14]),
+            case.contents + case.quiet,
+            (plate.length, plate.width),
+            margin=FINGERTIP_RADIUS + 0.001,
+        )
+        self._places: list[Point] = [(float(x), float(y)) for x, y in drawn]
+        self._drawn = draw_imperfections(self._rig, seed=1000 + seed)
+        self._wanted = _Wanted()
+        self._last = case.contents - 1
+
+    async def run(self) -> Outcome:
+        """All fingers at once, then each event."""
+        wire = Wire("serial", speed=921_600, shared=True)
+        on: Any
+        async with _chain.armed(
+            wire,
+            self._rig,
+            self._case.table,
+            intent_source=self._wanted,
+            timing=self._timing,
+            imperfections=self._drawn,
+        ) as on:
+            on.must_be_felt = False
+            log = Log(self._rig, self._drawn, clock.now())
+            log.watch(on.far.bench)
+            case = self._case
+            contents = self._places[: case.contents]
+            for id, band in enumerate(case.bands_for(contents)):
+                self._wanted.targets[id] = {"band": band}
+            self._wanted.targets[self._last]["modulation_hz"] = case.modulation_hz
+            on.at = dict(enumerate(self._places))
+            before = first = await self._settled(on)
+            events = []
+            for name in case.events:
+                event = await self._event(on, name, before)
+                events.append(event)
+                before = event.after
+            for applied in on.applied:
+                owners = {n: _id(one) for n, one in applied.contents.items()}
+                log.own(owners, applied.time - FIRST)  # amplifiers start one after another
+            on.far.bench.advance(before.until)
+            return _measured(log, first, events, self._timing, self._last, case.quiet)
+
+    async def _settled(self, on: Any) -> _Steady:
+        await on.hold(SETTLING)
+        return _Steady(on.applied[-1], clock.now())
+
+    async def _event(self, on: Any, name: str, before: _Steady) -> _Event:
+        count, began, path = len(on.applied), clock.now(), [clock.now()]
+        if name == LEAVES:
+            for load in LIFTING:
+                self._place(on, {str(self._last): float(load)})
+                await asyncio.sleep(STEP)
+            began = clock.now()
+            del on.at[self._last]
+        elif name == JOINS:
+            on.at[self._last] = self._places[self._last]
+        elif name == CHANGES:
+            self._wanted.targets[self._last]["band"] = self._other_band(before)
+        else:
+            for number, at in enumerate(self._way(on.at)):
+                on.at[self._last] = at
+                if number % REPORTED == 0:
+                    on.report()
+                else:
+                    self._place(on, {})
+                await asyncio.sleep(STEP)
+                path.append(clock.now())
+        after = await self._settled(on)
+        first = on.applied[min(count, len(on.applied) - 1)]
+        return _Event(name, max(first.time, began), before, first, after, tuple(pairwise(path)))
+
+    def _place(self, on: Any, loads: Mapping[str, float]) -> None:
+        """Place the fingers on the plate without a report of the panel."""
+        fingers = {str(id): place for id, place in on.at.items()}
+        on.far.bench.place_fingers(fingers, now=clock.now(), loads=loads)
+
+    def _other_band(self, before: _Steady) -> tuple[float, float]:
+        """A band of the changed content without its frequency."""
+        frequencies = self._case.table.frequencies
+        low, high = float(frequencies[0]), float(frequencies[-1])
+        played = before.promised[self._last].frequency or low
+        return (played + 30, high) if played < math.sqrt(low * high) else (low, played - 30)
+
+    def _way(self, at: Mapping[int, Point]) -> Iterator[Point]:
+        """The places on the way that leaves most room to other fingers and edges."""
+        x, y = at[self._last]
+        others = [place for id, place in at.items() if id != self._last]
+        plate, edge = self._rig.plate, FINGERTIP_RADIUS + 0.001
+
+        def along(way: Point) -> list[Point]:
+            steps = np.arange(1, round(WAY / SPEED / STEP) + 1) * SPEED * STEP
+            return [(x + float(s) * way[0], y + float(s) * way[1]) for s in steps]
+
+        def room(way: Point) -> float:
+            end_x, end_y = along(way)[-1]
+            is_on = edge <= end_x <= plate.length - edge and edge <= end_y <= plate.width - edge
+            return min(math.dist(a, o) for a in along(way) for o in others) if is_on else -1.0
+
+        yield from along(max(((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)), key=room))
+
+
+def _id(one: Any) -> int:
+    return int(one.content.targets[0][0].key.id)
+
+
+def _measured(
+    log: Log, first: _Steady, events: list[_Event], timing: Timing, last: int, quiet: int
+) -> Outcome:
+    """What was felt in a session, beside what was promised."""
+    until = events[-1].after.until if events else first.until
+    heard = {id: Heard.by(id, log, until) for id in range(last + 1 + quiet)}
+
+    def felt(steady: _Steady, id: int) -> float | None:
+        if len(steady.served) > 1:
+            return heard[id].contrast_db(steady.span)
+        others = [each.key.id for each in steady.applied.contacts if each.key.id != id]
+        leaks = [heard[each].foreign_db_sl(steady.span) for each in others]
+        return heard[id].own_db_sl(steady.span) - max(leaks) if leaks else None
+
+    def pairs(steady: _Steady) -> list[tuple[float, float]]:
+        both = [
+            (steady.promised[id].promised_contrast_db, felt(steady, id)) for id in steady.served
+        ]
+        return [(a, b) for a, b in both if a is not None and b is not None]
+
+    start = pairs(first)
+    promises = [each.promised_contrast_db for each in first.promised.values()]
+    found = Outcome(
+        (min(each for each in promises if each is not None), min((b for _, b in start), default=0)),
+        len(first.served) / (last + 1),
+        start,
+    )
+    for event in events:
+        found.fingers += pairs(event.after)
+        if event.name == MOVES:
+            mover = heard[last]
+            resting = [mover.contrast_db(each.span) for each in (event.before, event.after)]
+            found.events[MOVES].append(mover.contrast_db(*event.path) - float(np.mean(resting)))
+        else:
+            _note(event, found, heard, timing, last)
+    return found
+
+
+def _note(
+    event: _Event, found: Outcome, heard: Mapping[int, Heard], timing: Timing, last: int
+) -> None:
+    """Note the first 100 ms of an event at every finger, beside what was promised."""
+    span = event.time, event.time + FIRST
+    after, before = event.after.promised, event.before.promised
+    onset = -math.inf
+    contents, promised_level = (
+        (event.before.applied, before[last].level_db_sl)
+        if event.name == LEAVES
+        else (event.first, after[last].level_db_sl)
+    )
+    for one in contents.contents.values():
+        if _id(one) == last:
+            pattern = timing.with_transient_measures(one.content.question, one.pattern)
+            contrast = pattern.transient_contrast_db
+            if contrast is not None and promised_level is not None:
+                onset = promised_level - contrast
+    for id in event.after.served:
+        foreign = heard[id].foreign_db_sl(span, strongest=True)
+        promised = after[id].promised_contrast_db
+        own = heard[id].own_db_sl(span, strongest=True)
+        if event.name == JOINS and promised is not None:
+            kind = "first 100 ms, joining" if id == last else "first 100 ms, beside"
+            found.events[kind].append(own - foreign - promised)
+        if id != last and id in event.before.served:
+            steady = [each[id].foreign_level_db_sl for each in (before, after)]
+            levels = [onset, max((each for each in steady if each is not None), default=-math.inf)]
+            expected = 10 * math.log10(sum(10 ** (each / 10) for each in levels) + 1e-12)
+            found.events[event.name].append(foreign - expected)

@@ -164,7 +164,7 @@ def test_run_prints_help_and_version(
 ) -> None:
     """On standard output; the program is called era however it was started."""
     assert run(["--version"], entries) == 0
-    assert capsys.readouterr().out == "era-haptics 0.1.0\n"
+    assert capsys.readouterr().out == "era-haptics 0.2.0\n"
     assert run(["--help"], entries) == 0
     text = capsys.readouterr().out
     assert text.startswith("Usage: era ")

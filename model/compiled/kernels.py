@@ -91,7 +91,9 @@ def kernels() -> Kernels | None:
 
 def run(kernel: Callable[..., int], *given: Any) -> int:
     """Run a kernel on structures and other arguments; its status. Raises MemoryError."""
-    arguments = [ctypes.byref(e) if isinstance(e, ctypes.Structure) else e for e in given]
+    arguments = []
+    for each in given:
+        arguments.append(ctypes.byref(each) if isinstance(each, ctypes.Structure) else each)
     status = kernel(*arguments)
     if status == NO_MEMORY:
         raise MemoryError("kernels could not get the memory that an answer takes")

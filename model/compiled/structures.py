@@ -1,14 +1,16 @@
-"""Structures of the kernels in C, whose headers say what is in them."""
+"""Structures and arrays as the kernels in C take them, whose headers say what is in them."""
 
 import ctypes
 from ctypes import c_float, c_int, c_void_p
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from model.compiled.lanes import as_given
-
 FOUND, NO_MEMORY = 0, -1
+
+_TYPES = {"i": np.int32, "f": np.float32, "c": np.complex64}
+"""Of values that are integers, real and complex."""
 
 
 def _fields(**names: str) -> list[tuple[str, Any]]:
@@ -27,9 +29,14 @@ class Structure(ctypes.Structure):
         self.arrays = [*getattr(self, "arrays", [])]
         for name, array in given.items():
             if array is not None:
-                kept = as_given(array)
+                kept: NDArray[Any] = np.ascontiguousarray(array, dtype=_TYPES[array.dtype.kind])
                 self.arrays.append(kept)
                 setattr(self, name, kept.ctypes.data)
+
+
+def as_given(values: NDArray[Any]) -> NDArray[Any]:
+    """Values as a kernel reads them: single precision, or integers of 32 bits, one by one."""
+    return np.ascontiguousarray(values, dtype=_TYPES[values.dtype.kind])
 
 
 class Plates(Structure):

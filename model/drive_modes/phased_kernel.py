@@ -4,7 +4,6 @@ import numpy as np
 
 from model.compiled import structures
 from model.compiled.kernels import Kernels, run
-from model.compiled.lanes import address_of, as_given
 from model.drive_modes.coherent import (
     LEVEL_RESERVE,
     MAX_GROWTH,
@@ -43,8 +42,8 @@ def tried(kernels: Kernels, coherent: Coherent, forms: Forms, method: Method) ->
         few_fields=forms.few,
         fine_fields=forms.fine,
     )
-    weights, rows = np.empty((f, n), dtype=np.complex64), as_given(np.arange(f))
+    weights, rows = np.empty((f, n), dtype=np.complex64), np.arange(f, dtype=np.int32)
     score, missed, bound = measures = np.empty((3, f), dtype=np.float32)
-    to = [address_of(each) for each in (weights, *measures)]
-    run(kernels.library.search_stage, on, given(method), address_of(rows), f, *to)
+    to = [each.ctypes for each in (weights, *measures)]
+    run(kernels.library.search_stage, on, given(method), rows.ctypes, f, *to)
     return CoherentResult(score, weights, bound, missed)

@@ -3,9 +3,10 @@
 import cmath
 from collections.abc import Sequence
 
-from model.arrays import FloatArray
+import numpy as np
+
+from model.arrays import Complex64Array, FloatArray
 from model.choice import NEARLY
-from model.drive_modes.forms import Weights
 from model.structure.attachments import Era
 from model.vibration.excitation import Excitation, Tone
 
@@ -13,19 +14,23 @@ ROUNDING = 1e-6  # of single precision
 
 
 def excitation_of(
-    drive: Weights, eras: Sequence[Era], frequencies: FloatArray, *, gain: float
+    weights: Sequence[tuple[int, Complex64Array]],
+    eras: Sequence[Era],
+    frequencies: FloatArray,
+    *,
+    gain: float,
 ) -> Excitation:
     """Tones by ERA, at a gain of up to 1; at each frequency the strongest, the first of
     those nearly as strong, has phase zero.
 
-    frequencies (f,) [Hz]: by the drive's indices.
+    weights (eras,): at each of some frequencies (f,) [Hz], by index.
     """
     tones = {}
-    for index, weight in drive.tones():
+    for index, at_frequency in weights:
+        sizes = np.abs(at_frequency)
         # Python's own numbers: those of numpy take ten times as long, one by one.
-        values = weight.tolist()
-        nearly_largest = (1 - NEARLY) * max(map(abs, values))
-        strongest = next(value for value in values if abs(value) >= nearly_largest)
+        values = at_frequency.tolist()
+        strongest = values[int((sizes >= (1 - NEARLY) * sizes.max()).argmax())]
         factor = strongest.conjugate() / abs(strongest)
         frequency = float(frequencies[index])
         for era, value in zip(eras, values, strict=True):

@@ -9,8 +9,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray
 from model.compiled.kernels import Kernels, kernels, run
-from model.compiled.lanes import address_of, as_given
-from model.compiled.structures import Drawn, Grouped, Plates, Sensors
+from model.compiled.structures import Drawn, Grouped, Plates, Sensors, as_given
 from model.ensemble.draws import Drawing, Draws
 from model.ensemble.plate_on_eras import PlateOnEras
 from model.ensemble.touched_plate import RIDGE, LoadedContacts, Sensed, TouchedPlate, drawn_on
@@ -40,7 +39,8 @@ class TouchedByKernel(TouchedPlate):
     @cached_property
     def structure(self) -> Plates:
         """The plate as kernels read it."""
-        found = Plates.from_buffer_copy(_of_table(self.on))
+        of_table = _kept.get(self.on) or _of_table(self.on)
+        found = Plates.from_buffer_copy(of_table)
         found.k = len(self.centres)
         found.point(centres=self.centres, stiffness=self.stiffness)
         return found
@@ -61,7 +61,7 @@ class TouchedByKernel(TouchedPlate):
         sizes = ((f, g, p, n), (f, g, fine_count, n), (f, g, n, n), (f, g, n, n))
         found = [np.empty(size, dtype=np.complex64) for size in sizes]
         to, at = (ctypes.c_void_p * 4)(*(each.ctypes.data for each in found)), as_given(rows)
-        run(self.kernels.library.forms_stage, self.structure, of, address_of(at), f, to)
+        run(self.kernels.library.forms_stage, self.structure, of, at.ctypes, f, to)
         return LoadedContacts(found[0], None if fine is None else found[1], found[2], found[3])
 
     def drawn(
@@ -89,25 +89,22 @@ class TouchedByKernel(TouchedPlate):
         draws = draws_structure(self.on, k, by)
         run(
             self.kernels.library.tones_stage,
-            *(self.structure, draws, at, address_of(given[0]), m, address_of(given[1]), to),
+            *(self.structure, draws, at, given[0].ctypes, m, given[1].ctypes, to),
         )
         return Sensed(means, loudest, powers if with_powers else None)
 
 
 def _of_table(on: PlateOnEras) -> Plates:
     """A plate without fingers as kernels read it, kept with it."""
-    found = _kept.get(on)
-    if found is None:
-        plate = on.plate
-        (b, r), t = plate.shapes.shape, on.thickness_count
-        found = Plates(plate.era_count, b, 0, r, t, plate.load_std)
-        found.point(
-            **{name: getattr(on, name) for name in _OF_CASES},
-            **{name: getattr(plate, name) for name in _OF_ROWS},
-            attached=plate.stiffness,
-        )
-        return _kept.setdefault(on, found)  # of threads at once all take the first one's
-    return found
+    plate = on.plate
+    (b, r), t = plate.shapes.shape, on.thickness_count
+    found = Plates(plate.era_count, b, 0, r, t, plate.load_std)
+    found.point(
+        **{name: getattr(on, name) for name in _OF_CASES},
+        **{name: getattr(plate, name) for name in _OF_ROWS},
+        attached=plate.stiffness,
+    )
+    return _kept.setdefault(on, found)  # of threads at once all take the first one's
 
 
 _kept: WeakKeyDictionary[PlateOnEras, Plates] = WeakKeyDictionary()

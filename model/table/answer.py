@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 
 from model.arguments import expect_at_least
-from model.arrays import FloatArray, IntArray
+from model.arrays import IntArray
 from model.choice import best_by, best_of
-from model.drive_modes.forms import Weights
 from model.drive_modes.tones import excitation_of
 from model.errors import InputError
 from model.finger.perception import decibels
 from model.table.contents import Contents, Stream
 from model.table.contents_kernel import choose_tones
+from model.table.raster import FingertipShapes
 from model.table.request import (
     APART_HZ,
     MIN_CONTRAST_DB,
@@ -103,7 +103,7 @@ class _Answering:
         """Change the plan until the worst finger has the contrast, else take the best tried."""
         count = len(self.requests)
         quiet = range(count, count + len(self.fingers))
-        plan = _Plan(tuple((number,) for number in range(count)), tuple(quiet))
+        plan = _Plan(tuple(zip(range(count), strict=True)), tuple(quiet))
         tried = [(plan, self._measure(plan))]
         while self._is_out_of_bounds(*tried[-1]) or (
             _worst_of(tried[-1]) < min_contrast_db and len(tried[-1][0].contents) > 1
@@ -127,8 +127,8 @@ class _Answering:
                 is_disturbing=is_disturbing,
             )
         return Answer(
-            tuple(found.layers[number] for number in range(count)),
-            tuple(found.quiet[number] for number in quiet),
+            tuple(map(found.layers.__getitem__, range(count))),
+            tuple(map(found.quiet.__getitem__, quiet)),
             found.worst_db,
             found.stroke_factor,
             plan.applied + below + found.applied,
@@ -145,13 +145,15 @@ class _Answering:
 
     def _disturbed(self, found: _Measured) -> list[int]:
         """Fingers that would feel more of others' contents than they allow."""
-        felt = {finger: layer.foreign_level_db_sl for finger, layer in found.layers.items()}
-        felt |= {finger: each.level_db_sl for finger, each in found.quiet.items()}
-        return [
-            finger
-            for finger, level in felt.items()
-            if level is not None and not level <= self._every[finger].max_foreign_db_sl
-        ]
+        disturbed = []
+        for finger, layer in found.layers.items():
+            level, most = layer.foreign_level_db_sl, self.requests[finger].max_foreign_db_sl
+            if level is not None and not level <= most:
+                disturbed.append(finger)
+        for finger, each in found.quiet.items():
+            if not each.level_db_sl <= self._every[finger].max_foreign_db_sl:
+                disturbed.append(finger)
+        return disturbed
 
     def _with_less(self, plan: _Plan, found: _Measured) -> _Plan:
         """The plan after the next step of the rule."""
@@ -202,103 +204,103 @@ class _Answering:
         return [*self.requests, *self.fingers]
 
     @cached_property
-    def _rows(self) -> IntArray:
-        """Rows of the table's frequencies that any band holds."""
-        return np.unique(np.concatenate(self._bands))
+    def _bands(self) -> list[tuple[int, int]]:
+        """The first of the rows that each request may have, and one past the last."""
+        frequencies, bands = self.table.frequencies, []
+        for request in self.requests:
+            low, high = request.band_hz
+            first = int(frequencies.searchsorted(low))
+            end = int(frequencies.searchsorted(high, side="right"))
+            if first == end:
+                nearest = frequencies[np.abs(frequencies - low).argmin()]
+                raise InputError(
+                    f"band of {_at(request)} must be LOW-HIGH in Hz and hold a frequency of the "
+                    f"table, {frequencies[0]:g} to {frequencies[-1]:g} Hz, of which {nearest:g} Hz "
+                    f"is the nearest, got {low:g}-{high:g}"
+                )
+            bands.append((first, end))
+        return bands
 
     @cached_property
-    def _bands(self) -> list[IntArray]:
-        """Rows that each request may have."""
-        return [self._band(each) for each in self.requests]
+    def _rows(self) -> IntArray:
+        """Rows of the table's frequencies that any band holds."""
+        is_held = np.zeros(len(self.table.frequencies), dtype=bool)
+        for first, end in self._bands:
+            is_held[first:end] = True
+        return np.flatnonzero(is_held)
 
-    def _band(self, request: Request) -> IntArray:
-        frequencies, (low, high) = self.table.frequencies, request.band_hz
-        rows = np.flatnonzero((frequencies >= low) & (frequencies <= high))
-        if len(rows) == 0:
-            raise InputError(
-                f"band of {_at(request)} must be LOW-HIGH in Hz and hold a frequency of the table, "
-                f"{frequencies[0]:g} to {frequencies[-1]:g} Hz, of which "
-                f"{frequencies[np.abs(frequencies - low).argmin()]:g} Hz is the nearest, got "
-                f"{low:g}-{high:g}"
-            )
-        return rows
+    @cached_property
+    def _tips(self) -> FingertipShapes:
+        """Shapes of the plate at all fingers."""
+        return self.table.read_fingertips([each.at for each in self._every])
 
     def _contents(self, plan: _Plan) -> Contents:
         """A plan for a kernel."""
-        table, every = self.table, self._every
-        bands = []
-        for band in self._bands:
-            rows = np.searchsorted(self._rows, band).tolist()
-            bands.append((rows[0], rows[-1] + 1))
+        bands = list(map(tuple, self._rows.searchsorted(self._bands).tolist()))
         streams = []
         for fingers in plan.contents:
-            requests = [self.requests[finger] for finger in fingers]
             own = tuple(bands) if self.bands_may_swap else (bands[fingers[0]],)
-            level, priority = (
-                max(getattr(e, key) for e in requests) for key in ("level_db_sl", "priority")
-            )
+            request = self.requests[fingers[0]]
+            level, priority = request.level_db_sl, request.priority
+            for finger in fingers[1:]:
+                request = self.requests[finger]
+                level = max(level, request.level_db_sl)
+                priority = max(priority, request.priority)
             streams.append(Stream(fingers, level, own, priority))
-        first = streams[0]
-        is_plain = len(streams) == len(first.targets) == len(first.bands) == 1
-        is_ranked = is_plain and bool(plan.quiet)
-        others = [finger for stream in streams[1:] for finger in stream.targets]
-        rest = (
-            None if plan.quiet or others else [self.requests[finger].at for finger in first.targets]
-        )
+        first, rows, background = streams[0], self._rows, None
+        is_ranked = len(streams) == len(first.targets) == len(first.bands) == 1 <= len(plan.quiet)
+        if is_ranked:
+            rows = np.arange(*self._bands[first.targets[0]])
+        elif len(streams) == 1 and not plan.quiet:
+            places = [self.requests[finger].at for finger in first.targets]
+            background = self.table.background(places)
         return Contents(
-            table.read_fingertips([each.at for each in every]),
-            tuple(each.load for each in every),
+            self._tips,
+            tuple([each.load for each in self._every]),
             tuple(streams),
             plan.quiet,
-            self._bands[first.targets[0]] if is_ranked else self._rows,
+            rows,
             self.apart_hz,
-            background=None if rest is None else table.background(rest),
+            background=background,
             is_ranked=is_ranked,
         )
 
     def _measure(self, plan: _Plan) -> _Measured:
         """What fingers feel of a plan's contents."""
+        layers: dict[int, Layer] = {}
+        quiet: dict[int, QuietFinger] = {}
         if not plan.contents:
-            nothing = {n: QuietFinger(self._every[n].at, *_NOTHING) for n in plan.quiet}
-            return _Measured({}, nothing, None, 1.0)
+            for finger in plan.quiet:
+                quiet[finger] = QuietFinger(self._every[finger].at, *_NOTHING)
+            return _Measured({}, quiet, None, 1.0)
         table, contents = self.table, self._contents(plan)
         found = choose_tones(table, contents)
         if found is None:
             raise AssertionError("contents must have tones")
-        with np.errstate(divide="ignore"):
-            contrast, level, foreign_amplitudes = (
-                _known(decibels(each))
-                for each in (found.contrast, found.level, found.foreign_amplitudes)
-            )
-        layers = {}
+        felt = decibels(np.column_stack([found.contrast, found.level, found.foreign_amplitudes]))
+        figures: list[Any] = np.where(np.isnan(felt), None, felt).tolist()  # type: ignore[call-overload]
         for number, stream in enumerate(contents.streams):
-            drive = Weights.at(int(found.rows[number]), found.weights[number])
+            weights = [(int(found.rows[number]), found.weights[number])]
             excitation = excitation_of(
-                drive, table.eras, table.frequencies, gain=float(found.gains[number])
+                weights, table.eras, table.frequencies, gain=float(found.gains[number])
             )
             for finger in stream.targets:
-                nominal, median, promised = contrast[finger]
+                nominal, median, promised, level, promised_level, foreign = figures[finger]
                 is_shared = finger != stream.targets[0]
                 layers[finger] = Layer(
                     self.requests[finger],
                     excitation,
                     "shared" if is_shared else verdict_of(promised),
-                    level_db_sl=level[finger][0],
-                    promised_level_db_sl=level[finger][1],
+                    level_db_sl=level,
+                    promised_level_db_sl=promised_level,
                     felt_contrast_db=nominal,
                     median_felt_contrast_db=median,
                     promised_contrast_db=promised,
-                    foreign_level_db_sl=foreign_amplitudes[finger],
+                    foreign_level_db_sl=foreign,
                 )
-        quiet = {
-            finger: QuietFinger(
-                self._every[finger].at,
-                contrast[finger][0],
-                contrast[finger][2],
-                foreign_amplitudes[finger],
-            )
-            for finger in plan.quiet
-        }
+        for finger in plan.quiet:
+            nominal, _, promised, _, _, foreign = figures[finger]
+            quiet[finger] = QuietFinger(self._every[finger].at, nominal, promised, foreign)
         worst = None if math.isnan(found.worst) else float(decibels(found.worst))
         applied = () if found.is_apart else (f"frequencies are nearer than {self.apart_hz:g} Hz",)
         return _Measured(layers, quiet, worst, found.stroke_factor, applied)
@@ -315,8 +317,3 @@ def _worst_of(tried: tuple[_Plan, _Measured]) -> float:
 
 def _at(request: Request) -> str:
     return f"({request.at[0]:g}, {request.at[1]:g}) m"
-
-
-def _known(values: FloatArray) -> list[Any]:
-    """Values as lists, None for those that are not known."""
-    return list(np.where(np.isnan(values), None, values).tolist())  # type: ignore[call-overload]

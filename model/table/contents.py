@@ -19,8 +19,8 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.ensemble.draws import Drawing
-from model.table.fingertip_shapes import FingertipShapes
 from model.table.question import Question
+from model.table.raster import FingertipShapes
 
 JUDGING_DRAWS = Drawing(count=64, seed=1, thicknesses=5)
 PROMISED_DRAWS = Drawing(count=200, seed=8, thicknesses=40, bases=5)

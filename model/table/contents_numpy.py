@@ -33,7 +33,7 @@ from model.table.contents import (
     Tones,
 )
 from model.table.fingers_on_plate import MAX_FINGERS_BY_POINT, FingersOnPlate
-from model.table.fingertip_shapes import FingertipShapes
+from model.table.raster import FingertipShapes
 
 if TYPE_CHECKING:
     from model.table.table import LocalizationTable

@@ -13,9 +13,9 @@ from model.drive_modes.forms import Forms, Weights
 from model.ensemble.draws import Drawing
 from model.ensemble.measures import Felt, Fingertips, felt, felt_at
 from model.ensemble.touched_plate import LoadedContacts, TouchedPlate, gram, outer
-from model.table.fingertip_shapes import FingertipShapes
 from model.table.pulse_gains import PulseResponses
 from model.table.question import Question
+from model.table.raster import FingertipShapes
 from model.transients.onset import RINGING_TIMES, RampedRinging
 
 MAX_FINGERS_BY_POINT = 4

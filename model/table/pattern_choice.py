@@ -123,7 +123,7 @@ def pattern_of(
     amplitudes = [*tones.level[0] / gain, tones.loudest / gain, *tones.contrast[0]]
     nominal, robust, loudest, contrast, median, promised = decibels(np.array(amplitudes)).tolist()
     gain_db = min(0.0, question.level_db_sl - robust)
-    drive = Weights.at(int(tones.rows[0]), tones.weights[0])
+    drive = [(int(tones.rows[0]), tones.weights[0])]
     return Pattern(
         excitation=excitation_of(drive, eras, frequencies, gain=10 ** (gain_db / 20)),
         ramp=ONSET_RAMP,
@@ -331,7 +331,7 @@ def _pattern(
     gain = 10 ** (gain_db / 20)
     pattern = partial(
         Pattern,
-        excitation=excitation_of(drive, candidates.eras, candidates.frequencies, gain=gain),
+        excitation=excitation_of(drive.tones(), candidates.eras, candidates.frequencies, gain=gain),
         ramp=ONSET_RAMP,
         level_db_sl=gain_db + nominal[0],
         robust_level_db_sl=gain_db + robust[0],

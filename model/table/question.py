@@ -1,6 +1,7 @@
 """Questions to a localization table: contacts, level and drive mode."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -79,8 +80,9 @@ class Question:
             )
         check_loads(self.loads)
         for what, contacts in (("target", self.targets), ("quiet finger", self.quiet)):
-            for x, y in {contact for contact in contacts if contacts.count(contact) > 1}:
-                raise InputError(f"{what} ({x:g}, {y:g}) m must be given once, got two")
+            for x, y in contacts:
+                if contacts.count((x, y)) > 1:
+                    raise InputError(f"{what} ({x:g}, {y:g}) m must be given once, got two")
         if self.drive_mode is not None and self.drive_mode not in DRIVE_MODES:
             raise InputError(
                 f"drive mode must be one of {', '.join(DRIVE_MODES)}, got {self.drive_mode!r}"
@@ -107,14 +109,8 @@ class Question:
 
     def check_on(self, plate: Plate) -> None:
         """Raise InputError for a contact off the plate."""
-        for what, contacts in (("target", self.targets), ("quiet finger", self.quiet)):
-            for x, y in contacts:
-                if not plate.contains(x, y):  # False for NaN
-                    raise InputError(
-                        f"{what} ({x:g}, {y:g}) m must be on the plate, from (0, 0) to "
-                        f"({plate.length:g}, {plate.width:g}) m"
-                        f"{in_metres(x, y, length=plate.length, width=plate.width)}"
-                    )
+        check_on_plate("target", self.targets, plate)
+        check_on_plate("quiet finger", self.quiet, plate)
 
     def drive_mode_on(self, own: str) -> str:
         """Return the drive mode on a table of a default mode; raises InputError if unplayable."""
@@ -125,3 +121,14 @@ class Question:
                 f"got {drive_mode}; build a table for them: era table build --mode"
             )
         return drive_mode
+
+
+def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:
+    """Raise InputError for a finger off the plate; what: the finger's name."""
+    length, width = plate.length, plate.width
+    for x, y in places:
+        if not (0 <= x <= length and 0 <= y <= width):  # False for NaN
+            raise InputError(
+                f"{what} ({x:g}, {y:g}) m must be on the plate, from (0, 0) to "
+                f"({length:g}, {width:g}) m{in_metres(x, y, length=length, width=width)}"
+            )

@@ -6,22 +6,25 @@ product, whatever the mesh.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from model.arrays import FloatArray, IntArray, lattice
+from model.arrays import Float32Array, FloatArray, IntArray, lattice
 from model.errors import InputError
 from model.finger.fingertip import FINGERTIP_RADIUS, FIVE_AND_FINE, FIVE_POINTS, fingertips_on
 from model.structure.footprint import mean_over
 from model.structure.plate import Plate
+from model.table.question import Point
 
 POINTS_PER_WAVELENGTH = 20
 MAX_SPACING, MIN_SPACING = 0.008, 0.003  # m
 PATCH = 6  # points along a side of an interpolation, at least
 FEW = len(FIVE_POINTS.points)
+MAX_KEPT = 512
+"""Fingertips whose shapes are kept, of some 8 kB each."""
 
 
 @dataclass(frozen=True)
@@ -68,16 +71,22 @@ class Raster:
         """Positions [m], (point_count, 2)."""
         return lattice(self.x, self.y)
 
-    def fingertips(self, centres: FloatArray) -> "Fingertips":
-        """Interpolation at the fingertips centred at (k, 2) [m] on the plate."""
+    def fingertips(self, centres: FloatArray, values: Float32Array) -> "FingertipShapes":
+        """Values (point_count, r) at the fingertips centred at (k, 2) [m] on the plate."""
         points, weights = fingertips_on(
             centres, length=self.length, width=self.width, rule=FIVE_AND_FINE
         )
         index, interpolation = self._patches(centres, points)
+        found = interpolation @ values.take(index, axis=0)
         few, fine = weights.astype(np.float32)
-        return Fingertips(index, interpolation, few[:, :FEW], fine[:, FEW:])
+        return FingertipShapes(
+            np.ascontiguousarray(found[:, :FEW]),
+            np.ascontiguousarray(found[:, FEW:]),
+            few[:, :FEW],
+            fine[:, FEW:],
+        )
 
-    def at(self, values: NDArray[np.float32], points: FloatArray) -> NDArray[np.float32]:
+    def at(self, values: Float32Array, points: FloatArray) -> Float32Array:
         """Values (point_count, c) at points [m] (n, 2) of the plate: (n, c).
 
         At footprints (n, 3) their means.
@@ -115,9 +124,7 @@ class Raster:
             found[axis, 0, :count, :count] = np.linalg.inv(powers)
         return found
 
-    def _patches(
-        self, centres: FloatArray, points: FloatArray
-    ) -> tuple[IntArray, NDArray[np.float32]]:
+    def _patches(self, centres: FloatArray, points: FloatArray) -> tuple[IntArray, Float32Array]:
         """Raster points around centres (k, 2), and their weights at points (k, p, 2) nearby.
 
         (k, patch) and (k, p, patch).
@@ -126,7 +133,8 @@ class Raster:
         start = np.rint(centres / spacing - (side - 1) / 2).astype(int)
         start = np.minimum(np.maximum(start, 0), count - side)
         local = (points / spacing - start[:, None]) * (2 / (side - 1)) - 1
-        along = _powers(local.transpose(2, 0, 1), max(side)) @ self._lagrange
+        powers = np.vander(local.transpose(2, 0, 1).ravel(), max(side), increasing=True)
+        along = powers.reshape(2, *points.shape[:2], -1) @ self._lagrange
         along_x, along_y = along.astype(np.float32)
         weights = along_y[:, :, : side[1], None] * along_x[:, :, None, : side[0]]
         index = (start[:, 1] * self.nx + start[:, 0])[:, None] + self._patch_index
@@ -134,29 +142,35 @@ class Raster:
 
 
 @dataclass(frozen=True, eq=False)
-class Fingertips:
-    """Points under fingertips with their interpolation on a raster.
+class FingertipShapes:
+    """Shapes (k, p, r) under k fingertips and weights (k, p) of the points in the mean over each.
 
-    First the five points of each fingertip for searches, then the fine ones for figures, each with
-    the centre first. index (k, patch): raster points around each finger; interpolation (k, p,
-    patch); few_weights (k, 5), fine_weights (k, 21): of the points in the mean over a fingertip.
+    At few points for searches and at fine ones for figures; the centre comes first.
     """
 
-    index: IntArray
-    interpolation: NDArray[np.float32]
-    few_weights: NDArray[np.float32]
-    fine_weights: NDArray[np.float32]
-
-    def read(self, values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Values (point_count, c) of the raster at the few (k, 5, c) and the fine (k, 21, c)."""
-        found = self.interpolation @ values.take(self.index, axis=0)
-        return np.ascontiguousarray(found[:, :FEW]), np.ascontiguousarray(found[:, FEW:])
+    few: Float32Array
+    fine: Float32Array
+    few_weights: Float32Array
+    fine_weights: Float32Array
 
 
-def _powers(x: FloatArray, count: int) -> FloatArray:
-    """1, x, x², ... along a new last axis of `count`."""
-    powers = np.empty((*x.shape, count))
-    powers[..., 0] = 1.0
-    for each in range(1, count):
-        np.multiply(powers[..., each - 1], x, out=powers[..., each])
-    return powers
+class FingertipReader:
+    """Reads shapes (points, r) on a raster at fingertips, kept for fingers that do not move."""
+
+    def __init__(self, raster: Raster, shapes: Float32Array) -> None:
+        self._raster, self._shapes = raster, shapes
+        self._kept: dict[Point, tuple[Float32Array, ...]] = {}
+
+    def __call__(self, places: Sequence[Point]) -> FingertipShapes:
+        """Read at fingertips centred at places [m] of the plate; from any thread."""
+        kept = self._kept
+        missing = [place for place in places if place not in kept]
+        if missing:
+            if len(kept) > MAX_KEPT:
+                kept = self._kept = {}  # another thread may still read the one before
+                missing = list(places)
+            tips = self._raster.fingertips(np.array(missing), self._shapes)
+            read = zip(tips.few, tips.fine, tips.few_weights, tips.fine_weights, strict=True)
+            kept.update(zip(missing, read, strict=True))
+        found = zip(*map(kept.__getitem__, places), strict=True)
+        return FingertipShapes(*map(np.array, found))

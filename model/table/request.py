@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from model.arguments import expect_number, shown
-from model.config.points import in_metres
 from model.errors import InputError
 from model.files.frame import as_frame
 from model.finger import MAX_CONTACTS
@@ -17,7 +16,7 @@ from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import STRONG_DB_SL
 from model.structure.attachments import check_loads
 from model.structure.plate import Plate
-from model.table.question import MAX_LEVEL_DB_SL, MIN_LEVEL_DB_SL, Point
+from model.table.question import MAX_LEVEL_DB_SL, MIN_LEVEL_DB_SL, Point, check_on_plate
 from model.vibration.excitation import Excitation
 
 APART_HZ = 30.0
@@ -114,7 +113,7 @@ def _check_bound(given: float, *, what: str, unit: str) -> None:
 def _check_pair(given: object, *, what: str, such_as: str) -> None:
     """Raise InputError for anything but two numbers."""
     pair = given if isinstance(given, Sequence | np.ndarray) else ()
-    if len(pair) != 2 or not all(isinstance(each, Real) for each in pair):
+    if len(pair) != 2 or not (isinstance(pair[0], Real) and isinstance(pair[1], Real)):
         raise InputError(f"{what} must be two numbers such as {such_as}, got {shown(given)}")
 
 
@@ -205,15 +204,10 @@ def check_requests(requests: Sequence[Request], fingers: Sequence[Finger], plate
     every: list[Request | Finger] = [*requests, *fingers]
     if len(every) > MAX_CONTACTS:
         raise InputError(f"an answer must have up to {MAX_CONTACTS} fingers, got {len(every)}")
-    check_loads(each.load for each in every)
+    check_loads([each.load for each in every])
+    check_on_plate("finger", [each.at for each in every], plate)
     for number, finger in enumerate(every):
         x, y = finger.at
-        if not plate.contains(x, y):  # False for NaN
-            raise InputError(
-                f"finger ({x:g}, {y:g}) m must be on the plate, from (0, 0) to "
-                f"({plate.length:g}, {plate.width:g}) m"
-                f"{in_metres(x, y, length=plate.length, width=plate.width)}"
-            )
         for other in every[:number]:
             if math.dist(other.at, finger.at) < FINGERTIP_RADIUS:
                 raise InputError(

@@ -38,12 +38,11 @@ from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS, Contents
 from model.table.contents_kernel import choose_tones
 from model.table.contents_numpy import onset_contrast
 from model.table.fingers_on_plate import FingersOnPlate
-from model.table.fingertip_shapes import FingertipReader, FingertipShapes
 from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.pattern_choice import Candidates, choose_pattern, pattern_of
 from model.table.pulse_gains import OverEffect
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
-from model.table.raster import Raster
+from model.table.raster import FingertipReader, FingertipShapes, Raster
 from model.transients.onset import RampedOnsets, RampedRinging, ramped_ringing
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation, base_amplitudes

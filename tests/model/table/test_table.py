@@ -135,7 +135,8 @@ def test_fingertips_reads_the_points_of_the_disc():
     plate = smooth_rig().plate
     raster = Raster.for_plate(plate, frequency_max=500.0)
     places = raster.points.astype(np.float32)
-    few, fine = raster.fingertips(np.array(CONTACTS)).read(places)
+    tips = raster.fingertips(np.array(CONTACTS), places)
+    few, fine = tips.few, tips.fine
     expected = [fingertip_points(x, y, plate) for x, y in CONTACTS]
     np.testing.assert_allclose(fine, expected, atol=1e-7)
     assert few.shape == (5, 5, 2)
@@ -150,7 +151,7 @@ def test_fingertips_interpolates_fields_of_the_plate():
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
     kept = free.acceleration(rig.eras, FREQUENCIES, raster.points).transpose(2, 0, 1)
     values = np.ascontiguousarray(kept.astype(np.complex64)).reshape(len(kept), -1)
-    _, fine = raster.fingertips(np.array(CONTACTS)).read(values.view(np.float32))
+    fine = raster.fingertips(np.array(CONTACTS), values.view(np.float32)).fine
     found = fine.reshape(-1, fine.shape[-1])
     points = np.concatenate([fingertip_points(x, y, rig.plate) for x, y in CONTACTS])
     solved = free.acceleration(rig.eras, FREQUENCIES, points).transpose(2, 0, 1)

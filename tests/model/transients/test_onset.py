@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from model.drive_modes.forms import Weights
 from model.drive_modes.tones import excitation_of
 from model.errors import InputError
 from model.reduction.reduced_plate import reduce_plate
@@ -49,8 +48,8 @@ def test_ramped_onset_contrast_equals_sampled_contrast(ramp, within):
         rows = rng.integers(len(FREQUENCIES), size=3)
         weights = (rng.uniform(-1, 1, (3, 4)) + 1j * rng.uniform(-1, 1, (3, 4))) / 2
         weights = weights.astype(np.complex64)
-        tips = table.raster.fingertips(np.array(places))
-        _, shapes = tips.read(table.shapes)
+        tips = table.raster.fingertips(np.array(places), table.shapes)
+        shapes = tips.fine
         count = len(targets)
         found = onsets.contrast(
             rows,
@@ -59,7 +58,7 @@ def test_ramped_onset_contrast_equals_sampled_contrast(ramp, within):
             quiet=shapes[count:].reshape(-1, shapes.shape[-1]),
         )
         for row, weight, contrast in zip(rows, weights, found, strict=True):
-            excitation = excitation_of(Weights.at(row, weight), table.eras, FREQUENCIES, gain=1.0)
+            excitation = excitation_of([(row, weight)], table.eras, FREQUENCIES, gain=1.0)
             bases = ramped_onset(excitation, table.eras, ramp=ramp)
             exact = transients.contrast_db(bases, targets=targets, quiet=quiet)
             errors.append(20 * np.log10(contrast) - exact)

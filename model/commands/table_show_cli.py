@@ -22,8 +22,7 @@ def show(
     """Show levels, weak cells, contrast and origin of a table."""
     from model.commands.options import progress_bar
     from model.table.file import load_table
-    from model.table.overview import find_overview
-    from model.table.summary import summarize
+    from model.table.overview import find_overview, summarize
 
     table = load_table(table_file)
     started = time.perf_counter()

@@ -11,8 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from model.compiled.compiler import compile_library
-from model.compiled.library_cache import kept_library
+from model.compiled.library_cache import compile_library, kept_library
 from model.compiled.structures import NO_MEMORY
 from model.errors import InputError
 

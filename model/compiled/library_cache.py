@@ -1,4 +1,4 @@
-"""Libraries compiled at first use and kept in the user's cache folder.
+"""Libraries compiled by the machine's compiler at first use, kept in the user's cache folder.
 
 They run within this process. So one is loaded only if no other user could have written it, and if
 it is whole: the SHA-256 of its content is in a file beside it.
@@ -9,7 +9,9 @@ import hashlib
 import logging
 import os
 import platform
+import shutil
 import stat
+import subprocess
 import sys
 import sysconfig
 import tempfile
@@ -19,8 +21,59 @@ from pathlib import Path
 
 import platformdirs
 
-from model.compiled.compiler import compile_library
 from model.errors import InputError
+
+_COMPILERS = ("cc", "gcc", "clang")
+_TIMEOUT = 120.0  # s
+
+
+def compile_library(
+    path: Path, sources: Iterable[Path], *, flags: Sequence[str], what: str
+) -> None:
+    """Compile C sources to a shared library; what: its name in messages. Raises InputError."""
+    compiler = os.environ.get("CC") or next(filter(shutil.which, _COMPILERS), None)
+    if compiler is None or not shutil.which(compiler.split()[0]):
+        raise InputError(
+            f"{what} is compiled at first use and there is no C compiler "
+            f"({compiler or ', '.join(_COMPILERS)}); install one (Debian: apt install gcc "
+            "libc6-dev; macOS: xcode-select --install)"
+        )
+    # Of its own, since threads and processes may compile the same at once.
+    with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
+        made = Path(folder) / path.name
+        _compile(made, compiler.split(), sources, flags=flags, what=what)
+        with made.open("rb") as file:
+            os.fsync(file.fileno())  # a name must not outlive a power failure without its content
+        made.replace(path)
+
+
+def _compile(
+    made: Path,
+    compiler: Sequence[str],
+    sources: Iterable[Path],
+    *,
+    flags: Sequence[str],
+    what: str,
+) -> None:
+    files = map(str, (made, *sorted(sources)))
+    command = [*compiler, *flags, "-fPIC", "-shared", "-o", *files, "-lm"]
+    try:
+        done = subprocess.run(  # noqa: S603  the user's compiler
+            command, capture_output=True, text=True, timeout=_TIMEOUT, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise InputError(
+            f"{what} must be compiled within {_TIMEOUT:g} s, got no end of {' '.join(compiler)}; "
+            "set CC to another compiler"
+        ) from None
+    if done.returncode:
+        lines = done.stderr.strip().splitlines() or ["no message"]
+        first = next((line for line in lines if "error" in line), lines[0])
+        raise InputError(
+            f"{what} could not be compiled by {' '.join(compiler)}: {first}; install the C headers "
+            "(Debian: apt install gcc libc6-dev)"
+        )
+
 
 MAX_KEPT_LIBRARIES = 8  # the least recently used go first
 
@@ -51,12 +104,12 @@ def kept_library(
         with suppress(OSError):
             return _load(path)
         with suppress(OSError):  # no space
-            _compile(path, sources, flags=flags, what=what)
+            _compile_with_sum(path, sources, flags=flags, what=what)
             return _load(path)
     with tempfile.TemporaryDirectory(prefix="era-haptics-") as own:
         try:
             path = _own_folder(Path(own)) / file
-            _compile(path, sources, flags=flags, what=what)
+            _compile_with_sum(path, sources, flags=flags, what=what)
             return _load(path)
         except OSError as error:
             raise InputError(f"{what} cannot be loaded: {error}") from None
@@ -103,7 +156,9 @@ def _load(path: Path) -> ctypes.CDLL:
     return found
 
 
-def _compile(path: Path, sources: Sequence[Path], *, flags: Sequence[str], what: str) -> None:
+def _compile_with_sum(
+    path: Path, sources: Sequence[Path], *, flags: Sequence[str], what: str
+) -> None:
     compile_library(path, sources, flags=flags, what=what)
     with tempfile.NamedTemporaryFile("w", prefix=".", dir=path.parent, delete=False) as file:
         file.write(hashlib.sha256(path.read_bytes()).hexdigest())

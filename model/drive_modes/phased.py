@@ -6,9 +6,18 @@ adds a force where the drive acts anyway: without errors the best contrast does 
 
 from dataclasses import dataclass
 
-from model.compiled.kernels import kernels
-from model.drive_modes import phased_kernel
-from model.drive_modes.coherent import Coherent, CoherentResult, Method
+import numpy as np
+
+from model.compiled import structures
+from model.compiled.kernels import kernels, run
+from model.drive_modes.coherent import (
+    LEVEL_RESERVE,
+    MAX_GROWTH,
+    MAX_MULTIPLIER,
+    Coherent,
+    CoherentResult,
+    Method,
+)
 from model.drive_modes.forms import Forms
 
 MAX_TARGETS = 4
@@ -24,7 +33,36 @@ class Phased(Coherent):
         by = kernels()
         if by is None or len(forms.targets) > MAX_TARGETS:
             return super().tried(forms, method)
-        return phased_kernel.tried(by, self, forms, method)
+        f, q, n, _ = forms.quiet.shape
+        is_deep = forms.few is not None and forms.fine is not None
+        points = [
+            each.shape[2] if each is not None and is_deep else 0 for each in (forms.few, forms.fine)
+        ]
+        on = structures.GivenForms(
+            *(n, len(forms.targets), q, *points, forms.wanted, forms.level_margin),
+            *(self.phases[1], self.iterations),
+        )
+        on.point(
+            of_targets=forms.targets.swapaxes(0, 1),
+            target_power=forms.target_power.swapaxes(0, 1),
+            quiet=forms.quiet,
+            threshold=forms.threshold,
+            few_fields=forms.few,
+            fine_fields=forms.fine,
+        )
+        weights, rows = np.empty((f, n), dtype=np.complex64), np.arange(f, dtype=np.int32)
+        score, missed, bound = measures = np.empty((3, f), dtype=np.float32)
+        to = [each.ctypes for each in (weights, *measures)]
+        run(by.library.search_stage, on, as_structure(method), rows.ctypes, f, *to)
+        return CoherentResult(score, weights, bound, missed)
 
 
 PHASED = Phased(phases=(1, 5), iterations=8)
+
+
+def as_structure(method: Method) -> structures.Method:
+    """A method as kernels read it."""
+    return structures.Method(
+        *(method.steps, method.is_limited, method.variance, method.gain),
+        *(LEVEL_RESERVE, MAX_GROWTH, MAX_MULTIPLIER),
+    )

@@ -19,12 +19,10 @@ from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from model.arrays import Complex64Array, Float32Array, IntArray
+from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 from model.choice import NEARLY, best_few
 from model.drive_modes.forms import SILENT, Forms, Weights
-from model.drive_modes.sources import sums_of_sources
 
 BATCH = 256
 """Patterns evaluated together."""
@@ -46,10 +44,10 @@ class SourcePowers:
     quiet: Float32Array
 
 
-def source_powers(forms: Forms, members: NDArray[np.float32]) -> SourcePowers:
+def source_powers(forms: Forms, members: Float32Array) -> SourcePowers:
     """Powers of groups of ERAs, members (groups, eras) 1 or 0."""
     threshold_power = (forms.threshold**2)[None, None]
-    amplitude = np.abs(forms.targets @ members.T).transpose(0, 2, 1) ** 2 / threshold_power
+    amplitude = amplitude_powers(forms.targets, members) / threshold_power
     expected = group_powers(forms.target_power, members) / threshold_power
     return SourcePowers(
         amplitude.astype(np.float32),
@@ -58,7 +56,12 @@ def source_powers(forms: Forms, members: NDArray[np.float32]) -> SourcePowers:
     )
 
 
-def group_powers(forms: Complex64Array, members: NDArray[np.float32]) -> Float32Array:
+def amplitude_powers(fields: ComplexArray | Complex64Array, members: Float32Array) -> FloatArray:
+    """Squared magnitude of fields (t, f, eras) for groups (groups, eras): (t, groups, f)."""
+    return np.asarray(np.abs(fields @ members.T).transpose(0, 2, 1) ** 2)
+
+
+def group_powers(forms: Complex64Array, members: Float32Array) -> Float32Array:
     """Power of forms (q, f, eras, eras) for groups (groups, eras): (q, groups, f)."""
     q, f, *_ = forms.shape
     products = (members[:, :, None] * members[:, None]).reshape(len(members), -1)
@@ -72,7 +75,7 @@ def find_switched(forms: Forms, min_score: float) -> list[tuple[float, Weights]]
     Empty if none is above min_score. The first one is exact: patterns are excluded by bounds only.
     """
     eras, f = forms.era_count, forms.frequency_count
-    powers = source_powers(forms, _members(eras))
+    powers = source_powers(forms, members_of(eras))
     target = powers.target.reshape(len(powers.target), -1)
     variance = powers.variance.reshape(target.shape)
     quiet = powers.quiet.reshape(len(powers.quiet), -1)
@@ -127,10 +130,25 @@ def find_switched(forms: Forms, min_score: float) -> list[tuple[float, Weights]]
 def max_sensation_switched(forms: Forms) -> float:
     """Return the highest amplitude to threshold at the weakest target, the same pattern for all."""
     eras = forms.era_count
-    powers = source_powers(forms, _members(eras))
-    target = powers.target.reshape(len(powers.target), -1)
-    padded = np.concatenate([target, np.zeros((len(target), 1), np.float32)], axis=1)
-    return float(np.sqrt(sums_of_sources(padded, eras).min(axis=0).max()))
+    powers = source_powers(forms, members_of(eras))
+    return float(np.sqrt(sums_of_sources(powers.target, eras).min(axis=0).max()))
+
+
+def sums_of_sources(powers: Float32Array | FloatArray, eras: int) -> Float32Array:
+    """Values of all patterns (c, n), from those of all sources (c, groups, f).
+
+    Patterns are every ERA alone, then every pair, frequencies of its first ERA running slowest.
+    """
+    c, _, f = powers.shape
+    alone = powers[:, :eras]
+    one, other = np.array(list(combinations(range(eras), 2)), dtype=int).reshape(-1, 2).T
+    sums = np.empty((c, eras * f + len(one) * f * f), dtype=powers.dtype)
+    sums[:, : eras * f] = alone.reshape(c, -1)
+    pairs = sums[:, eras * f :].reshape(c, len(one), f, f)
+    np.add(alone[:, one, :, None], alone[:, other, None, :], out=pairs)
+    same = np.arange(f)
+    pairs[:, :, same, same] = powers[:, eras:]
+    return sums
 
 
 def _pairs(gain: Float32Array, eras: int, count: int) -> tuple[IntArray, IntArray]:
@@ -153,7 +171,7 @@ def _pairs(gain: Float32Array, eras: int, count: int) -> tuple[IntArray, IntArra
 
 
 @lru_cache(maxsize=8)
-def _members(eras: int) -> NDArray[np.float32]:
+def members_of(eras: int) -> Float32Array:
     """Every ERA alone, then every pair, (groups, eras), as sources are ordered."""
     groups = [*((era,) for era in range(eras)), *combinations(range(eras), 2)]
     members = np.zeros((len(groups), eras), dtype=np.float32)
@@ -168,5 +186,5 @@ def _drive(sources: tuple[int, ...], eras: int, count: int) -> Weights:
     index = np.full(eras, SILENT)
     for source in sources:
         group, frequency = divmod(source, count)
-        index[_members(eras)[group] > 0] = frequency
+        index[members_of(eras)[group] > 0] = frequency
     return Weights(index, (index != SILENT).astype(np.complex64))

@@ -24,8 +24,7 @@ from model.structure.attachments import (
     drive_forces,
     full_strokes,
 )
-from model.structure.dispersion import Dispersion
-from model.structure.modal_elasticity import ModalElasticity
+from model.structure.modal_elasticity import Dispersion, ModalElasticity
 from model.structure.plate import Plate
 
 LEAST_THICKNESS = 0.1

@@ -20,10 +20,9 @@ from functools import cached_property
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.reduction.free_modes import RESIDUAL_ORDER
 from model.reduction.free_plate import FreeModes, FreePlate
 from model.reduction.place_slopes import place_slopes
-from model.reduction.truncation import truncation_slopes, truncation_weights
+from model.reduction.truncation import RESIDUAL_ORDER, truncation_slopes, truncation_weights
 
 _TERMS = 2 * RESIDUAL_ORDER
 

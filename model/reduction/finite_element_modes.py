@@ -8,9 +8,9 @@ from scipy import linalg
 from model.arrays import FloatArray
 from model.fem.mesh import DOF_PER_NODE, Mesh
 from model.fem.plate import RIGID_BODY_MODES, PlateMatrices, assemble, factorise, lowest_modes
-from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
-from model.structure.dispersion import Dispersion
+from model.reduction.truncation import RESIDUAL_ORDER, PointSolutions
 from model.structure.footprint import as_footprints
+from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 
 _MAX_CACHE_BYTES = 256 << 20  # of solved points

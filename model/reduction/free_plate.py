@@ -19,9 +19,8 @@ from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.mesh import Mesh, check_frequencies
 from model.reduction.finite_element_modes import FiniteElementModes, finite_element_modes
-from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
 from model.reduction.spectral_modes import SpectralModes, spectral_modes
-from model.reduction.truncation import truncation_weights
+from model.reduction.truncation import RESIDUAL_ORDER, PointSolutions, truncation_weights
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import (
     Era,

@@ -40,9 +40,8 @@ from model.errors import InputError
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, FingertipLoad, PointLoad, footprints_of
-from model.structure.dispersion import Dispersion
 from model.structure.footprint import as_footprints
-from model.structure.modal_elasticity import ModalElasticity, loss_factors
+from model.structure.modal_elasticity import Dispersion, ModalElasticity, loss_factors
 from model.structure.plate import Plate
 from model.structure.support import check_supported
 
@@ -56,7 +55,7 @@ _DEPENDENT = 1e-9
 class ReductionBasis:
     """Source of a reduction: the solved free plate and the footprints (n, 3) [m].
 
-    truncated_terms: between those points (`model.reduction.free_modes`); residual_transform
+    truncated_terms: between those points (`model.reduction.truncation`); residual_transform
     (RESIDUAL_VECTORS n, s): from the residual vectors of the points to the coordinates.
     """
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import FloatArray
-from model.reduction.free_modes import RESIDUAL_ORDER, PointSolutions
+from model.reduction.truncation import RESIDUAL_ORDER, PointSolutions
 from model.spectral.functions import CLASSES, deflections_by_class
 from model.spectral.local_compliance import (
     Unresolved,
@@ -21,9 +21,9 @@ from model.spectral.local_compliance import (
 )
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import Band, SpectralClass, SpectralPlate
-from model.structure.dispersion import Dispersion
 from model.structure.equivalent import short_wave_plate
 from model.structure.footprint import check_on_plate
+from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 
 _MAX_CACHED = 4  # sets of points whose shapes are kept

@@ -4,17 +4,47 @@ A plate is made of nothing as homogeneous as its theory has it: laminate, seams,
 change the lowest modes each in its own way. So a plate may state by how much the eigenvalue and the
 loss factor of its lowest elastic modes differ (`Plate.mode_deviations`), and that its loss factor
 varies as a power of the frequency. Shapes stay those of the theory, and so do all higher modes.
+
+Adhesives and air change the complex eigenvalues of modes with frequency: their dispersion.
 """
 
 from dataclasses import dataclass
-from typing import Self
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
-from model.structure.dispersion import Dispersion
 from model.structure.plate import LOSS_FREQUENCY, Plate
+
+
+@dataclass(frozen=True, eq=False)
+class Dispersion:
+    """What is added to the eigenvalues of r modes, which they have at their own frequencies.
+
+    frequencies (k,) [Hz], ascending; values (k, r) [rad²/s²]: in the mode's own shape; a cubic
+    spline of the logarithm of frequency in between, constant outside.
+    """
+
+    frequencies: FloatArray
+    values: ComplexArray
+
+    def at(self, omega: FloatArray) -> ComplexArray:
+        """At omega (f,) [rad/s], (f, r) [rad²/s²]."""
+        low, high = self.frequencies[[0, -1]]
+        frequencies = np.clip(np.asarray(omega) / (2 * np.pi), low, high)
+        return np.asarray(self._spline(np.log(frequencies)))
+
+    def padded(self, count: int) -> "Dispersion":
+        """With further modes that do not change."""
+        return Dispersion(self.frequencies, np.pad(self.values, ((0, 0), (0, count))))
+
+    @cached_property
+    def _spline(self) -> Any:
+        from scipy.interpolate import CubicSpline  # which homogeneous plates do not need
+
+        return CubicSpline(np.log(self.frequencies), self.values, axis=0)
 
 
 def loss_factors(plate: Plate, omega: FloatArray) -> FloatArray:

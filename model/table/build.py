@@ -22,7 +22,7 @@ from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig, canonical_json
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import footprints_of
-from model.structure.dispersion import Dispersion
+from model.structure.modal_elasticity import Dispersion
 from model.structure.support import check_supported
 from model.table.file import FORMAT_VERSION, MAX_BYTES
 from model.table.raster import Raster

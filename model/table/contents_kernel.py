@@ -10,8 +10,7 @@ from model.compiled.kernels import run
 from model.compiled.structures import FOUND, Drawn, FoundTones, GivenQuestion, Method, Rules
 from model.drive_modes.coherent import ONE_FINGER, SEVERAL, WITHIN_STROKE
 from model.drive_modes.forms import LEVEL_MARGIN
-from model.drive_modes.phased import MAX_TARGETS, PHASED
-from model.drive_modes.phased_kernel import given as as_method
+from model.drive_modes.phased import MAX_TARGETS, PHASED, as_structure
 from model.ensemble.measures import PERCENTILE
 from model.ensemble.touched_by_kernel import TouchedByKernel, draws_structure, touch
 from model.ensemble.touched_plate import RIDGE
@@ -141,8 +140,8 @@ def _rules_of(table: "LocalizationTable") -> Rules:
         *(len(CENTRE_AND_RIM), plate.gain_variance < MAX_VARIANCE_FINE, plate.thickness > 0),
         *(TIME_COUNT, plate.gain_variance, RIDGE, LEVEL_MARGIN, NEARLY_HIGHEST, REACHED),
         *(10 ** (-ONSET_MARGIN_DB / 20), ONSET_WEIGHT, PERCENTILE, PROMISED_PERCENTILE),
-        *(PHASED.phases[1], PHASED.iterations, as_method(ONE_FINGER), as_method(SEVERAL)),
-        (Method * 3)(*map(as_method, WITHIN_STROKE)),
+        *(PHASED.phases[1], PHASED.iterations, as_structure(ONE_FINGER), as_structure(SEVERAL)),
+        (Method * 3)(*map(as_structure, WITHIN_STROKE)),
     )
     found.point(
         rim=CENTRE_AND_RIM,

@@ -16,11 +16,7 @@ from numpy.typing import NDArray
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 from model.drive_modes import UNRESTRICTED
 from model.drive_modes.forms import Forms
-from model.drive_modes.sources import (
-    magnitudes_of_sources,
-    per_source,
-    sums_of_sources,
-)
+from model.drive_modes.switched import amplitude_powers, members_of, sums_of_sources
 from model.ensemble.attached_plate import AttachedPlate, attach
 from model.ensemble.plate_on_eras import PlateOnEras
 from model.ensemble.touched_by_kernel import touch
@@ -32,7 +28,7 @@ from model.rig.rig import physics_fingerprint
 from model.rig.uncertainty import Uncertainty
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loads
-from model.structure.dispersion import Dispersion
+from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS, Contents
 from model.table.contents_kernel import choose_tones
@@ -80,7 +76,7 @@ class LocalizationTable:
     - omega: (r,) [rad/s], of the reduced free plate (`model.reduction.reduced_plate`)
     - losses: (r,) [rad²/s²], of it beside those of the plate's loss factor
     - dispersion_frequencies: (k,) [Hz], dispersion: (k, r) [rad²/s²], change of its omega² with
-      frequency (`model.structure.dispersion`), k = 0 for none
+      frequency (`model.structure.modal_elasticity`), k = 0 for none
     - attachment_shapes: (eras + masses, r) [1/sqrt(kg)], its shapes at ERAs and masses
     - shapes: (points, r) [1/sqrt(kg)], its shapes on the raster
     - discretisation_error: (f,), estimated relative L2 error of the fields over the raster
@@ -258,10 +254,11 @@ class LocalizationTable:
     @cached_property
     def available_level_db_sl(self) -> FloatArray:
         """Highest level [dB SL] of any `switched` pattern at the centre of each cell, (cells,)."""
-        sources = magnitudes_of_sources(self._cell_fields)
-        powers = (sources / per_source(self.thresholds, len(self.eras))) ** 2
+        eras = len(self.eras)
+        powers = amplitude_powers(self._cell_fields.transpose(2, 0, 1), members_of(eras))
+        powers /= self.thresholds**2
         # Cell by cell, since fine frequency steps make millions of patterns.
-        maxima = [sums_of_sources(cell[None], len(self.eras)).max() for cell in powers.T]
+        maxima = [sums_of_sources(cell[None], eras).max() for cell in powers]
         return decibels(np.sqrt(np.array(maxima, dtype=float)))
 
     @cached_property

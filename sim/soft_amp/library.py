@@ -5,8 +5,7 @@ from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
-from model.compiled.compiler import compile_library
-from model.compiled.library_cache import kept_library
+from model.compiled.library_cache import compile_library, kept_library
 from model.errors import InputError
 
 ENGINE = "engine.so"

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from model.compiled import compiler, library_cache
-from model.compiled.compiler import compile_library
+from model.compiled import library_cache
 from model.compiled.kernels import kernels
+from model.compiled.library_cache import compile_library
 from model.errors import InputError
 
 _PROGRAM = """
@@ -156,7 +156,7 @@ def test_compiler_that_gives_no_library_is_bad_input(
 ) -> None:
     """Neither is there a file then, nor a part of one."""
     monkeypatch.setenv("CC", cc)
-    monkeypatch.setattr(compiler, "_TIMEOUT", 0.01)
+    monkeypatch.setattr(library_cache, "_TIMEOUT", 0.01)
     with pytest.raises(InputError):
         compile_library(tmp_path / "seven.so", [source], flags=(), what="seven")
     assert [path.name for path in tmp_path.iterdir()] == ["seven.c"]

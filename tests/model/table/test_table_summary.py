@@ -9,9 +9,14 @@ import pytest
 from model.finger.grid import Grid
 from model.structure.attachments import PointLoad
 from model.table.build import build_table
-from model.table.overview import CONTACT_SETS, Overview, contrast_distribution, find_overview
+from model.table.overview import (
+    CONTACT_SETS,
+    Overview,
+    contrast_distribution,
+    find_overview,
+    summarize,
+)
 from model.table.question import Question
-from model.table.summary import summarize
 from model.table.weak_cells import (
     WeakCells,
     ask_once,

@@ -147,8 +147,8 @@ class _Answering:
         """Fingers that would feel more of others' contents than they allow."""
         disturbed = []
         for finger, layer in found.layers.items():
-            level, most = layer.foreign_level_db_sl, self.requests[finger].max_foreign_db_sl
-            if level is not None and not level <= most:
+            level, allowed = layer.foreign_level_db_sl, self.requests[finger].max_foreign_db_sl
+            if level is not None and not level <= allowed:
                 disturbed.append(finger)
         for finger, each in found.quiet.items():
             if not each.level_db_sl <= self._every[finger].max_foreign_db_sl:
@@ -285,7 +285,7 @@ class _Answering:
                 weights, table.eras, table.frequencies, gain=float(found.gains[number])
             )
             for finger in stream.targets:
-                nominal, median, promised, level, promised_level, foreign = figures[finger]
+                nominal, median, promised, level, promised_level, foreign_level = figures[finger]
                 is_shared = finger != stream.targets[0]
                 layers[finger] = Layer(
                     self.requests[finger],
@@ -296,11 +296,11 @@ class _Answering:
                     felt_contrast_db=nominal,
                     median_felt_contrast_db=median,
                     promised_contrast_db=promised,
-                    foreign_level_db_sl=foreign,
+                    foreign_level_db_sl=foreign_level,
                 )
         for finger in plan.quiet:
-            nominal, _, promised, _, _, foreign = figures[finger]
-            quiet[finger] = QuietFinger(self._every[finger].at, nominal, promised, foreign)
+            nominal, _, promised, _, _, level = figures[finger]
+            quiet[finger] = QuietFinger(self._every[finger].at, nominal, promised, level)
         worst = None if math.isnan(found.worst) else float(decibels(found.worst))
         applied = () if found.is_apart else (f"frequencies are nearer than {self.apart_hz:g} Hz",)
         return _Measured(layers, quiet, worst, found.stroke_factor, applied)

@@ -117,7 +117,7 @@ def test_search_finds_the_best_of_all_layouts_on_a_coarse_raster(monkeypatch) ->
     strong = tuple(replace(era, stroke=0.01) for era in rig().eras)
     loud = replace(rig(), uncertainty=GAINS, eras=strong)
     pairs = tuple(replace(anywhere(loud.plate), quiet=(1, 1)).sets(4, seed=4))
-    rule = ContactRule((1, 1), 0.05, lambda rng, n: np.zeros((n, 2)), pairs, "given")
+    rule = ContactRule((1, 1), 0.05, lambda rng, n: np.zeros((n, 2)), pairs)
     search = LayoutSearch(problem(rig=loud, count=3, contacts=rule))
     candidates = search.problem.candidates
     ends = np.array([loud.limits.frequency_min, loud.limits.frequency_max])
@@ -244,7 +244,7 @@ def test_scores_count_plates_of_other_thickness_exactly(monkeypatch) -> None:
     strong = tuple(replace(era, stroke=0.01) for era in rig().eras)
     loud = replace(rig(), uncertainty=replace(GAINS, thickness=0.04), eras=strong)
     pairs = tuple(replace(anywhere(loud.plate), quiet=(1, 1)).sets(4, seed=4))
-    rule = ContactRule((1, 1), 0.05, lambda rng, n: np.zeros((n, 2)), pairs, "given")
+    rule = ContactRule((1, 1), 0.05, lambda rng, n: np.zeros((n, 2)), pairs)
     some = problem(rig=loud, contacts=rule)
     (found,) = LayoutSearch(some).scored([some.own_positions])
     dense = dense_score(loud, some.own_positions, pairs, some.searched_frequencies)

@@ -45,8 +45,9 @@ class _Play:
 
 @dataclass
 class _Finger:
-    """The region of a finger, where it entered, and its plays."""
+    """The region of a finger that is down since a time [s], where it entered, and its plays."""
 
+    since: float
     region: Region | None
     entered: tuple[float, float]
     plays: list[_Play] = field(default_factory=list)
@@ -123,7 +124,9 @@ class EffectPlayer:
         """
         effect = self.layout.effects[name]
         level = effect.level_db_sl if level_db_sl is None else level_db_sl
-        finger = self._fingers.get(contact.key) or self._add(contact, now)
+        finger = self._fingers.get(contact.key)
+        if finger is None or finger.since != contact.since:
+            finger = self._add(contact, now)
         # Replacing the earlier one keeps requests from piling up.
         finger.plays = [
             play
@@ -169,9 +172,10 @@ class EffectPlayer:
 
     def _update_regions(self, contacts: Sequence[Contact], now: float) -> None:
         """Start and end effects as fingers enter and leave regions."""
-        keys = {contact.key for contact in contacts}
-        self._already_pressed &= keys
-        for key in [key for key in self._fingers if key not in keys]:
+        since = {contact.key: contact.since for contact in contacts}
+        self._already_pressed &= since.keys()
+        # One that came down again with the same id, perhaps between two intents, is another.
+        for key in [key for key, one in self._fingers.items() if since.get(key) != one.since]:
             del self._fingers[key]
         for contact in contacts:
             finger = self._fingers.get(contact.key)
@@ -194,7 +198,7 @@ class EffectPlayer:
     def _add(self, contact: Contact, now: float) -> _Finger:
         """Add a new finger and start its effects."""
         position = (contact.x, contact.y)
-        finger = _Finger(self.layout.region_at(*position), position)
+        finger = _Finger(contact.since, self.layout.region_at(*position), position)
         self._fingers[contact.key] = finger
         self._enter(finger, contact, now)
         if contact.key in self._already_pressed:

@@ -55,6 +55,20 @@ def test_click_ends_after_its_duration() -> None:
     assert player.intent(here, 10.1).until is None
 
 
+@pytest.mark.parametrize("is_requested", [False, True])
+def test_a_finger_that_came_down_again_feels_its_press_again(is_requested: bool) -> None:
+    """Also with the same id, and no intent between: it is known by when it came down."""
+    layout = SurfaceLayout(effects={"click": Click(), "hum": Buzz(level=9.0)}, elsewhere="click")
+    player = EffectPlayer(layout)
+    assert wanted(player, [finger(1)], 0.0) == {1: 20.0}
+    assert wanted(player, [finger(1)], 1.0) == {}
+    if is_requested:
+        player.play("hum", finger(1, since=1.98), 1.99, level_db_sl=None)
+    again = [finger(1, since=1.98)]
+    assert wanted(player, again, 2.0) == {1: 9.0 if is_requested else 20.0}
+    assert wanted(player, again, 3.0) == ({1: 9.0} if is_requested else {})
+
+
 def test_buzz_lasts_while_the_finger_stays() -> None:
     """A buzz without a duration goes on; a new finger starts it again."""
     player = EffectPlayer(SurfaceLayout())

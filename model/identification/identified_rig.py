@@ -25,7 +25,7 @@ def plate_with(plate: Plate, values: Values) -> Plate:
     )
     return replace(
         plate.scaled(modulus=values.modulus, thickness=values.thickness),
-        loss_factor=values.loss_factor,
+        loss_factor=max(values.loss_factor, 0.0),
         loss_exponent=values.loss_exponent,
         mode_deviations=tuple((float(a), float(b)) for a, b in deviations if len(deviations)),
     )
@@ -39,7 +39,7 @@ def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
             x=float(values.places[number, 0]),
             y=float(values.places[number, 1]),
             stiffness=float(values.stiffness[number]),
-            damping=float(values.damping[number]),
+            damping=float(max(values.damping[number], 0.0)),
             bolt_mass=float(max(values.bolt_mass[number], 0.0)),
             gains=_gains(era, rig, values, number),
         )

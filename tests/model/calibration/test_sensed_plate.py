@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.calibration.sensed_plate import SensedPlate, sensed_plate
+from model.calibration.sensed_plate import Parameters, SensedPlate, sensed_plate
 from model.rig.rig import Rig
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import PointLoad
@@ -92,3 +92,17 @@ def test_responses_scale_with_stiffness_and_mass(plate, other):
     _, scaled = np.split(plate.of(other).responses(), 2)
     np.testing.assert_allclose(scaled, FACTOR**2 * at, rtol=1e-9, atol=1e-9 * np.abs(at).max())
     assert np.abs(at_scaled - scaled).max() > 0.1 * np.abs(at).max()
+
+
+@pytest.mark.parametrize("loss_factor", np.linspace(0.001, 0.05, 20).tolist())
+def test_lower_bounds_are_no_loss_and_no_damping(loss_factor):
+    """A fit that ends at them has a rig: by rounding values would be just below zero."""
+    eras = [
+        replace(era, damping=1e3 * loss_factor * share)
+        for era, share in zip(RIG.eras, (0.02, 0.03, 0.07, 0.11), strict=True)
+    ]
+    plate = replace(RIG.plate, loss_factor=loss_factor)
+    parameters = Parameters.of(replace(RIG, plate=plate, eras=tuple(eras)))
+    values = parameters.values(parameters.bounds[0])
+    is_factor = [row.is_factor for row in parameters.rows]
+    np.testing.assert_allclose(values[np.logical_not(is_factor)], 0, atol=1e-12)

@@ -484,17 +484,18 @@ def _alone(
         answer = _query(table, levels, contact, target, quiet, capabilities, before)
     except Exception as error:
         return _failed(targets, quiet, error)
-    pattern, change, reason = answer.pattern, 0.0, None
-    if target.is_short:
-        left = [
-            capabilities.max_amplitudes[name] / tone.amplitude
-            for name, tone in pattern.excitation.items()
-            if tone.amplitude > 0
-        ]
-        if math.isfinite(capabilities.max_power):
-            left.append(_power_left(table, pattern, beside.contents, capabilities.max_power))
-        change = min(0.0, float(decibels(min(left, default=1.0))))
-        if change < 0 and answer.felt_db_sl + change < 0:
+    pattern, reason = answer.pattern, None
+    left = [
+        capabilities.max_amplitudes[name] / tone.amplitude
+        for name, tone in pattern.excitation.items()
+        if tone.amplitude > 0
+    ]
+    if math.isfinite(capabilities.max_power):
+        left.append(_power_left(table, pattern, beside.contents, capabilities.max_power))
+    change = min(0.0, float(decibels(min(left, default=1.0))))
+    if change < 0 and answer.felt_db_sl + change < 0:
+        reason = "the limits of the amplifiers allow nothing that is felt; raise them"
+        if beside.contents:
             reason = "the contents of other fingers use the whole stroke; lift a finger"
     felt, promised = answer.felt_db_sl + change, answer.promised_contrast_db
     leak = -math.inf if promised is None else felt - promised

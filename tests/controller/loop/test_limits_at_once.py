@@ -133,3 +133,23 @@ def test_a_click_is_within_the_power_that_what_lasts_leaves() -> None:
         )
     (held_back,) = found.not_served
     assert "lift a finger" in str(held_back.held_back)
+
+
+@pytest.mark.parametrize("what", ["level", "power"])
+def test_a_lone_steady_content_is_within_a_limit(what: str) -> None:
+    """It is lowered to the limit, 0.8 of its amplitude, instead of refused by the amplifiers."""
+    target = Target(CONTACTS[0].key, 14.0)
+    intent = HapticIntent((target,))
+    free = Selector(table(), EffectLevels(table())).select(CONTACTS, intent, FREE)
+    most = 0.8 * sums(free).max()
+    capabilities = replace(FREE, max_power=0.8**2 * float((sums(free) ** 2).sum()))
+    if what == "level":
+        capabilities = replace(
+            FREE, max_amplitudes={name: most * each for name, each in FREE.max_amplitudes.items()}
+        )
+    found = Selector(table(), EffectLevels(table())).select(CONTACTS, intent, capabilities)
+    assert sums(found) == pytest.approx(0.8 * sums(free), rel=1e-6)
+    (before,), (after,) = free.predictions, found.predictions
+    assert before.level_db_sl is not None
+    assert after.level_db_sl == pytest.approx(before.level_db_sl + 20 * np.log10(0.8))
+    assert after.promised_contrast_db == pytest.approx(before.promised_contrast_db)

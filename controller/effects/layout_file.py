@@ -156,7 +156,8 @@ def _check_region(
     uses = [region.on_press, region.on_move, region.on_release]
     if uses == [None, None, None]:
         for key in ("level", "band", "frequency", "own", "may_share"):
-            if getattr(region, key) not in (None, False):
+            given = getattr(region, key)
+            if given is not None and given is not False:  # a level may be 0
                 validation.add(
                     (*path, key), f"has no effect to apply to; add an effect or remove the {key}"
                 )

@@ -119,6 +119,7 @@ AT = "circle: {at: [0.1, 0.1], radius: 1 cm}"
         ),
         (f"regions: {{a: {{{AT}, frequency: 100}}}}", "1: regions.a.frequency:", "add an effect"),
         (f"regions:\n a:\n  {AT}\n  own: true", "4: regions.a.own:", "add an effect"),
+        (f"regions: {{a: {{{AT}, level: 0}}}}", "1: regions.a.level:", "add an effect"),
         (
             f"regions: {{a: {{{AT}, on_press: buzz, own: true, may_share: true}}}}",
             "1: regions.a.may_share:",

@@ -8,7 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
+import numpy as np
+
 from controller.sources.contacts import Contact, ContactKey
+from model.arrays import FloatArray
+from model.choice import best_of
 from model.finger.perception import STRONG_DB_SL
 from model.table.question import SHAPED_FROM
 
@@ -111,3 +115,13 @@ class IntentSource(Protocol):
 
         While it raises, all channels are silent.
         """
+
+
+def band_of_table(band: tuple[float, float], frequencies: FloatArray) -> tuple[float, float]:
+    """Return a band [Hz] that has frequencies of a table: itself, or the nearest of them alone."""
+    low, high = band
+    if low < high and ((frequencies >= low) & (frequencies <= high)).any():
+        return band
+    middle = np.sqrt(low * high)
+    nearest = float(frequencies[best_of(-np.abs(np.log(frequencies / middle)))])
+    return nearest, nearest

@@ -6,10 +6,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.intent import Target
+from controller.loop.intent import Target, band_of_table
 from controller.sources.contacts import Contact
 from model.arrays import FloatArray
 from model.choice import best_of
@@ -127,16 +125,6 @@ def playable_band(
         if ((frequencies >= together[0]) & (frequencies <= together[1])).any():
             low, high = together
     return low, high
-
-
-def band_of_table(band: tuple[float, float], frequencies: FloatArray) -> tuple[float, float]:
-    """Return a band [Hz] that has frequencies of a table: itself, or the nearest of them alone."""
-    low, high = band
-    if low < high and ((frequencies >= low) & (frequencies <= high)).any():
-        return band
-    middle = np.sqrt(low * high)
-    nearest = float(frequencies[best_of(-np.abs(np.log(frequencies / middle)))])
-    return nearest, nearest
 
 
 def _over_duration(

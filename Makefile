@@ -128,7 +128,7 @@ bench: .venv/installed-peers
 bench-latency: .venv/installed-test
 	$(BIN)/python -m benchmarks.latency --report
 
-# Half an hour: what fingers feel of several contents, beside what they were promised.
+# Five minutes: what fingers feel of several contents, beside what they were promised.
 # Others: make bench-promise PROMISE='--plates 8'
 bench-promise: .venv/installed
 	$(BIN)/python -m benchmarks.promise --report $(PROMISE)

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.wires.calls`: functions of the host that one set enters, and their files.
+"""`python -m benchmarks.wires`: functions of the host that one set enters, and their files.
 
 A set of four channels on one amplifier, and on four at a line each, 20 ms after the one before,
 over simulated amplifiers in this process. What these and the event loop do does not count.

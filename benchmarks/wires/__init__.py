@@ -1,1 +1,0 @@
-"""What a set takes in the host."""

@@ -7,7 +7,29 @@ from functools import partial
 from typing import cast
 
 from drivers import clock
-from drivers.codec.modbus.crc import crc16
+from drivers.codec.modbus.adu import (
+    EXCEPTION,
+    READ,
+    WRITE,
+    Adu,
+    checked,
+    framed,
+    read_pdu,
+    response_size,
+    split_tcp,
+    write_pdu,
+)
+from drivers.codec.modbus.registers import (
+    AREA,
+    BOX,
+    EXCEPTIONS,
+    HEAD,
+    IDENTITY,
+    IDENTITY_COUNT,
+    PRESENT,
+    REPLY,
+    unpack_identity,
+)
 from drivers.conformance.check import driving, reading
 from drivers.conformance.client import (
     QUIET,
@@ -19,20 +41,15 @@ from drivers.conformance.client import (
     expect,
     expect_equal,
     expect_reply,
+    read_as,
 )
 from drivers.conformance.subject import Subject
 from drivers.protocol.records import Values
 from drivers.protocol.table import BY_NUMBER, MAX_WORDS, MESSAGES, NO_CHANNEL, REFUSALS
 
-BOX, REPLY = 256, 128  # registers of a message, offset of its reply
-HEAD = 2  # registers of a reply before its words: tag, result
-IDENTITY, TEXT = 1065, 16  # first register, registers of a text
-WRITE, READ_HOLDING, READ = 16, 3, 4
-PRESENT = tuple(MESSAGES[name].number for name in ("GetCaps", "GetStatus", "GetFaults"))
-EXCEPTION = 0x80
-_HEADER = struct.Struct(">HHHB")  # transaction, protocol, length, unit
-_LEAST = 5  # bytes of a frame
-_EXCEPTIONS = {1: "UNKNOWN_TYPE", 2: "UNKNOWN_TYPE", 3: "BAD_LENGTH"}
+READ_HOLDING = 3
+"""The other function that reads."""
+_PRESENT = tuple(MESSAGES[name].number for name in PRESENT)
 
 
 class ModbusClient(Client):
@@ -51,34 +68,27 @@ class ModbusClient(Client):
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""
         self._buffer += data
-        while len(self._buffer) >= (size := self._size()):
-            frame, self._buffer = self._buffer[:size], self._buffer[size:]
-            transaction, unit, pdu = 0, frame[0], frame[1:-2]
-            if self.is_rtu:
-                check, seen = crc16(frame[:-2]).hex(), frame[-2:].hex()
-                expect(check == seen, "CRC of a response", expected=check, seen=seen)
-            else:
-                transaction, _, _, unit = _HEADER.unpack_from(frame)
-                pdu = frame[_HEADER.size :]
-            self.take(Heard(clock.now(), transaction, pdu[0], (), (unit, pdu)))
+        for adu in self._split():
+            expect(bool(adu.pdu), "response", expected="a valid frame", seen=adu.raw.hex())
+            heard = Heard(clock.now(), adu.transaction, adu.pdu[0], (), (adu.unit, adu.pdu))
+            self.take(heard)
 
-    def _size(self) -> int:
-        """Return how long the frame is that the buffer begins with, at least."""
-        if len(self._buffer) < _LEAST:
-            return _LEAST
+    def _split(self) -> list[Adu]:
         if not self.is_rtu:
-            return 6 + int.from_bytes(self._buffer[4:6], "big")
-        _, function, count = self._buffer[:3]
-        return 5 if function & EXCEPTION else 5 + count if function in (READ, READ_HOLDING) else 8
+            found, self._buffer = split_tcp(self._buffer)
+            return found
+        found = []
+        while 0 < (size := response_size(self._buffer)) <= len(self._buffer):
+            frame, self._buffer = self._buffer[:size], self._buffer[size:]
+            found.append(checked(frame) or Adu(frame[0], b"", raw=frame))
+        return found
 
     def adu(self, pdu: bytes, *, unit: int | None = None) -> bytes:
         """Return a PDU in a frame under the next transaction number."""
         self.number = self.number % 0xFFFF + 1
         unit = self.address if unit is None else unit
-        if not self.is_rtu:
-            return _HEADER.pack(self.number, 0, len(pdu) + 1, unit) + pdu
-        body = bytes([unit]) + pdu
-        return body + crc16(body)
+        transaction = 0 if self.is_rtu else self.number
+        return framed(unit, pdu, transaction, is_rtu=self.is_rtu)
 
     async def transact(self, pdu: bytes) -> tuple[bytes, When]:
         """Send a PDU and await its response; returns that and when it was carried out."""
@@ -96,7 +106,7 @@ class ModbusClient(Client):
 
     async def read(self, first: int, count: int, *, function: int = READ) -> tuple[int, ...]:
         """Read registers; Violation for an exception."""
-        response, _ = await self.transact(struct.pack(">BHH", function, first, count))
+        response, _ = await self.transact(read_pdu(first, count, function=function))
         what = f"head of the response to a read of {count} registers from {first}"
         head = bytes([function, 2 * count])
         expect_equal((response[:2], len(response)), (head, 2 + 2 * count), what)
@@ -104,24 +114,18 @@ class ModbusClient(Client):
 
     async def hello(self) -> Values:
         """Read the identity."""
-        tag, versions, *texts = await self.read(IDENTITY, 2 + 4 * TEXT)
-        expect_equal(tag, 0, "tag of the identity")
-        identity: Values = {"versions": versions}
-        for at, name in enumerate(("vendor", "product", "serial_number", "firmware")):
-            raw = struct.pack(f">{TEXT}H", *texts[TEXT * at : TEXT * (at + 1)]).rstrip(b"\0")
-            text = identity[name] = raw.decode("utf-8", errors="replace")
-            is_good = "\ufffd" not in text and text.isprintable()
-            expect(is_good, name, expected="UTF-8 without control characters", seen=raw)
-        return identity
+        registers = await self.read(IDENTITY, IDENTITY_COUNT)
+        expect_equal(registers[0], 0, "tag of the identity")
+        return read_as("identity", unpack_identity, registers)
 
     async def exchange(self, number: int, words: Sequence[int]) -> Answer:
         """Write a message, then read its reply; one that shows the present is read alone."""
         tag, when = None, None
-        if number not in PRESENT or words:
+        if number not in _PRESENT or words:
             tag = self.number % 0xFFFF + 1  # that of the frame, see `write_of`
             response, when = await self.transact(self.write_of(number, words))
             if response[0] & EXCEPTION:
-                code = _EXCEPTIONS.get(response[1], f"exception {response[1]}")
+                code = EXCEPTIONS.get(response[1], f"exception {response[1]}")
                 return Answer(code, None, (), when)
         sent = clock.now()
         count = HEAD + min(self.reply_words.get(number, MAX_WORDS), MAX_WORDS)
@@ -160,15 +164,7 @@ class ModbusClient(Client):
         return heard
 
 
-def write_pdu(first: int, registers: Sequence[int]) -> bytes:
-    """Return the PDU that writes registers, also more than there can be."""
-    count = len(registers)
-    head = struct.pack(">BHHB", WRITE, first, count, 2 * count % 256)
-    return head + struct.pack(f">{count}H", *registers)
-
-
 _PLACE = "modbus.md#registers"
-_AREA = HEAD + MAX_WORDS
 _PING, _STATUS, _CAPS, _ACHIEVED, _STOP = (
     MESSAGES[name].number for name in ("Ping", "GetStatus", "GetCaps", "GetAchieved", "Stop")
 )
@@ -187,7 +183,7 @@ async def areas(subject: Subject) -> None:
     async def write(number: int, tag: int, *words: int) -> None:
         await client.transact(client.write_of(number, words, tag=tag))
 
-    async def area(number: int, count: int = _AREA, at: int = 0, function: int = READ) -> list[int]:
+    async def area(number: int, count: int = AREA, at: int = 0, function: int = READ) -> list[int]:
         return [*await client.read(BOX * number + REPLY + at, count, function=function)]
 
     for number in set(BY_NUMBER) - {_STATUS}:
@@ -211,9 +207,9 @@ async def areas(subject: Subject) -> None:
         tag, result, first = await area(number, 3)
         shown_once = tag, result, first > 0
         expect_equal(shown_once, (9, 0, True), "tag, result, words once a refusal was read")
-    texts = await client.read(IDENTITY, 2 + 4 * TEXT, function=READ_HOLDING)
-    part = await client.read(IDENTITY + 2, TEXT)
-    expect_equal(part, texts[2 : 2 + TEXT], "part of the identity")
+    texts = await client.read(IDENTITY, IDENTITY_COUNT, function=READ_HOLDING)
+    part = await client.read(IDENTITY + 2, 16)
+    expect_equal(part, texts[2:18], "part of the identity")
 
 
 @driving(_PLACE, "rtu", "tcp")
@@ -221,9 +217,9 @@ async def present_areas(subject: Subject) -> None:
     """It shows the status of the moment at every read, and other replies as they were."""
     client = _client(subject)
     await subject.run([subject.arm, subject.one(), subject.ping])
-    kept = await client.read(BOX * _PING + REPLY, _AREA)
+    kept = await client.read(BOX * _PING + REPLY, AREA)
     await subject.run([subject.one(level=0.5), partial(subject.request, "GetStatus")])
-    again = await client.read(BOX * _PING + REPLY, _AREA)
+    again = await client.read(BOX * _PING + REPLY, AREA)
     expect_equal(again, kept, "reply to a Ping, read again after a set")
     if client.is_rtu:
         data = client.adu(client.write_of(_PING, [subject.session], tag=4242), unit=0)
@@ -237,7 +233,7 @@ async def present_areas(subject: Subject) -> None:
 def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, int]]:
     """Yield PDUs with the exceptions that they must raise."""
     area = BOX * _PING + REPLY
-    last = area + _AREA
+    last = area + AREA
     functions = (1, 2, 5, 6, 22, 43, 100)
     for function in functions:
         yield f"function {function}", bytes([function]) + b"\0\0\0\1", 1
@@ -258,11 +254,11 @@ def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, i
         ("a read behind an area", last, 1, 2),
         ("a read of no message", BOX * 63 + REPLY, 1, 2),
         ("a read of what is written", BOX * _PING, 1, 2),
-        ("a read beyond the identity", IDENTITY, 3 + 4 * TEXT, 2),
+        ("a read beyond the identity", IDENTITY, IDENTITY_COUNT + 1, 2),
         ("a read of 0 registers", area, 0, 3),
         ("a read of 126 registers", area, 126, 3),
     ):
-        yield what, struct.pack(">BHH", READ, first, count), code
+        yield what, read_pdu(first, count), code
 
 
 @driving("modbus.md#functions-and-exceptions", "rtu", "tcp")

@@ -5,8 +5,7 @@ result, words). Responses are matched by the transaction number over TCP, by uni
 length over RTU, and by the tag.
 """
 
-import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from drivers.codec.modbus.adu import (
@@ -14,6 +13,15 @@ from drivers.codec.modbus.adu import (
     RequestAdu,
     ResponseReader,
     build_adu,
+)
+from drivers.codec.modbus.registers import (
+    BOX,
+    EXCEPTIONS,
+    HEAD,
+    IDENTITY,
+    IDENTITY_COUNT,
+    REPLY,
+    unpack_identity,
 )
 from drivers.host.wire import (
     WIDEST,
@@ -27,14 +35,10 @@ from drivers.host.wire import (
     read_nak,
     reply_words,
 )
-from drivers.protocol.records import TEXT_MAX, Refusal, Values
-from drivers.protocol.table import BROADCAST, MESSAGES, REACTION, TEXTS
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.table import BROADCAST, MESSAGES, REACTION
 from drivers.statistics import WireCounters
 
-_BOX = 256  # registers of a message
-_REPLY = 128  # offset of its reply
-_REPLY_HEAD = 2  # registers: tag, result
-_IDENTITY = 1065, 2 + len(TEXTS) * TEXT_MAX // 2  # first register, count
 _WRITE_SIZE = 9  # bytes on RTU of a write, without its registers
 _FRAME_SIZE = 3  # bytes on RTU of a frame beside its PDU
 _HEADER_SIZE = 7  # bytes on TCP of a frame beside its PDU
@@ -43,13 +47,6 @@ _BITS = 11  # of a byte, with start, parity and stop
 _GAP = 3.5  # characters of silence before a frame
 _SHORTEST_GAP = 0.00175  # s; by the standard above 19 200 baud
 _GATEWAY = (10, 11)  # no path to the amplifier, or no response from it
-_EXCEPTIONS: Mapping[int, str] = {
-    1: "UNKNOWN_TYPE",
-    2: "UNKNOWN_TYPE",
-    3: "BAD_LENGTH",
-    5: "BUSY",
-    6: "BUSY",
-}
 
 
 @dataclass(slots=True)
@@ -96,7 +93,7 @@ class ModbusWire(Wire):
             return b"".join(adu.frame for adu in adus)
         self._sizes.setdefault(address, WIDEST)
         if name == "Hello":
-            self._request = _Request(name, 0, self._adu(address, *_IDENTITY))
+            self._request = _Request(name, 0, self._adu(address, IDENTITY, IDENTITY_COUNT))
         else:
             self._request = self._written(address, name, values)
         return self._request.adu.frame
@@ -132,7 +129,7 @@ class ModbusWire(Wire):
 
         Two transactions, with the silences before all four frames.
         """
-        rest = self._time(_ANSWERS_SIZE + 2 * (_REPLY_HEAD + reply))
+        rest = self._time(_ANSWERS_SIZE + 2 * (HEAD + reply))
         return self.transit(words) + rest + 3 * self.silence
 
     def _time(self, characters: int) -> float:
@@ -154,7 +151,7 @@ class ModbusWire(Wire):
         message = MESSAGES[name]
         tag = self._number % 0xFFFF + 1
         registers = (tag, *message.request.pack(values))
-        return _Request(name, tag, self._adu(unit, message.number * _BOX, registers))
+        return _Request(name, tag, self._adu(unit, message.number * BOX, registers))
 
     def _arrival(self, request: _Request, response: ModbusResponse) -> Arrival | None:
         """Return what a response to the transaction on the wire means."""
@@ -162,13 +159,13 @@ class ModbusWire(Wire):
             return None
         if response.exception:
             self._request = None
-            if (refusal := _EXCEPTIONS.get(response.exception)) is not None:
+            if (refusal := EXCEPTIONS.get(response.exception)) is not None:
                 return Nak(refusal, None)
             return Broken(f"Modbus exception {response.exception}")
         unit = request.adu.unit
         if request.adu.is_write:
-            first = MESSAGES[request.name].number * _BOX + _REPLY
-            count = _REPLY_HEAD + reply_words(request.name, *self._sizes[unit])
+            first = MESSAGES[request.name].number * BOX + REPLY
+            count = HEAD + reply_words(request.name, *self._sizes[unit])
             request.adu = self._adu(unit, first, count)
             return More(request.adu.frame)
         tag, result, *words = response.registers
@@ -178,7 +175,7 @@ class ModbusWire(Wire):
         self._request, self._replied = None, (request.adu, response)
         try:
             if request.name == "Hello":
-                return Reply(_identity(response.registers))
+                return Reply(unpack_identity(response.registers))
             if result:
                 return read_nak((0, *divmod(result, 256)))
             values = MESSAGES[request.name].reply.unpack(words, is_strict=False)
@@ -187,13 +184,3 @@ class ModbusWire(Wire):
         if request.name == "GetCaps":
             self._sizes[unit] = values["channels"], values["layers"]
         return Reply(values)
-
-
-def _identity(registers: tuple[int, ...]) -> Values:
-    """Read the identity: tag, versions, texts padded with zeros; raises Refusal."""
-    raw = struct.pack(f">{len(registers)}H", *registers)
-    identity: Values = {"versions": registers[1]}
-    for number, field in enumerate(TEXTS):
-        text = raw[4 + number * TEXT_MAX :][:TEXT_MAX].rstrip(b"\0")
-        field.read(text, len(text), identity)
-    return identity

@@ -8,45 +8,34 @@ result, words). Not modelled: parity and collisions on a serial line.
 import math
 import struct
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
-from drivers.codec.modbus.crc import crc16
-from drivers.protocol.records import Refusal, Values
+from drivers.codec.modbus.adu import (
+    EXCEPTION,
+    READS,
+    RTU_MAX,
+    WRITE,
+    Adu,
+    checked,
+    framed,
+    request_size,
+    split_tcp,
+)
+from drivers.codec.modbus.registers import (
+    AREA,
+    BOX,
+    IDENTITY,
+    PRESENT,
+    REPLY,
+    pack_identity,
+)
+from drivers.protocol.records import Refusal
 from drivers.protocol.table import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
 from sim.transport.far_end import AmplifierPort, FarEnd, Send
 
-READS, WRITE = (3, 4), 16
-"""Functions."""
 FRAME_TIMEOUT = 0.02
 """Longest pause [s] within an RTU frame: less than the 30 ms after which a host repeats it."""
 TCP_TIMEOUT = 1.0
 """Longest pause [s] within a TCP frame, whose segments may be delayed."""
-
-_MBAP = struct.Struct(">HHHB")  # transaction, protocol, length, unit
-_LENGTH_MAX = 254
-_MIN_LENGTH = 4  # unit, function, CRC
-_MAX_LENGTH = 256
-_WITH_TWO_WORDS, _SIZE = 6, 8  # the last of these functions, and the size of their RTU requests
-_WRITE_SIZE, _COUNT_AT = 9, 6  # without the registers that the byte there counts
-
-
-class RequestAdu(NamedTuple):
-    """A request PDU for a unit; transaction: of TCP, repeated in the reply."""
-
-    unit: int
-    pdu: bytes
-    transaction: int = 0
-
-
-def rtu_frame(unit: int, pdu: bytes) -> bytes:
-    """A reply ADU on a serial line."""
-    body = bytes([unit]) + pdu
-    return body + crc16(body)
-
-
-def tcp_frame(request: RequestAdu, pdu: bytes) -> bytes:
-    """A reply ADU over TCP."""
-    return _MBAP.pack(request.transaction, 0, len(pdu) + 1, request.unit) + pdu
 
 
 class RequestReader:
@@ -54,7 +43,7 @@ class RequestReader:
 
     def __init__(self, *, is_rtu: bool) -> None:
         self.timeout = FRAME_TIMEOUT if is_rtu else TCP_TIMEOUT
-        self._split = _split_rtu if is_rtu else _split_tcp
+        self._is_rtu = is_rtu
         self._buffer = b""
         self._last = 0.0
 
@@ -63,48 +52,33 @@ class RequestReader:
         """Time after which `pause` discards a partial frame [s]; infinite without one."""
         return self._last + self.timeout if self._buffer else math.inf
 
-    def feed(self, data: bytes, now: float) -> list[RequestAdu]:
+    def feed(self, data: bytes, now: float) -> list[Adu]:
         """The requests that these bytes complete, in order."""
         before = self.pause(now)
         self._last = now
-        found, self._buffer = self._split(self._buffer + data, is_ended=False)
-        return before + found
+        split = _split_rtu if self._is_rtu else split_tcp
+        found, self._buffer = split(self._buffer + data)
+        return before + [each for each in found if each.pdu]
 
-    def pause(self, now: float) -> list[RequestAdu]:
+    def pause(self, now: float) -> list[Adu]:
         """Discard a partial frame after a timeout; requests that it ends are returned."""
         if not self._buffer or now - self._last <= self.timeout:
             return []
-        found, _ = self._split(self._buffer, is_ended=True)
-        self._buffer = b""
-        return found
+        ended, self._buffer = self._buffer, b""
+        return _split_rtu(ended, is_ended=True)[0] if self._is_rtu else []
 
 
-def _split_tcp(data: bytes, *, is_ended: bool) -> tuple[list[RequestAdu], bytes]:
-    """Split bytes by the lengths in headers; returns what is left, too."""
-    found: list[RequestAdu] = []
-    while len(data) >= _MBAP.size:
-        transaction, protocol, length, unit = _MBAP.unpack_from(data)
-        if protocol != 0 or not 2 <= length <= _LENGTH_MAX:
-            return found, b""  # the next frame cannot be found
-        end = _MBAP.size - 1 + length
-        if len(data) < end:
-            break
-        found.append(RequestAdu(unit, data[_MBAP.size : end], transaction))
-        data = data[end:]
-    return found, data
-
-
-def _split_rtu(data: bytes, *, is_ended: bool) -> tuple[list[RequestAdu], bytes]:
+def _split_rtu(data: bytes, *, is_ended: bool = False) -> tuple[list[Adu], bytes]:
     """Split bytes by functions, which determine lengths, and CRCs; returns what is left, too.
 
     Behind a damaged frame the next valid one is searched at every byte; a frame of an unknown
     function ends with the pause after it.
     """
-    whole = _checked(data) if is_ended else None
+    whole = checked(data) if is_ended else None
     if whole is not None:
         return [whole], b""
-    found: list[RequestAdu] = []
-    while is_ended or 0 < _rtu_size(data) <= len(data) or len(data) > _MAX_LENGTH:
+    found: list[Adu] = []
+    while is_ended or 0 < request_size(data) <= len(data) or len(data) > RTU_MAX:
         request, data = _first_request(data)
         if request is None:
             break
@@ -112,45 +86,21 @@ def _split_rtu(data: bytes, *, is_ended: bool) -> tuple[list[RequestAdu], bytes]
     return found, data
 
 
-def _first_request(data: bytes) -> tuple[RequestAdu | None, bytes]:
+def _first_request(data: bytes) -> tuple[Adu | None, bytes]:
     """Take the first valid request, with what is before it; returns what is left, too."""
-    for start in range(len(data) - _MIN_LENGTH + 1):
-        end = start + _rtu_size(data[start:])
-        request = _checked(data[start:end])
+    for start in range(len(data)):
+        end = start + request_size(data[start:])
+        request = checked(data[start:end])
         if request is not None:
             return request, data[end:]
-    return None, data[-_MAX_LENGTH:]
-
-
-def _rtu_size(data: bytes) -> int:
-    """Length of the request that begins here; 0 where it is not known, or not yet."""
-    function = data[1] if len(data) >= _MIN_LENGTH else 0
-    if 1 <= function <= _WITH_TWO_WORDS:
-        return _SIZE
-    if function == WRITE and len(data) > _COUNT_AT:
-        return min(_WRITE_SIZE + data[_COUNT_AT], _MAX_LENGTH)
-    return 0
-
-
-def _checked(frame: bytes) -> RequestAdu | None:
-    """The request in a frame with a valid CRC, else None."""
-    if len(frame) < _MIN_LENGTH or crc16(frame[:-2]) != frame[-2:]:
-        return None
-    return RequestAdu(frame[0], frame[1:-2])
+    return None, data[-RTU_MAX:]
 
 
 _MARGIN = 0.001  # s; behind the end of a pause, which must be exceeded
-_BOX = 256  # registers of a message
-_REPLY = 128  # offset of its reply
-_REPLY_HEAD = 2  # registers: tag, result
-_IDENTITY = 1065
-_TEXTS = ("vendor", "product", "serial_number", "firmware")
-_TEXT_SIZE = 32  # bytes
 _BROADCAST = 0
 _ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE = 1, 2, 3
 _READ_MAX, _WRITE_MAX = 125, 123
 _WRITE_HEAD = struct.Struct(">HHB")  # address, registers, bytes
-_PRESENT = ("GetCaps", "GetStatus", "GetFaults")
 
 
 class ModbusAmplifiers(FarEnd):
@@ -187,7 +137,7 @@ class ModbusAmplifiers(FarEnd):
         """Take the silence of the line until a time [s], which ends a frame that is not whole."""
         self._take(self._reader.pause(now), now)
 
-    def _take(self, requests: Sequence[RequestAdu], now: float) -> None:
+    def _take(self, requests: Sequence[Adu], now: float) -> None:
         for request in requests:
             if request.unit == _BROADCAST and self._is_rtu:
                 for number, each in [*self._units.items()]:
@@ -198,8 +148,8 @@ class ModbusAmplifiers(FarEnd):
             unit = self._units.get(request.unit)
             if unit is not None and unit.amplifier.is_answering:
                 pdu = unit.reply(request.pdu, now)
-                is_rtu = self._is_rtu
-                self._send(rtu_frame(request.unit, pdu) if is_rtu else tcp_frame(request, pdu))
+                frame = framed(request.unit, pdu, request.transaction, is_rtu=self._is_rtu)
+                self._send(frame)
                 self._move(request.unit)
 
     def _move(self, number: int) -> None:
@@ -234,8 +184,8 @@ class _Unit:
                 words = self._read(*_to_read(pdu[1:]), now)
                 return struct.pack(f">BB{len(words)}H", function, 2 * len(words), *words)
         except _ModbusException as exception:
-            return bytes([function | 0x80, exception.code])
-        return bytes([function | 0x80, _ILLEGAL_FUNCTION])
+            return bytes([function | EXCEPTION, exception.code])
+        return bytes([function | EXCEPTION, _ILLEGAL_FUNCTION])
 
     def take_broadcast(self, pdu: bytes, now: float) -> None:
         """Carry a request out that is for all units; its reply area stays as it is."""
@@ -265,12 +215,12 @@ class _Unit:
 
     def _read(self, address: int, count: int, now: float) -> Sequence[int]:
         """Return registers that can be read; raises _ModbusException."""
-        number, offset = divmod(address, _BOX)
-        if offset >= _REPLY and number in BY_NUMBER:
-            first = number * _BOX + _REPLY
+        number, offset = divmod(address, BOX)
+        if offset >= REPLY and number in BY_NUMBER:
+            first = number * BOX + REPLY
             area = self._reply_area(BY_NUMBER[number], now)
         else:
-            first, area = _IDENTITY, _identity(self.amplifier.identity)
+            first, area = IDENTITY, pack_identity(self.amplifier.identity)
         if not first <= address <= address + count <= first + len(area):
             raise _ModbusException(_ILLEGAL_ADDRESS)
         return area[address - first :][:count]
@@ -278,7 +228,7 @@ class _Unit:
     def _reply_area(self, message: Message, now: float) -> Sequence[int]:
         """Return the registers of a reply, with zeros behind it."""
         tag, result, words = self._replies.get(message.number, (0, 0, ()))
-        if message.name in _PRESENT:
+        if message.name in PRESENT:
             if result:  # a refusal is read once
                 self._replies[message.number] = tag, 0, ()
             else:
@@ -286,7 +236,7 @@ class _Unit:
         elif message.name == "SetAddress":
             self.is_moving = self.address > 0 and result == 0
         row = (tag, result, *words)
-        return row + (0,) * (_REPLY_HEAD + MAX_WORDS - len(row))
+        return row + (0,) * (AREA - len(row))
 
 
 class _ModbusException(Exception):
@@ -312,14 +262,7 @@ def _written(pdu: bytes) -> tuple[Message, int, Sequence[int]]:
     if not (1 <= count <= _WRITE_MAX and size == 2 * count == len(rest)):
         raise _ModbusException(_ILLEGAL_VALUE)
     tag, *words = struct.unpack(f">{count}H", rest)
-    number, offset = divmod(address, _BOX)
+    number, offset = divmod(address, BOX)
     if offset or number not in BY_NUMBER or len(words) > MAX_WORDS:
         raise _ModbusException(_ILLEGAL_ADDRESS)
     return BY_NUMBER[number], tag, words
-
-
-def _identity(identity: Values) -> Sequence[int]:
-    """Return the registers of the identity: tag 0, versions, texts padded with zeros."""
-    raw = [identity[name].encode()[:_TEXT_SIZE].decode(errors="ignore").encode() for name in _TEXTS]
-    texts = b"".join(text.ljust(_TEXT_SIZE, b"\0") for text in raw)
-    return (0, identity["versions"], *struct.unpack(f">{len(texts) // 2}H", texts))

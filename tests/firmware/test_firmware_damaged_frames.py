@@ -16,12 +16,12 @@ import pytest
 from drivers.codec.can_bus.adapter_text import SLCAN
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import REQUEST, segments
+from drivers.codec.modbus.adu import framed
 from drivers.protocol.table import MESSAGES, STATES, STATUS_FLAGS
 from firmware_requests import RandomHost
 from firmware_script import request, stuffed, unstuffed
 from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware
 from mutation import damage
-from sim.far_ends.modbus_amplifiers import rtu_frame
 
 COUNT = int(os.environ.get("FRAMES", "1000"))
 GET_CAPS, GET_STATUS = 2, 9
@@ -66,7 +66,7 @@ def can_line(body: bytes) -> bytes:
 
 WIRES: dict[str, tuple[Callable[..., Bodies], Callable[[bytes], bytes]]] = {
     "serial": (on_serial, lambda body: stuffed(body + struct.pack("<I", zlib.crc32(body)))),
-    "rtu": (on_modbus, lambda body: rtu_frame(1, body)),
+    "rtu": (on_modbus, lambda body: framed(1, body, is_rtu=True)),
     "tcp": (on_modbus, lambda body: struct.pack(">HHHB", 7, 0, len(body) + 1, 1) + body),
     "can": (on_can, can_line),
 }

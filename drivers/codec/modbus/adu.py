@@ -1,4 +1,4 @@
-"""Modbus ADUs of register requests, over TCP and RTU.
+"""Modbus ADUs of register requests, over TCP and RTU, for both ends; no I/O.
 
 A response is credited to a request alone that it answers; what is late, of others or damaged is
 counted.
@@ -7,17 +7,96 @@ counted.
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 from drivers.codec.modbus.crc import crc16
 from drivers.statistics import WireCounters
 
-_READ, _WRITE = 4, 16  # input registers, multiple registers
-_MBAP = 7  # transaction, protocol, length, unit
+READS, READ, WRITE = (3, 4), 4, 16
+"""Functions that read registers, the one of a host, and the one that writes them."""
+EXCEPTION = 0x80
+"""Bit of the function in a response that is an exception."""
+RTU_MAX = 256
+"""Longest frame on a serial line [bytes]."""
+_MBAP = struct.Struct(">HHHB")  # transaction, protocol, length, unit
 _LENGTH_MAX = 254  # unit and PDU
-_RTU_MAX = 256
-_EXCEPTION = 0x80
-_READS = (3, 4, 23)
-_WRITES = (5, 6, 15, 16)
+_RTU_MIN = 4  # unit, function, CRC
+_WITH_TWO_WORDS, _TWO_WORDS_SIZE = range(1, 7), 8  # functions, and the size of their requests
+_WRITE_SIZE, _COUNT_AT = 9, 6  # without the registers that the byte there counts
+_COUNTED, _ECHOING = (3, 4, 23), (5, 6, 15, 16)  # functions by the form of their responses
+
+
+class Adu(NamedTuple):
+    """A PDU for a unit, or of it; transaction: of TCP, 0 over RTU; raw: the whole frame.
+
+    Without a PDU raw are bytes that are no frame.
+    """
+
+    unit: int
+    pdu: bytes
+    transaction: int = 0
+    raw: bytes = b""
+
+
+def framed(unit: int, pdu: bytes, transaction: int = 0, *, is_rtu: bool) -> bytes:
+    """Return the frame of a PDU."""
+    if not is_rtu:
+        return _MBAP.pack(transaction, 0, len(pdu) + 1, unit) + pdu
+    body = bytes([unit]) + pdu
+    return body + crc16(body)
+
+
+def read_pdu(address: int, count: int, *, function: int = READ) -> bytes:
+    """Return the PDU that reads registers."""
+    return struct.pack(">BHH", function, address, count)
+
+
+def write_pdu(address: int, registers: Sequence[int]) -> bytes:
+    """Return the PDU that writes registers."""
+    count = len(registers)
+    return struct.pack(f">BHHB{count}H", WRITE, address, count, 2 * count % 256, *registers)
+
+
+def split_tcp(data: bytes) -> tuple[list[Adu], bytes]:
+    """Split bytes by the lengths in headers; returns what is left, too."""
+    found: list[Adu] = []
+    while len(data) >= _MBAP.size:
+        transaction, protocol, length, unit = _MBAP.unpack_from(data)
+        if protocol != 0 or not 2 <= length <= _LENGTH_MAX:
+            return [*found, Adu(unit, b"", raw=data)], b""  # the next frame cannot be found
+        raw, rest = data[: _MBAP.size - 1 + length], data[_MBAP.size - 1 + length :]
+        if len(raw) < _MBAP.size - 1 + length:
+            break
+        found.append(Adu(unit, raw[_MBAP.size :], transaction, raw))
+        data = rest
+    return found, data
+
+
+def checked(frame: bytes) -> Adu | None:
+    """Return what an RTU frame holds if its CRC is valid, else None."""
+    if len(frame) < _RTU_MIN or crc16(frame[:-2]) != frame[-2:]:
+        return None
+    return Adu(frame[0], frame[1:-2], raw=frame)
+
+
+def request_size(data: bytes) -> int:
+    """Return the size of the RTU request that begins here, at least; 0 where none can."""
+    function = data[1] if len(data) > 1 else 0
+    if function == WRITE:
+        size = _WRITE_SIZE + sum(data[_COUNT_AT : _COUNT_AT + 1])
+        return size if size <= RTU_MAX else 0
+    return _TWO_WORDS_SIZE if function in _WITH_TWO_WORDS else 0
+
+
+def response_size(data: bytes) -> int:
+    """Return the size of the RTU response that begins here, at least; 0 where none can."""
+    function = data[1] if len(data) > 1 else 0
+    if function & EXCEPTION:
+        return 5
+    if function in _COUNTED:
+        return 5 + sum(data[2:3])
+    return 8 if function in _ECHOING else 0
 
 
 @dataclass(frozen=True)
@@ -37,7 +116,7 @@ class RequestAdu:
     @property
     def is_write(self) -> bool:
         """Whether it writes registers, else it reads some."""
-        return self.head[0] == _WRITE
+        return self.head[0] == WRITE
 
 
 @dataclass(frozen=True)
@@ -53,17 +132,12 @@ def build_adu(
 ) -> RequestAdu:
     """Build the request of registers from an address on: how many to read, or those to write."""
     if isinstance(transfer, int):
-        pdu = struct.pack(">BHH", _READ, address, transfer)
-        head, size = bytes([_READ, 2 * transfer]), 2 + 2 * transfer
+        pdu = read_pdu(address, transfer)
+        head, size = bytes([READ, 2 * transfer]), 2 + 2 * transfer
     else:
-        count = len(transfer)
-        head, size = struct.pack(">BHH", _WRITE, address, count), 5
-        pdu = head + struct.pack(f">B{count}H", 2 * count, *transfer)
-    if is_rtu:
-        frame = bytes([unit]) + pdu
-        frame += crc16(frame)
-    else:
-        frame = struct.pack(">HHHB", transaction, 0, 1 + len(pdu), unit) + pdu
+        pdu = write_pdu(address, transfer)
+        head, size = pdu[:5], 5
+    frame = framed(unit, pdu, transaction, is_rtu=is_rtu)
     return RequestAdu(unit, transaction, frame, head, size)
 
 
@@ -78,61 +152,51 @@ class ResponseReader:
     def __init__(self, *, is_rtu: bool, counters: WireCounters) -> None:
         self._is_rtu = is_rtu
         self._counters = counters
-        self._buffer = bytearray()
+        self._buffer = b""
         self.unawaited: set[int] = set()
 
     def clear(self) -> None:
         """Discard partial data."""
-        if self._buffer:
-            self._counters.invalid_frames += 1
-            self._buffer.clear()
+        self._counters.invalid_frames += bool(self._buffer)
+        self._buffer = b""
 
     def feed(self, data: bytes, to: RequestAdu | None) -> list[ModbusResponse]:
         """Return the responses to a request in these bytes; to: None without a request."""
         self._buffer += data
-        split = self._next_rtu if self._is_rtu else self._next_tcp
         responses = []
-        while (frame := split(to)) is not None:
+        for adu in self._split(to):
+            if not adu.pdu:
+                self._counters.invalid_frames += 1
+                continue
             self._counters.frames_in += 1
-            transaction, unit, pdu = frame
-            if transaction in self.unawaited:
-                self.unawaited.remove(transaction)
+            if adu.transaction in self.unawaited:
+                self.unawaited.remove(adu.transaction)
                 continue
             response = None
-            if to is not None and (transaction, unit) == (to.transaction, to.unit):
-                response = _response(pdu, to)
+            if to is not None and (adu.transaction, adu.unit) == (to.transaction, to.unit):
+                response = _response(adu.pdu, to)
             if response is None:
                 self._counters.unexpected_frames += 1
             else:
                 responses.append(response)
         return responses
 
-    def _next_tcp(self, to: RequestAdu | None) -> tuple[int, int, bytes] | None:
-        if len(self._buffer) < _MBAP:
-            return None
-        transaction, protocol, length = (
-            int.from_bytes(self._buffer[at : at + 2], "big") for at in (0, 2, 4)
-        )
-        if protocol != 0 or not 2 <= length <= _LENGTH_MAX:
-            self.clear()  # the start of the next frame is unknown
-            return None
-        end = _MBAP - 1 + length
-        if len(self._buffer) < end:
-            return None
-        unit, pdu = self._buffer[_MBAP - 1], bytes(self._buffer[_MBAP:end])
-        del self._buffer[:end]
-        return transaction, unit, pdu
+    def _split(self, to: RequestAdu | None) -> list[Adu]:
+        if self._is_rtu:
+            return [*iter(partial(self._next_rtu, to), None)]
+        found, self._buffer = split_tcp(self._buffer)
+        return found
 
-    def _next_rtu(self, to: RequestAdu | None) -> tuple[int, int, bytes] | None:
+    def _next_rtu(self, to: RequestAdu | None) -> Adu | None:
         for start in range(len(self._buffer) - 4):
             size = self._rtu_size(start, to)
             if size and start + size <= len(self._buffer):
-                frame = bytes(self._buffer[start : start + size])
-                if crc16(frame[:-2]) == frame[-2:]:
+                adu = checked(self._buffer[start : start + size])
+                if adu is not None:
                     self._counters.invalid_frames += start > 0
-                    del self._buffer[: start + size]
-                    return 0, frame[0], frame[1:-2]
-        if len(self._buffer) > 2 * _RTU_MAX:
+                    self._buffer = self._buffer[start + size :]
+                    return adu
+        if len(self._buffer) > 2 * RTU_MAX:
             self.clear()
         return None
 
@@ -142,20 +206,18 @@ class ResponseReader:
         After invalid bytes only the response itself is accepted, since any bytes may look like the
         frame of another unit.
         """
-        unit, function, count = self._buffer[start : start + 3]
-        if start and (to is None or unit != to.unit or function & ~_EXCEPTION != to.head[0]):
+        size = response_size(self._buffer[start:])
+        if not start:
+            return size
+        unit, function = self._buffer[start : start + 2]
+        if to is None or unit != to.unit or function & ~EXCEPTION != to.head[0]:
             return 0
-        if function & _EXCEPTION:
-            return 5
-        if function in _READS:
-            size = 5 + count
-            return size if not start or (to is not None and size == to.size + 3) else 0
-        return 8 if function in _WRITES else 0
+        return size if function not in _COUNTED or size == to.size + 3 else 0
 
 
 def _response(pdu: bytes, to: RequestAdu) -> ModbusResponse | None:
     """Decode a PDU as the response to a request; None if it is not."""
-    if len(pdu) == 2 and pdu[0] == to.head[0] | _EXCEPTION and pdu[1]:
+    if len(pdu) == 2 and pdu[0] == to.head[0] | EXCEPTION and pdu[1]:
         return ModbusResponse(exception=pdu[1])
     if len(pdu) != to.size or not pdu.startswith(to.head):
         return None

@@ -12,10 +12,10 @@ from drivers.codec.modbus.adu import (
     RequestAdu,
     ResponseReader,
     build_adu,
+    framed,
 )
 from drivers.statistics import WireCounters
-from sim.far_ends.modbus_amplifiers import FRAME_TIMEOUT, RequestReader, rtu_frame, tcp_frame
-from sim.far_ends.modbus_amplifiers import RequestAdu as FarEndRequest
+from sim.far_ends.modbus_amplifiers import FRAME_TIMEOUT, RequestReader
 
 WORDS = (4711, *range(12))
 
@@ -25,7 +25,7 @@ def asked_and_answered(is_rtu: bool) -> tuple[RequestAdu, bytes]:
     transaction = 0 if is_rtu else 300
     request = build_adu(1, transaction, 3200, len(WORDS), is_rtu=is_rtu)
     pdu = struct.pack(f">BB{len(WORDS)}H", 4, 2 * len(WORDS), *WORDS)
-    return request, rtu_frame(1, pdu) if is_rtu else tcp_frame(FarEndRequest(1, b"", 300), pdu)
+    return request, framed(1, pdu, transaction, is_rtu=is_rtu)
 
 
 EXAMPLES = {is_rtu: asked_and_answered(is_rtu) for is_rtu in (True, False)}

@@ -19,7 +19,7 @@ PATIENCE = 180  # s; for a loaded machine, not an expectation
 
 @dataclass
 class FarEndProcess:
-    """What was started: URLs by the amplifiers' names, and its streams."""
+    """What was started: the URL by the amplifier's name, and its streams."""
 
     urls: Mapping[str, str]
     control: Path
@@ -42,9 +42,7 @@ class FarEndProcess:
 
 
 @asynccontextmanager
-async def far_end_process(
-    rig: Path, *options: str, amplifiers: int = 1
-) -> AsyncIterator[FarEndProcess]:
+async def far_end_process(rig: Path, *options: str) -> AsyncIterator[FarEndProcess]:
     """`era sim` of a rig file with these options; it ends with the context at the latest."""
     with tempfile.TemporaryDirectory() as folder:  # a short path, as sockets need
         control = Path(folder) / "control"
@@ -56,14 +54,11 @@ async def far_end_process(
         )
         try:
             assert process.stdout is not None
-            urls = {}
-            for _ in range(amplifiers):
-                line = (await asyncio.wait_for(process.stdout.readline(), PATIENCE)).decode()
-                name, _, url = line.strip().partition(": ")
-                urls[name] = url
+            line = (await asyncio.wait_for(process.stdout.readline(), PATIENCE)).decode()
+            name, _, url = line.strip().partition(": ")
             reader, writer = await asyncio.open_unix_connection(control, limit=1 << 24)
             try:
-                yield FarEndProcess(urls, control, process, reader, writer)
+                yield FarEndProcess({name: url}, control, process, reader, writer)
             finally:
                 writer.close()
                 with contextlib.suppress(ConnectionError):

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from felt_chain import LEVEL_DB_SL, LEVEL_LIMIT, ONSET, SENSORS, Heard, Played
+from felt_chain import LEVEL_DB_SL, ONSET, SENSORS, Heard, Played
 from model.arrays import ComplexArray, FloatArray
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import contrast_db, felt_part, mean_level_db_sl
@@ -32,8 +32,6 @@ from touch_stream import Situation, Stream
 STROKE = 100e-6  # m; of every ERA in the example
 JUDGED_UP_TO = 25.0  # dB; no model predicts what a quiet finger feels beyond that
 LEVEL_STEP, PHASE_STEP = 1e-4, 0.01  # the wires' own: full strokes, degrees
-PATTERN = 0.100  # s; from a touch to its pattern on the wire
-COMMANDED, RELEASE = 0.020, 0.010  # s; from the last finger's lift to a command of zero, its ramp
 
 
 @dataclass(frozen=True)
@@ -212,23 +210,6 @@ def _sampled(envelope: BaseEnvelope, knots: int) -> BaseEnvelope:
     return replace(envelope, knots=tuple(envelope.amplitude(times)), step=float(times[0]))
 
 
-def onset_is_on_time(played: Played, truth: Truth) -> None:
-    """Each change of the fingers leads to its pattern within 100 ms."""
-    late = [heard.delay for heard in _touched(played)]
-    assert max(late) <= PATTERN, late
-
-
-def silence_is_on_time(played: Played, truth: Truth) -> None:
-    """After the last lift, levels are zero within 20 ms and the ramp, by the amplifier's clock."""
-    late = []
-    for heard in played.heard:
-        if heard.situation.fingers:
-            continue
-        loud = [t for t, levels in played.polls if heard.begin <= t < heard.end and any(levels)]
-        late.append(max(loud, default=heard.begin) - heard.begin)
-    assert max(late) <= COMMANDED + RELEASE, late
-
-
 def plate_decays(played: Played, truth: Truth) -> None:
     """After that the plate rings on by itself, and less: by 13 dB from the steady state at once.
 
@@ -244,16 +225,6 @@ def plate_decays(played: Played, truth: Truth) -> None:
     assert max(left) < 0.05, left
 
 
-def levels_stay_within_limits(played: Played, truth: Truth) -> None:
-    """Levels within limits and only while a finger is down."""
-    spans = [(heard.begin, heard.end + COMMANDED + RELEASE) for heard in _touched(played)]
-    for moment, levels in played.polls:
-        assert max(levels) <= LEVEL_LIMIT, levels
-        is_touched = any(begin <= moment <= end for begin, end in spans)
-        assert is_touched or not any(levels), (moment, levels, spans)
-    assert len(played.polls) > 50, len(played.polls)
-
-
 def all_is_off_in_the_end(played: Played, truth: Truth) -> None:
     """Every amplifier is silent, without high voltage and without a fault."""
     for amplifier in played.summaries:
@@ -263,7 +234,7 @@ def all_is_off_in_the_end(played: Played, truth: Truth) -> None:
 
 
 def witness_reports_nothing(played: Played, truth: Truth) -> None:
-    """No rule of the protocol is broken."""
+    """No rule is broken: patterns and silences are in time, levels within limits."""
     assert not played.violations, played.violations[0]
 
 
@@ -274,10 +245,7 @@ CHECKS: Mapping[str, Callable[[Played, Truth], None]] = {
         plate_response_matches_model,
         localization_matches_prediction,
         onset_matches_prediction,
-        onset_is_on_time,
-        silence_is_on_time,
         plate_decays,
-        levels_stay_within_limits,
         all_is_off_in_the_end,
         witness_reports_nothing,
     )

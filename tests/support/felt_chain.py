@@ -4,11 +4,10 @@ Fingers are at every place of the stream, so that what they felt can be read for
 afterwards; those that do not touch have no weight.
 """
 
-import asyncio
-import math
 import random
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -49,24 +48,20 @@ SENSORS: Mapping[str, Place] = {
 STEADY = 0.3  # s; the end of each situation, when its transients have decayed
 ONSET = 0.1  # s; over which an onset is judged
 
-_POLL = 0.005  # s
-
 
 @dataclass(frozen=True)
 class Heard:
     """A situation as it was on the plate, from start to end [s].
 
-    patterns: as a daemon would report them, the first after a delay [s]; steady,
-    onset: what fingertips felt in the end and in the first 100 ms, by place; phasors (f, s) [m/s²]:
-    at the sensors in the end, at the frequencies that were played; fading: what sensors read where
-    nobody touched.
+    patterns: as a daemon would report them; steady, onset: what fingertips felt in the end and in
+    the first 100 ms, by place; phasors (f, s) [m/s²]: at the sensors in the end, at the frequencies
+    that were played; fading: what sensors read where nobody touched.
     """
 
     situation: Situation
     begin: float
     end: float
     patterns: tuple[Mapping[str, Any], ...] = ()
-    delay: float = 0.0
     steady: Mapping[str, Felt] = field(default_factory=dict)
     onset: Mapping[str, Felt] = field(default_factory=dict)
     phasors: ComplexArray | None = None
@@ -75,13 +70,9 @@ class Heard:
 
 @dataclass(frozen=True)
 class Played:
-    """Results of a stream; polls: times [s], and the levels of all channels then.
-
-    violations: what the witness found.
-    """
+    """Results of a stream; violations: what the witness found."""
 
     heard: list[Heard]
-    polls: list[tuple[float, list[float]]]
     summaries: Sequence[AmplifierSummary]
     violations: Sequence[Violation]
 
@@ -121,7 +112,7 @@ def play_stream(
             ]
             await chain.close()
             summaries = [chain.far.summary(name) for name in chain.far.devices]
-            return Played(heard, chain.polls, summaries, chain.witness.finish(clock.now()))
+            return Played(heard, summaries, chain.witness.finish(clock.now()))
 
     return run_virtual(run(), rng=random.Random(1))
 
@@ -130,28 +121,20 @@ def play_stream(
 class Streamed(Chain):
     """A chain with sensors, to which a stream is sent."""
 
-    polls: list[tuple[float, list[float]]] = field(default_factory=list)
-
     def __post_init__(self) -> None:
         """Place the sensors."""
+        self.is_felt = False
         self._sensors = Accelerometers(self.far.bench)
         self._sensors.place([Accelerometer(name, *at) for name, at in SENSORS.items()])
 
     async def send(self, stream: Stream) -> list[float]:
         """Deliver a stream at its pace; return the times of its changes [s]."""
-        polling = asyncio.create_task(self._poll())
-        self._touch(stream, {})
-        start = clock.now()
-        due = list(stream.changes)
         times = []
-        for frame in stream.frames():
-            await asyncio.sleep(max(0.0, start + frame.time - clock.now()))
-            while due and due[0][0] <= frame.time + 1e-6:
-                times.append(clock.now())
-                self._touch(stream, due.pop(0)[1])
-            self.controller.deliver(replace(frame, time=clock.now()))
-        polling.cancel()
-        return times
+        for (begin, fingers), (end, _) in pairwise([(0.0, {}), *stream.changes]):
+            times.append(clock.now())
+            self._touch(stream, fingers)
+            await self.hold(end - begin)
+        return [*times[1:], clock.now()]
 
     def hear(self, situation: Situation, begin: float, end: float) -> Heard:
         """Read what was felt in a situation between two times [s]."""
@@ -165,7 +148,6 @@ class Streamed(Chain):
         heard = replace(
             heard,
             patterns=tuple(map(_pattern, applied)),
-            delay=applied[0].time - begin if applied else math.inf,
             steady=steady,
             phasors=_phasors(
                 self._sensors.read(end - STEADY, end),
@@ -181,15 +163,9 @@ class Streamed(Chain):
 
     def _touch(self, stream: Stream, fingers: Mapping[int, str]) -> None:
         """Rest fingers on places; at the others they only feel."""
+        self.at = {id: stream.places[name] for id, name in fingers.items()}
         observers = stream.places.keys() - {*fingers.values()}
         self.far.bench.place_fingers(stream.places, now=clock.now(), observers=observers)
-        self.witness.contacts(clock.now(), tuple(fingers))
-
-    async def _poll(self) -> None:
-        while True:
-            levels = [level for each in self.levels().values() for level in each]
-            self.polls.append((clock.now(), levels))
-            await asyncio.sleep(_POLL)
 
 
 def _pattern(applied: Applied) -> Mapping[str, Any]:

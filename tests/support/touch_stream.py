@@ -1,13 +1,9 @@
-"""A touch stream that was recorded: fingers come, move and go, and what each change asks for."""
+"""A touch stream: fingers come, move and go, and what each change asks for."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from controller.sources.touch import Touch, TouchFrame
-
-LENGTH, WIDTH = 12 * 0.0254, 9 * 0.0254  # m; the example's plate
-FRAME = 1 / 60  # s; as touch tables send
 Place = tuple[float, float]
 
 
@@ -54,18 +50,3 @@ class Stream:
             found.append(Situation(begin, end, fingers, target, not before))
             before = fingers
         return found
-
-    def frames(self) -> Iterator[TouchFrame]:
-        """As a touch table sends it, with times [s] from the beginning."""
-        for number in range(round(self.changes[-1][0] / FRAME) + 1):
-            now = number * FRAME
-            down = [fingers for begin, fingers in self.changes if begin <= now + 1e-9][-1:]
-            yield self.frame(now, down[0] if down else {})
-
-    def frame(self, time: float, fingers: Mapping[int, str]) -> TouchFrame:
-        """All fingers at a time [s], each at its place."""
-        touches = tuple(
-            Touch(id, self.places[name][0] / LENGTH, 1 - self.places[name][1] / WIDTH)
-            for id, name in fingers.items()
-        )
-        return TouchFrame("table", time, touches)

@@ -168,12 +168,6 @@ def coarse_rig() -> Rig:
 
 
 @pytest.fixture(scope="session")
-def fine_rig() -> Rig:
-    """A mesh whose answers are near converged and still cheap, 48x36."""
-    return make_paper_rig(48, 36)
-
-
-@pytest.fixture(scope="session")
 def table_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A cache folder of all workers, in which one of them has built the example's table."""
     base = tmp_path_factory.getbasetemp()

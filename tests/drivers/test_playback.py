@@ -45,15 +45,6 @@ def test_tones_cross_fade_along_raised_cosines() -> None:
     assert playback.tokens == {0: 2}
 
 
-def test_kept_phase_continues_the_voice() -> None:
-    """One voice from level 0.5 to 0.7: 0.6 amid the ramp, t still counted from the first commit."""
-    playback = Playback(1, 8)
-    playback.commit([layer(0, tone())], 1, 0.0)
-    playback.commit([layer(0, tone(level=7000, keep_phase=True))], 2, 1.0)
-    assert amplitudes(playback, 1.01) == pytest.approx([0.6])
-    assert [voice.origin for voice in playback.voices_of(0)] == [0.0]
-
-
 def test_onset_and_ending_follow_straight_lines_through_knots() -> None:
     """From 0 through 0.2 at 90 degrees to 0.5; then from 0.5 through 0.1 to silence."""
     onset, ending = Envelope(100, ((2000, 9000),)), Envelope(50, ((1000, 0),))
@@ -66,17 +57,6 @@ def test_onset_and_ending_follow_straight_lines_through_knots() -> None:
     assert playback.silent_from == pytest.approx(0.51)
     playback.silence(0.5025, 0.05)
     assert playback.silent_from == pytest.approx(0.51)  # sooner, never later
-
-
-def test_set_silences_by_its_ending_unless_told_to_skip_it() -> None:
-    """Two steps of 30 ms along the ending, or the ramp of the later set."""
-    ending = Envelope(300, ((1000, 0),))
-    for skip, end in ((False, 1.06), (True, 1.02)):
-        playback = Playback(1, 8)
-        playback.commit([layer(0, tone(ending=ending))], 1, 0.0)
-        commands = (tone(level=0, skip_ending=True),) if skip else ()
-        playback.commit([layer(0, *commands)], 2, 1.0)
-        assert playback.silent_from == pytest.approx(end)
 
 
 def test_layers_do_not_touch_each_other() -> None:
@@ -94,32 +74,6 @@ def test_layers_do_not_touch_each_other() -> None:
     assert [playback.voices_of(channel)[0] for channel in (0, 1)] == kept
 
 
-def test_waiting_set_starts_when_the_onset_ends() -> None:
-    """Envelopes of 40 ms follow each other without a gap, however late the time is asked for."""
-    playback = Playback(1, 8)
-    chunk = Envelope(200, ((3000, 0),))
-    playback.commit([layer(0, tone(onset=chunk))], 1, 0.0)
-    playback.commit([layer(0, tone(level=1000, keep_phase=True, onset=chunk), after=True)], 2, 0.01)
-    playback.advance(0.05)
-    (voice,) = playback.voices_of(0)
-    assert (voice.transition.start, voice.transition.first) == pytest.approx((0.04, 0.5))
-    assert playback.tokens == {0: 2}
-    playback.commit([layer(0, tone(onset=chunk), after=True), layer(1)], 3, 0.06)
-    playback.silence(0.065, 0.005)
-    playback.advance(1.0)
-    assert playback.voices_of(0) == ()
-
-
-def test_end_of_a_layer_leaves_endings_under_way() -> None:
-    """A channel that falls silent by its ending goes on to, through 0.25 amid the last step."""
-    ending = Envelope(100, ((5000, 0),))
-    playback = Playback(2, 8)
-    playback.commit([layer(0, tone(ending=ending), tone(1))], 1, 0.0)
-    playback.commit([LayerSet(0, 0, 5, (tone(1),))], 2, 1.0)
-    playback.advance(1.015)
-    assert amplitudes(playback, 1.015) == pytest.approx([0.25])
-
-
 def test_voice_that_has_faded_is_not_continued_however_seldom_time_advances() -> None:
     """Its onset to level 0 ended at 20 ms, before that of the channel for which a set waits."""
     playback = Playback(2, 8)
@@ -128,19 +82,6 @@ def test_voice_that_has_faded_is_not_continued_however_seldom_time_advances() ->
     playback.commit([layer(0, tone(keep_phase=True), after=True)], 2, 0.01)
     playback.advance(1.0)
     assert [voice.origin for voice in playback.voices_of(0)] == pytest.approx([0.04])
-
-
-def test_oldest_fade_makes_room_for_a_voice_too_many() -> None:
-    """Of nine voices the one that has faded longest is silent within 2 ms; no set is refused."""
-    playback = Playback(1, 8)
-    for number in range(9):
-        playback.commit([layer(0, tone(frequency=2000 + 40 * number))], number + 1, number / 1000)
-    voices = playback.voices_of(0)
-    assert len(voices) == 9
-    assert voices[0].silent_from == pytest.approx(0.008 + 0.002)
-    assert [voice.silent_from for voice in voices[1:8]] == pytest.approx(
-        [0.002 + number / 1000 + 0.02 for number in range(7)]
-    )
 
 
 def test_random_sets_never_jump_and_keep_their_bounds() -> None:

@@ -12,14 +12,13 @@ from pathlib import Path
 import pytest
 
 import era_haptics
-from drivers.conformance import CheckResult, judge, of_kind
+from drivers.conformance import CheckResult, of_kind
 from drivers.conformance.check import run_checks
 from drivers.conformance.serial_frames import SerialClient
 from drivers.contents import Tone
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
-from long_form import shortly
 from registry.limits import GuardLimits
 from virtual_loop import run_virtual
 
@@ -135,23 +134,6 @@ def test_conformance_on_a_clock_that_is_moved(level: float, tmp_path: Path) -> N
     assert not failed, failed[0]
     skipped = {each.check.name for each in found if each.result == "skipped"}
     assert skipped == (SKIPPED if level < 0.5 else SKIPPED - {"limited"})
-
-
-@pytest.mark.parametrize("drives", shortly([False, True], [False]))
-async def test_conformance_on_a_pseudo_terminal(drives: bool, program: Path) -> None:
-    """In real time, within a minute of what it waits for; reading alone in the short form."""
-    far, near = pty.openpty()
-    running = subprocess.Popen([program], stdin=far, stderr=subprocess.PIPE)  # noqa: ASYNC220
-    try:
-        report = await judge(f"serial://{os.ttyname(near)}", drives=drives)
-    finally:
-        running.terminate()
-        _, errors = running.communicate()
-        os.close(near)
-        os.close(far)
-    failed = [f"{each.check.name}: {each.reason}" for each in report.results if each.reason]
-    assert report.overall == ("passed" if drives else "incomplete"), failed
-    assert errors == b""
 
 
 def tone(channel: int, level: float, frequency: float = 100.0, **other: object) -> Tone:

@@ -1,27 +1,22 @@
 """The firmware beside the simulated amplifier, under conformance, and with the host on lines."""
 
-import asyncio
 import cmath
 import math
 import random
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from drivers.contents import Layer, Shape, Tone
-from drivers.errors import LinkError
-from drivers.host.group import Group
-from drivers.protocol.table import BY_NUMBER, FAULTS, STATES
+from drivers.protocol.table import BY_NUMBER
 from firmware_judged import firmware_results
-from firmware_line import LINES, FirmwareLine
+from firmware_line import LINES
 from firmware_pair import WIRES, Pair, Sent
 from firmware_requests import RandomHost
 from long_form import shortly
 from moved_firmware import RATE, MovedFirmware
 from sim.amplifier.contract import Amplifier
-from virtual_loop import run_virtual
 
 REQUESTS = 600
 TOLERANCE = 3e-4  # of full level: 16-bit samples, and fixed point in up to 16 voices
@@ -145,31 +140,3 @@ def layers(ramp: float = 0.02) -> list[Layer]:
         Layer(0, (one, *(Tone(n, 130.0, 0.3, onset=ONSET) for n in (1, 2, 3))), ramp),
         Layer(3, tuple(Tone(n, 250.0, 0.2, onset=ONSET) for n in range(4)), ramp),
     ]
-
-
-@pytest.mark.parametrize("kind", LINES)
-def test_host_that_vanishes_leaves_silence(kind: str, replaying: Path) -> None:
-    """Silent within the watchdog and 5 ms of the last heartbeat; the host says that it is lost."""
-
-    async def run() -> None:
-        end = FirmwareLine(kind, replaying)
-        group = Group({"a": end.host}, watchdog=WATCHDOG)
-        await group.open()
-        await group.arm()
-        await group.apply({"a": layers()})
-        for _ in range(4):
-            await asyncio.sleep(0.05)
-            await group.beat()
-        end.firmware.samples()
-        end.is_deaf = True
-        with pytest.raises(LinkError):
-            await group.beat()
-        await asyncio.sleep(0.5)
-        samples = np.abs(end.firmware.samples()).max(axis=1)
-        assert samples[: round(0.2 * RATE)].max() > 0.5
-        assert not samples[round((WATCHDOG + 0.005) * RATE) :].any()
-        end.is_deaf = False
-        status = await end.host.read_status()
-        assert (status["state"], status["fault"]) == (STATES["FAULT"], FAULTS["WATCHDOG"])
-
-    run_virtual(run())

@@ -41,20 +41,6 @@ def falling(times: FloatArray, ramp: float) -> FloatArray:
     return np.asarray((1 + np.cos(np.pi * np.clip(times / ramp, 0, 1))) / 2)
 
 
-def test_channels_start_together_with_their_phases(replaying: Path) -> None:
-    """Every channel plays the formula of the page, with t from the commit, for three seconds."""
-    tones = [(110.0, 0.2, 0.0), (250.05, 1.0, -90.0), (20.0, 0.5, 179.99), (1999.95, 0.7, 12.34)]
-    set_ = apply(513, *(command(n, *each) for n, each in enumerate(tones)))
-    samples, _ = replay(
-        replaying, [(10, arm()), (50, set_), (1500, arm()), (1900, request(2))], 3000
-    )
-    assert not samples[: 50 * PER_MS].any()
-    playing = samples[50 * PER_MS :]
-    for channel, each in enumerate(tones):
-        expected = tone(seconds(len(playing)), *each)
-        assert np.abs(playing[:, channel] - expected).max() < TOLERANCE
-
-
 def test_frame_with_any_wrong_bit_is_not_answered(replaying: Path) -> None:
     """A CRC-32 finds every single one, be it in the frame or in the checksum."""
     frame = unstuffed(arm()[1:-1])

@@ -1,4 +1,4 @@
-"""The firmware on a line of the host, on the clock of a virtual loop: nothing takes real time."""
+"""The firmware on a line, on the clock of a virtual loop: nothing takes real time."""
 
 import asyncio
 from collections.abc import Callable
@@ -6,10 +6,7 @@ from pathlib import Path
 
 from drivers.codec.can_bus.adapter_text import SLCAN, TextReader
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
-from drivers.host.amplifier import Amplifier
-from drivers.host.line import Line
 from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware
-from words_line import KINDS, LIMITS
 
 LINES = {"serial": SERIAL, "rtu": MODBUS, "tcp": TCP, "can": CAN}
 """The kinds of wires, with the firmware's line of each."""
@@ -21,14 +18,13 @@ _TURN = 0.001  # s; between two turns of its loop
 class FirmwarePort:
     """One amplifier of firmware at address 1 behind a port of a kind of wire.
 
-    folder: of its library. is_deaf: nothing of the host arrives.
+    folder: of its library.
     """
 
     is_blocked = False
 
     def __init__(self, kind: str, folder: Path) -> None:
         self.firmware = MovedFirmware(folder)
-        self.is_deaf = False
         self.take: Callable[[bytes], None] = len
         """Takes what arrives at the host."""
         self._loop = asyncio.get_running_loop()
@@ -50,8 +46,7 @@ class FirmwarePort:
 
     def _arrived(self, data: bytes) -> None:
         self._follow()
-        if not self.is_deaf:
-            self.firmware.receive(self._line, data)
+        self.firmware.receive(self._line, data)
         self._fetch()
 
     def _turn(self) -> None:
@@ -69,13 +64,3 @@ class FirmwarePort:
             data = pack_frames(self._reader.feed(data))
         if data:
             self._loop.call_later(_WAY, lambda: self.take(data))
-
-
-class FirmwareLine(FirmwarePort):
-    """The firmware on a line of the host; host: of its amplifier."""
-
-    def __init__(self, kind: str, folder: Path) -> None:
-        super().__init__(kind, folder)
-        self.line = Line(KINDS[kind].wire(), self, "line")
-        self.take = self.line.received
-        self.host = Amplifier(self.line, 1, LIMITS, name="a")

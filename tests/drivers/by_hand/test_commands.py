@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.by_hand.cli import app
 from drivers.contents import Tone
-from drivers.errors import CommandError, CommandRefused, LinkError
+from drivers.errors import CommandError, CommandRefused
 from model.rig.file import example_rig_path
 from registry.limits import GuardLimits
 from word_wires import WORD_WIRES
@@ -84,14 +84,6 @@ def test_play_raises_when_the_watchdog_has_tripped(monkeypatch: pytest.MonkeyPat
             amplifier.play([Tone(0, 110.0, 0.2)], duration=1.0)
 
 
-def test_amplifier_of_another_full_level_is_refused() -> None:
-    """A rig says which one it has: the simulated one is of motion."""
-    with pytest.raises(LinkError, match="full level"):
-        BlockingAmplifier(DRAWN, limits=LIMITS, is_output=True).__enter__()
-    with BlockingAmplifier(DRAWN, limits=LIMITS, is_output=False):
-        pass
-
-
 def test_blocking_amplifier_ends_its_thread_when_opening_fails() -> None:
     """The error reaches the script, and the loop's thread has ended."""
     with pytest.raises(CommandError), BlockingAmplifier("sim://no-such-rig.yaml", limits=LIMITS):
@@ -132,17 +124,6 @@ def test_results_have_the_documented_keys(command: str, more: set[str]) -> None:
     assert set(result_of(command, URL)) == COMMON | more
 
 
-def test_drive_and_identify_of_a_simulated_rig() -> None:
-    """Four channels; what is driven is said as the wire has it."""
-    assert result_of("identify", URL)["channels"] == 4
-    options = ["--channel", "2", "--frequency", "123.45", "--level", "0.3", "--for", "0.05"]
-    driven = result_of("drive", URL, *options)
-    assert set(driven) == COMMON | {"achieved", "duration_s"}
-    assert driven["achieved"] == [
-        {"channel": 2, "frequency_hz": 123.45, "level": 0.3, "phase_deg": 0.0}
-    ]
-
-
 def test_unconfirmed_stop_exits_3_and_a_confirmed_one_names_the_next_command() -> None:
     """Nothing could be sent to a port that is not there."""
     result = invoke("stop", "serial:///dev/no-such-port", "--json")
@@ -171,12 +152,6 @@ def test_tones_are_measured_by_hand() -> None:
     for one in reading["sensors"]:
         assert [tone["frequency_hz"] for tone in one["tones"]] == [110.0, 150.0]
         assert [tone["amplitude"] for tone in one["tones"]] == [0.0, 0.0]
-
-
-def test_tones_too_close_are_an_error_of_the_command() -> None:
-    """Exit status 2 of the program, by the error's class."""
-    tones = ["--frequency", "110", "--frequency", "112", "--window", "0.1"]
-    assert isinstance(invoke("measure", URL, *tones).exception, CommandError)
 
 
 def test_conformance_reads_first_and_reports_what_is_left() -> None:
@@ -212,12 +187,6 @@ def test_discover_reports_why_a_port_cannot_be_opened(monkeypatch: pytest.Monkey
     result = invoke("discover")
     assert result.exit_code == 0, result.output
     assert "no such port" in result.stdout
-
-
-def test_discover_lists_amplifiers_of_urls() -> None:
-    """Each with its identity."""
-    (found,) = result_of("discover", URL, "--no-probe")["amplifiers"]
-    assert (found["url"], found["serial_number"]) == (URL, "SIM-main")
 
 
 @pytest.mark.parametrize(("url", "status"), [("foo", 2), ("serial:///dev/no-such-port", 3)])

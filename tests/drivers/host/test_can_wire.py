@@ -8,7 +8,6 @@ import pytest
 
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, segments, unpack_frames
-from drivers.contents import Layer, Tone
 from drivers.errors import LinkError
 from drivers.host.can_wire import CanWire
 from drivers.host.group import Group
@@ -149,25 +148,6 @@ def test_random_frames_raise_nothing_and_are_no_reply(wire: CanWire) -> None:
             assert wire.received(pack_frames([CanFrame(can_id, data)])) == []
     assert wire.counters.unexpected_frames > 0
     assert wire.received(ANSWERS["reply"][0]) == ANSWERS["reply"][1]
-
-
-@in_virtual_time
-async def test_frames_in_any_order_and_doubled_play_the_same_set() -> None:
-    """Each message backwards, each frame twice, both ways; none is repeated for it."""
-    end = MemoryLine("can", "a")
-    group = Group(end.hosts)
-    await group.open()
-    end.inward = end.outward = lambda name, data: [
-        (0.0002 + 1e-5 * at, pack_frames([frame] * 2))
-        for at, frame in enumerate(reversed(unpack_frames(data)))
-    ]
-    await group.arm()
-    tones = (Tone(0, 100.0, 0.5), Tone(1, 100.0, 0.5))
-    await group.apply({"a": [Layer(0, tones, 0.001)]})
-    await asyncio.sleep(0.002)
-    assert end.levels("a") == [0.5, 0.5]
-    assert (await group.stop())["a"].is_confirmed
-    assert end.retries == 0
 
 
 def beside_another_host(test: Callable[[Group, MemoryLine], Awaitable[None]]) -> None:

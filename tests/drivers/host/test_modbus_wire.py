@@ -226,28 +226,6 @@ async def test_damaged_length_costs_one_attempt() -> None:
     assert end.retries == 1
 
 
-@pytest.mark.parametrize("kind", ["rtu", "tcp"])
-@in_virtual_time
-async def test_each_response_has_its_time(kind: str) -> None:
-    """25 ms for that of the write and 25 ms for that of the read: no attempt is repeated.
-
-    A stop that waits is not kept waiting for the second one.
-    """
-    end = MemoryLine(kind, "a")
-    host = end.hosts["a"]
-    await host.open()
-    end.outward = lambda name, data: [(0.025, data)]
-    await host.read_status()
-    assert end.retries == 0
-    begin = end.loop.time()
-    reading = asyncio.ensure_future(host.read_status())
-    await asyncio.sleep(0.02)
-    stopping = asyncio.ensure_future(host.stop())
-    await asyncio.gather(reading, stopping)
-    stopped = min(time for time, request in end.sent if request == "1:8")
-    assert stopped - begin <= 0.02 + 0.008 + 0.001
-
-
 @in_virtual_time
 async def test_stop_is_not_sent_over_a_reply() -> None:
     """On RTU a status of two channels, 8 + 39 characters and two silences, begins 4 ms late."""

@@ -8,7 +8,7 @@ import pytest
 
 from drivers.errors import CommandError, CommandRefused, FrameError
 from drivers.host.sensors import Sensor, measure_tones, read_sensors, start_reading
-from drivers.protocol.records import Refusal, Values
+from drivers.protocol.records import Values
 from drivers.protocol.table import READING_STATES, UNKNOWN_PLACE, sensor_reading
 from virtual_loop import in_virtual_time
 from words_line import MemoryLine
@@ -143,20 +143,3 @@ async def test_tones_that_the_window_does_not_tell_apart_are_not_sent() -> None:
             await start_reading(line.hosts["a"], frequencies, 0.4)
     with pytest.raises(CommandError):
         await start_reading(line.hosts["a"], [110.0], 11.0)
-
-
-@in_virtual_time
-async def test_refused_measurement_is_told() -> None:
-    """As of frequencies beyond the sensors."""
-
-    def alter(name: str, reply: Values) -> Values:
-        if name == "Measure":
-            raise Refusal("frequencies must be at most 1000 Hz")
-        return reply
-
-    line = await opened(alter)
-    with pytest.raises(CommandRefused, match="BAD_VALUE"):
-        await start_reading(line.hosts["a"], [2000.0], 0.4)
-    without = MemoryLine("serial", "b").hosts["b"]
-    await without.open()
-    assert await read_sensors(without) == ()

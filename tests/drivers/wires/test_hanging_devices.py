@@ -86,21 +86,6 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> I
     assert device.is_closed.wait(20)
 
 
-@pytest.mark.parametrize("device", [_Hanging], indirect=True)
-@pytest.mark.parametrize("kind", OPENINGS)
-async def test_device_opened_after_a_cancellation_is_closed(device: _Hanging, kind: str) -> None:
-    """The cancelled task does not wait for it."""
-    task = asyncio.create_task(OPENINGS[kind]())
-    assert await asyncio.to_thread(device.is_opening.wait, 20)
-    task.cancel()
-    await asyncio.wait({task})
-    assert task.cancelled()
-    assert not device.is_closed.is_set()
-    device.may_close.set()
-    device.may_open.set()
-    assert await asyncio.to_thread(device.is_closed.wait, 20)
-
-
 @pytest.mark.parametrize("kind", OPENINGS)
 async def test_close_does_not_wait_for_a_device_that_hangs(
     device: _Hanging, kind: str, caplog: pytest.LogCaptureFixture

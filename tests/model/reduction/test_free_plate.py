@@ -178,18 +178,6 @@ def test_receptances_equal_direct_solve(free):
             assert np.linalg.norm(quick - exact) < 2e-6 * np.linalg.norm(exact)
 
 
-def test_acceleration_is_independent_of_the_cache_size(monkeypatch):
-    """A plate that may keep no solved point answers as one that keeps them all."""
-    frequencies = np.array([60.0, 470.0])
-    layouts = [random_eras(np.random.default_rng(seed), 4) for seed in (0, 1, 0)]
-    plates = [solve_free_plate(PAPER, MESHES["15x11"]) for _ in range(2)]
-    keeping = [plates[0].acceleration(eras, frequencies, plates[0].mesh.nodes) for eras in layouts]
-    monkeypatch.setattr("model.reduction.finite_element_modes._MAX_CACHE_BYTES", 0)
-    for eras, kept in zip(layouts, keeping, strict=True):
-        again = plates[1].acceleration(eras, frequencies, plates[1].mesh.nodes)
-        np.testing.assert_allclose(again, kept, rtol=1e-9)
-
-
 @pytest.mark.parametrize("kind", ["elements", "polynomials", "layers"])
 def test_shapes_at_footprints_are_not_those_of_points_of_the_same_bytes(kind):
     """Three points and two footprints of six numbers each, one after the other."""

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.calibration.sensed_plate import sensed_plate
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
@@ -15,7 +14,6 @@ from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import footprints_of
 from model.structure.plate import LOSS_FREQUENCY, Plate
-from model.table.build import build_table
 
 FREQUENCIES = np.array([65.0, 150.0, 240.0, 430.0])
 DEVIATIONS = ((0.02, 0.3), (0.0, 0.0), (-0.03, -0.4))
@@ -63,18 +61,6 @@ def test_direct_solution_refuses_modes_of_its_own(rig: Rig) -> None:
     assert isinstance(rig.mesh, SpectralMesh)
     with pytest.raises(InputError):
         direct_spectral_acceleration(rig.plate, rig.mesh, rig.eras, FREQUENCIES, POINTS)
-
-
-def test_tables_and_sensed_plates_have_them(rig: Rig) -> None:
-    """Fields of a table and of a plate with parameters are those of the plate solved alone."""
-    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
-    expected = free.acceleration(rig.eras, FREQUENCIES, POINTS)
-    largest = np.abs(expected).max()
-    table = build_table(rig, frequencies=FREQUENCIES)
-    np.testing.assert_allclose(table.unit_fields(POINTS), expected, atol=3e-3 * largest)
-    responses = sensed_plate(rig, POINTS, FREQUENCIES).responses()
-    strokes = np.array([era.stroke for era in rig.eras])[:, None]
-    np.testing.assert_allclose(responses * strokes, expected, atol=3e-3 * largest)
 
 
 def test_plate_in_time_has_them(rig: Rig) -> None:

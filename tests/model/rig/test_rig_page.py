@@ -4,11 +4,9 @@ import re
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import model
 from key_tables import bounds_in_words, key_rows, quantities
-from model.cli import app
 from model.config.units import quantity
 from model.rig.file import load_rig
 from model.rig.sections import (
@@ -99,11 +97,3 @@ def test_page_lists_the_known_materials():
     assert [(name, float(E) * 1e9, float(rho), float(nu)) for name, E, rho, nu in printed] == [
         (material.name, material.E, material.rho, material.nu) for material in known
     ]
-
-
-def test_page_quotes_the_output_for_the_glass_panel():
-    """Every quoted line is in the output of the command that the page names."""
-    result = CliRunner().invoke(app, ["plate", "show", str(ROOT / "examples" / "glass_panel.yaml")])
-    quoted = PAGE[PAGE.index("    laminate of 2.7 mm") :].split("\n\n")[0].splitlines()
-    assert len(quoted) == 8
-    assert {line.removeprefix("    ") for line in quoted} <= set(result.stdout.splitlines())

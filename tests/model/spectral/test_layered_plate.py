@@ -18,9 +18,7 @@ from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import Band, SpectralPlate
 from model.structure.attachments import Era, footprints_of
 from model.structure.equivalent import equivalent_plate
-from model.structure.plate import AirGap, Bond, Laminate, Layer, Material, Plate
-from model.table.build import build_table
-from model.table.file import load_table, save_table
+from model.structure.plate import Bond, Laminate, Layer, Material, Plate
 from model.vibration.natural_modes import direct_responder, natural_modes
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "glass_panel.yaml"
@@ -69,13 +67,6 @@ def test_free_strip_equals_elasticity(layers):
     expected = strip_frequencies(layers, 0.375, 6)
     found, _ = frequencies_of(panel(layers, width=1.0), (16, 0), parities=((1, 1), (-1, 1)))
     np.testing.assert_allclose(found[:6], expected, rtol=5e-3)
-
-
-def test_free_panel_does_not_depend_on_its_degrees():
-    """Frequencies of the first twelve modes stay within 0.1 % with four degrees more each way."""
-    plate = panel(PANEL)
-    low, high = (frequencies_of(plate, each, cut=500.0)[0][:12] for each in ((13, 9), (17, 13)))
-    np.testing.assert_allclose(low, high, rtol=1e-3)
 
 
 def test_layers_of_one_material_are_the_homogeneous_plate():
@@ -159,28 +150,6 @@ def test_lossy_layers_damp_in_time_as_at_each_frequency():
     expected = 0.01 + free.modes.losses / np.maximum(free.modes.eigenvalues, 1.0)
     order = np.argsort(free.modes.eigenvalues)[3:7]
     np.testing.assert_allclose(modes.damping_ratios[3:7], expected[order] / 2, rtol=0.02)
-
-
-def test_a_table_holds_what_changes_with_frequency(tmp_path):
-    """Its fields are those of the solved plate within 0.5 %, also when read from its file.
-
-    Of an adhesive by frequency and air: without the change with frequency they differ by 5 %.
-    """
-    core = replace(PANEL[1], by_frequency=((10.0, 0.5, 0.3), (1000.0, 2.0, 0.5)))
-    example = load_rig(EXAMPLE)
-    plate = replace(
-        panel((PANEL[0], core, PANEL[2]), loss_factor=0.01), air_gap=AirGap(2e-3, closed=True)
-    )
-    rig = replace(example, plate=plate, mesh=SpectralMesh(10, 8, 0.375, 0.225))
-    frequencies = np.array([80.0, 200.0, 300.0])
-    path = tmp_path / "table.npz"
-    save_table(build_table(rig, frequencies=frequencies), path)
-    table = load_table(path)
-    points = np.array([[0.1, 0.1], [0.3, 0.2], [0.05, 0.15]])
-    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=300.0)
-    expected = free.acceleration(rig.eras, frequencies, points, loads=rig.masses)
-    error = np.linalg.norm(table.unit_fields(points) - expected) / np.linalg.norm(expected)
-    assert error < 0.005
 
 
 def test_finite_elements_refuse_layers():

@@ -11,7 +11,6 @@ from long_form import in_turn
 from model.errors import InputError
 from model.fem.mesh import Q5, Mesh
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.reduced_plate import reduce_plate
 from model.reduction.spectral_modes import spectral_modes
 from model.rig.meshes import mesh_of
 from model.spectral.direct import direct_spectral_acceleration
@@ -19,7 +18,7 @@ from model.spectral.functions import CLASSES
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralPlate
-from model.structure.attachments import Era, PointLoad, footprints_of
+from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Material, Plate
 from model.vibration.natural_modes import natural_modes
 from paper_plate import make_paper_rig
@@ -137,36 +136,6 @@ def _all_eigenvalues(plate: Plate, degrees, parity) -> np.ndarray:
     M = plate.material.rho * plate.thickness * np.eye(of.size)
     M[of.deflections :, of.deflections :] /= 6  # of opposite unit motions
     return linalg.eigvalsh(K, M)
-
-
-def test_local_compliance_is_smooth_over_the_plate():
-    """Along a line from a force over the whole plate a step of 1 mm changes no slope by much.
-
-    The field of a force is continuous but at the force: a term that ended in a step failed the
-    verification of tables, whose raster interpolates it.
-    """
-    plate = Plate(1.2, 0.8, 0.004, GLASS)
-    at = np.array([[0.45, 0.1]])
-    line = at + np.outer(np.arange(0.01, 0.7, 0.001), [1.0, 0.3])
-    found = local_compliance(plate, (19, 15), at, line)[0]
-    bend = np.abs(np.diff(found, 2))
-    assert bend[15:].max() < 2e-3 * local_compliance(plate, (19, 15), at, at)[0, 0]
-
-
-def test_static_vectors_carry_the_local_compliance():
-    """Pushed slowly at an ERA, a reduced plate moves there by the plate's whole receptance."""
-    mesh = SpectralMesh(12, 9, PAPER.length, PAPER.width)
-    free = solve_free_plate(PAPER, mesh, frequency_max=500.0)
-    places = footprints_of(_on_plate(PAPER, LAYOUTS["inside"]))
-    omega = 2 * math.pi * 5.0
-    lossless = replace(PAPER, loss_factor=0.0)
-    exact, _ = solve_free_plate(lossless, mesh, frequency_max=500.0).receptances(
-        places, places, np.array([5.0])
-    )
-    reduced = reduce_plate(PAPER, free.mesh, places)
-    shapes = reduced.at(places)
-    found = shapes / (reduced.omega**2 - omega**2) @ shapes.T
-    np.testing.assert_allclose(found, exact[0].real, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

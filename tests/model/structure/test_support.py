@@ -11,14 +11,12 @@ from model.fem.mesh import Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate, supported_modes
 from model.rig.file import example_rig_path, load_rig
-from model.structure.attachments import Era, Fingertip, PointLoad, footprints_of
+from model.structure.attachments import Era, Fingertip, PointLoad
 from model.structure.footprint import mean_over
 from model.structure.plate import Material, Plate
 from model.structure.support import check_supported, rigid_body_frequencies, support_problem
-from model.transients.base_motion import Term
 from model.vibration.natural_modes import direct_responder
 from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
-from sim.plant.plant import Plant
 
 PLATE = Plate(0.3, 0.2, 0.002, Material("aluminium", E=70e9, rho=2700.0, nu=0.33))
 
@@ -190,28 +188,6 @@ def test_reduction_with_feet_equals_a_factor_for_each_frequency(on_feet):
     respond = direct_responder(on_feet.plate, on_feet.mesh)
     exact = respond(*arguments, loads=on_feet.masses)
     np.testing.assert_allclose(found, exact, rtol=1e-3, atol=1e-4 * abs(exact).max())
-
-
-def test_plate_in_time_settles_to_the_response_on_feet(on_feet):
-    """The plate in time under one ERA's tone reaches the steady response, within 1 %."""
-    frequency = 130.0
-    eras, loads = on_feet.eras, on_feet.masses
-    point = np.array([[0.2, 0.15]])
-    free = solve_free_plate(on_feet.plate, on_feet.mesh, frequency_max=500.0)
-    expected = abs(free.acceleration(eras, np.array([frequency]), point, loads=loads)[0, 0, 0])
-    reduced = reduce_plate(on_feet.plate, on_feet.mesh, footprints_of(eras, loads))
-    plant = Plant(reduced, eras, loads=loads)
-    found = _steady_amplitude(plant, reduced.at(point), eras[0], frequency)
-    assert found == pytest.approx(expected, rel=0.01)
-
-
-def _steady_amplitude(plant, shapes, era: Era, frequency: float) -> float:
-
-    omega = 2 * math.pi * frequency
-    plant.set_input(0, [Term(0.0, math.inf, omega, era.stroke)])
-    plant.skip(3.0)
-    _, values = plant.advance(3.1, sample_rate=20_000.0, shapes=shapes)
-    return float(np.sqrt(2 * np.mean(values**2)))
 
 
 @pytest.mark.parametrize("foot", [-1e-3, math.nan])

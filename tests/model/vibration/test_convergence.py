@@ -1,8 +1,6 @@
 """How far meshes are from converged, against independent solvers and a different element."""
 
-import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -109,23 +107,3 @@ def test_default_frequencies_are_those_of_the_papers_maps(limit, expected):
     rig = make_paper_rig(12, 9)
     limited = replace(rig, limits=replace(rig.limits, frequency_max=limit))
     assert default_frequencies(limited).tolist() == expected
-
-
-@pytest.mark.long
-def test_page_shows_the_errors_of_the_study(whole):
-    """The page on the plate model prints each mesh with its errors, an estimate and changes."""
-    page = Path(__file__).parents[3] / "docs" / "concepts" / "plate-model.md"
-    text = page.read_text(encoding="utf-8")
-    rows = re.findall(r"^ +(\d+x\d+) +\S+ .*?((?: +[\d.]+ %){3})", text, re.MULTILINE)
-    assert len(rows) == len(whole.errors)
-    for (mesh, printed), error in zip(rows, whole.errors, strict=True):
-        assert mesh == f"{error.mesh.nx}x{error.mesh.ny}"
-        figures = [np.abs(error.frequency).max(), *error.response]
-        shown = [float(value) for value in re.findall(r"[\d.]+", printed)]
-        np.testing.assert_allclose(shown, 100 * np.array(figures), rtol=1e-3, atol=2e-3)
-    (estimate,) = re.findall(r"^ +estimated .*?([\d.]+) % +([\d.]+) %$", text, re.MULTILINE)
-    shown = np.array(estimate, dtype=float)
-    np.testing.assert_allclose(shown, 100 * whole.errors[-2].estimate, rtol=2e-3, atol=2e-3)
-    lines = re.findall(r"^    (?:is|has) [^%]*?([\d.]+) % +([\d.]+) %$", text, re.MULTILINE)
-    shown = np.array(lines, dtype=float)
-    np.testing.assert_allclose(shown, 100 * np.array([whole.by_place, whole.by_foot]), rtol=2e-3)

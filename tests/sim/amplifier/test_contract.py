@@ -4,14 +4,14 @@ import math
 
 import pytest
 
-from drivers.protocol.records import Refusal, Values
+from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import FAULTS, STATES
 from sim.amplifier.contract import Amplifier
 
 ARM = {"session": 7, "watchdog": 250}
-OFF, READY, ON, ENABLED = list(STATES)[1:5]
-STOPPED, REACTION, FAULT = list(STATES)[5:]
+OFF, *_, ENABLED = list(STATES)[1:5]
+_, REACTION, FAULT = list(STATES)[5:]
 
 
 def armed(*, channels: int = 2) -> Amplifier:
@@ -42,19 +42,6 @@ def play(amplifier: Amplifier, token: int, at: float, *commands: Command, **laye
 def levels(amplifier: Amplifier, at: float) -> list[int]:
     """Levels of the status at a time, in 1e-4."""
     return list(amplifier.handle("GetStatus", {}, at)["levels"])
-
-
-def refused(amplifier: Amplifier, name: str, values: Values, at: float = 0.1) -> str:
-    """The code with which a request is refused, which changes nothing of the status."""
-    amplifier.tick(at)
-    before = amplifier.status(at)
-    with pytest.raises(Refusal) as raised:
-        amplifier.handle(name, values, at)
-    assert amplifier.status(at) == before
-    return raised.value.code
-
-
-# From docs/reference: the state that follows each request, by state; "-": refused.
 
 
 def test_heat_derates_and_then_trips() -> None:

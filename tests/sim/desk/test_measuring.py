@@ -1,12 +1,10 @@
 """A plate measured through a sound card in memory, and what is refused."""
 
 import ctypes
-import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.model_in_time import DeskModel
@@ -17,7 +15,7 @@ from drivers.errors import LinkError
 from model.errors import InputError
 from model.rig.rig import Rig
 from sim.measuring.desk import Desk
-from sim.measuring.live_plot import STEPS, live_plot, plot
+from sim.measuring.live_plot import STEPS, plot
 from sim.measuring.loopback import latency
 from sim.measuring.measure import Measured, check_by_steps, measure
 from sim.measuring.multisine import Multisine, default_frequencies
@@ -218,19 +216,6 @@ def test_plot_has_a_line_for_each_sensor_and_fits() -> None:
     assert count.startswith("3 of 3 runs")
     few = plot(MULTISINE, runs, PLOTTED, width=80, height=6).splitlines()
     assert (len(few), "1 more" in few[-1]) == (3, True)
-
-
-@pytest.mark.parametrize("is_terminal", [True, False])
-def test_plot_is_shown_on_a_terminal_only(
-    monkeypatch: pytest.MonkeyPatch, is_terminal: bool
-) -> None:
-    """After the first of three runs."""
-    written = io.StringIO()
-    console = Console(file=written, force_terminal=is_terminal, width=80, height=24)
-    monkeypatch.setattr("rich.console.Console", lambda **_options: console)
-    with live_plot(MULTISINE, PLOTTED) as show:
-        show(recorded(1))
-    assert ("1 of 3 runs" in written.getvalue()) == is_terminal
 
 
 FRAMES = 64

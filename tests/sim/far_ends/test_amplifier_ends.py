@@ -145,28 +145,6 @@ def _with_check(body: bytes) -> bytes:
     return body + check.to_bytes(2, "little")
 
 
-async def test_serial_line_outlives_its_hosts(coarse_rig: Rig) -> None:
-    """Hosts come and go; one that does not read loses replies, which are counted."""
-    async with terminal_end(coarse_rig, SerialAmplifiers) as end:
-        for _ in range(3):
-            fd = opened(end.port)
-            os.write(fd, HELLO)
-            found: list[Frame] = []
-            reader = FrameReader()
-            while not found:
-                found = list(reader.feed(await read(fd, 1)))
-            assert (found[0].kind, found[0].version) == (0x81, 0)
-            assert b"SIM-main" in found[0].payload
-            os.close(fd)
-        fd = opened(end.port)
-        async with asyncio.timeout(TIMEOUT):
-            while not end.dropped_replies:
-                with contextlib.suppress(BlockingIOError):
-                    os.write(fd, HELLO)
-                await asyncio.sleep(0)
-        os.close(fd)
-
-
 NAK = 0x9F
 
 

@@ -10,12 +10,14 @@ from numpy.testing import assert_allclose
 from driven_bases import faded_base, shaped_base
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
+from model.finger.perception import felt_part
 from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, footprints_of
 from model.transients.base_motion import Term
 from resting_fingers import FINGERTIP, resting
 from sim.plant.plant import Plant
+from sim.plant.sampled import SampledPlant
 
 STROKE = 1e-4
 BASES = (
@@ -24,7 +26,7 @@ BASES = (
     shaped_base(STROKE, 171.0, start=0.002, step=0.005, knots=(0, 0.5, 0.8j, -0.3, 0)),
 )
 PLACES = ((0.11, 0.07), (0.25, 0.15), (0.3048, 0.1))
-ONE, TWO, THREE = resting(PLACES[0]), resting(*PLACES[:2]), resting(*PLACES)
+ONE, THREE = resting(PLACES[0]), resting(*PLACES)
 
 
 @pytest.fixture(scope="module")
@@ -120,32 +122,6 @@ def test_contacts_are_solved_once(
         plant.set_contacts({})
 
 
-def test_contacts_on_a_plate_without_nodes(coarse_rig: Rig) -> None:
-    """Without its origin a plate keeps its coordinates; a rigid one sways on all its springs."""
-    # Three rigid motions of a plate of 1 kg: up and down, and two tilts.
-    mesh = Mesh(2, 2, coarse_rig.plate.length, coarse_rig.plate.width)
-
-    def shapes(points: FloatArray) -> FloatArray:
-        x, y = (points[:, :2] - mesh.nodes.mean(axis=0)).T
-        return np.column_stack([np.ones(len(x)), 10 * x, 10 * y])
-
-    rigid = ReducedPlate(coarse_rig.plate, np.zeros(3), np.zeros(3), shapes)
-    plant = Plant(rigid, coarse_rig.eras)
-    x, y = map(float, mesh.nodes[4])
-    plant.set_contacts({"a": FingertipLoad(x, y, FINGERTIP)})
-    assert len(plant.reduced.omega) == 3
-    w = 2 * np.pi * 5.0
-    plant.set_input(0, [Term(0.0, np.inf, w, STROKE)])
-    plant.skip(60.0)
-    _, samples = plant.advance(61.0, sample_rate=1e3, shapes=np.array([[1.0, 0.0, 0.0]]))
-    k, c = coarse_rig.eras[0].stiffness, coarse_rig.eras[0].damping
-    spring = k + 1j * w * c
-    pulp, bone = 1000 + 2j * w, 500 + 2j * w - 0.005 * w**2
-    finger = pulp * bone / (pulp + bone) - 0.0002 * w**2
-    expected = w**2 * abs(spring / (4 * spring + finger - w**2)) * STROKE
-    assert np.abs(samples).max() == pytest.approx(expected, rel=1e-3)
-
-
 def test_plant_sampling_rate_may_change(coarse_rig: Rig, reduced: ReducedPlate) -> None:
     """Every tenth sample at 10 kHz is the sample at 1 kHz, also right after the other rate."""
     quick, mixed = (vibrating(reduced, coarse_rig) for _ in range(2))
@@ -156,3 +132,26 @@ def test_plant_sampling_rate_may_change(coarse_rig: Rig, reduced: ReducedPlate) 
     assert len(times) == 50
     rows = np.round((times - 0.05) * 10_000).astype(int) - 1
     assert_allclose(found, expected[rows], rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+def test_bases_given_as_samples_move_the_plate_as_their_formulas(
+    coarse_rig: Rig, reduced: ReducedPlate
+) -> None:
+    """At 48 kHz, with fingers that come and go: of what skin can feel within 1 %."""
+    rate = 48_000
+    exact, followed = vibrating(reduced, coarse_rig, until=0.0), Plant(reduced, coarse_rig.eras)
+    made = SampledPlant(followed, rate=rate)
+    pieces = []
+    for number, contacts in enumerate(({}, THREE, ONE)):
+        for plant in (exact, followed):
+            plant.set_contacts(contacts)
+        made.follow()
+        times = (np.arange(2400) + 1 + 2400 * number) / rate
+        bases = np.zeros((len(times), len(coarse_rig.eras)))
+        bases[:, :3] = [[base.motion(time)[0] for base in BASES] for time in times]
+        shapes = exact.reduced.at(POINTS)
+        samples = made.advance(bases, shapes=shapes)
+        _, halfway = exact.advance(times[-1], sample_rate=2 * rate, shapes=shapes)
+        pieces.append((samples, halfway[::2]))
+    found, expected = (felt_part(np.concatenate(each), rate) for each in zip(*pieces, strict=True))
+    assert_allclose(found, expected, rtol=0, atol=0.01 * np.abs(expected).max())

@@ -2,14 +2,11 @@
 
 import pytest
 
-from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import (
     Assembler,
     Message,
     frames_of,
-    pack_frames,
     segments,
-    unpack_frames,
 )
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
@@ -54,16 +51,6 @@ def test_frames_of_every_length_hold_all_words(words: int) -> None:
     assert last == Message(9, 5, tuple(range(words)))
 
 
-def test_lost_frame_in_the_middle_is_made_good_by_a_newer_number_alone() -> None:
-    """The rest waits in vain; the repetition under the next number is complete by itself."""
-    whole = Assembler(WireCounters())
-    lost, late = segments(5, 5, range(8)), segments(6, 5, range(8))
-    assert [whole.add(data, 0.0) for data in (lost[0], lost[2])] == [None, None]
-    assert [whole.add(data, 0.0) for data in late[:2]] == [None, None]
-    assert whole.add(lost[1], 0.0) is None  # older
-    assert whole.add(late[2], 0.0) == Message(6, 5, tuple(range(8)))
-
-
 @pytest.mark.parametrize(
     ("last", "number", "is_taken"),
     [(1, 2, True), (255, 1, True), (1, 128, True), (1, 129, False), (2, 1, False), (1, 255, False)],
@@ -102,9 +89,3 @@ def test_frames_of_number_0_begin_anew_with_each_first() -> None:
     lost, _ = segments(0, 30, [5, 0, 255, 1])
     assert [whole.add(data, 0.0) for data in (second, lost, first)] == [None] * 3
     assert whole.add(second, 0.0) == Message(0, 30, (4, 0, 255, 1))
-
-
-def test_packed_frames_are_read_back() -> None:
-    """Of every length, identifiers of 11 bits."""
-    frames = [CanFrame(0x7FF - length, bytes(range(length))) for length in range(9)]
-    assert unpack_frames(pack_frames(frames)) == frames

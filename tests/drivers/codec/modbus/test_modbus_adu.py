@@ -3,7 +3,6 @@
 import struct
 from itertools import pairwise
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,7 +14,6 @@ from drivers.codec.modbus.adu import (
     framed,
 )
 from drivers.statistics import WireCounters
-from sim.far_ends.modbus_amplifiers import FRAME_TIMEOUT, RequestReader
 
 WORDS = (4711, *range(12))
 
@@ -52,15 +50,3 @@ def test_response_is_found_in_any_pieces(is_rtu: bool, cuts: list[int], garbage:
     pieces = [stream[a:b] for a, b in pairwise(edges)]
     answers, _ = read(is_rtu, *pieces)
     assert accepted(answers) == [WORDS]
-
-
-@pytest.mark.parametrize("is_rtu", [True, False])
-def test_truncated_request_does_not_merge_with_the_next(is_rtu: bool) -> None:
-    """A set that ends early, and a complete one after the longest pause within a frame."""
-    frame = build_adu(1, 0, 1280, WORDS, is_rtu=is_rtu).frame
-    for missing in range(1, len(frame)):
-        reader = RequestReader(is_rtu=is_rtu)
-        assert reader.feed(frame[:-missing], 10.0) == []
-        found = reader.feed(frame, 10.0 + reader.timeout + 0.01)
-        assert [request.pdu for request in found] == [frame[1:-2] if is_rtu else frame[7:]]
-    assert FRAME_TIMEOUT < 0.05

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 import canopen
 import pytest
 from canopen.sdo.client import SdoClient
-from canopen.sdo.exceptions import SdoAbortedError
 
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
@@ -98,24 +97,3 @@ def test_identity_is_read_by_a_foreign_master(read: SdoClient) -> None:
     texts = [read.upload(0x2000, each) for each in range(1, 5)]
     assert texts == [b"era-haptics", b"simulated amplifier", b"SIM-a", b"1"]
     assert [read.upload(0x2000, each) for each in (0, 5)] == [b"\x05", b"\x08\x00"]
-
-
-def test_words_of_capabilities_and_status_are_read(read: SdoClient) -> None:
-    """2001: 21 words from one channel, 8 layers, 16 voices on; 2002: 18 words, disarmed, 25 C."""
-    assert [read.upload(0x2001, each)[0] for each in range(4)] == [21, 1, 8, 16]
-    assert [read.upload(0x2002, each)[0] for each in (0, 1, 6)] == [18, 1, 250]
-
-
-def test_only_the_heartbeat_can_be_written(bus: Bus, read: SdoClient) -> None:
-    """1017 sets the interval; others are refused, as are objects that are not there."""
-    read.download(0x1017, 0, b"\x0a\x00")
-    assert read.upload(0x1017, 0) == b"\x0a\x00"
-    assert bus.end.next_event == pytest.approx(0.05)
-    for index, subindex, code in (
-        (0x1000, 0, 0x0601_0002),
-        (0x1017, 1, 0x0609_0011),
-        (0x1016, 1, 0x0602_0000),
-    ):
-        with pytest.raises(SdoAbortedError) as raised:
-            read.download(index, subindex, b"\0\0")
-        assert raised.value.code == code

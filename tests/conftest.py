@@ -22,7 +22,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
-import preloaded  # noqa: E402
 from drivers import garbage_collection  # noqa: E402
 from model.config import document  # noqa: E402
 from model.reduction import free_plate  # noqa: E402
@@ -98,11 +97,6 @@ document.plain_yaml = lambda kind: _KeptYaml() if kind == "safe" else _plain_yam
 
 garbage_collection.gc = SimpleNamespace(**vars(gc) | {"collect": partial(gc.collect, 1)})  # type: ignore[attr-defined]
 """A daemon in a test starts without visiting all objects of the suite: a fifth of a second each."""
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Start `era` without loading it anew each time."""
-    config.add_cleanup(preloaded.install().close)
 
 
 @pytest.hookimpl(optionalhook=True)

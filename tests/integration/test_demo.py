@@ -27,11 +27,11 @@ from controller.sources.capture import RecordedDatagram, read_capture, write_cap
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
 from daemon_bench import until
+from installed_program import ERA
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from patient_daemon import wait_long
 
-ERA = Path(sys.executable).with_name("era")
 FRAME = 1 / 50
 ERA_NAMES = {"SW", "SE", "NE", "NW"}
 

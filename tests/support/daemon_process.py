@@ -27,11 +27,11 @@ from daemon_bench import (
     until_state,
     write_daemon,
 )
+from installed_program import ERA
 from journal import Journal, loudness
 from model.table.file import save_table
 from rig_on_wire import FarSide
 
-ERA = Path(sys.executable).with_name("era")
 STARTING = 180.0  # s; for a loaded machine
 WATCHDOG, REACTION = 0.25, 0.005  # s; the longest time of an amplifier to be silent
 

@@ -10,7 +10,6 @@ import os
 import socket
 import ssl
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -48,12 +47,12 @@ from controller.api.schema import (
 from controller.api.server import ApiServer
 from controller.api.topics import StateEvent
 from daemon_bench import PATIENCE, daemon_table, write_daemon
+from installed_program import ERA
 from model.rig.file import parse_rig
 from model.table.file import save_table
 from model.table.table import LocalizationTable
 from rig_files import write_rig
 
-ERA = Path(sys.executable).with_name("era")
 TOKEN = "a-token-of-these-tests-only"
 
 

@@ -1,9 +1,13 @@
-"""Programs of the system that a test needs and a machine may lack."""
+"""The `era` under test, and programs of the system that a machine may lack."""
 
 import os
 import shutil
+import sys
+from pathlib import Path
 
 import pytest
+
+ERA = str(Path(sys.executable).with_name("era"))
 
 
 def installed_program(*names: str, package: str) -> str:

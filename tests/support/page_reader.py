@@ -13,8 +13,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from installed_program import ERA
 from patient_daemon import RESTING
-from preloaded import ERA
 from printed import difference
 from typed_page import Edited, Interrupted, PageError, Seen, Step, Typed, Written
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from benchmarks.desk.capture import Capture
-from preloaded import ERA
+from installed_program import ERA
 
 RATE = 48_000
 BLOCK = 128

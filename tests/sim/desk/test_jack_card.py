@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import LinkError
+from installed_program import ERA
 from model.errors import InputError
-from preloaded import ERA
 from sim.measuring.sound_card import SoundCard, open_card
 from sim.soft_amp.output import open_output
 from sim.soft_amp.settings import Protocol, Settings

@@ -4,16 +4,13 @@ import os
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from controller.loop.loop import Controller
-from controller.sources.touch import TouchFrame
 from sim.faults.fault_window import FaultWindow
-from soak import run_seed, shrink
+from soak import run_seed
 from soak_chain import run_plan
 from soak_plan import (
     AMPLIFIER_FAULTS,
@@ -94,14 +91,6 @@ def held(
     return Plan(3, (Line(wire, KINDS[wire][0]),), 1, ordered, 4.0, 4.0)
 
 
-def _deaf_to_lifts(deliver: Callable[..., None]) -> Callable[..., None]:
-    def deafly(controller: Controller, frame: TouchFrame) -> None:
-        if frame.touches:
-            deliver(controller, frame)
-
-    return deafly
-
-
 PLANS = {
     "held on serial": held(),
     "held on modbus-tcp": held(wire="modbus-tcp"),
@@ -117,16 +106,3 @@ def test_soak_plan_breaks_no_rule(plan: str) -> None:
     """Short plans, each of which breaks a rule once a fault of tests/faults is planted."""
     found = run_plan(PLANS[plan]).violations
     assert not found, "; ".join(found)
-
-
-def test_soak_shrink_keeps_only_the_needed_actions(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Arming and the finger are all that makes this plan fail."""
-    plan = held(
-        FaultInjection(3.7, 0, FaultWindow("delay", lasts=0.1, delay=0.002)),
-        commands=(OperatorAction(3.8, "disarm"), OperatorAction(3.9, "clear")),
-    )
-    monkeypatch.setattr(Controller, "deliver", _deaf_to_lifts(Controller.deliver))
-    smaller, kept = shrink(plan)
-    assert [type(action) for action in smaller.actions] == [OperatorAction, TouchSequence]
-    assert [plan.actions[number] for number in kept] == list(smaller.actions)
-    assert smaller.actions[0] == OperatorAction(0.5, "ready")

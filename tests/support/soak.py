@@ -2,7 +2,6 @@
 
 python tests/support/soak.py --seeds 4000 --long 500             short ones and long ones
 python tests/support/soak.py --seed 17 --trace trace.txt         one of the long again, all of it
-python tests/support/soak.py --seed 17 --short --shrink          what of a short one is needed
 """
 
 import argparse
@@ -14,7 +13,6 @@ import time
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import nullcontext
-from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -23,7 +21,7 @@ for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"  # before numpy loads
 
 from soak_chain import Outcome, run_plan  # noqa: E402
-from soak_plan import KINDS, Plan, make_plan  # noqa: E402
+from soak_plan import KINDS, make_plan  # noqa: E402
 
 _PROGRESS_INTERVAL = 250  # runs
 
@@ -32,26 +30,6 @@ def run_seed(job: tuple[int, bool], wire: str | None = None) -> tuple[Outcome, b
     """Run a seed, on one kind of wire where one is named; whether it is short stands beside."""
     seed, short = job
     return run_plan(make_plan(seed, wire, short=short)), short
-
-
-def shrink(plan: Plan) -> tuple[Plan, list[int]]:
-    """Leave out of a plan that fails all without which it fails, too; and what is left of it."""
-    kept = list(range(len(plan.actions)))
-    size = max(1, len(kept) // 2)
-    while size:
-        at = 0
-        while at < len(kept):
-            fewer = kept[:at] + kept[at + size :]
-            if run_plan(_only(plan, fewer)).violations:
-                kept = fewer
-            else:
-                at += size
-        size //= 2
-    return _only(plan, kept), kept
-
-
-def _only(plan: Plan, kept: Iterable[int]) -> Plan:
-    return replace(plan, actions=tuple(plan.actions[number] for number in kept))
 
 
 def report(found: Iterable[tuple[Outcome, bool]], *, minutes: float, again: str) -> int:
@@ -98,7 +76,6 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--seed", type=int, help="run only this one, and print its plan's hash")
     parser.add_argument("--trace", type=Path, help="with --seed: write everything that happens")
-    parser.add_argument("--shrink", action="store_true", help="with --seed: find what is needed")
     options = parser.parse_args()
     if options.seed is not None:
         return _run_one(options)
@@ -117,11 +94,8 @@ def main() -> int:
 
 
 def _run_one(options: argparse.Namespace) -> int:
-    """Run one seed, or what is needed of it."""
+    """Run one seed."""
     plan = make_plan(options.seed, options.wire, short=options.short)
-    if options.shrink:
-        plan, _ = shrink(plan)
-        _print(*(f"    {str(action)[:200]}" for action in plan.actions))
     with options.trace.open("w") if options.trace else nullcontext() as file:
         outcome = run_plan(plan, trace=file)
     ends = f"{len(outcome.violations)} violations, trace {outcome.digest}"

@@ -8,7 +8,7 @@ import pytest
 from controller.daemon.lease import Lease
 from controller.daemon.states import DaemonEvent, DaemonState, Trigger
 from controller.loop.loop import Controller
-from controller_bench import DISARMED, STOPPED, BenchLines
+from controller_bench import DISARMED, STOPPED
 from controller_bench import ENABLED as ARMED
 from drivers.errors import CommandRefused, LinkError
 from drivers.host.line import GRACE
@@ -114,52 +114,6 @@ async def test_end_of_the_control_loop_ends_the_daemon() -> None:
         await cancel_loop()
 
 
-@pytest.mark.parametrize("error", [LinkError("a line"), OSError("a line")])
-@in_virtual_time
-async def test_line_that_cannot_be_closed_is_opened_again(
-    monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
-    """After a loss, as any other."""
-    async with watched() as daemon:
-        close, errors = BenchLines.close, [error]
-
-        async def fail_once(lines: BenchLines) -> None:
-            await close(lines)
-            if errors:
-                raise errors.pop()
-
-        monkeypatch.setattr(BenchLines, "close", fail_once)
-        daemon.cut()
-        await asyncio.sleep(3)
-        assert not errors
-        daemon.obey()
-        await asyncio.sleep(10)
-        assert daemon.state in (DaemonState.READY_TO_SWITCH_ON, DaemonState.FAULT)
-
-
-@in_virtual_time
-async def test_amplifiers_that_can_be_neither_opened_nor_released_are_opened_again() -> None:
-    """An unforeseen exception of either does not end the daemon."""
-    async with watched() as daemon:
-        controller = daemon.controller
-        open_again, release = controller.open, controller.release
-        errors = [ZeroDivisionError("a bug"), OSError("another bug")]
-
-        async def fail_to_release() -> None:
-            controller.release = release
-            raise errors.pop()
-
-        async def fail_to_open() -> None:
-            controller.open, controller.release = open_again, fail_to_release
-            raise errors.pop(0)
-
-        controller.open = fail_to_open
-        await daemon.handle(ARM)
-        await daemon.handle(DaemonEvent(Trigger.LINK_LOST))
-        await asyncio.sleep(3)
-        assert (errors, daemon.state) == ([], DaemonState.FAULT)
-
-
 @in_virtual_time
 async def test_epochs_of_two_daemons_differ() -> None:
     """An acknowledgement of what another daemon latched is none; all are exact in JSON numbers."""
@@ -183,21 +137,6 @@ async def test_control_loop_gives_signs_of_life_in_every_state() -> None:
         assert daemon.state is DaemonState.COMM_LOST
         moments = [*daemon.alive, asyncio.get_running_loop().time()]
         assert max(b - a for a, b in itertools.pairwise(moments)) <= 0.6
-
-
-@pytest.mark.parametrize("trigger", [Trigger.STOP, Trigger.FAULT])
-@in_virtual_time
-async def test_stop_without_reply_is_handled_as_loss(trigger: Trigger) -> None:
-    """The amplifier is assumed energised, the stop is latched."""
-    async with watched() as daemon:
-        daemon.cut()
-        await daemon.handle(DaemonEvent(trigger))
-        await asyncio.sleep(0.01)
-        assert daemon.state is DaemonState.COMM_LOST
-        assert daemon.links[0] == "lost"
-        daemon.obey()
-        await asyncio.sleep(1)
-        assert daemon.state is DaemonState.FAULT
 
 
 @in_virtual_time

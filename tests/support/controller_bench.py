@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from committed_sets import CommittedSets
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer, Silenced
 from controller.sources.touch import Touch, TouchFrame
@@ -18,7 +19,7 @@ from drivers.host.serial_wire import SerialWire
 from drivers.host.wire import Event
 from drivers.opening import Lines
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, unpack_layers
+from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import NO_CHANNEL, QUANTITIES
 from model.rig.rig import Rig
 from model.vibration.excitation import Tone
@@ -97,8 +98,7 @@ class FarEnd:
         self._baud = baud
         self._line: Line | None = None
         self._end: SerialAmplifiers | None = None
-        self._parts: dict[int, dict[int, Any]] = {}
-        self._sent: list[Sent] = []
+        self._sets = CommittedSets()
 
     def connect(self) -> Line:
         """Open a line to it; raises LinkError while it is cut."""
@@ -157,25 +157,10 @@ class FarEnd:
 
     def _handle(self, name: str, values: Values, now: float) -> Values:
         self.asked.append((now, name, values))
-        self._note(name, values, now)
         answer = self.answer(name, values)
-        return self.obey(name, values, now) if answer is None else answer
-
-    def _note(self, name: str, values: Values, now: float) -> None:
-        if name == "Silence":
-            self._sent.append(Sent(now, 0, QUANTITIES["ramp"].from_wire(values["ramp"])))
-        if name == "Set":
-            several = self._parts.setdefault(values["token"], {})
-            several[values["index"]] = values["stream"]
-            if values["now"] and len(several) == values["parts"]:
-                self._commit(values["token"], now)
-        if name == "Commit":
-            self._commit(values["token"], now)
-
-    def _commit(self, token: int, now: float) -> None:
-        several = self._parts.pop(token, {})
-        stream = [word for index in sorted(several) for word in several[index]]
-        self._sent += [_sent(one, token, now) for one in unpack_layers(stream)]
+        reply = self.obey(name, values, now) if answer is None else answer
+        self._sets.note(name, values, reply, now)
+        return reply
 
     def status(self) -> Values:
         """What it reports now."""
@@ -201,7 +186,12 @@ class FarEnd:
 
     def sets(self) -> list[Sent]:
         """All sets that were committed, and silences, in order."""
-        return self._sent
+        ramps = {now: values["ramp"] for now, name, values in self.asked if name == "Silence"}
+        return [
+            _sent(one, token, now)
+            for now, token, layers in self._sets.all
+            for one in layers or (LayerSet(0, ramps[now], 0, ()),)
+        ]
 
     def requests(self, *names: str) -> list[Values]:
         """What was asked, of some names."""

@@ -3,16 +3,16 @@
 import asyncio
 from collections.abc import Mapping
 from contextlib import AbstractAsyncContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
 from chain import Chain
+from committed_sets import CommittedSets
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, unpack_layers
 from model.finger.perception import detection_threshold
 from model.table.build import build_table
 from model.table.table import LocalizationTable
@@ -38,16 +38,14 @@ class Fingers(Chain):
     carries them out.
     """
 
-    committed: list[tuple[float, int, tuple[LayerSet, ...]]] = field(default_factory=list)
-    _staged: dict[int, dict[int, list[int]]] = field(default_factory=dict)
-
     def __post_init__(self) -> None:
         """Note what requests of the host change."""
-        obey = self.far.device.handle
+        obey, sets = self.far.device.handle, CommittedSets()
+        self.committed = sets.all
 
         def handle(name: str, values: Values, now: float) -> Values:
             reply = obey(name, values, now)
-            self._note(name, values, reply)
+            sets.note(name, values, reply, now)
             return reply
 
         self.far.device.handle = handle  # type: ignore[method-assign]
@@ -72,24 +70,6 @@ class Fingers(Chain):
                 level = float((amplitudes[is_own][0] * felt.weights).sum() / felt.weights.sum())
                 found[int(name)] = 20 * np.log10(level / others)
         return found
-
-    def _note(self, name: str, values: Values, reply: Values) -> None:
-        now = asyncio.get_running_loop().time()
-        if name == "Set":
-            parts = self._staged.setdefault(values["token"], {})
-            parts[values["index"]] = list(values["stream"])
-            if reply["played"]:
-                self._commit(values["token"], now)
-        elif name == "Commit":
-            self._commit(values["token"], now)
-        elif name == "Silence":
-            self.committed.append((now, 0, ()))
-
-    def _commit(self, token: int, now: float) -> None:
-        parts = self._staged.pop(token, None)
-        if parts is not None:  # else it was repeated
-            words = [word for part in sorted(parts) for word in parts[part]]
-            self.committed.append((now, token, unpack_layers(words)))
 
 
 def fingers_on(

@@ -14,7 +14,7 @@ from drivers.errors import LinkError
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from sim.libjack import IS_INPUT, IS_OUTPUT, JackClient, jack_name, libjack
-from sim.soft_amp.library import library
+from sim.soft_amp.library import address_of
 from sim.soft_amp.output import portaudio_device, portaudio_stream, sounddevice
 
 MAX_PORTS = 64
@@ -84,13 +84,6 @@ class SoundCard(ABC):
         self._transfer.ports = None if ports is None else ctypes.addressof(ports)
         return ctypes.addressof(self._transfer)
 
-    @staticmethod
-    def address(name: str) -> int:
-        """The address of a callback."""
-        found = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value
-        assert found is not None  # noqa: S101  of a function
-        return found
-
     def run(self, played: FloatArray) -> Float32Array:
         """Play samples (n, outputs), and return those recorded meanwhile (n, inputs).
 
@@ -159,7 +152,7 @@ def activate(
         ("transfer_jack_process", library.jack_set_process_callback),
         ("transfer_jack_shutdown", library.jack_on_shutdown),
     ):
-        set_callback(client.pointer, card.address(name), given)
+        set_callback(client.pointer, address_of(name), given)
     client.activate()
     return out, into
 
@@ -209,7 +202,7 @@ class PortAudioCard(SoundCard):
         try:
             self._stream = portaudio_stream(
                 found["index"],
-                self.address("transfer_portaudio"),
+                address_of("transfer_portaudio"),
                 self.given(),
                 outputs=outputs,
                 inputs=inputs,

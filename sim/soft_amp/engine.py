@@ -150,9 +150,3 @@ class Engine:
     def use_jack(self, calls: JackCalls) -> None:
         """Set what the callbacks of JACK call."""
         self._library.sound_use_jack(ctypes.byref(calls))
-
-    def address(self, name: str) -> int:
-        """The address of a callback."""
-        found = ctypes.cast(getattr(self._library, name), ctypes.c_void_p).value
-        assert found is not None  # noqa: S101  of a function
-        return found

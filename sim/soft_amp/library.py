@@ -44,6 +44,13 @@ def library() -> ctypes.CDLL:
     )
 
 
+def address_of(name: str) -> int:
+    """Return the address of a function of the library, a callback."""
+    found = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value
+    assert found is not None  # noqa: S101  of a function
+    return found
+
+
 def compile_engine(path: Path) -> None:
     """Compile the library to a file. Raises InputError."""
     folder = _sources()

@@ -10,6 +10,7 @@ from drivers.errors import LinkError
 from model.errors import InputError
 from sim.libjack import IS_OUTPUT, JackClient, check_free, jack_name, libjack
 from sim.soft_amp.engine import Engine, JackCalls
+from sim.soft_amp.library import address_of
 from sim.soft_amp.settings import Settings, check_rate
 
 CLIENT = "era-soft-amp"
@@ -68,7 +69,7 @@ class JackOutput:
             "sound_jack_connect": library.jack_set_port_connect_callback,
         }
         for callback, set_callback in set_.items():
-            set_callback(self._client.pointer, engine.address(callback), None)
+            set_callback(self._client.pointer, address_of(callback), None)
         self._client.activate()
         for port, name in zip(self._ports, self._inputs, strict=True):
             self._client.connect(port, name)
@@ -218,7 +219,7 @@ class PortAudioOutput:
         try:
             self._stream = portaudio_stream(
                 self._number,
-                engine.address("sound_portaudio"),
+                address_of("sound_portaudio"),
                 0,
                 outputs=self._settings.channels,
                 samplerate=self.rate,

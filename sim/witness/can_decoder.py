@@ -7,6 +7,7 @@ masters read, concern no rule. Other text is ignored.
 import re
 from collections import deque
 
+from drivers.codec.can_bus.adapter_text import SLCAN, SOCKETCAND
 from drivers.codec.can_bus.canopen import BLOCK, CANOPEN, CanFrame, cob_id
 from drivers.codec.can_bus.segments import NODE_MAX, REPLY, REQUEST, Assembler, frames_of
 from drivers.codec.can_bus.segments import Message as Words
@@ -27,17 +28,8 @@ from sim.witness.decoded import (
 _MAX_REST = 512  # bytes kept of text that does not end
 _KEPT = 3 * frames_of(MAX_WORDS)  # frames of the host, which an adapter may echo
 _NMT_START: int = CANOPEN["nmt"]["start"]
-_END = {"slcan": re.compile(rb"[\r\a]"), "socketcand": re.compile(rb"(?<=>)")}
-_SLCAN = re.compile(rb"t(?P<id>[0-7][0-9A-Fa-f]{2})(?P<size>[0-8])(?P<data>(?:[0-9A-Fa-f]{2})*)")
-_SEND = re.compile(rb"< send (?P<id>[0-9A-Fa-f]+) (?P<size>\d)(?P<data>(?: [0-9A-Fa-f]{2})*) +>")
-_FRAME = re.compile(
-    rb"< frame (?P<id>[0-9A-Fa-f]+) [0-9.]+ (?P<data>(?:[0-9A-Fa-f]{2} ?){0,8})(?P<size>) ?>"
-)
-_TEXT = {
-    "slcan": {"amplifier": _SLCAN, "host": _SLCAN},
-    "socketcand": {"amplifier": _SEND, "host": _FRAME},
-}
-_IS_FRAME = re.compile(rb"t|< (?:send|frame) ")
+_FORMS = {"slcan": SLCAN, "socketcand": SOCKETCAND}
+_IS_FRAME = re.compile(rb"t|< (?:send|frame) [0-9A-Fa-f]{1,3} ")  # with an 11-bit identifier
 
 
 class CanDecoder(Decoder):
@@ -45,17 +37,18 @@ class CanDecoder(Decoder):
 
     def __init__(self, kind: str) -> None:
         super().__init__()
-        self._end, self._text = _END[kind], _TEXT[kind]
+        self._form = _FORMS[kind]
         self._sent: deque[CanFrame] = deque(maxlen=_KEPT)
         self._senders: dict[tuple[int, bool], _Sender] = {}  # by identifier, and whether numbered
 
     def feed(self, direction: Direction, time: float, data: bytes) -> list[DecodedFrame]:
         """Decode bytes; returns the complete frames."""
-        *pieces, rest = self._end.split(self.rest[direction] + data)
+        *pieces, rest = self._form.end.split(self.rest[direction] + data)
         self.rest[direction] = rest[-_MAX_REST:]
+        decode = self._form.decode_sent if direction == "amplifier" else self._form.decode
         seen: list[DecodedFrame] = []
         for piece in map(bytes.strip, pieces):
-            frame = self._frame(direction, piece)
+            frame = decode(piece)
             if frame is None:
                 if _IS_FRAME.match(piece):
                     seen.append((piece, damaged("a malformed frame line")))
@@ -69,13 +62,6 @@ class CanDecoder(Decoder):
                 sender.cut_short = None
             seen.append((piece, message))
         return seen
-
-    def _frame(self, direction: Direction, piece: bytes) -> CanFrame | None:
-        found = self._text[direction].fullmatch(piece)
-        data = bytes.fromhex(found["data"].decode()) if found else b""
-        if found is None or len(data) != int(found["size"] or len(data)):
-            return None
-        return CanFrame(int(found["id"], 16), data)
 
     def _sender(self, frame: CanFrame) -> "_Sender":
         is_numbered = frame.data[:1] != b"\0"

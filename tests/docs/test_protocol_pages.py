@@ -20,7 +20,7 @@ from drivers.protocol.table import MESSAGES, QUANTITIES
 from protocol_tables import FILES, PARTS, WRITER, written
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
-from sim.far_ends.can_bus.word_objects import WordObjects
+from sim.far_ends.can_bus.word_objects import ObjectServer
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
@@ -253,17 +253,18 @@ def test_monitor_reads_the_frames_of_the_page_by_the_dbc() -> None:
 def test_master_finds_the_objects_of_the_eds_in_the_amplifier() -> None:
     """`canopen` reads it; every object has the subindices and sizes that the far end serves."""
     sheet = canopen.import_od(str(DOCS / "amplifier.eds"), node_id=1)
-    objects = WordObjects(Amplifier("a", channels=4), 1, lambda: 0.0)
+    objects = ObjectServer(Amplifier("a", channels=4), 1)
     for index, entry in sheet.items():
         if index < 0x1000:
             continue
         if isinstance(entry, canopen.objectdictionary.ODVariable):
-            assert len(objects.read(index, 0)) == len(entry) // 8
+            assert len(objects.read(index, 0, 0.0)) == len(entry) // 8
             continue
-        assert objects.read(index, 0)[0] == len(entry) - 1 == max(entry)
+        assert objects.read(index, 0, 0.0)[0] == len(entry) - 1 == max(entry)
         for subindex, each in entry.items():
-            served = objects.read(index, subindex)
+            served = objects.read(index, subindex, 0.0)
             if each.data_type != canopen.objectdictionary.VISIBLE_STRING:
                 assert len(served) == len(each) // 8
-    limits = objects.read(0x2001, 1 + list(sheet[0x2001].names).index("limits 3 level_max") - 1)
+    number = list(sheet[0x2001].names).index("limits 3 level_max")
+    limits = objects.read(0x2001, number, 0.0)
     assert int.from_bytes(limits, "little") == 10000

@@ -12,21 +12,24 @@ _LINE = re.compile(rb"t([0-9A-Fa-f]{3})([0-8])((?:[0-9A-Fa-f]{2})*)")
 SLCAN_RATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
 """Bit rates [bit/s] by the number of the command S of LAWICEL."""
 _STAMP = 4  # digits of a timestamp, if the adapter is configured to send it
-_ELEMENT = re.compile(
+_HEARD = re.compile(
     rb"< frame ([0-9A-Fa-f]{3}) (?:[0-9A-Fa-f]{2} )?[0-9]+\.[0-9]+ "
     rb"((?:[0-9A-Fa-f]{2} ?){0,8}) ?"
 )
+_SENT = re.compile(rb"< *send ([0-7]?[0-9A-Fa-f]{1,2}) ([0-8])((?: [0-9A-Fa-f]{1,2})*) *")
 
 
 class TextFormat(NamedTuple):
-    """How an adapter writes frames: what ends each text, a frame as text, and a text as a frame.
+    """How frames are written: what ends each text, a frame as text to an adapter, and text as one.
 
-    decode: None for what is no data frame with an 11-bit identifier.
+    decode: text of an adapter; decode_sent: text to it; None for what is no data frame with an
+    11-bit identifier.
     """
 
     end: re.Pattern[bytes]
     encode: Callable[[CanFrame], bytes]
     decode: Callable[[bytes], CanFrame | None]
+    decode_sent: Callable[[bytes], CanFrame | None]
 
 
 def _slcan_line(frame: CanFrame) -> bytes:
@@ -49,8 +52,15 @@ def _element(frame: CanFrame) -> bytes:
 
 
 def _of_element(element: bytes) -> CanFrame | None:
-    found = _ELEMENT.fullmatch(element, max(element.rfind(b"<"), 0))
+    found = _HEARD.fullmatch(element, max(element.rfind(b"<"), 0))
     return None if found is None else _frame(*found.groups())
+
+
+def _of_sent(element: bytes) -> CanFrame | None:
+    found = _SENT.fullmatch(element, max(element.rfind(b"<"), 0))
+    if found is None or len(found[3].split()) != int(found[2]):
+        return None
+    return CanFrame(int(found[1], 16), bytes(int(byte, 16) for byte in found[3].split()))
 
 
 def _frame(identifier: bytes, digits: bytes) -> CanFrame | None:
@@ -58,8 +68,8 @@ def _frame(identifier: bytes, digits: bytes) -> CanFrame | None:
     return CanFrame(number, bytes.fromhex(digits.decode())) if number <= _ID_MAX else None
 
 
-SLCAN = TextFormat(re.compile(rb"[\r\x07]"), _slcan_line, _of_slcan_line)
-SOCKETCAND = TextFormat(re.compile(rb">"), _element, _of_element)
+SLCAN = TextFormat(re.compile(rb"[\r\x07]"), _slcan_line, _of_slcan_line, _of_slcan_line)
+SOCKETCAND = TextFormat(re.compile(rb">"), _element, _of_element, _of_sent)
 
 
 class TextReader:

@@ -8,7 +8,7 @@ effect; modes other than raw mode, extended identifiers, discovery by broadcast.
 import re
 
 from drivers import clock
-from drivers.codec.can_bus.adapter_text import SLCAN
+from drivers.codec.can_bus.adapter_text import SLCAN, SOCKETCAND
 from drivers.codec.can_bus.canopen import CanFrame
 from sim.far_ends.can_bus.bus import CanBus
 from sim.transport.far_end import FarEnd, Send
@@ -75,7 +75,6 @@ class SlcanAdapter(FarEnd):
 
 BUS_NAME = "can0"
 _MAX_ELEMENT = 512  # characters of an element
-_ELEMENT = re.compile(r"send ([0-7]?[0-9A-Fa-f]{1,2}) ([0-8])((?: [0-9A-Fa-f]{1,2})*)")
 
 
 class SocketcandClient(FarEnd):
@@ -84,7 +83,7 @@ class SocketcandClient(FarEnd):
     def __init__(self, bus: CanBus, send: Send) -> None:
         self._bus = bus
         self._send = send
-        self._rest = ""
+        self._rest = b""
         self._is_open = self._is_raw = False
         self._listener = self._hear  # one object, by which the bus knows it
         send(b"< hi >")
@@ -95,29 +94,28 @@ class SocketcandClient(FarEnd):
 
     def receive(self, data: bytes, now: float) -> None:
         """Process complete elements; text between them is skipped."""
-        *elements, rest = (self._rest + data.decode("ascii", errors="replace")).split(">")
-        self._rest = rest if len(rest) <= _MAX_ELEMENT else ""
+        *elements, rest = (self._rest + data).split(b">")
+        self._rest = rest if len(rest) <= _MAX_ELEMENT else b""
         for element in elements:
-            _, bracket, content = element.partition("<")
+            _, bracket, content = element.partition(b"<")
             if bracket:
                 self._element(content.strip())
 
-    def _element(self, element: str) -> None:
-        name = element.partition(" ")[0]
+    def _element(self, element: bytes) -> None:
         if not self._is_open:
-            self._is_open = element == f"open {BUS_NAME}"
+            self._is_open = element == f"open {BUS_NAME}".encode()
             self._send(b"< ok >" if self._is_open else b"< error could not open bus >")
             if not self._is_open:
                 self._send(b"")
-        elif element == "rawmode":
+        elif element == b"rawmode":
             self._send(b"< ok >")
             if not self._is_raw:
                 self._is_raw = True
                 self._bus.join(self._listener)
-        elif element == "echo":
+        elif element == b"echo":
             self._send(b"< echo >")
-        elif name == "send":
-            if frame := _frame_of(element):  # socketcand sends no error either
+        elif element.startswith(b"send "):
+            if frame := SOCKETCAND.decode_sent(b"<" + element):  # nor does socketcand say more
                 self._bus.send(frame, sender=self._listener)
         else:
             self._send(b"< error unknown command >")
@@ -125,11 +123,3 @@ class SocketcandClient(FarEnd):
     def _hear(self, frame: CanFrame) -> None:
         stamp = f"{clock.now():.6f}"  # only differences are meaningful
         self._send(f"< frame {frame.id:03X} {stamp} {frame.data.hex().upper()} >".encode())
-
-
-def _frame_of(element: str) -> CanFrame | None:
-    """The frame of an element send, else None."""
-    found = _ELEMENT.fullmatch(element)
-    if found is None or len(found[3].split()) != int(found[2]):
-        return None
-    return CanFrame(int(found[1], 16), bytes(int(byte, 16) for byte in found[3].split()))

@@ -31,7 +31,7 @@ from drivers.protocol.table import (
 )
 from drivers.statistics import WireCounters
 from sim.amplifier.contract import SILENCING_RAMP
-from sim.far_ends.can_bus.word_objects import FAULT_NAMES, SdoServer, WordObjects
+from sim.far_ends.can_bus.word_objects import FAULT_NAMES, ObjectServer
 from sim.transport.far_end import AmplifierPort, FarEnd, Send
 
 _NMT: Mapping[str, int] = CANOPEN["nmt"]
@@ -106,7 +106,6 @@ class _Node:
         self._amplifier = amplifier
         self._send = send
         self.number = number
-        self._now = 0.0
         self._was_faulty = False
         self._heartbeat_due = 0.0
         self._reset()
@@ -115,12 +114,7 @@ class _Node:
     def _reset(self) -> None:
         self._state = _PRE_OPERATIONAL
         self._requests = Assembler(WireCounters())
-        self._objects = WordObjects(self._amplifier, self.number, lambda: self._now)
-        self._sdo = SdoServer(
-            read=self._objects.read,
-            write=self._objects.write,
-            send=lambda data: self._put(cob_id("sdo_answer", self.number), data),
-        )
+        self._objects = ObjectServer(self._amplifier, self.number)
 
     @property
     def is_listening(self) -> bool:
@@ -166,9 +160,9 @@ class _Node:
 
     def read(self, data: bytes, now: float) -> None:
         """Take a frame to the objects."""
-        self._now = now
-        if self._state != _STOPPED and self._amplifier.is_answering:
-            self._sdo.receive(data)
+        is_served = self._state != _STOPPED and self._amplifier.is_answering
+        if is_served and (reply := self._objects.reply(data, now)):
+            self._put(cob_id("sdo_answer", self.number), reply)
 
     def request(self, data: bytes, now: float) -> None:
         """Take a frame of a request, and carry out the message that it completes."""

@@ -7,13 +7,10 @@ others are refused, since nothing longer than four bytes can be written.
 
 import struct
 import zlib
-from collections.abc import Callable
 
-from drivers.codec.can_bus.canopen import CANOPEN, cob_id
+from drivers.codec.can_bus.canopen import BLOCK, CANOPEN, cob_id
 from drivers.protocol.table import FAULTS, MESSAGES
 from sim.transport.far_end import AmplifierPort
-
-LENGTH = 8
 
 TOGGLE = 0x0503_0000
 UNKNOWN_COMMAND = 0x0504_0001
@@ -33,90 +30,69 @@ class SdoAbort(Exception):
         self.code = code
 
 
-class SdoServer:
-    """Serves one client; read and write raise SdoAbort."""
+FAULT_NAMES = {number: name for name, number in FAULTS.items()}
+_INDEX = CANOPEN["objects"]
+_TEXTS = ("vendor", "product", "serial_number", "firmware")
 
-    def __init__(
-        self,
-        *,
-        read: Callable[[int, int], bytes],
-        write: Callable[[int, int, bytes], None],
-        send: Callable[[bytes], None],
-    ) -> None:
-        self._read = read
-        self._write = write
-        self._send = send
+
+class ObjectServer:
+    """The objects of an amplifier at a node, served to one client.
+
+    heartbeat: its interval [ms], 0 for none; the one object that can be written.
+    """
+
+    def __init__(self, amplifier: AmplifierPort, node: int) -> None:
+        self._amplifier = amplifier
+        self._node = node
+        self.heartbeat: int = CANOPEN["heartbeat_ms"]
         self._object = (0, 0)
         self._rest: bytes | None = None  # of an upload
         self._toggle = 0
 
-    def receive(self, data: bytes) -> None:
-        """Process a request; frames of other than eight bytes are ignored."""
-        if len(data) != LENGTH:
-            return
+    def reply(self, data: bytes, now: float) -> bytes:
+        """Return the reply to a request at a time [s]; none to frames of other than eight bytes."""
+        if len(data) != BLOCK:
+            return b""
         command = data[0] >> 5
         try:
             if command in (_DOWNLOAD, _UPLOAD):
                 self._rest = None
                 self._object = struct.unpack_from("<HB", data, 1)
             if command == _DOWNLOAD and data[0] & _EXPEDITED:
-                self._download(data)
-            elif command == _UPLOAD:
-                self._begin_upload()
-            elif command == _UPLOAD_SEGMENT and self._rest is not None:
-                self._upload_segment(self._rest, data[0] >> 4 & 1)
-            elif command == _ABORT:
-                self._rest = None
-            else:
+                length = 4 - (data[0] >> 2 & 3) if data[0] & 1 else 4
+                self._write(*self._object, data[4 : 4 + length], now)
+                return struct.pack("<BHB4x", 0x60, *self._object)
+            if command == _UPLOAD:
+                return self._begin_upload(now)
+            if command == _UPLOAD_SEGMENT and self._rest is not None:
+                return self._upload_segment(self._rest, data[0] >> 4 & 1)
+            if command != _ABORT:
                 raise SdoAbort(UNKNOWN_COMMAND)
         except SdoAbort as abort:
             self._rest = None
-            self._send(struct.pack("<BHBL", 0x80, *self._object, abort.code))
+            return struct.pack("<BHBL", 0x80, *self._object, abort.code)
+        self._rest = None
+        return b""
 
-    def _download(self, data: bytes) -> None:
-        length = 4 - (data[0] >> 2 & 3) if data[0] & 1 else 4
-        self._write(*self._object, data[4 : 4 + length])
-        self._send(struct.pack("<BHB4x", 0x60, *self._object))
-
-    def _begin_upload(self) -> None:
-        value = self._read(*self._object)
+    def _begin_upload(self, now: float) -> bytes:
+        value = self.read(*self._object, now)
         if 1 <= len(value) <= 4:
             command = 0x43 | (4 - len(value)) << 2
-            self._send(struct.pack("<BHB4s", command, *self._object, value))
-        else:
-            self._rest, self._toggle = value, 0
-            self._send(struct.pack("<BHBL", 0x41, *self._object, len(value)))
+            return struct.pack("<BHB4s", command, *self._object, value)
+        self._rest, self._toggle = value, 0
+        return struct.pack("<BHBL", 0x41, *self._object, len(value))
 
-    def _upload_segment(self, rest: bytes, toggle: int) -> None:
+    def _upload_segment(self, rest: bytes, toggle: int) -> bytes:
         if toggle != self._toggle:
             raise SdoAbort(TOGGLE)
         piece, is_last = rest[:7], len(rest) <= 7
-        command = toggle << 4 | (7 - len(piece)) << 1 | is_last
         self._toggle ^= 1
         self._rest = None if is_last else rest[7:]
-        self._send(struct.pack("<B7s", command, piece))
+        return struct.pack("<B7s", toggle << 4 | (7 - len(piece)) << 1 | is_last, piece)
 
-
-FAULT_NAMES = {number: name for name, number in FAULTS.items()}
-_INDEX = CANOPEN["objects"]
-_TEXTS = ("vendor", "product", "serial_number", "firmware")
-
-
-class WordObjects:
-    """Objects of an amplifier at a node; now: the time [s].
-
-    heartbeat: its interval [ms], 0 for none; the one object that can be written.
-    """
-
-    def __init__(self, amplifier: AmplifierPort, node: int, now: Callable[[], float]) -> None:
-        self._amplifier = amplifier
-        self._node = node
-        self._now = now
-        self.heartbeat: int = CANOPEN["heartbeat_ms"]
-
-    def read(self, index: int, subindex: int) -> bytes:
-        """Read an object; raises SdoAbort."""
-        entries = self._entries(index)
+    def read(self, index: int, subindex: int, now: float) -> bytes:
+        """Read an object at a time [s]; raises SdoAbort."""
+        entries = self._entries(index, now)
         if not isinstance(entries, list):
             entries = [entries]
         else:
@@ -125,16 +101,15 @@ class WordObjects:
             raise SdoAbort(NO_SUBINDEX)
         return entries[subindex]
 
-    def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Write an object; raises SdoAbort."""
-        self.read(index, subindex)
+    def _write(self, index: int, subindex: int, data: bytes, now: float) -> None:
+        self.read(index, subindex, now)
         if index != _INDEX["heartbeat_producer"]:
             raise SdoAbort(READ_ONLY)
         if len(data) != 2:
             raise SdoAbort(BAD_LENGTH)
         self.heartbeat = int.from_bytes(data, "little")
 
-    def _entries(self, index: int) -> bytes | list[bytes]:
+    def _entries(self, index: int, now: float) -> bytes | list[bytes]:
         """Return an object, or its subindices from 1 on."""
         if index == _INDEX["device_type"]:
             return _u32(CANOPEN["device_type"])
@@ -152,13 +127,13 @@ class WordObjects:
             texts = [identity[name].encode() for name in _TEXTS]
             return [*texts, identity["versions"].to_bytes(2, "little")]
         if index == _INDEX["capabilities"]:
-            return self._words("GetCaps")
+            return self._words("GetCaps", now)
         if index == _INDEX["status"]:
-            return self._words("GetStatus")
+            return self._words("GetStatus", now)
         raise SdoAbort(NO_OBJECT)
 
-    def _words(self, name: str) -> list[bytes]:
-        reply = self._amplifier.handle(name, {}, self._now())
+    def _words(self, name: str, now: float) -> list[bytes]:
+        reply = self._amplifier.handle(name, {}, now)
         return [word.to_bytes(2, "little") for word in MESSAGES[name].reply.pack(reply)]
 
 

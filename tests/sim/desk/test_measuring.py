@@ -21,6 +21,7 @@ from sim.measuring.measure import Measured, check_by_steps, measure
 from sim.measuring.multisine import Multisine, default_frequencies
 from sim.measuring.sound_card import SoundCard
 from sim.sensors.sensor_file import WiredSensor
+from sim.soft_amp.library import address_of
 
 RATE = 8_000.0
 DELAY = 73
@@ -246,7 +247,7 @@ class CallbackCard(SoundCard):
             ctypes.c_ulong,
             ctypes.c_void_p,
         )
-        callback = kind(self.address("transfer_portaudio"))
+        callback = kind(address_of("transfer_portaudio"))
         block = np.ones(FRAMES, dtype=np.float32)
         out = np.zeros(FRAMES, dtype=np.float32)
         recorded, played, given = block.ctypes.data, out.ctypes.data, self.given()

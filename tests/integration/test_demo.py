@@ -4,11 +4,9 @@ import asyncio
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -26,11 +24,11 @@ from controller.demo.scene import Scene, layout_of_people
 from controller.sources.capture import RecordedDatagram, read_capture, write_capture
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import tuio_datagram
-from daemon_bench import until
 from installed_program import ERA
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from patient_daemon import wait_long
+from virtual_sockets import run_virtual_on_sockets
 
 FRAME = 1 / 50
 ERA_NAMES = {"SW", "SE", "NE", "NW"}
@@ -64,47 +62,9 @@ def environment(table_cache):
     return os.environ | {"XDG_CACHE_HOME": str(table_cache)}
 
 
-async def replay_as_felt(datagrams, host, port):
-    """Send a capture; each change waits until what the one before led to has played for a while."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        down_before = set()
-        for datagram in datagrams:
-            down = {i for i, down, up, *_ in SCHEDULE if down <= datagram.time < up}
-            if down != down_before:
-                await until(partial(plays_for, down_before))
-                down_before = down
-            sender.sendto(datagram.payload, (host, port))
-            await asyncio.sleep(FRAME)
-
-
-def plays_for(fingers):
-    """Whether a pattern has played for all of these fingers for half a second, or nothing plays."""
-    playing = recorders[-1]._playing
-    if not fingers:
-        return playing is None
-    is_for_all = playing is not None and len(playing.applied.contacts) == len(fingers)
-    return is_for_all and time.monotonic() - playing.applied.time > 0.5
-
-
-recorders = []
-
-
-def make_recorder(*arguments, **options):
-    """A recorder that `plays_for` asks."""
-    recorders.append(TouchRecorder(*arguments, **options))
-    return recorders[-1]
-
-
 @pytest.fixture
 def demo(environment, tmp_path, monkeypatch, capsys):
-    """Run `era demo --json` in this process, as slowly as the machine is; its far end is another.
-
-    Returns exit status, output and errors. Nothing is lost because something took long.
-    """
-    wait_long(monkeypatch)
-    monkeypatch.setattr(controller.demo.run, "CONTACT_TIMEOUT", 60.0)
-    monkeypatch.setattr(controller.demo.run, "TouchRecorder", make_recorder)
-    monkeypatch.setattr(controller.demo.run, "replay_capture", replay_as_felt)
+    """Run `era demo --json` in this process; returns exit status, output and errors."""
     monkeypatch.setenv("XDG_CACHE_HOME", environment["XDG_CACHE_HOME"])
     monkeypatch.chdir(tmp_path)
 
@@ -116,30 +76,22 @@ def demo(environment, tmp_path, monkeypatch, capsys):
     return run_demo
 
 
-@pytest.mark.real_time
-@pytest.mark.parametrize(
-    "wire",
-    [
-        pytest.param("serial", marks=[pytest.mark.long, pytest.mark.alone]),
-        "can",
-        pytest.param("modbus", marks=pytest.mark.long),
-    ],
-)
-def test_demo_contacts_feel_the_prediction(wire, capture, demo, monkeypatch):
+def test_demo_contacts_feel_the_prediction(capture, demo, monkeypatch):
     """Each touch has its row; level within 3 dB of the promise, contrast at least the promised.
 
     Of the first plate that is drawn, on which these touches keep it. Then the same as two people,
     by a layout that the daemon has reloaded: both that are down together have a content each.
+    In virtual time; what differs on wires is a far end of its own, see below.
     """
+    monkeypatch.setattr(asyncio, "run", run_virtual_on_sockets)
     plate = load_rig(example_rig_path()).plate
     layout = layout_of_people(plate, {"left": None, "right": None})
     recorded = read_capture(capture)
     scenes = [Scene(recorded), Scene(recorded, layout)]
     monkeypatch.setattr(controller.demo.scene, "example_scenes", lambda rig: scenes)
-    status, out, said = demo("--wire", wire)
+    status, out, said = demo("--wire", "sim")
     assert status == 0, said
     result = json.loads(out)
-    assert result["wire"] == wire
     rows, people = result["touches"][: len(SCHEDULE)], result["touches"][len(SCHEDULE) :]
     assert len(people) == len(SCHEDULE)
     assert not any("fingers" in row for row in (*rows, people[2]))
@@ -182,6 +134,7 @@ def test_demo_contacts_feel_the_prediction(wire, capture, demo, monkeypatch):
 @pytest.mark.real_time
 def test_demo_reports_a_far_end_that_ended(capture, demo, monkeypatch):
     """Killing the amplifiers' process midway ends the run with status 3 and one paragraph."""
+    wait_long(monkeypatch)
     far_ends = []
 
     async def start(*arguments, **options):
@@ -189,7 +142,7 @@ def test_demo_reports_a_far_end_that_ended(capture, demo, monkeypatch):
         return far_ends[-1]
 
     def killing(*arguments, on_row):
-        return make_recorder(*arguments, on_row=lambda row: far_ends[0].kill())
+        return TouchRecorder(*arguments, on_row=lambda row: far_ends[0].kill())
 
     start_far_end = controller.demo.far_end._start
     monkeypatch.setattr(controller.demo.far_end, "_start", start)

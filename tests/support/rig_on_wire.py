@@ -64,15 +64,27 @@ async def far_side(
 
     wire: of all of them, or of each by name.
     """
-    bench = Bench(rig, now=clock.now(), imperfections=imperfections)
-    devices = [
-        AmplifierDevice(bench, name, address=number, faults=Faults(begin=clock.now(), seed=seed))
-        for number, name in enumerate(bench.amplifiers, start=1)
-    ]
+    bench, devices = make_bench(rig, seed=seed, imperfections=imperfections)
     wires = dict.fromkeys(bench.amplifiers, wire) if isinstance(wire, Wire) else wire
-    async with open_wires(wires, devices) as urls:
+    async with open_wires(wires, [*devices.values()]) as urls:
         try:
-            yield FarSide(urls, {device.name: device for device in devices}, bench)
+            yield FarSide(urls, devices, bench)
         finally:
-            for device in devices:
+            for device in devices.values():
                 device.close()
+
+
+def make_bench(
+    rig: Rig,
+    *,
+    seed: int = 0,
+    imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
+) -> tuple[Bench, dict[str, AmplifierDevice]]:
+    """A bench, and a device for each amplifier at addresses 1, 2, ..., without faults as yet."""
+    bench = Bench(rig, now=clock.now(), imperfections=imperfections)
+    return bench, {
+        name: AmplifierDevice(
+            bench, name, address=number, faults=Faults(begin=clock.now(), seed=seed)
+        )
+        for number, name in enumerate(bench.amplifiers, start=1)
+    }

@@ -17,10 +17,10 @@ from drivers.host.serial_wire import SerialWire
 from drivers.opening import Lines
 from model.rig.rig import Rig
 from registry.limits import GuardLimits
+from rig_on_wire import far_side, make_bench
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
-from sim.far_ends.wires import Wire, open_wire
-from sim.faults.fault_window import Faults
+from sim.far_ends.wires import Wire
 from sim.memory_line import MemoryPort
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
@@ -69,15 +69,6 @@ class HostedRig:
                 await self.group.beat()
 
 
-def make_bench(rig: Rig) -> tuple[Bench, dict[str, AmplifierDevice]]:
-    """A bench, and a device for each amplifier at addresses 1, 2, ..., without faults as yet."""
-    bench = Bench(rig, now=clock.now())
-    return bench, {
-        name: AmplifierDevice(bench, name, address=number, faults=Faults(begin=clock.now()))
-        for number, name in enumerate(bench.amplifiers, 1)
-    }
-
-
 def memory_line(devices: Sequence[AmplifierDevice], name: str) -> Line:
     """The host's line to devices of a bench."""
     lines: list[Line] = []
@@ -110,16 +101,13 @@ async def rig_on_wire(
     rig: Rig, wire: Wire, *, watchdog: float = WATCHDOG
 ) -> AsyncIterator[HostedRig]:
     """The amplifiers of a rig on a wire, identified and disarmed; watchdog [s]."""
-    bench, devices = make_bench(rig)
-    async with open_wire(wire, list(devices.values())) as urls:
+    async with far_side(wire, rig) as far:
         opened = Lines()
         try:
-            group = await _opened_group(opened, urls, watchdog)
-            yield HostedRig(bench, devices, group, urls, opened, watchdog)
+            group = await _opened_group(opened, far.urls, watchdog)
+            yield HostedRig(far.bench, far.devices, group, far.urls, opened, watchdog)
         finally:
             await opened.close()
-            for device in devices.values():
-                device.close()
 
 
 async def _opened_group(lines: Lines, urls: Mapping[str, str], watchdog: float) -> Group:

@@ -16,11 +16,11 @@ from drivers.codec.serial_line.frame import Frame, FrameReader, encode_frame
 from drivers.errors import LinkError
 from drivers.protocol.table import REFUSALS
 from model.rig.rig import Rig
+from rig_on_wire import make_bench
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.far_end import FarEnd, TcpEnd, TerminalEnd
-from words_bench import make_bench
 
 TIMEOUT = 15.0  # s; of a busy machine
 IDENTITY = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, 1065, 66)  # read of 66 registers, TCP

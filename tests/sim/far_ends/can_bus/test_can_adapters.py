@@ -9,11 +9,11 @@ import pytest
 
 from drivers.codec.can_bus.canopen import CanFrame
 from model.rig.rig import Rig
+from rig_on_wire import make_bench
 from sim.far_ends.can_bus.adapters import SlcanAdapter, SocketcandClient
 from sim.far_ends.can_bus.bus import CanBus
 from sim.faults.fault_window import Faults
 from sim.transport.far_end import TcpEnd, TerminalEnd
-from words_bench import make_bench
 
 TIMEOUT = 5.0  # s; for a loaded machine, not an expectation
 FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))

@@ -204,16 +204,15 @@ class Amplifier(Dialogue):
         """Read the status, which feeds nothing."""
         return await self.line.submit(self, priority, "GetStatus", {})
 
-    async def clear(self, latch: int | None = None) -> Values:
-        """Acknowledge the stop or fault with this latch, None for the newest that was shown.
+    async def clear(self) -> Values:
+        """Acknowledge the newest stop or fault that was shown.
 
         It is identified anew: one that has lost its supply since counts its latches from 1 again.
         """
         before, shown = self.silences, self.latch
         status = await self.identify(timeout=REPLY_TIMEOUT)
-        if latch is None:
-            has_restarted = shown is None or is_newer_token(shown, status["latch"])
-            latch = status["latch"] if has_restarted else shown
+        has_restarted = shown is None or is_newer_token(shown, status["latch"])
+        latch = status["latch"] if has_restarted else shown
         if before != self.silences:
             raise Preempted(f"amplifier {self.name}: a stop or disarm came first")
         return await self.request("Clear", {"latch": latch}, Priority.CLEAR)

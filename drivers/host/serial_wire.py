@@ -24,7 +24,6 @@ from drivers.host.wire import (
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import (
     BROADCAST,
-    BY_NUMBER,
     EVENT,
     HELLO,
     MESSAGES,
@@ -106,10 +105,7 @@ class SerialWire(Wire):
         try:
             if kind == request.kind == HELLO:
                 return Reply(unpack_identity(frame.payload))
-            if kind != request.kind:
-                return read_reply(request.kind, kind, unpack_words(frame.payload))
-            words = unpack_words(frame.payload)  # nearly always
-            return Reply(BY_NUMBER[kind].reply.unpack(words, is_strict=False))
+            return read_reply(request.kind, kind, unpack_words(frame.payload))
         except Refusal as refusal:
             return Broken(str(refusal))
 

@@ -112,11 +112,6 @@ class TerminalEnd:
         """The path of the host's side."""
         return self._terminal.port
 
-    @property
-    def dropped_replies(self) -> int:
-        """Replies lost because the host did not read."""
-        return self._terminal.dropped
-
     async def __aenter__(self) -> Self:
         """Serve in the running event loop."""
         self._terminal.listen()

@@ -6,7 +6,7 @@ import os
 import tempfile
 import tty
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -116,12 +116,11 @@ class PseudoTerminal:
     """The far end's side of a serial line: a pseudo-terminal of the system. Raises LinkError.
 
     on_data: called with bytes from the host; unpluggable: the port is a symbolic link, which
-    outlives each pseudo-terminal; dropped: writes lost because the host did not read.
+    outlives each pseudo-terminal. What a host does not read is lost.
     """
 
     def __init__(self, on_data: Callable[[bytes], None], *, unpluggable: bool = False) -> None:
         self._on_data = on_data
-        self.dropped = 0
         self._master = self._slave = -1
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self.plug_in()
@@ -186,11 +185,8 @@ class PseudoTerminal:
         """Write to the host; discarded while unplugged."""
         if self._master < 0:
             return
-        try:
-            complete = os.write(self._master, data) == len(data)
-        except BlockingIOError:
-            complete = False
-        self.dropped += not complete
+        with suppress(BlockingIOError):
+            os.write(self._master, data)
 
     def _link(self) -> None:
         link = Path(self.port)

@@ -104,7 +104,6 @@ class MemoryTerminal(PseudoTerminal):
     """The far end's side of a line."""
 
     def __init__(self, machine: MemoryMachine, name: str, on_data: Callable[[bytes], None]) -> None:
-        self.dropped = 0
         self.is_plugged = True
         self._machine = machine
         self._name = name

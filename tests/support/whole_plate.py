@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg, sparse
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.fem.plate import PlateMatrices, assemble
 from model.structure.attachments import Era, FingertipLoad
@@ -51,23 +51,6 @@ class WholePlate:
             C[number, number] += tip.joint_damping
             K[number, number] += tip.joint_stiffness
         return M, C, K
-
-    def steady(
-        self,
-        driven: int,
-        frequency: float,
-        points: FloatArray,
-        contacts: Mapping[str, FingertipLoad],
-    ) -> ComplexArray:
-        """Acceleration per base amplitude [1/s²] at points, one ERA driven as sin, solved whole."""
-        M, C, K = self.with_contacts(contacts)
-        w = 2 * np.pi * frequency
-        push = (self.eras[driven].stiffness + 1j * w * self.eras[driven].damping) * self.hold[
-            driven
-        ]
-        dynamic = K + 1j * w * C - w**2 * M
-        answer = linalg.solve(dynamic, np.pad(push, (0, len(contacts))))[: len(push)]
-        return np.asarray(-(w**2) * self.matrices.deflection_at(points) @ answer)
 
     def stepped(
         self,

@@ -235,13 +235,6 @@ def test_slow_line_has_its_verdicts(kind: str, monkeypatch: pytest.MonkeyPatch) 
         assert (found.result, found.attempts) == (Result.PASSED, 1), found
 
 
-def test_heartbeat_on_its_way_at_a_reset_is_none_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At 7 ms each way one arrives after reset_node was sent, from before it was heard."""
-    monkeypatch.setattr("judged_line.DELAY", 0.007)
-    (result,) = judged("can", ["network_management"])
-    assert result.result is Result.PASSED, result.reason
-
-
 READ_ALONE = {MESSAGES[name].number for name in ("GetStatus", "GetCaps", "GetFaults")}
 
 
@@ -286,22 +279,6 @@ def test_amplifier_that_obeys_late_fails(monkeypatch: pytest.MonkeyPatch) -> Non
     read, obeyed = judged("serial", ["replies_in_time", "obeys_in_time"])
     assert (read.result, obeyed.result) == ("passed", "failed"), obeyed.reason
     assert "replies to Ping" in obeyed.seen
-
-
-@in_virtual_time
-async def test_late_amplifier_has_no_longer_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After 80 ms on a line of 0.4 ms: an exchange counts as the 10 ms that it may take there."""
-    obey_late(monkeypatch, 0.08)
-    seen = []
-
-    async def note(subject: Subject) -> None:
-        seen.append(subject.exchange_time)
-
-    line = JudgedLine("serial", varied())
-    check = Check("noted", "passes", "", drives=True, kinds=(), run=note)
-    await run_checks([(1, check)], line.client, level=0.2)
-    line.close()
-    assert seen == [pytest.approx(0.0105, abs=0.0002)]
 
 
 def test_request_that_comes_after_an_onset_is_no_violation(

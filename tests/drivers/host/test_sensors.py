@@ -127,14 +127,6 @@ async def test_incomplete_reading_is_an_error(changes: dict[str, Any]) -> None:
 
 
 @in_virtual_time
-async def test_more_sensors_than_counted_are_an_error() -> None:
-    """A list that holds more than the number of all."""
-    line = await opened(partial(changed, "GetSensors", all=9))
-    with pytest.raises(FrameError, match="must be 9, got 10"):
-        await read_sensors(line.hosts["a"])
-
-
-@in_virtual_time
 async def test_tones_that_the_window_does_not_tell_apart_are_not_sent() -> None:
     """110 and 112 Hz need half a second; no tone and seventeen are none."""
     line = await opened()

@@ -120,14 +120,6 @@ def test_document_reports_all_repeated_keys_in_order_of_lines(tmp_path: Path) ->
     ]
 
 
-def test_document_reports_no_more_than_the_first_problems(tmp_path: Path) -> None:
-    """Fifty of two thousand repeated keys are reported."""
-    with pytest.raises(ConfigError) as caught:
-        read_document(write(tmp_path, "k: 1\n" * 2_000))
-    assert [each.line for each in caught.value.problems] == list(range(2, 52))
-    assert "more than 50 errors" in str(caught.value)
-
-
 def test_error_escapes_control_characters_of_a_key(tmp_path: Path) -> None:
     """A key cannot send commands to a terminal."""
     with pytest.raises(ConfigError) as caught:

@@ -60,14 +60,6 @@ def test_high_order_elements_do_not_lock(thickness):
     np.testing.assert_allclose(solved, thin, rtol=1e-3)
 
 
-def test_mode_shapes_have_unit_modal_mass(coarse_rig):
-    """Rigid motion up and down of the plate on very soft ERAs has shape 1 / sqrt(plate mass)."""
-    soft = tuple(Era(era.name, era.x, era.y, 1e-3, 0.0, 0.0, era.stroke) for era in coarse_rig.eras)
-    shapes = modes(assemble(coarse_rig.plate, coarse_rig.mesh), 3, support="eras", eras=soft)
-    up = shapes.mode_shapes[:, np.argmin(shapes.mode_shapes.std(axis=0))]
-    np.testing.assert_allclose(np.abs(up), coarse_rig.plate.mass**-0.5, rtol=1e-4)
-
-
 def test_bolt_mass_lowers_rigid_modes_as_by_hand(coarse_rig):
     """Soft ERAs with heavy bolts: the heave mode is sqrt(4 k / (m_plate + 4 m_bolt)) / 2 pi."""
     heavy = tuple(
@@ -137,20 +129,6 @@ def test_mesh_is_read_as_it_is_printed():
     for text in ("14x12 Legendre with strips of 3 mm", "12x9 Q5 with strips of 3 kg", "12x9 with"):
         with pytest.raises(InputError):
             parse_mesh(text, plate)
-
-
-def test_accurate_mesh_follows_the_bending_wavelength():
-    """At twice the frequency the wave is 1.41 times shorter, at four times half as long."""
-    plate = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
-    low, high = (Mesh.accurate(plate, frequency_max=f) for f in (500.0, 2000.0))
-    # 0.3048 m and 0.2286 m of waves 0.1704 m and 0.0852 m long, 5.5 elements each
-    assert [(mesh.nx, mesh.ny) for mesh in (low, high)] == [(10, 8), (20, 15)]
-    assert low.strip == high.strip == 0.003
-
-
-def test_accurate_mesh_has_no_strips_when_plate_is_thick():
-    """Where the edge's layer is as wide as an element, the element follows it already."""
-    assert Mesh.accurate(Plate(0.2, 0.1, 0.02, ALUMINIUM), frequency_max=500.0).strip == 0
 
 
 @pytest.mark.parametrize("kind", [("MITC4", 12, 9), ("Q3", 4, 3)])

@@ -99,11 +99,3 @@ def test_unsupported_motion_is_not_compared(count, free):
     assert len(study.natural_frequencies) == len(study.errors[0].frequency) == 12 - free
     assert study.natural_frequencies[0] > 1
     assert np.abs(study.errors[0].frequency).max() < 0.03
-
-
-@pytest.mark.parametrize(("limit", "expected"), [(500.0, [110, 250]), (200.0, [110]), (80.0, [80])])
-def test_default_frequencies_are_those_of_the_papers_maps(limit, expected):
-    """At 110 Hz and 250 Hz, as far as the rig's limit allows."""
-    rig = make_paper_rig(12, 9)
-    limited = replace(rig, limits=replace(rig.limits, frequency_max=limit))
-    assert default_frequencies(limited).tolist() == expected

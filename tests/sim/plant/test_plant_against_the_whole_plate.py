@@ -104,23 +104,6 @@ def phasors(
     return lock_in(times, samples, frequency) / STROKE
 
 
-@pytest.mark.parametrize("frequency", [60.0, 110.0, 207.0, 250.0, 320.0, 410.0, 500.0])
-def test_plant_steady_state_agrees_with_the_full_model(
-    frequency: float, rig: Rig, whole: WholePlate, reduced: ReducedPlate
-) -> None:
-    """Within 0.1 % of the unreduced plate's frequency response, before, under and after fingers."""
-    plant = Plant(reduced, rig.eras)
-    plant.set_input(2, [Term(0.0, np.inf, 2 * np.pi * frequency, STROKE)])
-    points = np.vstack([rig.mesh.nodes, [FIRST, SECOND, MOVED]])
-    until = 0.0
-    for contacts in ({}, resting(FIRST, SECOND), resting(MOVED, SECOND), {}):
-        plant.set_contacts(contacts)
-        until += 10.0
-        plant.skip(until)
-        found = phasors(plant, points, 2, frequency, until)
-        assert apart(found, whole.steady(2, frequency, points, contacts)) < 1e-3
-
-
 def test_plant_viscous_equivalent_agrees_with_the_loss_factor() -> None:
     """Against the hysteretic direct solve: magnitudes over the plate, 0.1 % in the median.
 

@@ -53,11 +53,11 @@ from collections.abc import Mapping
 
 from model.errors import InputError
 from sim.control.context import SimulationContext
-from sim.control.plate_operations import OPERATIONS, Operation, Request, Response, parse_number
+from sim.control.plate_operations import OPERATIONS, Operation, Response
+from sim.control.requests import Request, Step, read
 from sim.faults.fault_window import parse_fault
 
 VERSION = 3
-_MAX_STEP = 3600.0  # s of virtual time in one request
 
 
 async def carry_out(context: SimulationContext, line: bytes, *, now: float) -> Response:
@@ -136,11 +136,9 @@ async def _recover(context: SimulationContext, request: Request, now: float) -> 
 
 
 async def _step(context: SimulationContext, request: Request, now: float) -> Response:
-    seconds = parse_number(request, "seconds", "seconds")
+    seconds = read(Step, request).seconds
     if context.step is None:
         raise InputError("step needs virtual time: start era sim with --virtual-time")
-    if not 0 < seconds <= _MAX_STEP:
-        raise InputError(f"seconds must be above 0 and at most {_MAX_STEP:g}, got {seconds:g}")
     await context.step(seconds)
     context.bench.advance(now + seconds)
     return {"ok": True, "time_s": context.bench.time}

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
+from cobs import cobs
 
 from drivers.codec.can_bus.adapter_text import SLCAN
 from drivers.codec.can_bus.canopen import CanFrame
@@ -19,7 +20,7 @@ from drivers.codec.can_bus.segments import REQUEST, segments
 from drivers.codec.modbus.adu import framed
 from drivers.protocol.table import MESSAGES, STATES, STATUS_FLAGS
 from firmware_requests import RandomHost
-from firmware_script import request, stuffed, unstuffed
+from firmware_script import request
 from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware
 from mutation import damage
 
@@ -64,8 +65,13 @@ def can_line(body: bytes) -> bytes:
     return SLCAN.encode(CanFrame(can_id, body[2:10]))
 
 
+def on_line(body: bytes) -> bytes:
+    """A frame with its checksum."""
+    return b"\0" + cobs.encode(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
+
+
 WIRES: dict[str, tuple[Callable[..., Bodies], Callable[[bytes], bytes]]] = {
-    "serial": (on_serial, lambda body: stuffed(body + struct.pack("<I", zlib.crc32(body)))),
+    "serial": (on_serial, on_line),
     "rtu": (on_modbus, lambda body: framed(1, body, is_rtu=True)),
     "tcp": (on_modbus, lambda body: struct.pack(">HHHB", 7, 0, len(body) + 1, 1) + body),
     "can": (on_can, can_line),
@@ -77,7 +83,7 @@ def words_of(firmware: MovedFirmware, number: int) -> tuple[int, ...]:
     """The reply on its serial line, behind a zero that ends what was begun there."""
     firmware.sent(SERIAL)
     firmware.receive(SERIAL, b"\0" + request(number))
-    frame = unstuffed(firmware.sent(SERIAL).split(b"\0")[-2])
+    frame = cobs.decode(firmware.sent(SERIAL).split(b"\0")[-2])
     assert frame[0] == 0x80 | number
     return struct.unpack(f"<{len(frame[5:-4]) // 2}H", frame[5:-4])
 

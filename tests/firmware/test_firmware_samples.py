@@ -5,21 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cobs import cobs
 
-from firmware_script import (
-    DISARM,
-    GET_STATUS,
-    PER_MS,
-    STOP,
-    Script,
-    apply,
-    arm,
-    command,
-    replay,
-    request,
-    stuffed,
-    unstuffed,
-)
+import hand_written as hand
+from firmware_script import PER_MS, Script, apply, arm, replay, request
+from hand_written import tone as command
 from model.arrays import FloatArray
 from moved_firmware import RATE, SERIAL, MovedFirmware
 
@@ -43,9 +33,9 @@ def falling(times: FloatArray, ramp: float) -> FloatArray:
 
 def test_frame_with_any_wrong_bit_is_not_answered(replaying: Path) -> None:
     """A CRC-32 finds every single one, be it in the frame or in the checksum."""
-    frame = unstuffed(arm()[1:-1])
+    frame = cobs.decode(arm()[1:-1])
     damaged = [
-        stuffed(frame[:at] + bytes([frame[at] ^ 1 << bit]) + frame[at + 1 :])
+        b"\0" + cobs.encode(frame[:at] + bytes([frame[at] ^ 1 << bit]) + frame[at + 1 :]) + b"\0"
         for at in range(len(frame))
         for bit in range(8)
     ]
@@ -80,9 +70,9 @@ def test_square_of_voltages_is_the_summed_force(replaying: Path, square_law: Pat
 @pytest.mark.parametrize(
     ("watchdog_ms", "last"),
     [
-        (2000, (60, request(DISARM, 20))),
-        (2000, (60, request(STOP, 20))),
-        (100, (60, request(GET_STATUS))),  # its watchdog expires: a fault
+        (2000, (60, request(hand.DISARM, 20))),
+        (2000, (60, request(hand.STOP, 20))),
+        (100, (60, request(hand.GET_STATUS))),  # its watchdog expires: a fault
     ],
     ids=["disarmed", "stopped", "fault"],
 )
@@ -134,8 +124,8 @@ def test_stalled_loop_is_silent_as_soon_as_it_runs(
     t = seconds(len(samples))
     gain = falling(t - first, 0.005)
     assert np.abs(samples - gain * tone(t + 0.1, 100, 0.5, 90)).max() < TOLERANCE
-    firmware.receive(SERIAL, request(GET_STATUS))
-    status = unstuffed(firmware.sent(SERIAL).split(b"\0")[-2])
+    firmware.receive(SERIAL, request(hand.GET_STATUS))
+    status = cobs.decode(firmware.sent(SERIAL).split(b"\0")[-2])
     assert (status[5], status[7]) == (7, 1)  # FAULT, of the watchdog
 
 
@@ -146,7 +136,7 @@ def test_watchdog_left_is_real_time_after_a_stall(replaying: Path) -> None:
     firmware.move(0.1)
     firmware.stall(0.2, is_converter_still=True)
     firmware.move(0.21)
-    firmware.receive(SERIAL, request(GET_STATUS))
-    status = unstuffed(firmware.sent(SERIAL).split(b"\0")[-2])
+    firmware.receive(SERIAL, request(hand.GET_STATUS))
+    status = cobs.decode(firmware.sent(SERIAL).split(b"\0")[-2])
     assert status[5] == 4  # OPERATION_ENABLED
     assert int.from_bytes(status[13:15], "little") == pytest.approx(40, abs=1)

@@ -39,7 +39,6 @@ SLOWEST = (
     "test_firmware_host.py",
     "test_latency_measured.py",
     "test_errors.py",
-    "test_witnessed_chain.py",
     "test_link_faults.py",
     "test_dashboard_losses.py",
     "test_rig_check.py",

@@ -21,16 +21,14 @@ from controller.cli.demo import app
 from controller.cli.main import run
 from controller.demo.recorder import TouchRecorder
 from controller.demo.scene import Scene, layout_of_people
-from controller.sources.capture import RecordedDatagram, read_capture, write_capture
-from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import tuio_datagram
+from controller.sources.capture import read_capture
 from installed_program import ERA
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from patient_daemon import wait_long
+from touch_schedule import write_schedule
 from virtual_sockets import run_virtual_on_sockets
 
-FRAME = 1 / 50
 ERA_NAMES = {"SW", "SE", "NE", "NW"}
 
 # (id, down [s], up [s], x, y in TUIO's coordinates): one finger, then a second beside it, a pause,
@@ -45,15 +43,8 @@ SCHEDULE = [
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     """A TUIO capture of the schedule."""
-    datagrams = []
-    for number in range(int(2.1 / FRAME)):
-        now = number * FRAME
-        touches = tuple(Touch(i, x, y) for i, down, up, x, y in SCHEDULE if down <= now < up)
-        frame = TouchFrame("test", now, touches)
-        datagrams.append(RecordedDatagram(now, tuio_datagram(frame, number + 1)))
     path = tmp_path_factory.mktemp("touches") / "touches.tuio"
-    write_capture(path, datagrams)
-    return path
+    return write_schedule(path, SCHEDULE, 2.1)
 
 
 @pytest.fixture(scope="module")

@@ -10,13 +10,12 @@ import model
 from controller.demo.run import run_demo
 from controller.demo.scene import Scene, example_scenes
 from controller.effects.layout_file import load_layout
-from controller.sources.capture import RecordedDatagram, read_capture, write_capture
-from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import tuio_datagram
+from controller.sources.capture import read_capture
 from long_form import shortly
 from model.rig.file import load_rig
 from model.table.build import build_table
 from model.table.question import Question
+from touch_schedule import write_schedule
 from virtual_sockets import run_virtual_on_sockets
 
 EXAMPLES = Path(model.__file__).parents[1] / "examples"
@@ -28,15 +27,8 @@ SCHEDULE = ((1, 0.1, 0.9, 0.30, 0.35), (2, 0.15, 0.9, 0.80, 0.70))
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two fingers, the second of which shall feel it."""
-    datagrams = []
-    for number in range(50):
-        now = number / 50
-        touches = tuple(Touch(id, x, y) for id, down, up, x, y in SCHEDULE if down <= now < up)
-        frame = TouchFrame("test", now, touches)
-        datagrams.append(RecordedDatagram(now, tuio_datagram(frame, number + 1)))
     path = tmp_path_factory.mktemp("touches") / "touches.tuio"
-    write_capture(path, datagrams)
-    return path
+    return write_schedule(path, SCHEDULE, 1.0)
 
 
 @pytest.mark.parametrize("name", shortly(CHANNELS, ["eight_eras", "car_display"]))

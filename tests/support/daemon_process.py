@@ -177,26 +177,6 @@ async def play(era: AsyncClient, far: FarSide) -> None:
     raise AssertionError("nothing is played")
 
 
-@dataclass
-class Window:
-    """Observation of a daemon; widest_gap [s]: between two signs of life on the wire."""
-
-    widest_gap: float
-    states: set[str]
-
-
-async def watch(
-    daemon: DaemonProcess, era: AsyncClient, journal: Journal, seconds: float
-) -> Window:
-    """Observe the daemon for some seconds while fingers are held down."""
-    begin = time.monotonic()
-    states = set()
-    while time.monotonic() < begin + seconds:
-        states.add((await era.status()).state)
-        await asyncio.sleep(0.05)
-    return Window(journal.widest_gap(begin, time.monotonic()), states)
-
-
 async def plays_on(
     what: str, daemon: DaemonProcess, era: AsyncClient, journal: Journal, *, seconds: float = 0.6
 ) -> None:
@@ -206,9 +186,11 @@ async def plays_on(
     printed figure.
     """
     await play(era, daemon.far)
-    window = await watch(daemon, era, journal, seconds)
-    assert window.states == {ENABLED}
-    tell(f"between signs of life, {what}", window.widest_gap)
+    begin = time.monotonic()
+    while time.monotonic() < begin + seconds:
+        assert (await era.status()).state == ENABLED
+        await asyncio.sleep(0.05)
+    tell(f"between signs of life, {what}", journal.widest_gap(begin, time.monotonic()))
 
 
 def tell(what: str, seconds: float) -> None:

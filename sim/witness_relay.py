@@ -15,25 +15,20 @@ from dataclasses import dataclass
 
 import serial
 
-from drivers.codec.can_bus.segments import NODE_MAX
 from drivers.errors import CommandError, LinkError
-from drivers.urls import ADDRESS, ADDRESS_MAX, BAUD, RTU_BAUD, AmplifierUrl
+from drivers.urls import Place
+from drivers.wires.known import address_of
 from model.errors import InputError
 from sim.transport.pseudo_terminal import PseudoTerminal
 from sim.witness.capture import Direction
 from sim.witness.witness import Witness
 
 _KINDS = {
-    "serial": ("serial", BAUD, ADDRESS_MAX),
-    "serial+tcp": ("serial", 0, ADDRESS_MAX),
-    "modbus+tcp": ("modbus-tcp", 0, 255),  # where there is only one unit it may be 255
-    "modbus+rtu": ("modbus-rtu", RTU_BAUD, ADDRESS_MAX),
-    "can+socketcand": ("socketcand", 0, NODE_MAX),
-    "can+slcan": ("slcan", 115_200, NODE_MAX),
+    **dict.fromkeys(("serial", "serial+tcp"), "serial"),
+    **{"modbus+tcp": "modbus-tcp", "modbus+rtu": "modbus-rtu"},
+    **{"can+socketcand": "socketcand", "can+slcan": "slcan"},
 }
-"""By scheme: kind of wire, speed of a device [baud], highest address."""
-_FORM = f"one of {', '.join(_KINDS)} with a device or HOST:PORT, as era sim prints it"
-_OPTIONS = ("address", "baud", "bitrate", "parity", "stop")
+"""Kinds of wire by scheme."""
 
 
 @dataclass(frozen=True)
@@ -57,18 +52,15 @@ class WireEndpoint:
 def parse_endpoint(url: str) -> WireEndpoint:
     """Parse a URL; raises InputError where no relay is possible."""
     try:
-        parsed = AmplifierUrl(url, _FORM, known=_OPTIONS)
-        if parsed.scheme not in _KINDS:
-            raise parsed.refused("scheme must be of a wire that can be relayed")
-        kind, baud, highest = _KINDS[parsed.scheme]
-        place = parsed.server(has_path=True) if parsed.place else parsed.device(baud)
-        text = parsed.options.get("address", parsed.number)
-        if kind == "modbus-tcp":
-            text = parsed.path.strip("/")
-        number = parsed.whole(text, "address", highest) if text else ADDRESS
+        address = address_of(url)
     except CommandError as problem:
         raise InputError(str(problem)) from problem
-    return WireEndpoint(url, kind, place.name, number, place.baud if place.device else 0)
+    kind = _KINDS.get(url.partition("://")[0].lower())
+    place = getattr(address, "place", None)
+    if kind is None or not isinstance(place, Place) or place.name not in url:
+        known = ", ".join(_KINDS)
+        raise InputError(f"{url}: scheme must be one of {known}, with a device or HOST:PORT")
+    return WireEndpoint(url, kind, place.name, address.number, place.baud if place.device else 0)
 
 
 _READ_MAX = 4096

@@ -1,30 +1,22 @@
 """`era rig check --url` as typed, against simulated amplifiers on wires in virtual time."""
 
-import asyncio
 import json
 import math
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from controller.cli.demo import app
 from controller.daemon.socket_lock import SocketLock
 from drivers.errors import CommandError, LinkError
-from memory_machine import live_in_memory
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from rig_files import write_rig
-from rig_on_wire import far_side
 from sim.amplifier.contract import Amplifier
-from virtual_loop import run_virtual
-from wires import WIRES
-
-PORT = "serial:///dev/memory0?baud=921600"
+from typed_on_wire import PORT, typed_on_wire
 
 Check = Callable[..., Result]
 
@@ -34,17 +26,8 @@ def check(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Check:
     """The command, on an event loop in virtual time with a plate of its own at the far end."""
 
     def run(*options: str, on: Rig, file: str = "rig.yaml") -> Result:
-        async def beside(main: Coroutine[Any, Any, Any]) -> Any:
-            live_in_memory()
-            async with far_side(WIRES["serial"], on):
-                return await main
-
-        monkeypatch.setattr(asyncio, "run", lambda main: run_virtual(beside(main)))
         write_rig(tmp_path / "rig.yaml", mesh="auto")
-        result = CliRunner().invoke(app, ["rig", "check", str(tmp_path / file), *options])
-        if result.exception is not None and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        return result
+        return typed_on_wire(monkeypatch, on, "check", str(tmp_path / file), *options)
 
     return run
 

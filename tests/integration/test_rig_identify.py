@@ -1,27 +1,18 @@
 """`era rig identify` as typed, against simulated amplifiers on wires in virtual time."""
 
-import asyncio
 import json
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from controller.cli.demo import app
-from memory_machine import live_in_memory
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from rig_files import TWO_AMPLIFIERS, write_rig
-from rig_on_wire import far_side
-from virtual_loop import run_virtual
-from wires import WIRES
-
-PORT = "serial:///dev/memory0?baud=921600"
-"""Where the first far end on a serial line in memory is."""
+from typed_on_wire import PORT, typed_on_wire
 
 Identify = Callable[..., Result]
 
@@ -39,19 +30,8 @@ def truth() -> Rig:
 def identify(truth: Rig, monkeypatch: pytest.MonkeyPatch) -> Identify:
     """The command, on an event loop in virtual time with the far end in it."""
 
-    def run(rig: Path, *options: str, wire: str = "serial", on: Rig = truth) -> Result:
-        async def beside(main: Coroutine[Any, Any, Any]) -> Any:
-            live_in_memory()
-            async with far_side(WIRES[wire], on) as far:
-                run.urls = far.urls  # type: ignore[attr-defined]
-                return await main
-
-        monkeypatch.setattr(asyncio, "run", lambda main: run_virtual(beside(main)))
-        arguments = ["rig", "identify", str(rig), *options]
-        result = CliRunner().invoke(app, arguments)
-        if result.exception is not None and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        return result
+    def run(rig: Path, *options: str) -> Result:
+        return typed_on_wire(monkeypatch, truth, "identify", str(rig), *options)
 
     return run
 

@@ -32,15 +32,16 @@ from controller.api.server import Handler
 from controller.daemon.active_layout import ActiveLayout
 from controller.daemon.api_views import amplifier_silence, hello_result
 from controller.daemon.config import DaemonConfig
-from controller.daemon.lease import Lease, check_lease
 from controller.daemon.operation import LEASE_OVER
 from controller.daemon.publisher import EventPublisher
 from controller.daemon.states import (
     ENERGISED,
     DaemonEvent,
     DaemonState,
-    StateMachine,
+    Lease,
+    Operation,
     Trigger,
+    check_lease,
 )
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches
@@ -101,22 +102,22 @@ class ApiService:
 
     def holds_lease(self, client: Connection) -> bool:
         """Whether a client armed or renewed the current lease: it is never evicted."""
-        lease = self._supervisor.machine.lease_at(clock.now())
+        lease = self._supervisor.operation.lease_at(clock.now())
         return lease is not None and self._tokens.get(client) == lease.token
 
     def _status(self, client: Connection, params: Empty) -> StatusResult:
-        machine, view, now = self._supervisor.machine, self._publisher.view, clock.now()
-        lease = machine.lease_at(now)
-        pattern = view.pattern_event() if machine.state is _ENABLED else None
+        operation, view, now = self._supervisor.operation, self._publisher.view, clock.now()
+        lease = operation.lease_at(now)
+        pattern = view.pattern_event() if operation.state is _ENABLED else None
         return StatusResult(
             time_s=now,
             unix_time_s=time.time(),
-            state=machine.state.value,
-            cause=machine.cause,
-            remedy=machine.remedy,
-            epoch=machine.epoch,
+            state=operation.state.value,
+            cause=operation.cause,
+            remedy=operation.remedy,
+            epoch=operation.epoch,
             assume_energised=self._supervisor.assume_energised(now),
-            lost_for_s=None if machine.lost is None else now - machine.lost.at,
+            lost_for_s=None if operation.lost is None else now - operation.lost.at,
             watchdog_s=self._controller.watchdog,
             armed_by=lease.owner if lease else None,
             lease_left_s=lease.expires_at - now if lease else None,
@@ -146,24 +147,24 @@ class ApiService:
         )
 
     async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
-        if self._supervisor.machine.is_lease_over(clock.now()):  # what plays is not inherited
+        if self._supervisor.operation.is_lease_over(clock.now()):  # what plays is not inherited
             await self._supervisor.handle(LEASE_OVER)
-        machine = self._supervisor.machine
-        if machine.state in ENERGISED:
-            raise _armed_already(machine)
-        if machine.state is not DaemonState.READY_TO_SWITCH_ON:
-            raise _wrong_state(machine)
+        operation = self._supervisor.operation
+        if operation.state in ENERGISED:
+            raise _armed_already(operation)
+        if operation.state is not DaemonState.READY_TO_SWITCH_ON:
+            raise _wrong_state(operation)
         lease = Lease(params.owner, params.lease_s)
         cause = f"armed by {params.owner!a}"
         try:
             await self._supervisor.handle(
                 DaemonEvent(Trigger.ARM, cause, "era disarm, or era stop", lease)
             )
-            machine = self._supervisor.machine
-            if machine.state is not _ENABLED or machine.lease is None:
-                raise _wrong_state(machine)
-            if machine.lease.token != lease.token:
-                raise _armed_already(machine)
+            operation = self._supervisor.operation
+            if operation.state is not _ENABLED or operation.lease is None:
+                raise _wrong_state(operation)
+            if operation.lease.token != lease.token:
+                raise _armed_already(operation)
         except BaseException:
             self._supervisor.withdraw(lease.token, "arming failed")
             raise
@@ -178,32 +179,32 @@ class ApiService:
         return RenewResult(lease_s=lease.duration)
 
     async def _disarm(self, client: Connection, params: DisarmParams) -> Empty:
-        machine = self._supervisor.machine
+        operation = self._supervisor.operation
         if params.lease is not None:
-            check_lease(machine.lease, params.lease, clock.now())
-        if machine.state in ENERGISED:
+            check_lease(operation.lease, params.lease, clock.now())
+        if operation.state in ENERGISED:
             cause = f"disarmed by {params.client or client.name!a}"
             await self._supervisor.handle(DaemonEvent(Trigger.DISARM, cause))
-            machine = self._supervisor.machine
-        if machine.state is not DaemonState.READY_TO_SWITCH_ON:  # disarmed and read back
-            raise _wrong_state(machine)
+            operation = self._supervisor.operation
+        if operation.state is not DaemonState.READY_TO_SWITCH_ON:  # disarmed and read back
+            raise _wrong_state(operation)
         return Empty()
 
     def _stop(self, client: Connection, params: RequestedBy) -> Awaitable[StopResult]:
         """Stop; the amplifiers' requests are queued when this returns."""
         cause = f"stopped by {params.client or client.name!a}"
         stopping = self._supervisor.stop(cause, "clear (era clear), then arm again")
-        return _silence(stopping, self._supervisor.machine.epoch)
+        return _silence(stopping, self._supervisor.operation.epoch)
 
     async def _clear(self, client: Connection, params: ClearParams) -> Empty:
-        machine = self._supervisor.machine
-        if machine.state is DaemonState.COMM_LOST:
-            raise _wrong_state(machine, ErrorCode.LINK)
-        if machine.state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT):
-            if params.epoch not in (None, machine.epoch):
+        operation = self._supervisor.operation
+        if operation.state is DaemonState.COMM_LOST:
+            raise _wrong_state(operation, ErrorCode.LINK)
+        if operation.state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT):
+            if params.epoch not in (None, operation.epoch):
                 raise RpcError(
                     ErrorCode.WRONG_STATE,
-                    f"epoch must be that of what is latched now, {machine.epoch}, got "
+                    f"epoch must be that of what is latched now, {operation.epoch}, got "
                     f"{params.epoch}: another stop, fault or loss came since",
                     where="epoch",
                     remedy="look at the status, then clear again",
@@ -211,9 +212,9 @@ class ApiService:
             await self._supervisor.handle(
                 DaemonEvent(Trigger.CLEAR, f"acknowledged by {params.client or client.name!a}")
             )
-            machine = self._supervisor.machine
-        if machine.state is not DaemonState.READY_TO_SWITCH_ON:
-            raise _wrong_state(machine)
+            operation = self._supervisor.operation
+        if operation.state is not DaemonState.READY_TO_SWITCH_ON:
+            raise _wrong_state(operation)
         return Empty()
 
     async def _forget(self, client: Connection, params: RequestedBy) -> Empty:
@@ -239,9 +240,9 @@ class ApiService:
         return self._layout.effects()
 
     def _play(self, client: Connection, params: PlayParams) -> Empty:
-        machine = self._supervisor.machine
-        if machine.state is not _ENABLED or self._controller.degraded:
-            raise _wrong_state(machine)
+        operation = self._supervisor.operation
+        if operation.state is not _ENABLED or self._controller.degraded:
+            raise _wrong_state(operation)
         self._layout.play_nearest(params, self._publisher.view.contacts, now=clock.now())
         self._controller.request_update()
         return Empty()
@@ -265,10 +266,10 @@ class ApiService:
             self._supervisor.withdraw(token, "the arming client disconnected")
 
 
-def _armed_already(machine: StateMachine) -> RpcError:
+def _armed_already(operation: Operation) -> RpcError:
     """Return the error of a client that arms what another has armed, or is arming."""
-    what, lease = "another client is arming", machine.lease
-    if machine.state is _ENABLED and lease is not None:
+    what, lease = "another client is arming", operation.lease
+    if operation.state is _ENABLED and lease is not None:
         what = f"armed by {lease.owner!a} for {lease.expires_at - clock.now():.1f} s more"
     return RpcError(ErrorCode.LEASE, what, remedy="wait, or disarm first: every client may")
 
@@ -283,10 +284,10 @@ async def _silence(stopping: Awaitable[Mapping[str, Stopped]], epoch: int) -> St
     return StopResult(epoch=epoch, amplifiers=amplifiers)
 
 
-def _wrong_state(machine: StateMachine, code: ErrorCode = ErrorCode.WRONG_STATE) -> RpcError:
+def _wrong_state(operation: Operation, code: ErrorCode = ErrorCode.WRONG_STATE) -> RpcError:
     return RpcError(
         code,
-        headline(machine.state.value, machine.cause),
+        headline(operation.state.value, operation.cause),
         where="state",
-        remedy=machine.remedy or _REMEDIES.get(machine.state),
+        remedy=operation.remedy or _REMEDIES.get(operation.state),
     )

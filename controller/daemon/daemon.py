@@ -22,7 +22,7 @@ from controller.daemon.publisher import EventPublisher
 from controller.daemon.reload import changed_keys, reload_problem
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
-from controller.daemon.states import ENERGISED, DaemonState, StateMachine
+from controller.daemon.states import ENERGISED, DaemonState, Operation
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches, TouchInputs
 from controller.learning.learning import Learning
@@ -91,7 +91,7 @@ class Daemon:
         self._frequencies = table.frequencies
         self._warn_of_bands(config)
         self._publisher = EventPublisher(
-            machine=lambda: self._supervisor.machine,
+            operation=lambda: self._supervisor.operation,
             amplifiers=lambda: amplifier_statuses(
                 self._controller.amplifiers,
                 config.urls,
@@ -222,7 +222,7 @@ class Daemon:
             _logger.warning("layout: %s", problem)
 
     def _apply(self, new: DaemonConfig, changed: list[str], *, differs: bool) -> None:
-        is_armed = self._supervisor.machine.state in ENERGISED
+        is_armed = self._supervisor.operation.state in ENERGISED
         problem = reload_problem(self._config, new, changed, is_armed=is_armed)
         if problem is not None:
             _logger.error("config: reload rejected, keeping previous: %s", problem)
@@ -283,7 +283,7 @@ class Daemon:
         text = str(error) if is_expected else failure_text(error)
         _logger.error("touch source %s: failed, restarting: %s", name, text)
 
-    def _dump_fault(self, old: StateMachine, new: StateMachine) -> None:
+    def _dump_fault(self, old: Operation, new: Operation) -> None:
         is_fault = new.state in (
             DaemonState.FAULT_REACTION_ACTIVE,
             DaemonState.FAULT,
@@ -293,7 +293,7 @@ class Daemon:
         if is_fault and folder is not None:
             self._dumps.write(folder, cause=new.cause)
 
-    def _follow_state(self, old: StateMachine, new: StateMachine) -> None:
+    def _follow_state(self, old: Operation, new: Operation) -> None:
         """Learn of the plate from when all amplifiers are open."""
         if self._learning is None:
             return
@@ -312,8 +312,8 @@ class Daemon:
         task.add_done_callback(self._reloads.discard)
 
     def _status_line(self) -> str:
-        machine = self._supervisor.machine
-        return headline(machine.state.value, machine.cause)
+        operation = self._supervisor.operation
+        return headline(operation.state.value, operation.cause)
 
 
 def _read(old: DaemonConfig) -> tuple[DaemonConfig, list[str], bool]:

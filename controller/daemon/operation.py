@@ -1,37 +1,47 @@
 """The operation of the plate: the one owner of its state, and who may change it by which event.
 
-Actions come before observers: these are called a moment later, each guarded (`DeferredCalls`).
+Actions come before observers: these are called a moment later, each guarded (`DeferredCalls`). The
+outcome of each action at the amplifiers is the next event; a lost link is one wherever it shows.
 """
 
 import asyncio
 import logging
+import math
 import secrets
-from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from controller.daemon.deferred_calls import DeferredCalls, call_guarded
-from controller.daemon.lease import Lease, check_lease
+from controller.daemon.read_back import READ_BACK_INTERVAL, find_problem, is_any_armed
 from controller.daemon.states import (
     ACKNOWLEDGE,
     Action,
     DaemonEvent,
     DaemonState,
-    StateMachine,
+    Lease,
+    Operation,
     Trigger,
+    check_lease,
     failed,
     step,
 )
+from controller.loop.loop import Controller
 from drivers import clock
-from drivers.errors import DriverError
+from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkError, Preempted
+from drivers.host.stop import Stopped
 from registry.plugins import failure_text
 
 _EPOCHS = 2**31  # of which a daemon begins at one by chance: exact as numbers of JSON
+_MAX_READ_BACKS = 15
+_WATCHDOG_MARGIN = 0.1  # s; of an amplifier that another host may have armed
 LEASE_OVER = DaemonEvent(Trigger.LEASE_LOST, "the arming lease was not renewed", "arm again")
-StateObserver = Callable[[StateMachine, StateMachine], None]
-"""Receives the old and the new state machine."""
+SEARCHING = "check cables and supply; the daemon reconnects by itself and stays disarmed"
+
+LinkChange = Literal["degraded", "restored", "lost", "retry", "reopened"]
+StateObserver = Callable[[Operation, Operation], None]
+"""Receives the operation before and after a change."""
 
 _LOG_LEVELS = {
     DaemonState.COMM_LOST: logging.ERROR,
@@ -43,33 +53,31 @@ _rate_limited_logger = logging.getLogger(f"{__name__}.background")
 _T = TypeVar("_T")
 
 
-class Operation(ABC):
-    """Applies events to the state machine and has their actions carried out.
+class Operator:
+    """Applies events to the operation of the plate, and carries out their actions by a controller.
 
     An unexpected exception in a transition or action ends in a stop of all amplifiers and in FAULT.
-    state_changed are called a moment after every change of the state or its epoch.
+    state_changed are called a moment after every change of the state or its epoch; link_changed
+    receives the kind of change, the lost amplifiers ("lost" only) and a message.
     """
 
-    def __init__(self, state_changed: Sequence[StateObserver]) -> None:
+    def __init__(
+        self,
+        *,
+        state_changed: Sequence[StateObserver],
+        link_changed: Callable[[LinkChange, Sequence[str], str], None],
+    ) -> None:
         # Not that of a daemon before, whose clients may be left.
-        self.machine = StateMachine(epoch=secrets.randbelow(_EPOCHS))
+        self.operation = Operation(epoch=secrets.randbelow(_EPOCHS))
         self._state_observers = (_log_transition, *state_changed)
+        self._link_observer = link_changed
+        self._controller_if_running: Controller | None = None
+        self._loss_lock = asyncio.Lock()  # held until the lost amplifiers are closed
+        self._clears: list[int] = []  # epochs of those in progress
         self._reports = DeferredCalls()
         self._tasks: set[asyncio.Task[Any]] = set()
         self._lease_timer: asyncio.TimerHandle | None = None
         self._changed = asyncio.Event()  # to another state, since `run` has looked at it
-
-    @abstractmethod
-    async def _do(self, action: Action, epoch: int) -> None:
-        """Carry out an action of an event that came in an epoch."""
-
-    @abstractmethod
-    async def _stop(self) -> None:
-        """Quick-stop all amplifiers."""
-
-    @abstractmethod
-    def _energised_until(self, now: float) -> float:
-        """When [s] amplifiers that are lost now must be silent."""
 
     async def handle(self, event: DaemonEvent) -> None:
         """Apply an event and carry out its actions; raises the error of an action.
@@ -95,23 +103,23 @@ class Operation(ABC):
     def renew(self, token: str) -> Lease:
         """Renew the lease of a token; raises RpcError if it has expired or is another's."""
         now = clock.now()
-        lease = check_lease(self.machine.lease, token, now).renewed(now)
-        self.machine = replace(self.machine, lease=lease)
+        lease = check_lease(self.operation.lease, token, now).renewed(now)
+        self.operation = replace(self.operation, lease=lease)
         return lease
 
     def withdraw(self, token: str, cause: str) -> None:
         """Disarm, unless the lease of a token has ended."""
-        lease = self.machine.lease
+        lease = self.operation.lease
         if lease is not None and lease.token == token:
             self.post(DaemonEvent(Trigger.LEASE_LOST, cause, "arm again"))
 
     def tick(self) -> None:
         """End the lease if it has expired, else look again when it will have."""
-        machine, now = self.machine, clock.now()
-        if machine.is_lease_over(now):
+        operation, now = self.operation, clock.now()
+        if operation.is_lease_over(now):
             self.post(LEASE_OVER)
-        elif machine.lease is not None:
-            pause = machine.lease.expires_at - now
+        elif operation.lease is not None:
+            pause = operation.lease.expires_at - now
             self._lease_timer = asyncio.get_running_loop().call_later(pause, self.tick)
 
     def _spawn(self, work: Coroutine[Any, Any, _T]) -> "asyncio.Task[_T]":
@@ -123,32 +131,32 @@ class Operation(ABC):
 
     def _step(self, event: DaemonEvent) -> tuple[Action, ...]:
         """Apply one transition; return its actions."""
-        before, now = self.machine, clock.now()
+        before, now = self.operation, clock.now()
         try:
             if event.trigger in (Trigger.LINK_LOST, Trigger.NOT_FOUND):
                 event = replace(event, energised_until=self._energised_until(now))
-            self.machine, actions = step(before, event, now)
+            self.operation, actions = step(before, event, now)
         except Exception as error:
-            self.machine, actions = failed(before, failure_text(error)), (Action.STOP,)
+            self.operation, actions = failed(before, failure_text(error)), (Action.STOP,)
         self._report_transition(before)
         return actions
 
-    def _report_transition(self, before: StateMachine) -> None:
+    def _report_transition(self, before: Operation) -> None:
         """Notify the observers of a new epoch, deferred; look after a lease that has begun."""
-        if self.machine.epoch == before.epoch:
+        if self.operation.epoch == before.epoch:
             return
         self._changed.set()
         for observer in self._state_observers:
-            call_guarded(partial(self._reports.add, partial(observer, before, self.machine)))
+            call_guarded(partial(self._reports.add, partial(observer, before, self.operation)))
         if self._lease_timer is not None:
             self._lease_timer.cancel()
-        if self.machine.state is DaemonState.OPERATION_ENABLED:
+        if self.operation.state is DaemonState.OPERATION_ENABLED:
             self.tick()
 
     def _applied(self, event: DaemonEvent) -> Coroutine[Any, Any, None]:
         """Apply an event; await its actions."""
         actions = self._step(event)
-        return self._carry_out(actions, self.machine.epoch)
+        return self._carry_out(actions, self.operation.epoch)
 
     async def _carry_out(self, actions: Sequence[Action], epoch: int) -> None:
         for action in actions:
@@ -156,7 +164,7 @@ class Operation(ABC):
 
     async def _fail(self, error: Exception) -> None:
         """Stop all amplifiers after an unexpected exception, which is a fault."""
-        before, self.machine = self.machine, failed(self.machine, failure_text(error))
+        before, self.operation = self.operation, failed(self.operation, failure_text(error))
         self._report_transition(before)
         await asyncio.shield(self._spawn(self._stop()))
 
@@ -170,8 +178,180 @@ class Operation(ABC):
             _rate_limited_logger.exception("failed, stopping all amplifiers")
             await self._fail(error)
 
+    def stop(self, cause: str, remedy: str | None = None) -> Awaitable[Mapping[str, Stopped]]:
+        """Quick-stop all amplifiers in any state; await the outcome of each, by name.
 
-def _log_transition(before: StateMachine, after: StateMachine) -> None:
+        The requests to the amplifiers are queued when this returns.
+        """
+        stopping = self._spawn(self._stopped(self._controller.stop()))
+        self._step(DaemonEvent(Trigger.STOP, cause, remedy))
+        return asyncio.shield(stopping)
+
+    def assume_energised(self, now: float) -> bool:
+        """Whether a lost amplifier may still be playing at a time [s].
+
+        Over a network for longer: there a request without reply may arrive late, and feed its
+        watchdog.
+        """
+        lost = self.operation.lost
+        return lost is not None and now < max(lost.energised_until, self._may_play_until)
+
+    @property
+    def _controller(self) -> Controller:
+        if self._controller_if_running is None:
+            raise RuntimeError("supervisor is not running")
+        return self._controller_if_running
+
+    @property
+    def _may_play_until(self) -> float:
+        """When [s] the watchdog must have silenced each amplifier as identified last."""
+        known = self._controller.amplifiers.values()
+        return max((each.feeding.may_play_until for each in known), default=-math.inf)
+
+    def _energised_until(self, now: float) -> float:
+        """When [s] amplifiers that are lost now must be silent; one never seen may be armed."""
+        if self._controller.amplifiers:
+            return self._may_play_until
+        return now + self._controller.watchdog + _WATCHDOG_MARGIN
+
+    def _link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
+        report = partial(self._link_observer, change, lost, message)
+        call_guarded(partial(self._reports.add, report))
+
+    async def _do(self, action: Action, epoch: int) -> None:
+        match action:
+            case Action.VERIFY:
+                await self._over_link(self._verify(epoch), epoch)
+            case Action.ARM:
+                await self._over_link(self._arm(), epoch)
+            case Action.DISARM:
+                await self._over_link(self._controller.disarm(), epoch)
+            case Action.STOP:
+                await self._stop()
+            case Action.REACT:
+                await self._stop()
+                cause, remedy = self.operation.cause, self.operation.remedy
+                await self.handle(DaemonEvent(Trigger.REACTION_DONE, cause, remedy))
+            case Action.CLEAR:
+                await self._over_link(self._clear(epoch), epoch)
+            case Action.RECONNECT:
+                await self._controller.release()
+                self._changed.set()
+            case Action.CLOSE:
+                await self._controller.close()
+
+    async def _over_link(self, work: Awaitable[object], epoch: int) -> None:
+        """Await work that needs the link; a loss or refusal becomes an event, then is raised.
+
+        Not where it is explained: by what has raised the epoch since, or by a stop that goes on.
+        """
+        try:
+            await work
+        except LinkError as error:
+            if isinstance(error, LinkDegraded) and self.operation.state is DaemonState.SWITCHED_ON:
+                await self.handle(DaemonEvent(Trigger.DISARM, "an amplifier did not reply to arm"))
+            else:
+                await self._handle_loss(error)
+            raise
+        except DriverError as error:
+            is_stopping = isinstance(error, Preempted) and self.operation.is_latched
+            if epoch == self.operation.epoch and not is_stopping:
+                await self.handle(DaemonEvent(Trigger.FAULT, str(error), ACKNOWLEDGE))
+            raise
+
+    async def _stopped(self, stopping: Awaitable[Mapping[str, Stopped]]) -> Mapping[str, Stopped]:
+        """Await a stop of all amplifiers; one that is lost is a lost link."""
+        outcomes = await stopping
+        try:
+            await self._check_links()
+        except Exception:
+            _rate_limited_logger.exception("handling of a lost link failed")
+        return outcomes
+
+    async def _stop(self) -> None:
+        await self._stopped(self._controller.stop())
+
+    @property
+    def _is_loss_handled(self) -> bool:
+        """Whether amplifiers are lost or closed already."""
+        return self.operation.state in (DaemonState.COMM_LOST, DaemonState.NOT_READY)
+
+    async def _check_links(self) -> None:
+        """Handle the loss of an amplifier unless it is handled already."""
+        causes = self._controller.group.lost_by.values()
+        if causes and not self._is_loss_handled:
+            await self._handle_loss(LinkError(next(iter(causes))))
+
+    async def _arm(self) -> None:
+        await self._controller.arm()
+        await self.handle(DaemonEvent(Trigger.ARMED, self.operation.cause))
+
+    async def _verify(self, epoch: int) -> None:
+        """Disarm what still plays, then read back all amplifiers."""
+        is_armed = is_any_armed(await self._controller.group.statuses())
+        if is_armed and epoch == self.operation.epoch:
+            await self._controller.disarm()
+        problem = await self._read_back(epoch)
+        if epoch != self.operation.epoch:
+            return  # stopped, or verified and armed, in the meantime
+        if problem is None:
+            cause = "all amplifiers are disarmed, at level zero and without a fault"
+            await self.handle(DaemonEvent(Trigger.VERIFIED, cause))
+        else:
+            await self.handle(DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE))
+
+    async def _clear(self, epoch: int) -> None:
+        self._clears.append(epoch)
+        try:
+            problem = await self._read_back(epoch, clears=True)
+        finally:
+            self._clears.remove(epoch)
+        self._check_none_since(epoch)
+        if problem is None:
+            await self.handle(DaemonEvent(Trigger.VERIFIED, "acknowledged, and the cause is gone"))
+            return
+        await self.handle(DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE))
+        raise CommandRefused(f"{problem}; the cause persists, so nothing was cleared")
+
+    def _check_none_since(self, epoch: int) -> None:
+        """Raise Preempted if a stop, fault or other clear came after an acknowledgement."""
+        if epoch != self.operation.epoch:
+            raise Preempted(
+                "not cleared: a stop, fault or other clear came after the request; find the cause "
+                "of what is latched, then clear again"
+            )
+
+    async def _read_back(self, epoch: int, *, clears: bool = False) -> str | None:
+        """Read back until all amplifiers are silent; return the problem that remains, if any.
+
+        clears: before each read, for one that is still ramping down ignores Clear. Ends early
+        when the epoch rises.
+        """
+        problem = None
+        for _ in range(_MAX_READ_BACKS):
+            if clears:
+                self._check_none_since(epoch)
+                await self._controller.clear()
+            group = self._controller.group
+            problem = find_problem(await group.statuses(), group.amplifiers)
+            if problem is None or epoch != self.operation.epoch:
+                break
+            await asyncio.sleep(READ_BACK_INTERVAL)
+        return problem
+
+    async def _handle_loss(self, error: LinkError) -> None:
+        """Handle a loss; concurrent reports of the same loss wait until it is handled."""
+        async with self._loss_lock:
+            group = self._controller.group
+            lost = [name for name in group.amplifiers if name in (*group.lost_by, *group.degraded)]
+            text = str(error)
+            if self.operation.state is not DaemonState.COMM_LOST:
+                self._link_changed("lost", lost, text)
+            cause = f"amplifier {', '.join(lost)}: {text}" if lost else text
+            await self.handle(DaemonEvent(Trigger.LINK_LOST, cause, SEARCHING))
+
+
+def _log_transition(before: Operation, after: Operation) -> None:
     if after.state is before.state:
         return
     _logger.log(

@@ -19,8 +19,8 @@ from controller.api.topics import (
 )
 from controller.daemon.api_views import PlateView, learning_summary, plate_event
 from controller.daemon.latency import LatencyStatistics
-from controller.daemon.plate_actions import LinkChange
-from controller.daemon.states import DaemonState, StateMachine
+from controller.daemon.operation import LinkChange
+from controller.daemon.states import DaemonState, Operation
 from controller.effects.layout import SurfaceLayout
 from controller.learning.learning_status import LearningStatus
 from controller.loop.observer import Applied, Observer, Silenced
@@ -35,7 +35,7 @@ _logger = logging.getLogger(__name__)
 class EventPublisher:
     """Keeps the current state of the plate and publishes every change at `hub`.
 
-    machine: the daemon's state machine; amplifiers: their statuses; effect_of: the effect that
+    operation: of the plate; amplifiers: their statuses; effect_of: the effect that
     plays for a contact; layout: the surface layout;
     learning: what is learned of the plate, None where nothing is to be.
     """
@@ -43,7 +43,7 @@ class EventPublisher:
     def __init__(
         self,
         *,
-        machine: Callable[[], StateMachine],
+        operation: Callable[[], Operation],
         amplifiers: Callable[[], list[AmplifierStatus]],
         effect_of: Callable[[ContactKey], str | None],
         layout: SurfaceLayout | None,
@@ -54,7 +54,7 @@ class EventPublisher:
         self.learning_latencies = LatencyStatistics()
         self._learning = learning
         self.amplifiers = amplifiers
-        self._machine = machine
+        self._operation = operation
         self._layout = layout
         self._last_link_message = ""
         self._loop = asyncio.get_running_loop()
@@ -81,7 +81,7 @@ class EventPublisher:
             refused=lambda reason: _logger.warning("refused: %s", reason),
         )
 
-    def state_changed(self, old: StateMachine, new: StateMachine) -> None:
+    def state_changed(self, old: Operation, new: Operation) -> None:
         """Publish a transition; outside OPERATION_ENABLED nothing plays."""
         self.hub.publish("state", lambda: _state_event(old, new))
         if self.view.applied is not None and new.state is not DaemonState.OPERATION_ENABLED:
@@ -152,7 +152,7 @@ class EventPublisher:
         return None if status is None else plate_event(status)
 
     def _state_event(self) -> StateEvent:
-        now = self._machine()
+        now = self._operation()
         return _state_event(now, now)
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
@@ -172,7 +172,7 @@ class EventPublisher:
         self.hub.publish("silence", self.view.silence_event)
 
 
-def _state_event(old: StateMachine, new: StateMachine) -> StateEvent:
+def _state_event(old: Operation, new: Operation) -> StateEvent:
     return StateEvent(
         old=old.state.value,
         new=new.state.value,

@@ -1,4 +1,4 @@
-"""The daemon's state machine: a transition table and `step`, a pure function that applies it.
+"""The operation of the plate: a transition table and `step`, a pure function that applies it.
 
 State names follow CiA 402.
 
@@ -12,12 +12,13 @@ State names follow CiA 402.
 """
 
 import math
+import secrets
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum, StrEnum, auto
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
-from controller.daemon.lease import Lease
+from controller.api.jsonrpc import ErrorCode, RpcError
 
 ACKNOWLEDGE = "find the cause, then clear (era clear) and arm again"
 """Remedy of every fault."""
@@ -71,6 +72,20 @@ class Action(Enum):
 
 
 @dataclass(frozen=True)
+class Lease:
+    """A lease; duration [s]: from each renewal; token: proves ownership; expires_at [s]."""
+
+    owner: str
+    duration: float
+    token: str = field(default_factory=lambda: secrets.token_hex(16))
+    expires_at: float = math.inf
+
+    def renewed(self, now: float) -> Self:
+        """Return it for its duration from now [s] on."""
+        return replace(self, expires_at=now + self.duration)
+
+
+@dataclass(frozen=True)
 class DaemonEvent:
     """An event with its cause and a remedy for the user.
 
@@ -92,7 +107,7 @@ class Loss(NamedTuple):
 
 
 @dataclass(frozen=True)
-class StateMachine:
+class Operation:
     """The operation of the plate: its state and everything that the next transition depends on.
 
     is_latched: a clear is required before arming; lost: while amplifiers cannot be reached; lease:
@@ -123,7 +138,7 @@ class Transition(NamedTuple):
 
     to: DaemonState
     actions: tuple[Action, ...] = ()
-    when: Callable[[StateMachine, float], bool] = lambda machine, now: True
+    when: Callable[[Operation, float], bool] = lambda operation, now: True
 
 
 _SILENT = (DaemonState.SWITCH_ON_DISABLED, DaemonState.READY_TO_SWITCH_ON)
@@ -138,8 +153,8 @@ _LATCHING = (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT_REACTION_ACTIVE, D
 _OPEN = (*_SILENT, *ENERGISED, *_LATCHING)
 
 
-def _is_latched(machine: StateMachine, now: float) -> bool:
-    return machine.is_latched
+def _is_latched(operation: Operation, now: float) -> bool:
+    return operation.is_latched
 
 
 TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
@@ -221,46 +236,44 @@ TRANSITIONS: Mapping[tuple[DaemonState, Trigger], tuple[Transition, ...]] = {
 
 
 def step(
-    machine: StateMachine, event: DaemonEvent, now: float
-) -> tuple[StateMachine, tuple[Action, ...]]:
-    """Apply an event at a time [s]; return the new state machine and the actions to carry out."""
-    updated = _with_event(machine, event, now)
-    for transition in TRANSITIONS.get((machine.state, event.trigger), ()):
+    operation: Operation, event: DaemonEvent, now: float
+) -> tuple[Operation, tuple[Action, ...]]:
+    """Apply an event at a time [s]; return the new operation and the actions to carry out."""
+    updated = _with_event(operation, event, now)
+    for transition in TRANSITIONS.get((operation.state, event.trigger), ()):
         if transition.when(updated, now):
-            return _enter(machine, updated, transition.to, event), transition.actions
-    return machine, ()
+            return _enter(operation, updated, transition.to, event), transition.actions
+    return operation, ()
 
 
-def failed(machine: StateMachine, cause: str) -> StateMachine:
-    """Return the state machine after an unexpected exception: latched, and in FAULT if open."""
-    epoch = machine.epoch + 1
-    if machine.state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):
-        return replace(machine, is_latched=True, epoch=epoch)
-    return StateMachine(DaemonState.FAULT, cause, ACKNOWLEDGE, is_latched=True, epoch=epoch)
+def failed(operation: Operation, cause: str) -> Operation:
+    """Return the operation after an unexpected exception: latched, and in FAULT if open."""
+    epoch = operation.epoch + 1
+    if operation.state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):
+        return replace(operation, is_latched=True, epoch=epoch)
+    return Operation(DaemonState.FAULT, cause, ACKNOWLEDGE, is_latched=True, epoch=epoch)
 
 
-def _with_event(machine: StateMachine, event: DaemonEvent, now: float) -> StateMachine:
+def _with_event(operation: Operation, event: DaemonEvent, now: float) -> Operation:
     """Update what an event sets regardless of the next state."""
     if event.trigger in _OVERTAKING:
-        machine = replace(machine, epoch=machine.epoch + 1)
+        operation = replace(operation, epoch=operation.epoch + 1)
     match event.trigger:
         case Trigger.ARM if event.lease is not None:
-            return replace(machine, lease=event.lease.renewed(now))
-        case Trigger.ARMED if machine.lease is not None:  # arming may have taken longer than it
-            return replace(machine, lease=machine.lease.renewed(now))
+            return replace(operation, lease=event.lease.renewed(now))
+        case Trigger.ARMED if operation.lease is not None:  # arming may have taken longer than it
+            return replace(operation, lease=operation.lease.renewed(now))
         case Trigger.STOP:
-            return replace(machine, is_latched=True)
-        case Trigger.NOT_FOUND | Trigger.LINK_LOST if machine.lost is None:
-            is_latched = machine.is_latched or machine.state in ENERGISED
+            return replace(operation, is_latched=True)
+        case Trigger.NOT_FOUND | Trigger.LINK_LOST if operation.lost is None:
+            is_latched = operation.is_latched or operation.state in ENERGISED
             lost = Loss(now, event.energised_until)
-            return replace(machine, lost=lost, is_latched=is_latched)
+            return replace(operation, lost=lost, is_latched=is_latched)
         case _:
-            return machine
+            return operation
 
 
-def _enter(
-    before: StateMachine, updated: StateMachine, to: DaemonState, event: DaemonEvent
-) -> StateMachine:
+def _enter(before: Operation, updated: Operation, to: DaemonState, event: DaemonEvent) -> Operation:
     """Enter the next state of a transition with its cause and remedy."""
     if to is before.state:
         # A persisting fault may have a new cause.
@@ -283,3 +296,16 @@ def _enter(
         lost=updated.lost if to is DaemonState.COMM_LOST else None,
         lease=updated.lease if to in ENERGISED else None,
     )
+
+
+def check_lease(lease: Lease | None, token: str, now: float) -> Lease:
+    """Return a lease; raises RpcError if it has expired [s], or is not that of a token."""
+    if lease is None or now >= lease.expires_at:
+        raise RpcError(ErrorCode.LEASE, "lease has expired", remedy="arm again")
+    if not secrets.compare_digest(lease.token.encode(), token.encode()):
+        raise RpcError(
+            ErrorCode.LEASE,
+            f"lease belongs to {lease.owner!a}",
+            remedy="wait until it expires, or disarm first: every client may",
+        )
+    return lease

@@ -11,8 +11,7 @@ from dataclasses import replace
 from functools import partial
 
 from controller.daemon.deferred_calls import call_guarded
-from controller.daemon.operation import StateObserver
-from controller.daemon.plate_actions import SEARCHING, LinkChange, PlateActions
+from controller.daemon.operation import SEARCHING, LinkChange, Operator, StateObserver
 from controller.daemon.read_back import are_silent, find_problem
 from controller.daemon.states import (
     ACKNOWLEDGE,
@@ -39,7 +38,7 @@ _logger = logging.getLogger(__name__)
 _rate_limited_logger = logging.getLogger(f"{__name__}.background")
 
 
-class Supervisor(PlateActions):
+class Supervisor(Operator):
     """The operation of the plate by the amplifiers of a controller.
 
     The controller must be created with `observe(observer)` and `connected` of this supervisor.
@@ -101,7 +100,7 @@ class Supervisor(PlateActions):
         try:
             await self._open()
             self.started.set()
-            while self.machine.state is not DaemonState.NOT_READY:
+            while self.operation.state is not DaemonState.NOT_READY:
                 if loop.done():
                     raise RuntimeError("control loop has ended before the daemon")
                 self._changed.clear()
@@ -163,12 +162,12 @@ class Supervisor(PlateActions):
     @property
     def _must_reopen(self) -> bool:
         """Whether amplifiers are lost, and all lines are closed."""
-        return self.machine.state is DaemonState.COMM_LOST and self._controller.is_released
+        return self.operation.state is DaemonState.COMM_LOST and self._controller.is_released
 
     async def _fail(self, error: Exception) -> None:
         await super()._fail(error)
-        if self.machine.state is DaemonState.COMM_LOST:  # what should have closed them has failed
-            await self._do(Action.RECONNECT, self.machine.epoch)
+        if self.operation.state is DaemonState.COMM_LOST:  # what should have closed them has failed
+            await self._do(Action.RECONNECT, self.operation.epoch)
 
     async def _restore_link(self) -> None:
         """Reopen the amplifiers, with growing pauses; leave COMM_LOST once they are all silent."""
@@ -176,7 +175,7 @@ class Supervisor(PlateActions):
             try:
                 await self._reconnect()
             finally:
-                if self.machine.state is DaemonState.COMM_LOST:
+                if self.operation.state is DaemonState.COMM_LOST:
                     await self._controller.release()
         except DriverError as error:
             _rate_limited_logger.info("failed: %s", error)
@@ -186,7 +185,7 @@ class Supervisor(PlateActions):
 
     async def _reconnect(self) -> None:
         for pause in pauses():
-            if self.machine.state is not DaemonState.COMM_LOST:
+            if self.operation.state is not DaemonState.COMM_LOST:
                 return
             if await self._reopen():
                 break
@@ -222,7 +221,7 @@ class Supervisor(PlateActions):
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(STATUS_INTERVAL):
-                while self.machine.state is not DaemonState.NOT_READY and not self._must_reopen:
+                while self.operation.state is not DaemonState.NOT_READY and not self._must_reopen:
                     await self._changed.wait()
                     self._changed.clear()
                 return
@@ -239,25 +238,25 @@ class Supervisor(PlateActions):
             _rate_limited_logger.exception("status read failed")
 
     async def _check_disarmed(self) -> None:
-        epoch, group = self.machine.epoch, self._controller.group
+        epoch, group = self.operation.epoch, self._controller.group
         statuses = await group.statuses()
-        if epoch != self.machine.epoch:
+        if epoch != self.operation.epoch:
             return  # they may have been read before
-        problem, state = find_problem(statuses, group.amplifiers), self.machine.state
+        problem, state = find_problem(statuses, group.amplifiers), self.operation.state
         if problem is not None and state is DaemonState.READY_TO_SWITCH_ON:
             fault = DaemonEvent(Trigger.FAULT, problem, ACKNOWLEDGE)
             await self._in_background(self.handle(fault))
         elif (
             not are_silent(statuses, group.amplifiers)
             and state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
-            and self.machine.epoch not in self._clears  # a clear reads back for itself
+            and self.operation.epoch not in self._clears  # a clear reads back for itself
         ):
             _rate_limited_logger.error("stop repeated: %s", problem)
             await self._stop()
 
     def _check_own_stop(self, cause: str) -> bool:
         """Post a fault where the loop itself has stopped the amplifiers of an armed plate."""
-        is_armed = self.machine.state is DaemonState.OPERATION_ENABLED
+        is_armed = self.operation.state is DaemonState.OPERATION_ENABLED
         group = self._controller.group
         is_stopped = is_armed and self._controller.is_open and not group.is_armed
         if is_stopped:
@@ -267,7 +266,7 @@ class Supervisor(PlateActions):
     def _check_degraded(self) -> None:
         """Note that armed amplifiers have ceased to reply, or that all reply again."""
         degraded = self._controller.degraded
-        if self.machine.state is not DaemonState.OPERATION_ENABLED:
+        if self.operation.state is not DaemonState.OPERATION_ENABLED:
             self._is_degraded = False
         elif bool(degraded) is self._is_degraded or self._controller.group.lost_by:
             pass  # of one that is lost the next heartbeat says so
@@ -290,7 +289,7 @@ class Supervisor(PlateActions):
 
     def _amplifier_event(self, name: str, event: Values) -> None:
         """Post a fault that an amplifier reports unsolicited, ahead of the next heartbeat."""
-        if not event["fault"] or self.machine.state not in ENERGISED:
+        if not event["fault"] or self.operation.state not in ENERGISED:
             return
         channel = "" if event["channel"] == NO_CHANNEL else f", channel {event['channel']}"
         cause = f"amplifier {name} reports {name_of(FAULTS, event['fault'])}{channel}"

@@ -39,7 +39,7 @@ class Chain:
     """
 
     far: FarSide
-    machine: MemoryMachine
+    operation: MemoryMachine
     witness: Witness
     controller: Controller
     at: dict[int, Position] = field(default_factory=dict)
@@ -70,7 +70,7 @@ class Chain:
         """
         loop = asyncio.get_running_loop()
         assert isinstance(loop, VirtualLoop)
-        machine = live_in_memory()
+        operation = live_in_memory()
         far_end = far_side(wires, plate or rig, seed=1, imperfections=imperfections)
         async with far_end as far:
             for amplifier in far.bench.amplifiers.values():
@@ -89,7 +89,7 @@ class Chain:
                 urls=far.urls,
                 **{"intent_source": BuzzNewestContact(), **options},
             )
-            chain = cls(far, machine, witness, controller)
+            chain = cls(far, operation, witness, controller)
             controller.observers.append(
                 Observer(pattern_applied=chain.applied.append, silenced=chain.silenced.append)
             )

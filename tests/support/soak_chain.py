@@ -140,7 +140,7 @@ class _Run:
         assert isinstance(loop, VirtualLoop)
         self.loop = loop
         loop.set_exception_handler(self._unhandled)
-        self.machine = live_in_memory()
+        self.operation = live_in_memory()
         self.rig = make_soak_rig(self.plan.amplifiers)
         self.contacts = SourceContacts()
         self.arm_requests = 0
@@ -329,7 +329,7 @@ class _Run:
 
     async def _kill(self) -> None:
         """Kill the host's process, and start another."""
-        self.machine.kill_host()
+        self.operation.kill_host()
         self.loop.kill_hosts()
         self.witness.closes()
         self.serving.cancel()

@@ -71,7 +71,7 @@ async def _stopped(folder: Path) -> tuple[tuple[str, ...], int]:
         lines=lambda: BenchLines({"main": far_end}),
     )
     running = asyncio.create_task(daemon._supervisor.run(daemon._controller))
-    await until(lambda: daemon._supervisor.machine.state.value == READY)
+    await until(lambda: daemon._supervisor.operation.state.value == READY)
     await daemon._supervisor.handle(DaemonEvent(Trigger.ARM))
     client, wire = daemon._server._make_connection(0), Wire()
     client.connection_made(wire)

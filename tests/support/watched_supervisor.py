@@ -39,7 +39,7 @@ class Watched:
     @property
     def state(self) -> DaemonState:
         """The state of the daemon."""
-        return self.supervisor.machine.state
+        return self.supervisor.operation.state
 
     async def handle(self, event: DaemonEvent) -> None:
         """Let the supervisor handle an event."""

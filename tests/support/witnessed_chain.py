@@ -48,7 +48,7 @@ class Scene(Chain):
 
     def __post_init__(self) -> None:
         """Delay what goes to the host, before the witness hears it."""
-        deliver = self.machine.deliver
+        deliver = self.operation.deliver
 
         def delayed(link: str, toward: str, data: bytes, to: Any) -> None:
             if toward == "host" and self.delay:
@@ -59,7 +59,7 @@ class Scene(Chain):
             else:
                 deliver(link, toward, data, to)
 
-        self.machine.deliver = delayed  # type: ignore[method-assign]
+        self.operation.deliver = delayed  # type: ignore[method-assign]
         self.is_felt = False
 
     @property
@@ -135,7 +135,7 @@ class Scene(Chain):
     def inject(self, kind: int, words: Sequence[int]) -> None:
         """Inject a request of another program toward the amplifier on the first wire."""
         link, data = self.witness.wires[0], hand.frame(kind, words, sequence=999)
-        self.machine.deliver(link, "amplifier", data, self.machine._terminals[link].inward)
+        self.operation.deliver(link, "amplifier", data, self.operation._terminals[link].inward)
 
     async def poll(self, times: int) -> None:
         """Read the status of the amplifier every 20 ms."""

@@ -15,13 +15,14 @@ import serial
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import ArmParams
 from controller.daemon.daemon import Daemon
-from controller.daemon.lease import Lease, check_lease
 from controller.daemon.states import (
     ENERGISED,
     DaemonEvent,
     DaemonState,
-    StateMachine,
+    Lease,
+    Operation,
     Trigger,
+    check_lease,
     step,
 )
 from controller.daemon.supervisor import Supervisor
@@ -93,7 +94,7 @@ async def test_event_read_late_takes_nothing_back_that_was_seen(tmp_path: Path) 
         assert (await next_event(era, "state")).data["epoch"] < epoch
         await era.clear()
         supervisor = bench.daemon._supervisor
-        supervisor.machine = replace(supervisor.machine, epoch=0)
+        supervisor.operation = replace(supervisor.operation, epoch=0)
         assert era._channel is not None
         era._channel.close()
         await era.stop()
@@ -159,10 +160,10 @@ async def test_daemon_disarms_when_arming_client_left(
 async def test_stop_that_fails_on_its_way_stops_all_and_ends_the_lease(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, latches: bool
 ) -> None:
-    """By a bug in its method, and one in the state machine as well: the amplifier stops anyhow."""
+    """By a bug in its method, and one in the transition as well: the amplifier stops anyhow."""
     async with ready_daemon(tmp_path) as (bench, era):
         await era.arm("me", lease_s=60)
-        supervisor, after = bench.daemon._supervisor, list[StateMachine]()
+        supervisor, after = bench.daemon._supervisor, list[Operation]()
         stop_all = bench.daemon._server._stop_all
 
         def fail(*_: object) -> None:
@@ -170,7 +171,7 @@ async def test_stop_that_fails_on_its_way_stops_all_and_ends_the_lease(
 
         def note() -> None:
             stop_all()
-            after.append(supervisor.machine)
+            after.append(supervisor.operation)
 
         monkeypatch.setattr(bench.daemon._server, "_stop_all", note)
         with monkeypatch.context() as broken:
@@ -179,9 +180,9 @@ async def test_stop_that_fails_on_its_way_stops_all_and_ends_the_lease(
                 broken.setattr(supervisor, "_step", fail)
             assert await error_code(era.stop()) is ErrorCode.INTERNAL
             await until(lambda: bench.far.summary().state == "QUICK_STOP_ACTIVE")
-        (machine,) = after
-        assert (machine.state.value == "QUICK_STOP_ACTIVE") is latches
-        assert (machine.lease is None) is latches
+        (operation,) = after
+        assert (operation.state.value == "QUICK_STOP_ACTIVE") is latches
+        assert (operation.lease is None) is latches
 
 
 @in_virtual_time_on_sockets
@@ -270,9 +271,9 @@ async def test_log_event_escapes_bytes_that_are_not_text(tmp_path: Path) -> None
 
 def expire(supervisor: Supervisor) -> None:
     """Let the lease have expired."""
-    assert supervisor.machine.lease is not None
-    lease = replace(supervisor.machine.lease, expires_at=0.0)
-    supervisor.machine = replace(supervisor.machine, lease=lease)
+    assert supervisor.operation.lease is not None
+    lease = replace(supervisor.operation.lease, expires_at=0.0)
+    supervisor.operation = replace(supervisor.operation, lease=lease)
 
 
 @in_virtual_time_on_sockets
@@ -308,8 +309,8 @@ async def test_arming_that_is_cancelled_leaves_nothing_armed_without_a_lease(
         arming.cancel()
         with pytest.raises(asyncio.CancelledError):
             await arming
-        assert bench.daemon._supervisor.machine.state not in ENERGISED
-        assert bench.daemon._supervisor.machine.lease is None
+        assert bench.daemon._supervisor.operation.state not in ENERGISED
+        assert bench.daemon._supervisor.operation.lease is None
         released.set()
         await until_state(era, "READY_TO_SWITCH_ON")
 
@@ -343,7 +344,7 @@ def test_lease_is_renewed_by_its_token_only(token: str) -> None:
 def test_lease_exists_while_energised_alone(state: DaemonState, trigger: Trigger) -> None:
     """Whatever happens; and what may not go on afterwards is told by the epoch."""
     lease = Lease("me", 5, expires_at=10.0) if state in ENERGISED else None
-    before = StateMachine(state, lease=lease, epoch=7)
+    before = Operation(state, lease=lease, epoch=7)
     after, _ = step(before, DaemonEvent(trigger, "a test", lease=Lease("you", 3)), 6.0)
     if after.state in ENERGISED:
         is_new = after.state is not state

@@ -1,4 +1,4 @@
-"""The daemon's state machine against a table written by hand, and invariants over histories."""
+"""The operation's states against a table written by hand, and invariants over histories."""
 
 import pytest
 from hypothesis import given
@@ -8,7 +8,7 @@ from controller.daemon.states import (
     Action,
     DaemonEvent,
     DaemonState,
-    StateMachine,
+    Operation,
     Trigger,
     failed,
     step,
@@ -66,10 +66,10 @@ def grid() -> dict[tuple[DaemonState, Trigger], str]:
     return cells
 
 
-def machines(state: DaemonState) -> list[StateMachine]:
-    """All machines in a state, with every combination of flags."""
+def operations(state: DaemonState) -> list[Operation]:
+    """All operations in a state, with every combination of flags."""
     return [
-        StateMachine(state, "why", None, latched)
+        Operation(state, "why", None, latched)
         for latched in (False, True)
         if latched or state not in LATCHED
     ]
@@ -83,10 +83,10 @@ def test_step_follows_table(state: DaemonState, trigger: Trigger) -> None:
     """The next state and the actions are those of the table, whatever the flags."""
     entry = grid()[state, trigger]
     to, _, letters = entry.partition(":")
-    for machine in machines(state):
-        after, actions = step(machine, DaemonEvent(trigger, "because", "do this"), LOST_AT)
+    for operation in operations(state):
+        after, actions = step(operation, DaemonEvent(trigger, "because", "do this"), LOST_AT)
         match trigger:
-            case Trigger.OPENED if state is DaemonState.NOT_READY and machine.is_latched:
+            case Trigger.OPENED if state is DaemonState.NOT_READY and operation.is_latched:
                 expected = (DaemonState.QUICK_STOP_ACTIVE, [Action.STOP])
             case _:
                 expected = (STATES.get(to, state), [ACTIONS[letter] for letter in letters])
@@ -102,7 +102,7 @@ def test_step_follows_table(state: DaemonState, trigger: Trigger) -> None:
 )
 def test_step_returns_latched_when_link_lost_while_energised(state: DaemonState) -> None:
     """A loss while energised leads to FAULT, so that it must be acknowledged before arming."""
-    before = StateMachine(state, is_latched=state in LATCHED)
+    before = Operation(state, is_latched=state in LATCHED)
     unplugged = DaemonEvent(
         Trigger.LINK_LOST, "unplugged", "look at cables", energised_until=ENERGISED_UNTIL
     )
@@ -117,11 +117,11 @@ def test_step_returns_latched_when_link_lost_while_energised(state: DaemonState)
 @pytest.mark.parametrize("state", DaemonState)
 def test_step_leaves_comm_lost_alone_when_reconnected(state: DaemonState) -> None:
     """For FAULT if anything is latched; in other states nothing changes."""
-    for machine in machines(state):
-        after, actions = step(machine, DaemonEvent(Trigger.RECONNECTED), ENERGISED_UNTIL)
+    for operation in operations(state):
+        after, actions = step(operation, DaemonEvent(Trigger.RECONNECTED), ENERGISED_UNTIL)
         if state is not DaemonState.COMM_LOST:
-            assert (after, actions) == (machine, ())
-        elif machine.is_latched:
+            assert (after, actions) == (operation, ())
+        elif operation.is_latched:
             assert (after.state, actions) == (DaemonState.FAULT, ())
         else:
             assert (after.state, actions) == (DaemonState.SWITCH_ON_DISABLED, (Action.VERIFY,))
@@ -130,7 +130,7 @@ def test_step_leaves_comm_lost_alone_when_reconnected(state: DaemonState) -> Non
 @pytest.mark.parametrize("state", DaemonState)
 def test_degraded_link_changes_no_state(state: DaemonState) -> None:
     """Its cause is said while armed."""
-    before = StateMachine(state, "why")
+    before = Operation(state, "why")
     degraded, actions = step(before, DaemonEvent(Trigger.LINK_CHANGED, "no reply"), 0.0)
     is_armed = state is DaemonState.OPERATION_ENABLED
     assert (degraded.state, degraded.cause, actions) == (
@@ -143,7 +143,7 @@ def test_degraded_link_changes_no_state(state: DaemonState) -> None:
 @pytest.mark.parametrize("state", DaemonState)
 def test_unexpected_exception_is_latched(state: DaemonState) -> None:
     """It is a fault where amplifiers are open, and elsewhere one once they are."""
-    after = failed(StateMachine(state), "a bug")
+    after = failed(Operation(state), "a bug")
     assert after.is_latched
     if state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):
         assert after.state is state
@@ -157,16 +157,16 @@ events = st.lists(st.tuples(st.sampled_from(Trigger), st.floats(0, 0.5)), min_si
 @given(events)
 def test_step_energises_only_by_arm(history: list[tuple[Trigger, float]]) -> None:
     """OPERATION_ENABLED is entered from SWITCHED_ON, and that by ARM in READY_TO_SWITCH_ON."""
-    machine, now = StateMachine(), 0.0
+    operation, now = Operation(), 0.0
     for trigger, pause in history:
         now += pause
-        before, (machine, actions) = machine, step(machine, DaemonEvent(trigger), now)
-        if machine.state is DaemonState.OPERATION_ENABLED and before.state is not machine.state:
+        before, (operation, actions) = operation, step(operation, DaemonEvent(trigger), now)
+        if operation.state is DaemonState.OPERATION_ENABLED and before.state is not operation.state:
             assert (before.state, trigger) == (DaemonState.SWITCHED_ON, Trigger.ARMED)
-        if machine.state is DaemonState.SWITCHED_ON and before.state is not machine.state:
+        if operation.state is DaemonState.SWITCHED_ON and before.state is not operation.state:
             assert (before.state, trigger) == (DaemonState.READY_TO_SWITCH_ON, Trigger.ARM)
         if Action.ARM in actions:
-            assert machine.state is DaemonState.SWITCHED_ON
+            assert operation.state is DaemonState.SWITCHED_ON
 
 
 @given(events)
@@ -175,10 +175,10 @@ def test_step_arms_after_latch_only_when_verified(history: list[tuple[Trigger, f
 
     Whoever says VERIFIED has cleared since: `test_clear_does_not_acknowledge_later_stop`.
     """
-    machine, now, owed = StateMachine(), 0.0, False
+    operation, now, owed = Operation(), 0.0, False
     for trigger, pause in history:
         now += pause
-        before, (machine, _) = machine, step(machine, DaemonEvent(trigger), now)
+        before, (operation, _) = operation, step(operation, DaemonEvent(trigger), now)
         if before.state is not DaemonState.NOT_READY and (
             (trigger is Trigger.STOP)
             or (trigger is Trigger.FAULT and before.state is not DaemonState.COMM_LOST)
@@ -192,5 +192,5 @@ def test_step_arms_after_latch_only_when_verified(history: list[tuple[Trigger, f
             owed = False
         if trigger is Trigger.CLOSE:  # a new start reads everything back by itself
             owed = False
-        if machine.state is DaemonState.SWITCHED_ON:
+        if operation.state is DaemonState.SWITCHED_ON:
             assert not owed

@@ -5,8 +5,7 @@ import itertools
 
 import pytest
 
-from controller.daemon.lease import Lease
-from controller.daemon.states import DaemonEvent, DaemonState, Trigger
+from controller.daemon.states import DaemonEvent, DaemonState, Lease, Trigger
 from controller.loop.loop import Controller
 from controller_bench import DISARMED, STOPPED
 from controller_bench import ENABLED as ARMED
@@ -60,7 +59,7 @@ async def test_unforeseen_exception_in_the_control_loop_is_a_fault(
             daemon.touch()
             await asyncio.sleep(0.1)
         assert daemon.state is DaemonState.FAULT
-        assert "a bug" in daemon.supervisor.machine.cause
+        assert "a bug" in daemon.supervisor.operation.cause
         assert (daemon.far_end.state, {*daemon.far_end.levels}) == (STOPPED, {0})
         await daemon.handle(CLEAR)
         await daemon.handle(ARM)
@@ -120,7 +119,7 @@ async def test_epochs_of_two_daemons_differ() -> None:
     epochs = set()
     for _ in range(2):
         async with watched() as daemon:
-            epochs.add(daemon.supervisor.machine.epoch)
+            epochs.add(daemon.supervisor.operation.epoch)
     assert len(epochs) == 2
     assert max(epochs) < 2**32
 
@@ -518,4 +517,4 @@ async def test_set_that_was_not_staged_stops_all_and_is_a_fault() -> None:
         await asyncio.sleep(0.1)
         assert daemon.far_end.state == STOPPED
         assert daemon.state is DaemonState.FAULT
-        assert "era clear" in (daemon.supervisor.machine.remedy or "")
+        assert "era clear" in (daemon.supervisor.operation.remedy or "")

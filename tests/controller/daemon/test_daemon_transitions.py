@@ -13,7 +13,7 @@ from controller.daemon.states import (
     Action,
     DaemonEvent,
     DaemonState,
-    StateMachine,
+    Operation,
     Trigger,
 )
 from drivers.errors import DriverError
@@ -42,7 +42,7 @@ async def until(made: Watched, *states: DaemonState) -> None:
         if made.state in states:
             return
         await asyncio.sleep(0.01)
-    pytest.fail(f"stays in {made.supervisor.machine}")
+    pytest.fail(f"stays in {made.supervisor.operation}")
 
 
 async def arm_again(made: Watched) -> None:
@@ -62,7 +62,7 @@ async def arm_again(made: Watched) -> None:
 
 
 async def enter(made: Watched, state: DaemonState) -> None:
-    """Lead the amplifier into OPERATION_ENABLED and the machine into a state."""
+    """Lead the amplifier into OPERATION_ENABLED and the operation into a state."""
     await made.handle(DaemonEvent(Trigger.ARM))
     match state:
         case DaemonState.OPERATION_ENABLED:
@@ -75,8 +75,8 @@ async def enter(made: Watched, state: DaemonState) -> None:
             await made.handle(DaemonEvent(Trigger.LINK_LOST, "test"))
         case _:
             latched = state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
-            made.supervisor.machine = StateMachine(state, "test", is_latched=latched)
-    assert made.supervisor.machine.state is state
+            made.supervisor.operation = Operation(state, "test", is_latched=latched)
+    assert made.supervisor.operation.state is state
     made.far_end.asked.clear()
 
 

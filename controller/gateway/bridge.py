@@ -86,6 +86,7 @@ async def _to_browser(socket: WebSocket, link: DaemonLink) -> None:
         line = await link.next_line()
         async with asyncio.timeout(SEND_TIMEOUT):
             await socket.send_text(line.decode())
+        await asyncio.sleep(0)  # of lines that came together none goes to a browser that has left
 
 
 async def _draw(socket: WebSocket, field: DrawnField) -> None:

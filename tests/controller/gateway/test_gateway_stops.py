@@ -99,7 +99,7 @@ class DeafBrowser:
 
     def __init__(self) -> None:
         self.frames: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
-        self._sent = 0
+        self.sent = 0
 
     async def receive(self) -> dict[str, Any]:
         """The next frame."""
@@ -107,8 +107,8 @@ class DeafBrowser:
 
     async def send_text(self, _: str) -> None:
         """Send the first frame; the others wait."""
-        self._sent += 1
-        if self._sent > 1:
+        self.sent += 1
+        if self.sent > 1:
             await asyncio.Event().wait()
 
 
@@ -160,3 +160,36 @@ async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
     await asyncio.sleep(0)
     assert len(lines) < 900
     assert lines[-1] == stop.encode()
+
+
+class LeavingBrowser(DeafBrowser):
+    """A WebSocket of a browser that leaves when it is sent its second frame."""
+
+    async def send_text(self, _: str) -> None:
+        """Send a frame without waiting; the event loop sees next that the browser has left."""
+        self.sent += 1
+        if self.sent == 2:
+            left = {"type": "websocket.disconnect", "code": 1006}
+            asyncio.get_running_loop().call_soon(self.frames.put_nowait, left)
+
+
+async def test_lines_that_came_together_are_not_sent_to_a_browser_that_has_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of them would be a warning in the log."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        hello = b'{"jsonrpc":"2.0","id":"web","result":{"api_version":"%s"}}\n'
+        writer.write(hello % API_VERSION.encode() + 1000 * b"{}\n")
+        await reader.read()
+        writer.close()
+
+    path, browser = tmp_path / "era.sock", LeavingBrowser()
+    async with await asyncio.start_unix_server(serve, path), asyncio.timeout(PATIENCE):
+        opened = await link.DaemonLink.open(path, "browser")
+        monkeypatch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
+        await bridge.bridge(browser, path, DrawnField(path))  # type: ignore[arg-type]
+    opened.abort()
+    await asyncio.sleep(0)
+    assert 2 <= browser.sent < 10

@@ -23,6 +23,7 @@ _PER_HERTZ = QUANTITIES["frequency"].per_unit
 _SAME = 1e-6  # s; ends nearer than that are one, so that rounding decides nothing
 
 
+@lru_cache(maxsize=256)  # of a set's command asked for by its limits, its playback and its commit
 def amplitude_of(level: int, phase: int) -> complex:
     """Return the complex amplitude in full levels of a level and phase of the wire."""
     return _amplitudes_at([(level, phase)])[0]

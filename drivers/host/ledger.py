@@ -159,6 +159,7 @@ class Ledger:
                 if token != expected.get(layer, 0):
                     return f"token of layer {layer} must be {expected.get(layer, 0)}, got {token}"
         late, tolerance = sent_at - self.lag, _STEPS * max(self.capabilities["level_step"], 1)
+        is_measured = has_feature(self.capabilities, "levels_measured")
         for channel, level in enumerate(status["levels"]):
             highest, is_settled = 0.0, is_steady
             for voice in playback.all_voices[channel]:
@@ -177,7 +178,7 @@ class Ledger:
             low = 0
             if is_settled:
                 low = round(min(playback.level(channel, now), 1.0) * _LEVEL.per_unit)
-            if has_feature(self.capabilities, "levels_measured"):
+            if is_measured:
                 error = round(_MEASURING_ERROR * _LEVEL.per_unit)
                 low -= min(error, round(_WEAK * low))
                 high += min(error, round(_WEAK * high))

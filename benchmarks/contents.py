@@ -109,17 +109,19 @@ def _print_row(
     from model.table.answer import answer
     from model.table.request import Finger, Request
 
-    worst, kept, times = [], [], []
-    for number, places in enumerate(_sets(table, contents, quiet, count=count, apart=apart)):
+    worst, kept, times, asked = [], [], [], []
+    for places in _sets(table, contents, quiet, count=count, apart=apart):
         requests = [Request(at) for at in places[:contents]]
         fingers = [Finger(at) for at in places[contents:]]
         started = time.process_time()
         found = answer(table, requests, fingers, apart_hz=20, min_contrast_db=-np.inf)
         times.append(1e3 * (time.process_time() - started))
+        asked.append((found, places[contents:]))
+    for number, (found, left) in enumerate(asked):  # afterwards: a live answer follows another
         if found.promised_worst_db is None:
             raise ValueError("a set must have two fingers")
         worst.append(found.promised_worst_db)
-        kept.append(_kept(table, found, [each.at for each in fingers], seed=number))
+        kept.append(_kept(table, found, left, seed=number))
     print(
         f"{names[0]:12} {names[1]:11} {contents:4d}+{quiet:<2d} {np.median(worst):10.1f} "
         f"({np.percentile(worst, 10):.1f}) {100 * np.mean(kept):5.0f} % {np.median(times):6.1f} ms",

@@ -61,6 +61,7 @@ class ExpectedAmplifier(ExpectedState):
         self.token: int | None = None
         self._report_always = report_always
         self._session: int | None = None
+        self._answered = 0  # number of the newest request of which a reply was seen
 
     def forget_state(self) -> None:
         """Treat the state as unknown until the next status."""
@@ -93,7 +94,13 @@ class ExpectedAmplifier(ExpectedState):
             self.unanswered.append(sent)
 
     def granted(self, sent: Sent, values: Values, end: float) -> None:
-        """Apply a request carried out until a time [s], and compare its reply."""
+        """Apply a request carried out until a time [s], and compare its reply.
+
+        A reply that the wire delayed beyond that of a newer request says nothing of now.
+        """
+        if sent.number < self._answered:
+            return
+        self._answered = sent.number
         request, when = sent.request, (sent.begin, end)
         status = values if REPLIES.get(request.name) is STATUS_RECORD else None
         self.advance(sent.begin)

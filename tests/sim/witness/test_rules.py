@@ -107,6 +107,16 @@ def test_commit_without_a_reply_shows_in_the_next_status() -> None:
     assert talk.found == []
 
 
+def test_reply_that_is_delayed_beyond_newer_ones_says_nothing_of_now() -> None:
+    """An older set was accepted before the newer one, as its number shows; later it would not be."""
+    late = Talk().armed().playing().told("faults", "a", are_on=True)
+    late.sends(hand.SET, hand.part(6, hand.layer(0, hand.tone(0, 100, 0.3))))
+    number = late.sequence
+    late.rest(0.04).staged(7, hand.layer(0)).committed(7, tokens=(0, 0, 0, 0), levels=(5000, 0))
+    late.numbered(number).replies(hand.SET, hand.taken(6))
+    assert late.found == []
+
+
 @pytest.mark.parametrize("to", [1, 0])
 def test_amplifier_is_followed_to_its_new_address(to: int) -> None:
     """Set for serial number "7" by itself or as a broadcast; the status at address 3 is its own."""

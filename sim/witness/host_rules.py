@@ -296,8 +296,7 @@ class HostRules:
         if name in ("Stop", "GetStatus"):
             session.last_stop = time
         if name in _SILENCING:
-            is_silenced = session.last_silenced >= self._last_lift and not session.vibrates(time)
-            if not (session.is_stopped or is_silenced):
+            if session.vibrates(time) and not session.is_stopped:
                 self._check_release(session, time, values["ramp"])
             session.silence_sent(time)
         if name == "Disarm":

@@ -117,6 +117,13 @@ def test_reply_that_is_delayed_beyond_newer_ones_says_nothing_of_now() -> None:
     assert late.found == []
 
 
+def test_disarm_after_the_last_lift_releases_only_what_plays() -> None:
+    """An amplifier that was silent under the finger has nothing to end in time."""
+    idle = Talk().armed().told("contacts", [1]).rest(0.01).told("contacts", []).rest(0.01)
+    idle.exchange(hand.DISARM, (100,), hand.status(hand.SWITCHED_ON))
+    assert idle.found == []
+
+
 @pytest.mark.parametrize("to", [1, 0])
 def test_amplifier_is_followed_to_its_new_address(to: int) -> None:
     """Set for serial number "7" by itself or as a broadcast; the status at address 3 is its own."""

@@ -141,6 +141,8 @@ class ExpectedAmplifier(ExpectedState):
             if is_carried_out(request, status):
                 until = min(end, begun + REACTION) if is_broadcast else end
                 self._apply(request, (begun, max(until, begun)), status)
+            elif request.name == "Arm":
+                self.token = None  # 0, if it was carried out before what disarmed again
             elif is_broadcast and request.name == "Stop":
                 self._report("stop", end, "did not obey a broadcast Stop")
             elif is_broadcast and self.sets.is_staged(token, begun + REACTION):

@@ -9,7 +9,7 @@ import pytest
 import amplifier_violations
 import hand_written as hand
 import host_violations
-from hand_written_talk import Talk
+from hand_written_talk import HALF, Talk
 from sim.witness.capture import read_capture
 from sim.witness.witness import Witness
 
@@ -108,7 +108,7 @@ def test_commit_without_a_reply_shows_in_the_next_status() -> None:
 
 
 def test_reply_that_is_delayed_beyond_newer_ones_says_nothing_of_now() -> None:
-    """An older set was accepted before the newer one, as its number shows; later it would not be."""
+    """The older set was accepted before the newer one, as the number of its request shows."""
     late = Talk().armed().playing().told("faults", "a", are_on=True)
     late.sends(hand.SET, hand.part(6, hand.layer(0, hand.tone(0, 100, 0.3))))
     number = late.sequence
@@ -122,6 +122,15 @@ def test_disarm_after_the_last_lift_releases_only_what_plays() -> None:
     idle = Talk().armed().told("contacts", [1]).rest(0.01).told("contacts", []).rest(0.01)
     idle.exchange(hand.DISARM, (100,), hand.status(hand.SWITCHED_ON))
     assert idle.found == []
+
+
+def test_arm_may_be_withdrawn_before_its_reply() -> None:
+    """It was carried out, so that the set committed last is none."""
+    talk = Talk().armed().playing()
+    talk.exchange(hand.DISARM, (5,), hand.status(hand.SWITCHED_ON, **HALF)).rest(0.01)
+    talk.sends(hand.ARM, (8, 250))
+    talk.exchange(hand.DISARM, (5,), hand.status(hand.SWITCHED_ON, token=0))
+    assert "token" not in talk.found
 
 
 @pytest.mark.parametrize("to", [1, 0])

@@ -302,9 +302,11 @@ class HostRules:
         if name == "Disarm":
             session.is_disarming = True
         elif name == "Stop":
+            is_confirmed = session.is_stopped and session.first_stop is None
             session.is_stopped, session.stop_requested_at, session.session = True, None, None
-            session.first_stop = time if session.first_stop is None else session.first_stop
-            self._expect_confirmation(session, time, session.first_stop)
+            if not (is_confirmed and session.amplifier.state in LATCHED):  # else by one before
+                session.first_stop = time if session.first_stop is None else session.first_stop
+                self._expect_confirmation(session, time, session.first_stop)
             if self._is_arm_requested:
                 self._is_arm_requested, self._last_silencing = False, time
         elif name == "Arm":

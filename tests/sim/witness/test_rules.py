@@ -133,6 +133,14 @@ def test_arm_may_be_withdrawn_before_its_reply() -> None:
     assert "token" not in talk.found
 
 
+def test_stop_of_what_a_stop_has_silenced_needs_no_second_confirmation() -> None:
+    """A broadcast for another amplifier of the line reaches it too."""
+    talk = Talk().armed()
+    talk.exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
+    talk.sends(hand.STOP, (5,), address=0)
+    assert talk.rest(0.3).found == []
+
+
 @pytest.mark.parametrize("to", [1, 0])
 def test_amplifier_is_followed_to_its_new_address(to: int) -> None:
     """Set for serial number "7" by itself or as a broadcast; the status at address 3 is its own."""

@@ -45,6 +45,8 @@ _BYTES = 200
 # status and a heartbeat of both, a silent set of both, and, as one of those that have waited goes
 # before each heartbeat, an operator's clear of both.
 _BYTES_BETWEEN_FEEDS = 620
+# Modbus RTU is silent before each of the four frames of those eight requests.
+_GAPS_BETWEEN_FEEDS = 8 * 4 * 0.00175  # s
 _PATTERN = 0.25  # s; from a touch to its pattern
 _NOTICED = 0.3  # s; from an unplugged wire to the controller's reaction
 _TIMERS_MAX = 2_000
@@ -171,7 +173,8 @@ class _Run:
                 self.contacts,
                 channels=1 + max(channel.number for channel in self.rig.wiring.values()),
                 release=self._release(),
-                heartbeat=self._release(_BYTES_BETWEEN_FEEDS),
+                heartbeat=self._release(_BYTES_BETWEEN_FEEDS)
+                + any(line.kind == "modbus-rtu" for line in lines) * _GAPS_BETWEEN_FEEDS,
             )
             self.checks = Checks(
                 far.bench, begin=loop.time(), contacts=self.contacts, sense=self.witness.sense

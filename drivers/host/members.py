@@ -200,7 +200,10 @@ class Members:
         Returns when [s] the last request went out. Raises as `apply`.
         """
         self._check_armed()
-        requests = [each.silence(ramp) for each in self.amplifiers.values()]
+        # On a line that they share none waits for one that does not reply: that comes last.
+        members = [*self.amplifiers.values()]
+        members.sort(key=lambda each: each.silence_cause is not None)
+        requests = [each.silence(ramp) for each in members]
         await self._exchange(self.all(requests))
         self.is_set_incomplete = False
         return self.last_sent_at

@@ -118,20 +118,24 @@ class HostRules:
     ) -> None:
         """Check that no reply is pending that a request must wait for.
 
-        preempted_by: number of the last request before which others may lose their replies.
+        preempted_by: number of the last request before which others may lose their replies. A
+        reading gives way, and the status of an amplifier that has left a request without a reply.
         """
+        mute = {each.request.address for each in pending if each.is_overdue}
         for each in pending:
+            name = each.request.name
+            is_reading = name in _READINGS or (name == "GetStatus" and each.request.address in mute)
             waits = sent.begun - each.begun
             # A last lift preempts too, even if a finger has come since.
             is_preempted = each.number < preempted_by or each.begun <= self._last_lift
             # The host counts from its write: the bytes may have waited in a transport since.
             is_given_up = waits >= self._times.reply - max(self._times.slack, _IN_TRANSPORT)
-            if not (is_preempted or is_given_up or each.request.name in _READINGS):
+            if not (is_preempted or is_given_up or is_reading):
                 session.report_always(
                     "credit",
                     sent.begun,
                     f"host sent {sent.request.name} to {session.name} {waits * 1e3:.1f} ms after "
-                    f"{each.request.name}, whose reply is pending",
+                    f"{name}, whose reply is pending",
                 )
 
     def check_request(self, session: AmplifierSession, time: float, request: Request) -> None:

@@ -190,10 +190,12 @@ class WatchedWire:
             if message.key is not None and (not is_copy or message.name == HELLO):
                 self._pending[message.key] = sent
             session.is_mute &= message.name != HELLO
-            if not message.problem:
+            if message.problem:
+                continue
+            if not session.is_mute:
                 session.amplifier.sent(sent)
-                if message.key is None:
-                    self._move(session, message)
+            if message.key is None:
+                self._move(session, message)
 
     def _check_request(self, session: AmplifierSession, time: float, sent: Sent) -> None:
         request = sent.request

@@ -86,6 +86,23 @@ async def test_degraded_amplifier_gets_nothing_that_plays_or_feeds(
     await host.ping()
 
 
+@grouped(("a", "b"))
+async def test_silence_does_not_wait_for_one_that_is_mute(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """The other amplifier of its line has its request at once."""
+    end = ends[0]
+    end.outward = lambda name, data: [] if end.sent[-1][1][0] == "1" else unaltered(name, data)
+    with pytest.raises(LinkTimeout):
+        await group.amplifiers["a"].ping()
+    began = end.loop.time()
+    silencing = asyncio.ensure_future(group.silence(0.005))
+    await asyncio.sleep(0.005)
+    assert next(each for at, each in end.sent if at >= began) == "2:7"
+    with pytest.raises(LinkError):
+        await silencing
+
+
 @grouped(("a",))
 async def test_stop_overtakes_what_is_queued(group: Group, ends: list[MemoryLine]) -> None:
     """With a set on the line and ten readings queued: silent within 20 ms, none is committed."""

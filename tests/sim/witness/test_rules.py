@@ -141,6 +141,16 @@ def test_stop_of_what_a_stop_has_silenced_needs_no_second_confirmation() -> None
     assert talk.rest(0.3).found == []
 
 
+@pytest.mark.parametrize(("before", "broken"), [(0.06, ["answer"]), (0.0, ["credit"])])
+def test_status_of_an_amplifier_that_is_mute_gives_way(before: float, broken: list[str]) -> None:
+    """What is mute has left a request without a reply; of another one the reply is awaited."""
+    talk = Talk().armed()
+    if before:
+        talk.sends(hand.GET_STATUS).rest(before)
+    talk.sends(hand.GET_STATUS).rest(0.005).says()
+    assert talk.found == broken
+
+
 @pytest.mark.parametrize("to", [1, 0])
 def test_amplifier_is_followed_to_its_new_address(to: int) -> None:
     """Set for serial number "7" by itself or as a broadcast; the status at address 3 is its own."""

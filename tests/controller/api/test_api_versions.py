@@ -19,19 +19,20 @@ from controller.gateway.link import DaemonLink
 from daemon_bench import PLACE, holding, running_daemon, until_state
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
-MAPPINGS = ("drive", "rejected_touches", "parameters", "layout")  # keyed by name, not messages
+# keyed by name, not messages: so many levels deep
+MAPPINGS = {"drive": 1, "layers": 2, "rejected_touches": 1, "parameters": 1, "layout": 1}
 
 
-def with_extra_keys(content: Any, *, is_mapping: bool = False) -> Any:
+def with_extra_keys(content: Any, mapping_depth: int = 0) -> Any:
     """A message of a later minor version: every object has a further key."""
     if isinstance(content, list):
         return [with_extra_keys(each) for each in content]
     if not isinstance(content, dict):
         return content
-    extra = {} if is_mapping else {"extra": [{"of": "later"}]}
-    return {
-        key: with_extra_keys(value, is_mapping=key in MAPPINGS) for key, value in content.items()
-    } | extra
+    if mapping_depth:
+        return {key: with_extra_keys(each, mapping_depth - 1) for key, each in content.items()}
+    later = {key: with_extra_keys(each, MAPPINGS.get(key, 0)) for key, each in content.items()}
+    return later | {"extra": [{"of": "later"}]}
 
 
 @contextlib.asynccontextmanager
@@ -88,9 +89,13 @@ async def test_extra_keys_of_a_later_minor_version_are_ignored(tmp_path: Path) -
             async with era.armed("me"), holding(era, PLACE), asyncio.timeout(60):
                 async for event in era.events():
                     assert "extra" in event.data["contacts"][0]
-                    assert "extra" in next(iter(event.data["drive"].values()))
-                    break
-                await field.newer_than(empty)
+                    drives = [event.data["drive"], *event.data["layers"].values()]
+                    assert all("extra" in tone for drive in drives for tone in drive.values())
+                    if event.data["layers"]:
+                        break
+                drawn = empty
+                while len(drawn) == len(empty):
+                    drawn = await field.newer_than(drawn)
         drawing.cancel()
         await asyncio.wait({drawing})
 

@@ -19,11 +19,15 @@ Minima have bounded magnitudes of their complex unknowns: no knot exceeds the st
 
 import math
 from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
-from scipy import linalg
+from numpy.typing import NDArray
+from scipy.linalg import lapack
 
-from model.arrays import ComplexArray, FloatArray, IntArray
+from model.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
 from model.transients import base_motion
 from model.transients.base_motion import KNOT_STEP
 from model.transients.time_response import PlateInTime
@@ -46,7 +50,7 @@ _TARGET_WEIGHT = 2.0
 _QUIET_WEIGHT = 0.03
 
 _SAMPLES = 5  # for each step; a demodulated response changes little within a millisecond
-_SETTLING_STEPS = 9  # included after the last knot of an onset
+_STEPS = ONSET_KNOTS + 9  # of an onset, until the plate has settled
 
 # Relative to the mean of a form's diagonal: keeps it definite, costs no contrast.
 _RIDGE = 1e-6
@@ -56,9 +60,10 @@ _RIDGE = 1e-6
 class Carrier:
     """Responses at one frequency that do not depend on the contacts, each ERA at full stroke.
 
-    hats (n, eras, r) and steady (eras, r): accelerations of the reduced coordinates; residual_form:
-    form of the plate's mean square after an ending, its first block for the tone that ends;
-    gain_variance: var(d).
+    Accelerations of the reduced coordinates. hats (samples, r, knots, eras): during the last step,
+    of a hat at each knot; they are those of one knot during all steps. steady (eras, r);
+    residual_form: form of the plate's mean square after an ending, its first block for the tone
+    that ends; gain_variance: var(d).
     """
 
     frequency: float
@@ -74,12 +79,12 @@ def solve_carrier(
     """Solve one frequency [Hz]; residual_form: `hats.mean_square` for the time after an ending."""
     omega = 2 * math.pi * frequency
     steady = -(omega**2) * steady_states(plate, omega) @ plate.displacement.T
-    steps = ONSET_KNOTS + _SETTLING_STEPS
-    hats = hat_accelerations(plate, omega, step=KNOT_STEP, steps=steps, samples=_SAMPLES)
+    hats = hat_accelerations(plate, omega, step=KNOT_STEP, steps=_STEPS, samples=_SAMPLES)
+    hats = hats.reshape(_STEPS, _SAMPLES, *hats.shape[1:])[::-1].transpose(1, 3, 0, 2)
     states = ending_states(plate, omega, step=KNOT_STEP, steps=ENDING_KNOTS)
     flat = states.reshape(len(states), -1)
     form = flat.conj().T @ residual_form @ flat
-    return Carrier(frequency, hats, steady, form, gain_variance)
+    return Carrier(frequency, np.ascontiguousarray(hats), steady, form, gain_variance)
 
 
 def onset_knots(
@@ -96,29 +101,38 @@ def onset_knots(
     target_rows, quiet_rows (d, r): shapes under targets and quiet fingers, whose sum of squares is
     the mean square there; rise [s].
     """
-    steps = ONSET_KNOTS + _SETTLING_STEPS
-    eras = len(active)
-    at_targets = _by_step(carrier.hats[:, active], target_rows)
-    at_quiet = _by_step(carrier.hats[:, active], quiet_rows)
-    target_form = _over_time(at_targets.conj().T @ at_targets, steps)
-    quiet_form = _over_time(at_quiet.conj().T @ at_quiet, steps)
-    times = KNOT_STEP * (np.arange(steps * _SAMPLES) + 0.5) / _SAMPLES
-    wanted = base_motion.rise(times, rise)[:, None] * (target_rows @ (amplitudes @ carrier.steady))
-    wanted = wanted.reshape(steps, -1).T
-    match = (at_targets.conj().T @ wanted).reshape(steps, eras, steps)
-    aim = np.stack([np.trace(match[:, :, knot:], axis1=0, axis2=2) for knot in range(steps)])
-
+    eras, variance = len(active), carrier.gain_variance
     steady = amplitudes[active, None] * carrier.steady[active]
-    weight = (
-        _TARGET_WEIGHT**2
-        * _expected_power(quiet_rows @ steady.T, carrier.gain_variance)
-        / _expected_power(target_rows @ steady.T, carrier.gain_variance)
+    quiet_power, target_power = (
+        _expected_power(rows @ steady.T, variance) for rows in (quiet_rows, target_rows)
     )
-    form = _with_errors(quiet_form, eras, carrier.gain_variance) + weight * target_form
+    weight = _TARGET_WEIGHT**2 * quiet_power / target_power
+    at_targets = math.sqrt(weight) * _at(target_rows, carrier.hats)[..., active]
+    at_quiet = _at(quiet_rows, carrier.hats)[..., active]
+    form = _form(np.concatenate([at_targets, at_quiet], axis=1))
+    _add_errors(form, _own_form(at_quiet), variance)
+    wanted = math.sqrt(weight) * target_rows @ (amplitudes @ carrier.steady)
+    along = np.tensordot(wanted, at_targets.conj(), axes=(0, 1)).reshape(-1, eras)
+    aim = _rises(rise) @ along
+
     free = (ONSET_KNOTS - 1) * eras
-    settled = np.tile(amplitudes[active], steps - ONSET_KNOTS + 1)
-    knots = _minimum(form[:free, :free], weight * aim.ravel()[:free] - form[:free, free:] @ settled)
+    settled = np.tile(amplitudes[active], _STEPS - ONSET_KNOTS + 1)
+    knots = _minimum(form[:free, :free], aim.ravel()[:free] - form[:free, free:] @ settled)
     return np.vstack([knots.reshape(-1, eras), amplitudes[active]])
+
+
+@cache
+def _rises(rise: float) -> FloatArray:
+    """The raised cosine that takes a time [s], as the hat of each knot meets it.
+
+    By knot, and by sample and knot of `Carrier.hats`.
+    """
+    times = KNOT_STEP * (np.arange(_STEPS * _SAMPLES) + 0.5) / _SAMPLES
+    wanted = np.zeros((2 * _STEPS, _SAMPLES))
+    wanted[:_STEPS] = base_motion.rise(times, rise).reshape(_STEPS, _SAMPLES)
+    since = np.arange(_STEPS)[::-1]  # steps since a hat began
+    met = wanted[np.arange(_STEPS)[:, None] + since]
+    return np.asarray(met.transpose(0, 2, 1).reshape(_STEPS, -1))
 
 
 def ending_knots(
@@ -142,9 +156,10 @@ def ending_knots(
     if target_rows is not None and quiet_rows is not None:
         vibration = amplitudes @ carrier.steady
         target = np.linalg.norm(target_rows @ vibration) ** 2
-        meanwhile = while_ending(carrier.hats[:, active], carrier.steady[active], quiet_rows)
+        meanwhile = while_ending(carrier.hats[..., active], carrier.steady[active], quiet_rows)
         form = form + _QUIET_WEIGHT * np.linalg.norm(vibration) ** 2 / target * meanwhile
-    form = _with_errors(form, eras, carrier.gain_variance)
+    blocks = form.reshape(ENDING_KNOTS, eras, ENDING_KNOTS, eras)
+    _add_errors(form, np.einsum("kele->kle", blocks), carrier.gain_variance)
     knots = _minimum(form[eras:, eras:], -form[eras:, :eras] @ start)
     return np.vstack([start, knots.reshape(-1, eras), np.zeros(eras)])
 
@@ -152,24 +167,24 @@ def ending_knots(
 def while_ending(hats: ComplexArray, steady: ComplexArray, quiet_rows: FloatArray) -> ComplexArray:
     """Form of the mean square at quiet fingers during an ending: the tone that ends, then knots.
 
-    hats (n, eras, r) and steady (eras, r) as in `Carrier`, quiet_rows (d, r) as in `onset_knots`.
-    An ending is the steady tone minus hats of the tone's height at every knot plus the knots' hats.
+    hats (samples, r, knots, eras) and steady (eras, r) as in `Carrier`, quiet_rows (d, r) as in
+    `onset_knots`. An ending is the steady tone minus hats of the tone's height at every knot plus
+    the knots' hats.
     """
     steps, eras = ENDING_KNOTS, len(steady)
-    at_quiet = _by_step(hats[: steps * _SAMPLES], quiet_rows)
-    tone = np.tile(quiet_rows @ steady.T, (_SAMPLES, 1))
-    cross = (tone.conj().T @ at_quiet).reshape(eras, steps, eras).cumsum(axis=1)[:, ::-1]
-    form = np.empty(((1 + steps) * eras,) * 2, dtype=complex)
-    form[:eras, :eras] = steps * tone.conj().T @ tone
-    form[:eras, eras:] = cross.reshape(eras, -1)
-    form[eras:, :eras] = form[:eras, eras:].conj().T
-    form[eras:, eras:] = _over_time(at_quiet.conj().T @ at_quiet, steps)
-    # Heights of hats from the tone and the knots before the last, which is zero.
-    heights = np.zeros((1 + steps, steps))
-    heights[:steps] = np.eye(steps)
-    heights[1:, 0] = -1
-    to_knots = np.kron(heights, np.eye(eras))
-    return np.asarray(to_knots.T @ form @ to_knots / (steps * _SAMPLES))
+    at_quiet = _at(quiet_rows, hats[:, :, -steps:])
+    tone = quiet_rows @ steady.T
+    cross = np.tensordot(tone.conj(), at_quiet.sum(axis=0), axes=(0, 0))
+    cross = cross[:, ::-1].cumsum(axis=1)[:, ::-1]
+    blocks = np.empty((1 + steps, eras, 1 + steps, eras), dtype=complex)
+    blocks[0, :, 0] = steps * _SAMPLES * tone.conj().T @ tone
+    blocks[0, :, 1:] = cross
+    blocks[1:, :, 0] = cross.conj().transpose(1, 2, 0)
+    blocks[1:, :, 1:] = _form(at_quiet).reshape(steps, eras, steps, eras)
+    # The tone takes its height off every hat; the last knot is zero.
+    blocks[0] -= blocks[1:].sum(axis=0)
+    blocks[:, :, 0] -= blocks[:, :, 1:].sum(axis=2)
+    return np.asarray(blocks[:-1, :, :-1].reshape((steps * eras,) * 2) / (steps * _SAMPLES))
 
 
 def _minimum(form: ComplexArray, right: ComplexArray) -> ComplexArray:
@@ -177,10 +192,11 @@ def _minimum(form: ComplexArray, right: ComplexArray) -> ComplexArray:
     return bounded_solution(form + ridge * np.eye(len(form)), right, np.ones(len(form)))
 
 
-def _with_errors(form: ComplexArray, eras: int, gain_variance: float) -> ComplexArray:
-    """Expected form under the errors of the ERAs."""
-    own = np.tile(np.eye(eras), (len(form) // eras,) * 2)
-    return np.asarray(form * (1 + gain_variance * own))
+def _add_errors(form: ComplexArray, own: ComplexArray, gain_variance: float) -> None:
+    """Add to a form what the errors of the ERAs do, by their own forms (knots, knots, eras)."""
+    knots, _, eras = own.shape
+    blocks = form.reshape(knots, eras, knots, eras)
+    np.einsum("kele->kle", blocks)[...] += gain_variance * own
 
 
 def _expected_power(responses: ComplexArray, gain_variance: float) -> float:
@@ -189,25 +205,37 @@ def _expected_power(responses: ComplexArray, gain_variance: float) -> float:
     return float(together + gain_variance * np.linalg.norm(responses) ** 2)
 
 
-def _by_step(hats: ComplexArray, rows: FloatArray) -> ComplexArray:
-    """Hats at rows (d, r): (samples * d, steps * eras), the steps side by side."""
-    responses = hats @ rows.T
-    count, eras, d = responses.shape
-    by_step = responses.reshape(count // _SAMPLES, _SAMPLES, eras, d).transpose(1, 3, 0, 2)
-    return by_step.reshape(_SAMPLES * d, -1)
+def _at(rows: FloatArray, hats: ComplexArray) -> ComplexArray:
+    """Hats (samples, r, knots, eras) at rows (d, r): (samples, d, knots, eras)."""
+    samples, _, *knots_and_eras = hats.shape
+    flat = hats.reshape(*hats.shape[:2], -1)
+    responses = (rows @ flat.view(float)).view(complex)
+    return np.asarray(responses.reshape(samples, len(rows), *knots_and_eras))
 
 
-def _over_time(products: ComplexArray, steps: int) -> ComplexArray:
-    """Form over all knots, summed over time, from products of steps i and j of two hats.
+def _form(responses: ComplexArray) -> ComplexArray:
+    """Form over knots and ERAs, summed over time, of the sum of squares over samples and rows.
 
-    Hats of knots k and l contribute to step t by their steps t - k and t - l: sums along the
-    diagonals of the products.
+    responses (samples, d, knots, eras) as in `Carrier.hats`. In the step before the last, each hat
+    is as that of the next knot in the last step, and so on.
     """
-    eras = len(products) // steps
-    sums = products.reshape(steps, eras, steps, eras).transpose(0, 2, 1, 3).copy()
-    for step in range(1, steps):
-        sums[step, 1:] += sums[step - 1, :-1]
-    return sums[::-1, ::-1].transpose(0, 2, 1, 3).reshape(products.shape)
+    knots, eras = responses.shape[2:]
+    flat = responses.reshape(-1, knots * eras)
+    form = flat.conj().T @ flat
+    by_knot = form.reshape(knots, eras, -1)
+    for later, knot in pairwise(by_knot[::-1]):
+        knot[:, :-eras] += later[:, eras:]
+    return form
+
+
+def _own_form(responses: ComplexArray) -> ComplexArray:
+    """The form's parts of one ERA each, (knots, knots, eras)."""
+    knots, eras = responses.shape[2:]
+    of_era = responses.reshape(-1, knots, eras).transpose(2, 1, 0)
+    own = (of_era.conj() @ of_era.transpose(0, 2, 1)).transpose(1, 2, 0).copy()
+    for later, knot in pairwise(own[::-1]):
+        knot[:-1] += later[1:]
+    return own
 
 
 def steady_states(plate: PlateInTime, omega: float) -> ComplexArray:
@@ -281,7 +309,7 @@ def _linear_ramps(plate: PlateInTime, s: complex, step: float) -> tuple[ComplexA
 # shaping makes are within 0.1 dB of their minimum after 30 steps; found by trying 1e-4 to 0.3.
 _PENALTY = 0.03
 _RELAXATION = 1.6
-_STEPS = 30
+_ITERATIONS = 30
 
 
 def bounded_solution(A: ComplexArray, b: ComplexArray, bound: FloatArray) -> ComplexArray:
@@ -290,24 +318,33 @@ def bounded_solution(A: ComplexArray, b: ComplexArray, bound: FloatArray) -> Com
     The unbounded solution where it satisfies the bounds; otherwise by alternating directions (ADMM:
     Boyd and others, 2011, section 5), whose result satisfies them exactly.
     """
-    x: ComplexArray = linalg.solve(A, b, assume_a="pos", check_finite=False)
-    if (np.abs(x) <= bound).all():
-        return x
+    _, free, _ = lapack.zposv(A, b)
+    if (np.abs(free) <= bound).all():
+        return np.asarray(free)
     penalty = _PENALTY * float(np.trace(A).real) / len(A)
-    inverse = np.linalg.inv(A + penalty * np.eye(len(A)))
-    offset = inverse @ b
+    single, limit = A.astype(np.complex64), bound.astype(np.float32)
+    single[np.diag_indices(len(A))] += penalty
+    inverse = _inverse(single)
+    offset = inverse @ b.astype(np.complex64)
     inverse *= penalty
-    feasible = _within(x, bound)
-    dual = np.zeros_like(x)
-    for _ in range(_STEPS):
+    feasible = _within(free.astype(np.complex64), limit)
+    dual = np.zeros_like(feasible)
+    for _ in range(_ITERATIONS):
         x = offset + inverse @ (feasible - dual)
         relaxed = _RELAXATION * x + (1 - _RELAXATION) * feasible + dual
-        feasible = _within(relaxed, bound)
+        feasible = _within(relaxed, limit)
         dual = relaxed - feasible
-    return feasible
+    return _within(feasible.astype(complex), bound)
 
 
-def _within(x: ComplexArray, bound: FloatArray) -> ComplexArray:
-    size = np.abs(x)
-    # Reduced by 1e-12, so that rounding never exceeds the bound.
-    return x * np.where(size > bound, (1 - 1e-12) * bound / np.maximum(size, 1e-300), 1.0)
+def _inverse(A: Complex64Array) -> Complex64Array:
+    """Of a Hermitian positive definite matrix."""
+    factor, _ = lapack.cpotrf(A)
+    upper, _ = lapack.cpotri(factor)
+    return np.asarray(np.triu(upper) + np.triu(upper, 1).conj().T)
+
+
+def _within(x: NDArray[Any], bound: NDArray[Any]) -> NDArray[Any]:
+    """Reduced to magnitudes within bounds by 1e-12 more, so that rounding never exceeds them."""
+    size = np.maximum(np.abs(x), 1e-30)
+    return np.asarray(x * np.minimum((1 - 1e-12) * bound / size, 1.0, dtype=size.dtype))

@@ -15,11 +15,12 @@ stroke (`model.transients.knots`).
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points, fingertip_weights
+from model.finger.fingertip import FINGERTIP_RADIUS, fingertips_on
 from model.finger.grid import Grid
 from model.finger.perception import is_background
 from model.transients.base_motion import BaseEnvelope, Envelopes
@@ -32,6 +33,7 @@ RISE = 0.040
 """How long [s] a target takes to full vibration along its raised cosine."""
 
 _SURROUNDINGS = Grid(12, 9)
+_KEPT = 16  # readings; of an onset and its ending, and of fingers that rest
 
 Position = tuple[float, float]
 
@@ -48,6 +50,7 @@ class Shaper:
         self._gain_variance = gain_variance
         self._residual_form = mean_square(plate, ENDING_WINDOW)
         self._carriers: dict[float, Carrier] = {}
+        self._fingertips = lru_cache(_KEPT)(self._read)
 
     def prepare(self, frequency: float) -> None:
         """Compute in advance everything for a frequency [Hz] that does not depend on contacts."""
@@ -66,8 +69,8 @@ class Shaper:
         fingers the plate beyond 50 mm of the targets takes their place. An ERA that the excitation
         leaves silent helps where there is one frequency only.
         """
-        target_rows = self._fingertips(targets)
-        quiet_rows = self._fingertips(quiet) if quiet else self._surroundings(targets)
+        target_rows = self._fingertips(tuple(targets))
+        quiet_rows = self._fingertips(tuple(quiet)) if quiet else self._surroundings(targets)
         envelopes: dict[str, BaseEnvelope] = {}
         for frequency, amplitudes, active in self._groups(excitation, helped=True):
             knots = onset_knots(
@@ -94,8 +97,8 @@ class Shaper:
         silent.
         """
         both = bool(targets and quiet)
-        target_rows = self._fingertips(targets) if both else None
-        quiet_rows = self._fingertips(quiet) if both else None
+        target_rows = self._fingertips(tuple(targets)) if both else None
+        quiet_rows = self._fingertips(tuple(quiet)) if both else None
         envelopes: dict[str, BaseEnvelope] = {}
         for frequency, amplitudes, active in self._groups(excitation, helped=False):
             knots = ending_knots(
@@ -143,22 +146,21 @@ class Shaper:
             )
         ]
 
-    def _fingertips(self, positions: Sequence[Position]) -> FloatArray:
+    def _read(self, positions: tuple[Position, ...]) -> FloatArray:
         """Rows (d, r) whose sum of squares is the mean square under the fingertips, summed.
 
         Coefficients of polynomials of second order, orthonormal over a fingertip's points: enough
         for bending waves much longer than the fingertip.
         """
-        rows = []
-        plate = self._plate.reduced.plate
-        for x, y in positions:
-            points = fingertip_points(x, y, plate)
-            root = np.sqrt(fingertip_weights(x, y, plate))[:, None]
-            u, v = ((points - [x, y]) / FINGERTIP_RADIUS).T
-            powers = np.column_stack([np.ones(len(u)), u, v, u * u, u * v, v * v])
-            basis, _ = np.linalg.qr(root * powers)
-            rows.append(basis.T @ (root * self._plate.shapes_at(points)))
-        return np.concatenate(rows)
+        plate, centres = self._plate.reduced.plate, np.array(positions)
+        points, weights = fingertips_on(centres, length=plate.length, width=plate.width)
+        root = np.sqrt(weights)[..., None]
+        u, v = np.moveaxis((points - centres[:, None]) / FINGERTIP_RADIUS, -1, 0)
+        powers = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+        basis, _ = np.linalg.qr(root * powers)
+        shapes = self._plate.shapes_at(points.reshape(-1, 2)).reshape(*u.shape, -1)
+        rows = (root * basis).transpose(0, 2, 1) @ shapes
+        return np.asarray(rows.reshape(-1, rows.shape[-1]))
 
     def _surroundings(self, targets: Sequence[Position]) -> FloatArray:
         """The same for the plate beyond 50 mm of all targets; all of a plate too small for it."""

@@ -242,8 +242,11 @@ class Selector:
                     is_moving=is_moving,
                 )
             beside = self._chosen_last if _is_for(self._chosen_last, contacts) else before
-            new = {
-                contact.key: _alone(
+            playing = {key: each for key, each in pulses.items() if _plays(each, triggered_at)}
+            new: dict[ContactKey, Selection] = {}
+            for contact, target in short:
+                playing.pop(contact.key, None)  # its new one takes its place
+                new[contact.key] = playing[contact.key] = _alone(
                     table,
                     levels,
                     contact,
@@ -252,10 +255,8 @@ class Selector:
                     capabilities,
                     pulses.get(contact.key),
                     protected,
-                    beside=beside,
+                    beside=_joined(beside, *playing.values()),
                 )
-                for contact, target in short
-            }
             return _Chosen(found, new, triggered_at, is_rested)
 
         if not self._thread.is_busy:
@@ -343,6 +344,25 @@ def _is_quick(lasting: Targets, protected: frozenset[ContactKey]) -> bool:
     """Whether it is one steady content that no finger must not notice."""
     keys = {contact.key for contact, _ in lasting}
     return len(lasting) == 1 and protected <= keys and lasting[0][1].modulation_hz is None
+
+
+def _plays(pulse: Selection, now: float) -> bool:
+    """Whether a short pulse has not ended at a time [s]."""
+    return any(target.pulse is not None and now < target.pulse.end for _, target in pulse.targets)
+
+
+def _joined(*parts: Selection) -> Selection:
+    """What plays together, and how strongly contacts feel what others do."""
+    levels = [part.quiet_levels for part in parts]
+    return Selection(
+        (),
+        (),
+        tuple(content for part in parts for content in part.contents),
+        quiet_levels={
+            key: _sum_db(level[key] for level in levels if key in level)
+            for key in dict.fromkeys(key for level in levels for key in level)
+        },
+    )
 
 
 def _intents(targets: Targets) -> set[Target]:

@@ -291,6 +291,26 @@ def test_a_pulse_is_held_back_where_others_use_the_whole_stroke(table: Table) ->
     assert held.held_back == "the contents of other fingers use the whole stroke; lift a finger"
 
 
+@pytest.mark.parametrize(("since", "left"), [(0.0, 0.6e-6), (0.02, 0.6e-6), (0.5, 1e-6)])
+def test_a_click_leaves_what_another_drives_until_that_has_ended(
+    table: Table, since: float, left: float
+) -> None:
+    """Of 1.6 µm, of which each would take 1 µm: at once, while the first plays, and after it."""
+    limits = replace(CAPABILITIES, max_amplitudes={"SW": 1.6e-6}, layers=2)
+    selector, contacts = Selector(table), (at(1, 0.1), at(2, 0.2))
+    first, second = (
+        Target(ContactKey("a", id), 12.0, pulse=Pulse(0.03, requested_at=requested_at))
+        for id, requested_at in ((1, 0.0), (2, since))
+    )
+    if since:
+        selector.select(contacts[:1], HapticIntent((first,)), limits, triggered_at=0.0)
+    both = HapticIntent((first, second))
+    selection = selector.select(contacts, both, limits, triggered_at=since)
+    amplitudes = [each.pattern.excitation["SW"].amplitude for each in selection.contents]
+    assert amplitudes == pytest.approx([1e-6, left])
+    assert selection.predictions[1].level_db_sl == pytest.approx(12 + 20 * math.log10(left / 1e-6))
+
+
 @pytest.mark.parametrize(
     ("until", "due"), [(None, None), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
 )

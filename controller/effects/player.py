@@ -64,7 +64,7 @@ class EffectPlayer:
 
     def __init__(self, layout: SurfaceLayout) -> None:
         self.layout = layout
-        self._already_pressed: set[ContactKey] = set()  # under another layout
+        self._already_pressed: dict[ContactKey, float] = {}  # since when [s], under another layout
         self._fingers: dict[ContactKey, _Finger] = {}
         self._number = 0
         self._last_click: tuple[ContactKey, Pulse] | None = None
@@ -109,7 +109,7 @@ class EffectPlayer:
         For them only effects for motion or without an end start.
         """
         self.layout = layout
-        self._already_pressed |= self._fingers.keys()
+        self._already_pressed.update((key, one.since) for key, one in self._fingers.items())
         self._fingers.clear()
 
     def effect_of(self, key: ContactKey) -> str | None:
@@ -173,10 +173,11 @@ class EffectPlayer:
     def _update_regions(self, contacts: Sequence[Contact], now: float) -> None:
         """Start and end effects as fingers enter and leave regions."""
         since = {contact.key: contact.since for contact in contacts}
-        self._already_pressed &= since.keys()
         # One that came down again with the same id, perhaps between two intents, is another.
         for key in [key for key, one in self._fingers.items() if since.get(key) != one.since]:
             del self._fingers[key]
+        pressed = self._already_pressed.items()
+        self._already_pressed = {key: then for key, then in pressed if since.get(key) == then}
         for contact in contacts:
             finger = self._fingers.get(contact.key)
             if finger is None:
@@ -201,8 +202,7 @@ class EffectPlayer:
         finger = _Finger(contact.since, self.layout.region_at(*position), position)
         self._fingers[contact.key] = finger
         self._enter(finger, contact, now)
-        if contact.key in self._already_pressed:
-            self._already_pressed.discard(contact.key)
+        if self._already_pressed.pop(contact.key, None) is not None:
             effects = self.layout.effects
             finger.plays = [
                 play

@@ -33,6 +33,8 @@ from model.vibration.excitation import Excitation, base_amplitudes
 KEPT_WITHIN = 3.0
 """How much more [dB] another frequency must promise to take the place of one that is felt."""
 
+LIMITS_LEAVE_NOTHING = "the limits of the amplifiers allow nothing that is felt; raise them"
+
 _SIDE_BANDS = 2
 _SILENT_DB = -60.0  # a gain by which a content is not felt
 
@@ -64,6 +66,7 @@ def query_jointly(
     modulations, playable = _modulations(targets, capabilities.layers), capabilities.frequencies
     found = with_modulation(table, requests, fingers, found, modulations, playable=playable)
     strokes = {era.name: era.stroke for era in table.eras}
+    free = found
     if _factor_within(found, capabilities, strokes) < 1 - NEARLY:
         gains_db = _gains_db(requests, found, capabilities, strokes)
         lowered = with_gains(table, requests, fingers, found, gains_db)
@@ -79,16 +82,26 @@ def query_jointly(
     places = [each.at for each in requests]
     fields = table.unit_fields(np.array(places), contacts=places)
     factor = _factor_within(found, capabilities, strokes)
+    change = float(decibels(factor))
+    unfelt = {
+        number
+        for number, (then, now) in enumerate(zip(free.layers, found.layers, strict=True))
+        if now.promised_level_db_sl + change < 0 <= then.promised_level_db_sl
+    }
     contents: list[Content] = []
     skipped: list[Prediction] = []
     for number, ((contact, target), layer) in enumerate(zip(targets, found.layers, strict=True)):
         if layer.verdict == HELD_BACK:
             skipped.append(_held_back(contact, layer))
+        elif number in unfelt:
+            skipped.append(not_served(contact, LIMITS_LEAVE_NOTHING))
         elif layer.verdict != SHARED:
             sharing = [
                 (*targets[other], one)
                 for other, one in enumerate(found.layers)
-                if one.verdict == SHARED and one.excitation == layer.excitation
+                if one.verdict == SHARED
+                and one.excitation == layer.excitation
+                and other not in unfelt
             ]
             served = [(contact, target, layer), *sharing]
             voices = [layer.excitation, *layer.side_bands]
@@ -100,14 +113,13 @@ def query_jointly(
             carrier = before.get((contact.key, 0))
             for voice, tones in enumerate(voices):
                 pattern = _pattern(table, replace(layer, excitation=tones), capabilities)
-                pattern = pattern.scaled(float(decibels(factor)))
+                pattern = pattern.scaled(change)
                 if carrier is not None or layer.side_bands:
                     then = carrier if is_continued else None
                     pattern = _in_phase(pattern, then, fields[:, :, number], table)
                 contents.append(
                     _content(served, targets, quiet, pattern, is_continued, factor, shape, voice)
                 )
-    change = float(decibels(factor))
     return Selection(
         tuple(targets),
         tuple(quiet),

@@ -16,7 +16,7 @@ from controller.loop.content import (
     not_served,
 )
 from controller.loop.intent import HapticIntent, Target
-from controller.loop.joint_answer import Shape, query_jointly
+from controller.loop.joint_answer import LIMITS_LEAVE_NOTHING, Shape, query_jointly
 from controller.loop.table_query import TableAnswer, query_table
 from controller.sources.contacts import Contact, ContactKey
 from model.drive_modes import UNRESTRICTED
@@ -514,7 +514,7 @@ def _alone(
         left.append(_power_left(table, pattern, beside.contents, capabilities.max_power))
     change = min(0.0, float(decibels(min(left, default=1.0))))
     if change < 0 and answer.felt_db_sl + change < 0:
-        reason = "the limits of the amplifiers allow nothing that is felt; raise them"
+        reason = LIMITS_LEAVE_NOTHING
         if beside.contents:
             reason = "the contents of other fingers use the whole stroke; lift a finger"
     felt, promised = answer.felt_db_sl + change, answer.promised_contrast_db

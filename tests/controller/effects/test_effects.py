@@ -376,8 +376,8 @@ def test_requested_effect_plays_for_an_unknown_finger() -> None:
 def test_new_layout_repeats_no_press(times: int) -> None:
     """A finger that is down feels what lasts and what moves by the new one, but no second click.
 
-    One that comes later feels all, also under the name of one that has lifted. It may be exchanged
-    twice before it is asked.
+    One that comes later feels all, also under the name of one that has lifted, be it unnoticed. It
+    may be exchanged twice before it is asked.
     """
     effects: dict[str, Effect] = {"buzz": Buzz(level=10.0), "click": Click(), "dots": Detents()}
     clicks = Region("left", LEFT, on_press="click", on_move="dots")
@@ -390,6 +390,8 @@ def test_new_layout_repeats_no_press(times: int) -> None:
     assert wanted(player, [finger(1, 0.056), finger(2, 0.15)], 1.1) == {1: 20.0, 2: 10.0}
     assert wanted(player, [], 2.0) == {}
     assert wanted(player, [finger(1, 0.05)], 3.0) == {1: 20.0}
+    player.replace(SurfaceLayout((clicks,), effects))
+    assert wanted(player, [finger(1, 0.05, since=3.5)], 4.0) == {1: 20.0}  # not asked between
 
 
 @given(

@@ -104,6 +104,21 @@ def test_who_is_lowered_too_far_is_held_back_by_the_rule() -> None:
     assert held_back.held_back
 
 
+def test_contents_that_a_limit_leaves_unfelt_are_held_back() -> None:
+    """With 40 dB less than 14 dB SL takes; a level below 0 dB SL from the start is kept."""
+    wanted = [Target(each.key, 14.0) for each in CONTACTS]
+    most = 0.01 * sums(chosen(FREE, *wanted)).max()
+    amplitudes = {name: most * each for name, each in FREE.max_amplitudes.items()}
+    found = chosen(replace(FREE, max_amplitudes=amplitudes), *wanted)
+    assert found.contents == ()
+    assert all(
+        "the limits of the amplifiers" in (each.held_back or "") for each in found.not_served
+    )
+    assert len(found.not_served) == 2
+    quiet = chosen(FREE, *(replace(each, level_db_sl=-10.0) for each in wanted))
+    assert len(quiet.contents) == 2
+
+
 @pytest.mark.parametrize("what", ["level", "power"])
 def test_of_equal_priority_the_louder_content_is_lowered(what: str) -> None:
     """Max-min: the softer one keeps its level as long as the louder one is above it."""

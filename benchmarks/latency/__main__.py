@@ -1,75 +1,245 @@
-"""Latency from a touch datagram to the last byte of the command on the wire.
+"""Time from a touch to the bytes on the wires of a real daemon, and what the daemon costs.
 
-    python -m benchmarks.latency [--seconds S] [--seed 1] [--report | --check WIRE]
+    python -m benchmarks.latency [--touches N] [--report]
 
-The daemon, the amplifier, the panel and programs that load the machine are separate processes
-(`benchmarks.latency.run`). It takes six minutes on an otherwise idle machine; a trial run with
---seconds 2 takes half of one. A disturbed case is repeated once; if that fails, too, the others
-follow.
-
---report: write docs/measured/latency.md. --check: measure taps at 100 Hz only, over `tcp` or a
-`pty`, and print the result as JSON.
+The daemon, floods and programs that load the machine are processes; the panel and the amplifiers,
+on pseudo-terminals, are this one. A touch is sent when the set of the one before has come and no
+other is under way, so that the next set is its own; a case with a planted delay proves that. Six
+minutes. Beside each figure is how busy other programs kept the processors: on a machine that is not
+left alone figures are upper bounds. --report: write docs/measured/latency.md.
 """
 
 import argparse
-import json
+import asyncio
+import os
+import platform
 import sys
-import tempfile
 import time
-from functools import partial
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
+import numpy as np
+
+from benchmarks.page import write_parts
 from benchmarks.setting import use_one_thread
+
+use_one_thread()  # with two the daemon would compete
+
+from benchmarks.latency import calls, crowd  # noqa: E402
+from benchmarks.latency.machine import OtherLoad, become_device, computed  # noqa: E402
+from benchmarks.latency.session import (  # noqa: E402
+    DAEMON,
+    Session,
+    daemon_session,
+    move_ten,
+    plain_session,
+    rest_one,
+    taps,
+)
+
+PAGE = Path(__file__).parents[2] / "docs" / "measured" / "latency.md"
+TOUCHES = 300
+PLANTED = 0.02  # s
+_RIGS = {"4 ERAs on 1": "paper_plate", "16 on 4": "table"}
+_PLANTED = (sys.executable, "-m", "benchmarks.latency.planted", PLANTED)
+_HEAD = (
+    "| case | touches | without a set | sets | median | 99th | maximum | of that amplifiers "
+    "| daemon: median | wire | CPU | other load |\n|---" + 11 * "|---" + "|"
+)
+_FURTHER_HEAD = "| | rig | measured | goal | other load |\n|---|---|---|---|---|"
+
+
+@dataclass(frozen=True)
+class Case:
+    """Taps: the name of the rig, and whether they are the baseline's, two at a time, beside floods
+    and programs that compute, or delayed; goal [ms] of the median."""
+
+    rig: str
+    is_plain: bool = False
+    is_two: bool = False
+    is_loaded: bool = False
+    is_planted: bool = False
+    goal: float | None = None
+
+    @property
+    def name(self) -> str:
+        """For the table."""
+        words = (
+            "plain asyncio" if self.is_plain else None,
+            "two with their own contents" if self.is_two else None,
+            "loaded" if self.is_loaded else None,
+            f"{1e3 * PLANTED:g} ms planted" if self.is_planted else None,
+        )
+        return ", ".join([self.rig, *filter(None, words)])
+
+
+CASES = (
+    *(Case(rig, goal=goal) for rig, goal in zip(_RIGS, (1.4, 3.8), strict=True)),
+    *(Case(rig, is_two=True, goal=goal) for rig, goal in zip(_RIGS, (2.9, 5.3), strict=True)),
+    Case("4 ERAs on 1", is_planted=True),
+    Case("4 ERAs on 1", is_loaded=True),
+    *(Case(rig, is_plain=True) for rig in _RIGS),
+)
+
+
+@asynccontextmanager
+async def opened(case: Case) -> AsyncIterator[Session]:
+    """The session of a case, with what loads it."""
+    async with AsyncExitStack() as stack:
+        rig = _RIGS[case.rig]
+        if case.is_plain:
+            session = await stack.enter_async_context(plain_session(rig))
+        else:
+            program = _PLANTED if case.is_planted else DAEMON
+            daemon = daemon_session(rig, program=program, is_two=case.is_two)
+            session = await stack.enter_async_context(daemon)
+        if case.is_loaded:
+            await stack.enter_async_context(crowd.floods(session.socket, *crowd.ALL))
+            await stack.enter_async_context(crowd.computing(2))
+        yield session
+
+
+async def row(case: Case, count: int) -> str:
+    """Measure a case; returns its row."""
+    async with opened(case) as session:
+        load, before = OtherLoad(), computed(session.pid)
+        found = await taps(session, count, is_two=case.is_two)
+        cost, others = (computed(session.pid) - before) / count, load.processors()
+        own = None if session.era is None else (await session.era.status()).latency_ms
+    quantiles = np.quantile(found.times, [0.5, 0.99, 1.0], method="inverted_cdf")
+    cells = [
+        case.name,
+        str(count),
+        str(found.unanswered),
+        str(found.sets),
+        *map(_ms, quantiles),
+        _ms(found.in_amplifiers),
+        "" if own is None or own.median is None else f"{own.median:.2f}",
+        _ms(found.wire),
+        _ms(cost),
+        f"{others:.2f}",
+    ]
+    if case.goal is not None:
+        cells[4] += f" (goal {case.goal:g})"
+    return _joined(cells)
+
+
+async def moving(session: Session, touches: int) -> str:
+    """The processor time of ten moving fingers."""
+    return await _processor(session, move_ten, touches / 30)
+
+
+async def resting(session: Session, touches: int) -> str:
+    """The processor time of one finger that rests."""
+    return await _processor(session, rest_one, touches / 30)
+
+
+async def fresh(session: Session, touches: int) -> str:
+    """How many stops of new clients are served."""
+    return f"{await crowd.fresh_stops(session, touches // 3)} of {touches // 3}"
+
+
+async def trips(session: Session, touches: int) -> str:
+    """Round trips of the lease's holder."""
+    return _late(await crowd.round_trips(session, touches))
+
+
+async def stops(session: Session, touches: int) -> str:
+    """Times of stops."""
+    return _late(await crowd.stops(session, touches))
+
+
+_Act: TypeAlias = Callable[[Session, int], Awaitable[str]]
+FURTHER: Sequence[tuple[str, str, str, _Act, tuple[tuple[str, int], ...]]] = (
+    ("processor, ten moving fingers at 60 Hz", "4 ERAs on 1", "half", moving, ()),
+    ("processor, one finger that rests", "16 on 4", "2 %", resting, ()),
+    (
+        *("stops of new clients beside 200 that reconnect", "4 ERAs on 1", "all"),
+        *(fresh, (crowd.RECONNECTING,)),
+    ),
+    (
+        "touch of the lease's holder beside these, slow readers and bad JSON, round trip",
+        *("4 ERAs on 1", "99th 20 ms", trips),
+        (crowd.RECONNECTING, crowd.SLOW, crowd.MALFORMED),
+    ),
+    ("stop until the wire, beside all floods", "4 ERAs on 1", "99th 5 ms", stops, crowd.ALL),
+)
+
+
+async def further_row(
+    name: str, rig: str, goal: str, act: _Act, kinds: Sequence[tuple[str, int]], touches: int
+) -> str:
+    """Measure something else than taps; returns its row."""
+    async with daemon_session(_RIGS[rig]) as session, crowd.floods(session.socket, *kinds):
+        load = OtherLoad()
+        text, others = await act(session, touches), load.processors()
+    return _joined([name, rig, text, goal, f"{others:.2f}"])
+
+
+async def _processor(
+    session: Session, act: Callable[[Session, float], Awaitable[None]], seconds: float
+) -> str:
+    await act(session, 1.0)
+    before = computed(session.pid)
+    await act(session, seconds)
+    return f"{100 * (computed(session.pid) - before) / seconds:.1f} %"
+
+
+def _late(times: np.ndarray) -> str:
+    median, late, most = np.quantile(times, [0.5, 0.99, 1.0], method="inverted_cdf")
+    return f"median {_ms(median)}, 99th {_ms(late)}, at most {_ms(most)} ms (of {len(times)})"
+
+
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.2f}"
+
+
+def _joined(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+async def measure(touches: int) -> tuple[str, str]:
+    """Measure everything with real daemons, printing each row; returns two tables."""
+    tables: list[list[str]] = []
+
+    def add(line: str) -> None:
+        tables[-1].append(line)
+        print(line, flush=True)
+
+    tables.append([])
+    add(_HEAD)
+    for case in CASES:
+        add(await row(case, touches))
+    tables.append([])
+    add(_FURTHER_HEAD)
+    for each in FURTHER:
+        add(await further_row(*each, touches))
+    first, second = ("\n".join(lines) for lines in tables)
+    return first, second
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.latency", description=__doc__)
-    parser.add_argument(
-        "--seconds", type=float, default=100.0, help="duration of the longest cases"
-    )
-    parser.add_argument("--seed", type=int, default=1)
-    purpose = parser.add_mutually_exclusive_group()
-    purpose.add_argument("--report", action="store_true")
-    purpose.add_argument("--check", choices=("tcp", "pty"))
+    parser.add_argument("--touches", type=int, default=TOUCHES, help="of each case")
+    parser.add_argument("--report", action="store_true", help="write docs/measured/latency.md")
     options = parser.parse_args()
-    use_one_thread()  # with two the daemon would compete
-
-    from benchmarks.latency.report import (
-        as_json,
-        cases,
-        check_case,
-        lines,
-        write_report,
-    )
-    from benchmarks.latency.run import Failed, Found, attempt, measure
-    from model.rig.file import example_rig_path, load_rig
-    from model.table.file import save_table
-    from model.table.table_cache import cached_table
-
-    seconds = options.seconds
-    table, _ = cached_table(load_rig(example_rig_path()))
-    found: list[Found | Failed] = []
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "table.npz"
-        save_table(table, file)
-        if options.check:
-            checked = check_case(options.check, seconds, options.seed)
-            one = attempt(checked, partial(measure, checked, file, table), attempts=1)
-            if isinstance(one, Failed):
-                sys.exit(f"no figures: {'; then: '.join(one.why)}")
-            print(json.dumps(as_json(one)))
-            return
-        begun = time.monotonic()
-        for case in cases(seconds, options.seed):
-            found.append(attempt(case, partial(measure, case, file, table)))
-            print(lines(found[-1:], first=len(found) == 1), flush=True)
-        minutes = (time.monotonic() - begun) / 60
-        print(f"{minutes:.1f} minutes")
+    own = calls.table(_RIGS)
+    print(own, flush=True)
+    note = "" if become_device() else " Real-time priority was not permitted."
+    begun = time.monotonic()
+    figures, further = asyncio.run(measure(options.touches))
+    minutes = (time.monotonic() - begun) / 60
     if options.report:
-        write_report(found, seconds=seconds, seed=options.seed, minutes=minutes)
-    failed = [each for each in found if isinstance(each, Failed)]
-    if failed:
-        sys.exit(f"no figures of {len(failed)} of {len(found)} cases: leave the machine alone")
+        note = (
+            f"`python -m benchmarks.latency --report` took {minutes:.0f} minutes with "
+            f"{options.touches} touches a case (Python {platform.python_version()}, "
+            f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors).{note}"
+        )
+        parts = {"taps": f"{note}\n\n{figures}", "further": further, "calls": own}
+        write_parts(PAGE, parts)
 
 
 if __name__ == "__main__":

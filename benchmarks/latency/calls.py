@@ -1,25 +1,18 @@
-"""Own calls and files on the way of a touch, and what a resting finger and a stop cost.
+"""Own calls and files on the way of a touch, and own calls for a finger that rests.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.latency.calls [RIG ...] [--stops N]
-
-Each rig of examples/ has a row: its amplifiers are in this process, on a line of memory each, and
-their own time is not counted. A touch: from its frame to the last byte of its set, answer included,
-after the first such touch. A resting finger: for two seconds, its frames coming 20 times a second.
-A stop: from the request to the last amplifier's first byte.
+Amplifiers are in this process, on a line of memory each, and not counted. A touch: from its frame
+to the last byte of its set, answer included, after the first such touch. A resting finger: for two
+seconds, its frames coming 20 times a second.
 """
 
-import argparse
 import asyncio
 import os
 import sys
 import time
 import types
 from collections import Counter
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Mapping
 from pathlib import Path
-
-import numpy as np
 
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
@@ -40,16 +33,15 @@ from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 _ROOT = Path(__file__).parents[2]
 _OWN = tuple(f"{_ROOT / name}{os.sep}" for name in ("controller", "drivers", "model", "registry"))
+_DRIVERS = f"{_ROOT / 'drivers'}{os.sep}"
 _FRAME_INTERVAL, _RESTING = 0.05, 2.0  # s
 _LEVEL = 15.0  # dB SL
-RIGS = ("paper_plate", "table")
 
 
 class FarEnd:
-    """An amplifier behind a line of memory; used [s]: the processor's time that it has taken."""
+    """An amplifier behind a line of memory."""
 
     is_blocked = False
-    used = 0.0
 
     def __init__(self, channels: int, written: Callable[[], None]) -> None:
         self._written = written
@@ -65,20 +57,19 @@ class FarEnd:
         """Do nothing: all that has come was handed over."""
 
     def _receive(self, data: bytes) -> None:
-        profile, begun = sys.getprofile(), time.process_time()
+        profile = sys.getprofile()
         sys.setprofile(None)
         self._end.receive(data, time.monotonic())
         sys.setprofile(profile)
-        FarEnd.used += time.process_time() - begun
 
     def _reply(self, data: bytes) -> None:
         asyncio.get_running_loop().call_soon(self.line.received, data)
 
 
 class MemoryLines(Lines):
-    """A new line of memory for each amplifier; written: called with its name at each write."""
+    """A new line of memory for each amplifier; written: called at each write."""
 
-    def __init__(self, rig: Rig, written: Callable[[str], None]) -> None:
+    def __init__(self, rig: Rig, written: Callable[[], None]) -> None:
         super().__init__()
         self._rig = rig
         self._written = written
@@ -94,7 +85,7 @@ class MemoryLines(Lines):
     ) -> Amplifier:
         """Return a host's amplifier."""
         wired = [each.number for each in self._rig.wiring.values() if each.amplifier == name]
-        far_end = FarEnd(max(wired) + 1, partial(self._written, name))
+        far_end = FarEnd(max(wired) + 1, self._written)
         return Amplifier(far_end.line, 1, limits, name=name, is_output=is_output)
 
 
@@ -121,19 +112,14 @@ class Count:
             self._pending[frame.f_code.co_filename] += 1
 
 
-async def measure(rig: Rig, stops: int) -> list[str]:
+async def measure(rig: Rig) -> list[str]:
     """Return the cells of a rig."""
-    count, sent_at, played = Count(), dict[str, float](), asyncio.Event()
-
-    def written(name: str) -> None:
-        sent_at.setdefault(name, time.perf_counter())
-        count.written()
-
+    count, played = Count(), asyncio.Event()
     table, _ = cached_table(rig)
     controller = Controller(
         rig,
         table,
-        lines=lambda: MemoryLines(rig, written),
+        lines=lambda: MemoryLines(rig, count.written),
         intent_source=EffectPlayer(SurfaceLayout(effects=default_effects(_LEVEL))),
         timing=Timing(table),
         observer=Observer(pattern_applied=lambda applied: played.set()),
@@ -144,68 +130,42 @@ async def measure(rig: Rig, stops: int) -> list[str]:
     running = asyncio.create_task(controller.run())
     x, y = rig.plate.length / 3, rig.plate.width / 3
 
-    async def touch(*touches: Touch) -> None:
+    def deliver(*touches: Touch) -> None:
         controller.deliver(TouchFrame("panel", asyncio.get_running_loop().time(), touches))
-        await asyncio.sleep(_FRAME_INTERVAL)
 
     async def rest() -> None:
         for _ in range(round(_RESTING / _FRAME_INTERVAL)):
-            await touch(Touch(3, x, y))
+            deliver(Touch(3, x, y))
+            await asyncio.sleep(_FRAME_INTERVAL)
 
-    await touch(Touch(1, x, y))
-    await touch()
+    deliver(Touch(1, x, y))
+    await asyncio.sleep(_FRAME_INTERVAL)
+    deliver()
     await asyncio.sleep(1.0)
     with count:
-        count.calls.clear()
         played.clear()
-        controller.deliver(
-            TouchFrame("panel", asyncio.get_running_loop().time(), (Touch(2, x + 0.02, y),))
-        )
+        deliver(Touch(2, x + 0.02, y))
         await played.wait()
     touched = count.calls
-    await touch()
+    in_drivers = sum(calls for file, calls in touched.items() if file.startswith(_DRIVERS))
     await rest()
-    begun, FarEnd.used = time.process_time(), 0.0
-    await rest()
-    processor = (time.process_time() - begun - FarEnd.used) / _RESTING
     count.calls.clear()
     with count:
         await rest()
     resting = count.calls.total() / _RESTING
-    times = []
-    for _ in range(stops):
-        await controller.arm()
-        await touch(Touch(3, x, y))
-        sent_at.clear()
-        begun = time.perf_counter()
-        await controller.stop()
-        times.append(1e3 * (max(sent_at.values()) - begun))
-        await controller.clear()
     await controller.close()
     await running
-    median, late = np.quantile(times, [0.5, 0.99])
-    return [
-        f"{len(rig.eras)} on {len(rig.amplifiers)}",
-        f"{touched.total()}",
-        f"{len(touched)}",
-        f"{resting:.0f}",
-        f"{100 * processor:.1f} %",
-        f"{median:.2f}",
-        f"{late:.2f}",
+    return [f"{touched.total()}", f"{in_drivers}", f"{len(touched)}", f"{resting:.0f}"]
+
+
+def table(rigs: Mapping[str, str]) -> str:
+    """Measure the rigs of examples, whose names are the values; returns a table."""
+    rows = [
+        "| rig | touch: calls (goal 300) | of these in drivers | files (goal 22) "
+        "| resting: calls a second (goal 3000) |",
+        "|---|---|---|---|---|",
     ]
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.latency.calls", description=__doc__)
-    parser.add_argument("rigs", nargs="*", default=RIGS, metavar="RIG")
-    parser.add_argument("--stops", type=int, default=400)
-    options = parser.parse_args()
-    print("| rig | ERAs on amplifiers | touch: calls | files | resting: calls a second |", end="")
-    print(" processor | stop [ms]: median | 99th |\n|---|---|---|---|---|---|---|---|")
-    for name in options.rigs:
-        rig = load_rig(_ROOT / "examples" / f"{name}.yaml")
-        print(f"| {name} | {' | '.join(asyncio.run(measure(rig, options.stops)))} |", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+    for name, file in rigs.items():
+        cells = asyncio.run(measure(load_rig(_ROOT / "examples" / f"{file}.yaml")))
+        rows.append(f"| {' | '.join([name, *cells])} |")
+    return "\n".join(rows)

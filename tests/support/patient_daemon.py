@@ -1,7 +1,6 @@
 """`era` that waits for its amplifiers as long as a busy machine may take: `patient_daemon.py ...`.
 
-With `--resting` first it waits as long for news of fingers; `--loading SECONDS CONFIG` is a daemon
-whose touches wait as long for their shaped onsets. Its amplifiers wait as long for it.
+With `--resting` first it waits as long for news of fingers. Its amplifiers wait as long for it.
 What it does is the same; what it does about silence is not, which other tests have as their
 subject.
 """
@@ -10,7 +9,6 @@ import sys
 
 import pytest
 
-from benchmarks.latency.daemon import run_daemon
 from controller.cli.main import main
 from controller.daemon.daemon import Daemon
 from controller.loop.loop import Controller
@@ -21,7 +19,6 @@ from drivers.host.line import Line
 
 PROGRAM = (sys.executable, __file__)
 RESTING = (*PROGRAM, "--resting")
-LOADING = (*PROGRAM, "--loading")
 REPLY_TIMEOUT = 5.0  # s; in place of 30 ms
 WATCHDOG = 2.0  # s; in place of 0.25 s, the longest of the protocol
 CONTACT_TIMEOUT = 3.0  # s; in place of 0.15 s, no longer than that of TUIO
@@ -42,7 +39,4 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--resting"]:
         patch.setattr(contacts, "CONTACT_TIMEOUT", CONTACT_TIMEOUT)
         del sys.argv[1]
-    if sys.argv[1:2] == ["--loading"]:
-        del sys.argv[1]
-        sys.exit(run_daemon())
     sys.exit(main())

@@ -58,7 +58,7 @@ async def open_dashboard(page: Page, gateway: GatewayProcess, screen: Screen) ->
         height=screen.height,
         is_phone=screen.is_phone,
     )
-    await page.until(STATE, lambda state: state not in (None, "away", "NOT_READY"))
+    await page.until(STATE, lambda state: state not in (None, "disconnected", "NOT_READY"))
     await page.until("document.querySelectorAll('#layer-eras rect').length")
 
 

@@ -17,8 +17,8 @@ from controller.api.schema import AmplifierSilence, Message
 from model.errors import reworded
 
 MAX_LINE_LENGTH = 1 << 16  # bytes, with the line feed
-MAX_OPENINGS = 160  # [ and { of a request: a touch frame has at most 67; bounds the depth too
-MAX_SEPARATORS = 1000  # : and , of a request: a touch frame has at most 400
+MAX_OPENINGS = 80  # [ and { of a request: a touch frame has at most 67; bounds the depth too
+MAX_SEPARATORS = 500  # : and , of a request: a touch frame has at most 400
 _MAX_ERROR_TEXT = 600  # characters of an error's message
 
 Id: TypeAlias = int | str | None

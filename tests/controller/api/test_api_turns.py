@@ -22,12 +22,37 @@ def serve(*, costs: float = 0.0) -> ServedApi:
     return ServedApi(clock=lambda: loop.time() - began_at, costs=costs)
 
 
+@pytest.fixture(autouse=True)
+def one_line_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """End turns by the number of lines, as virtual time stands still meanwhile."""
+    monkeypatch.setattr(turns, "MAX_TURN", 0.0)
+
+
 @in_virtual_time
-async def test_clients_take_a_burst_then_a_quarter_of_the_time(
+async def test_turn_ends_with_the_line_after_a_tenth_of_a_millisecond(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Whose lines take 30 us each: four of ten."""
+    lines = 0
+
+    def count(name: str) -> None:
+        nonlocal lines
+        lines += 1
+
+    monkeypatch.undo()
+    monkeypatch.setattr(turns.time, "perf_counter", lambda: 30e-6 * lines)
+    served = serve()
+    served.called = count
+    served.client()[0].data_received(REQUEST * 10)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert lines == 4
+
+
+@in_virtual_time
+async def test_clients_take_a_burst_then_a_quarter_of_the_time() -> None:
     """Of requests of 1 ms each: 20 at once, then 250 in a second, each overdrawn by at most one."""
-    monkeypatch.setattr(turns, "MAX_TURN", 0.0)  # a line per turn
     served = serve(costs=0.001)
     client, _ = served.client()
     client.data_received(TOUCH * 700)
@@ -67,11 +92,8 @@ async def test_client_whose_fingers_were_never_lifted_is_one_of_the_others() -> 
 
 
 @in_virtual_time
-async def test_requests_wait_while_a_touch_is_on_its_way_to_the_wire(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_requests_wait_while_a_touch_is_on_its_way_to_the_wire() -> None:
     """Until it is sent, and for 3 ms at most if touches follow each other without a gap."""
-    monkeypatch.setattr(turns, "MAX_TURN", 0.0)  # a line per turn
     served = serve()
     client, _ = served.client()
     served.is_busy = True

@@ -12,23 +12,19 @@ import threading
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, nullcontext
 from pathlib import Path
-from typing import cast
 
 import pytest
 
 from drivers import clock
 from drivers.by_hand.reaching import round_trip
 from drivers.contents import Layer, Tone
-from drivers.errors import DriverError, LinkDegraded, LinkError
+from drivers.errors import DriverError, LinkDegraded
 from drivers.garbage_collection import no_long_collections
 from drivers.host.amplifier import Amplifier
-from drivers.host.group import is_lost
-from drivers.host.members import GroupState
 from drivers.host.timing import HEARTBEAT, loss_detection_time
 from long_form import shortly
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
-from sim.amplifier.contract import Amplifier as SimulatedAmplifier
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultKind, FaultWindow
 from virtual_loop import in_virtual_time
@@ -68,11 +64,6 @@ async def linked(
 def host_of(hosted: HostedRig) -> Amplifier:
     """The host of the only amplifier."""
     return hosted.group.amplifiers["main"]
-
-
-def far_of(hosted: HostedRig) -> SimulatedAmplifier:
-    """The amplifier itself."""
-    return cast(SimulatedAmplifier, hosted.bench.amplifiers["main"])
 
 
 def fault(hosted: HostedRig, kind: FaultKind, **options: object) -> None:
@@ -119,74 +110,6 @@ async def again(hosted: HostedRig) -> None:
             with contextlib.suppress(DriverError):  # not yet silent
                 await hosted.group.clear()
                 await hosted.group.arm()
-
-
-@pytest.mark.parametrize("kind", ["unplug", "hang", "drop"])
-@over_every_wire
-@in_virtual_time
-async def test_cut_link_is_silent_and_detected(wire: str, kind: FaultKind, coarse_rig: Rig) -> None:
-    """Nothing plays that was sent after it; lost not before it is silent; reopened, not armed."""
-    async with linked(wire, coarse_rig) as hosted:
-        await play(hosted, 0.5)
-        fault(hosted, kind)
-        with pytest.raises(LinkError):
-            await beat_on(hosted)
-        while not is_lost(host_of(hosted)):
-            with pytest.raises(DriverError):
-                await play(hosted, 0.1)
-            await asyncio.sleep(HEARTBEAT / 10)
-        if kind != "unplug":
-            assert not any(hosted.levels("main"))
-        with contextlib.suppress(DriverError):
-            await beat_on(hosted)
-        assert hosted.group.state is GroupState.LOST
-        await asyncio.sleep(2 * WATCHDOG)
-        assert not any(hosted.levels("main"))
-        hosted.devices["main"].recover()
-        await hosted.reopen(within=10.0)
-        assert far_of(hosted).state in ("FAULT", "QUICK_STOP_ACTIVE")
-        assert not any(hosted.levels("main"))
-
-
-@pytest.mark.parametrize("kind", ["drop", "hang"])
-@over_every_wire
-@in_virtual_time
-async def test_short_stall_degrades_the_link_and_recovers(
-    wire: str, kind: FaultKind, coarse_rig: Rig
-) -> None:
-    """A stall of 100 ms, a watchdog of 250 ms: no new set meanwhile, and the last one plays on."""
-    async with linked(wire, coarse_rig) as hosted:
-        await play(hosted, 0.5)
-        fault(hosted, kind, lasts=0.1)
-        with pytest.raises(LinkDegraded):
-            await hosted.group.beat()
-        assert hosted.group.degraded == ("main",)
-        with pytest.raises(LinkDegraded, match="until it replies"):
-            await play(hosted, 0.1)
-        async with asyncio.timeout(0.2):
-            while hosted.group.degraded:
-                with contextlib.suppress(LinkDegraded):
-                    await hosted.group.beat()
-                await asyncio.sleep(0.005)
-        assert hosted.levels("main")[0] == 0.5
-        await play(hosted, 0.1)
-        assert hosted.levels("main")[0] == pytest.approx(0.1)
-
-
-@over_every_wire
-@in_virtual_time
-async def test_amplifier_without_replies_is_not_fed_for_ever(wire: str, coarse_rig: Rig) -> None:
-    """It hears the host, which hears nothing: its watchdog still ends what it plays."""
-    async with linked(wire, coarse_rig) as hosted:
-        await play(hosted, 0.5)
-        fault(hosted, "drop", toward="host")
-        unheard = clock.now()
-        while not is_lost(host_of(hosted)) and clock.now() < unheard + 3.0:
-            with contextlib.suppress(LinkError):
-                await hosted.group.beat()
-            await asyncio.sleep(HEARTBEAT)
-        assert far_of(hosted)._last_fed - unheard <= THREE_HEARTBEATS
-        assert not any(hosted.levels("main"))
 
 
 @pytest.mark.parametrize(

@@ -33,47 +33,6 @@ def slope_of(playback: Playback, time: float) -> float:
     return sum(voice.transition.slope(time) for voice in playback.voices_of(0))
 
 
-def test_tones_cross_fade_along_raised_cosines() -> None:
-    """A quarter into the ramp the gains are (1 ± cos 45°)/2; the old tone is gone at its end."""
-    playback = Playback(1, 8)
-    playback.commit([layer(0, tone())], 1, 0.0)
-    playback.commit([layer(0, tone(frequency=3000))], 2, 1.0)
-    old, new = (1 + math.cos(math.pi / 4)) / 2, (1 - math.cos(math.pi / 4)) / 2
-    assert amplitudes(playback, 1.005) == pytest.approx([0.5 * old, 0.5 * new])
-    playback.advance(1.02)
-    assert [voice.origin for voice in playback.voices_of(0)] == [1.0]
-    assert playback.tokens == {0: 2}
-
-
-def test_onset_and_ending_follow_straight_lines_through_knots() -> None:
-    """From 0 through 0.2 at 90 degrees to 0.5; then from 0.5 through 0.1 to silence."""
-    onset, ending = Envelope(100, ((2000, 9000),)), Envelope(50, ((1000, 0),))
-    playback = Playback(1, 8)
-    playback.commit([layer(0, tone(onset=onset, ending=ending), valid_for=500)], 1, 0.0)
-    assert amplitudes(playback, 0.005) == pytest.approx([0.1j])
-    assert amplitudes(playback, 0.015) == pytest.approx([0.25 + 0.1j])
-    playback.advance(0.5025)
-    assert amplitudes(playback, 0.5025) == pytest.approx([0.3])
-    assert playback.silent_from == pytest.approx(0.51)
-    playback.silence(0.5025, 0.05)
-    assert playback.silent_from == pytest.approx(0.51)  # sooner, never later
-
-
-def test_layers_do_not_touch_each_other() -> None:
-    """Sets, ends and renewals of layer 1 leave the voices of layer 0 the same objects."""
-    playback = Playback(2, 8)
-    playback.commit([layer(0, tone(), tone(1))], 1, 0.0)
-    kept = [playback.voices_of(channel)[0] for channel in (0, 1)]
-    playback.commit([layer(1, tone(frequency=4000), valid_for=100)], 2, 0.5)
-    playback.commit([layer(1, renew=True, valid_for=200)], 3, 0.55)
-    assert playback.silent_from == math.inf
-    playback.advance(0.74)
-    assert playback.tokens == {0: 1, 1: 2}
-    playback.advance(0.76)
-    assert playback.tokens == {0: 1}
-    assert [playback.voices_of(channel)[0] for channel in (0, 1)] == kept
-
-
 def test_voice_that_has_faded_is_not_continued_however_seldom_time_advances() -> None:
     """Its onset to level 0 ended at 20 ms, before that of the channel for which a set waits."""
     playback = Playback(2, 8)

@@ -5,14 +5,15 @@ Run by the judge of planted faults only: the suite has all checks in turn in
 `drivers.playback`, which conformance asks what must be played, on the firmware, which does not.
 """
 
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from drivers.conformance import CHECKS, Result, of_kind
-from firmware_judged import firmware_results
 from firmware_programs import build_firmware
 from judged_line import KINDS, judged, plain
+from moved_firmware import FirmwareEnd
 
 _CASES = [(kind, check.name) for kind in KINDS for _, check in of_kind(kind)]
 _OF_ANY_WIRE = [check.name for check in CHECKS if not check.kinds]
@@ -54,6 +55,6 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("name", _OF_ANY_WIRE)
 def test_firmware(name: str, firmware: Path) -> None:
     """It finds none on the firmware, whose playback is its own."""
-    (found,) = firmware_results("serial", firmware, [name])
+    (found,) = judged("serial", [name], far=partial(FirmwareEnd, "serial", firmware))
     violation = found.reason * (found.result is Result.FAILED)
     assert not violation, violation

@@ -4,17 +4,17 @@ import cmath
 import math
 import random
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from drivers.protocol.table import BY_NUMBER
-from firmware_judged import firmware_results
-from firmware_line import LINES
 from firmware_pair import Pair, Sent
 from firmware_requests import RandomHost
+from judged_line import judged
 from long_form import shortly
-from moved_firmware import RATE, MovedFirmware
+from moved_firmware import LINES, RATE, FirmwareEnd, MovedFirmware
 from sim.amplifier.contract import Amplifier
 
 REQUESTS = 600
@@ -120,7 +120,7 @@ SKIPPED = {"sensors", "steps_as_stated", "readings", "measured", "limited"}
 @pytest.mark.parametrize("kind", LINES)
 def test_firmware_passes_conformance(kind: str, replaying: Path) -> None:
     """Every check of its wire; nothing is skipped but what it has not."""
-    results = firmware_results(kind, replaying)
+    results = judged(kind, far=partial(FirmwareEnd, kind, replaying))
     failed = [f"{each.check.name}: {each.reason}" for each in results if each.result == "failed"]
     assert not failed, failed
     assert {each.check.name for each in results if each.result == "skipped"} == (

@@ -1,8 +1,6 @@
 """`era daemon` as a process over a pseudo-terminal: commands, locks, notices, children."""
 
 import asyncio
-import json
-import signal
 import socket
 import time
 from pathlib import Path
@@ -17,7 +15,7 @@ from daemon_process import (
     playing,
     run_era,
 )
-from patient_daemon import PROGRAM, RESTING
+from patient_daemon import PROGRAM
 
 pytestmark = pytest.mark.real_time
 
@@ -45,56 +43,6 @@ async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> 
         assert b"Traceback" not in log
         assert (await era.status()).state == "OPERATION_ENABLED"
         await until(lambda: any(far.summary().levels))
-
-
-async def test_commands_control_daemon(tmp_path: Path) -> None:
-    """status, arm, touch, stop, clear and disarm with their exit statuses and JSON."""
-    async with (
-        far_end(tmp_path) as far,
-        daemon_process(tmp_path, far, program=RESTING) as daemon,
-    ):
-        where = ("--socket", daemon.socket)
-        status, out, _ = await run_era("status", *where, "--json")
-        shown = json.loads(out)
-        assert (status, shown["state"]) == (0, "READY_TO_SWITCH_ON")
-        status, _, err = await run_era("clear", *where)
-        assert (status, err) == (0, "")
-        arming = await asyncio.create_subprocess_exec(
-            *(ERA, "arm", "--lease", "30", *map(str, where)), stdout=asyncio.subprocess.PIPE
-        )
-        assert arming.stdout is not None
-        assert await asyncio.wait_for(arming.stdout.readline(), PATIENCE)
-        status, out, _ = await run_era("touch", "0.1,0.1", "0.25,0.2", "--for", 0.5, *where)
-        assert status == 0
-        assert "20.0 dB SL" in out
-        assert "buzz" in out
-        status, _, err = await run_era("arm", "--once", *where)
-        assert status == 1
-        assert "'era arm'" in err
-        arming.send_signal(signal.SIGINT)
-        assert await asyncio.wait_for(arming.wait(), PATIENCE) == 0
-        async with await daemon.client() as era:
-            await until_state(era, "READY_TO_SWITCH_ON")
-        status, out, _ = await run_era("stop", *where, "--json")
-        assert (status, json.loads(out)["state"]) == (0, "QUICK_STOP_ACTIVE")
-        status, out, _ = await run_era("clear", *where)
-        assert (status, out.partition(":")[0]) == (0, "ready")
-        assert far.summary().state == "SWITCH_ON_DISABLED"
-        arming = await asyncio.create_subprocess_exec(
-            *(ERA, "arm", "--lease", "3", *map(str, where)),
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-        )
-        assert arming.stdout is not None
-        await asyncio.wait_for(arming.stdout.readline(), PATIENCE)
-        async with await daemon.client() as era:
-            await era.disarm()
-        _, err_bytes = await asyncio.wait_for(arming.communicate(), PATIENCE)
-        assert arming.returncode == 1
-        assert b"ready: " in err_bytes or b"off: " in err_bytes
-    status, _, err = await run_era("status", *where)
-    assert status == 3
-    assert str(daemon.socket) in err
 
 
 async def _get(port: int, path: str, *, host: str = "localhost") -> str:

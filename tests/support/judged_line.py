@@ -1,7 +1,11 @@
-"""A simulated amplifier of protocol 3 in memory, on a virtual clock, and its conformance."""
+"""An amplifier of protocol 3 in memory, on a virtual clock, and its conformance.
+
+It is a simulated one, or any other far end of a wire: the firmware, an example.
+"""
 
 import asyncio
 from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 from drivers.conformance import CHECKS, LEVEL, CheckResult, of_kind
 from drivers.conformance.check import run_checks
@@ -10,6 +14,7 @@ from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from virtual_loop import run_virtual
 from words_line import KINDS as WIRES
+from words_line import FarEnd
 
 PROTOCOLS = {"serial": "serial", "rtu": "Modbus RTU", "tcp": "Modbus TCP", "can": "CAN"}
 KINDS = tuple(PROTOCOLS)
@@ -18,18 +23,26 @@ CLIENTS = {kind: BY_PROTOCOL[protocol] for kind, protocol in PROTOCOLS.items()}
 DELAY = 0.0002  # s; of bytes on their way
 _TURN = 0.0005  # s; between looks at what is due
 
+Judged: TypeAlias = Amplifier | Callable[[Callable[[bytes], None]], FarEnd]
+"""A simulated amplifier, or what makes the far end of a wire of the function that it sends by."""
+
 
 class JudgedLine:
-    """A line to a simulated amplifier at address 1; a `Port` of its client."""
+    """A line to an amplifier at address 1; a `Port` of its client."""
 
-    def __init__(self, kind: str, far: Amplifier) -> None:
+    def __init__(self, kind: str, far: Judged) -> None:
         self._loop = asyncio.get_running_loop()
         self.client = CLIENTS[kind](1)
         self.client.port = self
-        self._end = WIRES[kind].far_end({1: far}, self._send)
+        self._ticked: list[Amplifier | FarEnd] = []
+        if isinstance(far, Amplifier):
+            self._ticked.append(far)
+            self._end = WIRES[kind].far_end({1: far}, self._send)
+        else:
+            self._end = far(self._send)
+        self._ticked.append(self._end)
         if isinstance(self._end, CanAmplifiers):
             self._end.start(self._loop.time())
-        self._far = far
         self._ticking = self._loop.create_task(self._tick())
 
     def write(self, data: bytes) -> None:
@@ -46,9 +59,8 @@ class JudgedLine:
     async def _tick(self) -> None:
         """Let happen what is due by itself."""
         while True:
-            now = self._loop.time()
-            self._far.tick(now)
-            self._end.tick(now)
+            for each in self._ticked:
+                each.tick(self._loop.time())
             await asyncio.sleep(_TURN)
 
 
@@ -69,7 +81,7 @@ def varied(channels: int = 4) -> Amplifier:
 
 async def results_of(
     kind: str,
-    far: Amplifier,
+    far: Judged,
     names: Sequence[str] = (),
     *,
     level: float = LEVEL,
@@ -89,10 +101,10 @@ def judged(
     names: Sequence[str] = (),
     *,
     level: float = LEVEL,
-    far: Amplifier | None = None,
+    far: Judged | None = None,
     on_result: Callable[[CheckResult], None] = lambda result: None,
 ) -> list[CheckResult]:
-    """Results on a simulated amplifier, a `varied` one if none is given, in virtual time."""
+    """Results on an amplifier, a `varied` one if none is given, in virtual time."""
     unknown = set(names) - {check.name for check in CHECKS}
     assert not unknown, unknown
     far = far or varied()

@@ -1,10 +1,14 @@
 """The firmware in this process, on a clock that its caller moves: nothing of it takes real time."""
 
 import ctypes
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from drivers import clock
+from drivers.codec.can_bus.adapter_text import SLCAN, TextReader
+from drivers.codec.can_bus.segments import pack_frames, unpack_frames
 from model.arrays import FloatArray
 
 RATE = 16000
@@ -12,6 +16,8 @@ RATE = 16000
 
 SERIAL, MODBUS, CAN, TCP = range(4)
 """Its lines; TCP: Modbus over TCP, whose replies come from MODBUS."""
+LINES = {"serial": SERIAL, "rtu": MODBUS, "tcp": TCP, "can": CAN}
+"""The kinds of wires, with the line of each."""
 
 _FULL = 32767  # of a sample
 _RING = 8192  # bytes
@@ -62,3 +68,32 @@ class MovedFirmware:
     def set_interlock(self, *, is_open: bool) -> None:
         """Open or close its interlock."""
         self._library.moved_interlock(is_open)
+
+
+class FirmwareEnd:
+    """Firmware at address 1, the far end of a kind of wire; folder: its library."""
+
+    def __init__(self, kind: str, folder: Path, send: Callable[[bytes], None]) -> None:
+        self._firmware = MovedFirmware(folder)
+        self._began = clock.now()
+        self._line, self._send = LINES[kind], send
+        self._reader = TextReader(SLCAN)
+        self._firmware.receive(CAN, b"O\r")
+        self._firmware.sent(CAN)
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take bytes from the host at a time [s]."""
+        if self._line == CAN:
+            data = b"".join(map(SLCAN.encode, unpack_frames(data)))
+        self._firmware.move(now - self._began)
+        self._firmware.receive(self._line, data)
+        self.tick(now)
+
+    def tick(self, now: float) -> None:
+        """Move its clock, and send what it has to say."""
+        self._firmware.move(now - self._began)
+        data = self._firmware.sent(self._line)
+        if self._line == CAN:
+            data = pack_frames(self._reader.feed(data))
+        if data:
+            self._send(data)

@@ -230,27 +230,3 @@ async def test_frames_take_their_time_on_a_slow_line(coarse_rig: Rig, kind: str,
         words = 9 + 4 + 8  # of a status: numbers, levels, tokens
         least = 2 * words * bits / 9600
         assert least < clock.now() - begin < 2 * least + 0.02
-
-
-async def test_real_ports_are_unplugged_and_plugged_in(coarse_rig: Rig, wire: Wire) -> None:
-    """Real pseudo-terminals and TCP: a tone, the lost line, the watchdog, and a tone once more."""
-    async with rig_on_wire(coarse_rig, wire, watchdog=2.0) as rig:
-        await rig.group.arm()
-        await rig.group.apply({"main": [layer((0, 110.0, 0.5), ramp=0.0)]})
-        assert rig.levels("main")[0] == 0.5
-        rig.devices["main"].inject_fault(FaultWindow("unplug"))
-        with pytest.raises(LinkError):
-            await rig.beat_until(clock.now() + 5.0)
-        await asyncio.sleep(2.1)
-        assert not any(rig.levels("main"))
-        rig.devices["main"].recover()
-        await rig.reopen(within=10.0)
-        status = rig.group.amplifiers["main"].status
-        assert status is not None
-        assert status["fault"] == FAULTS["WATCHDOG"]
-        await rig.group.clear()
-        await rig.group.arm()
-        await rig.group.apply({"main": [layer((1, 110.0, 0.25), ramp=0.0)]})
-        assert rig.levels("main")[:2] == (0.0, 0.25)
-        stopped = await rig.group.stop()
-        assert stopped["main"].is_confirmed

@@ -100,7 +100,7 @@ class Scorer:
         self._frequencies, self._omega = frequencies, 2 * np.pi * frequencies
         uncertainty = rig.uncertainty
         std = uncertainty.thickness
-        self._thicknesses = (1.0, 1 + std, 1 - std) if std > 0 else (1.0,)
+        self._thicknesses = np.array([1.0, 1 + std, 1 - std] if std > 0 else [1.0])
         self._minus_omega2 = -(self._omega**2).astype(np.float32)[:, None, None]
         tip = rig.fingertip
         finger = np.zeros(len(frequencies)) if tip is None else tip.dynamic_stiffness(self._omega)
@@ -130,25 +130,19 @@ class Scorer:
         return self._solved(np.column_stack([at, np.full(len(at), self._rig.eras[0].foot)]))
 
     def _solved(self, footprints: FloatArray) -> Places:
-        solved = [
-            self._free.receptances(
-                footprints,
-                self._points,
-                self._frequencies,
-                loads=self._rig.masses,
-                thickness=thickness,
-            )
-            for thickness in self._thicknesses
-        ]
-        between, to_points = (
-            np.array(each, dtype=np.complex64) for each in zip(*solved, strict=True)
+        between, to_points = self._free.receptances(
+            footprints,
+            self._points,
+            self._frequencies,
+            loads=self._rig.masses,
+            thickness=self._thicknesses,
         )
-        to_tips = np.ascontiguousarray(to_points.swapaxes(2, 3))
+        to_tips = np.ascontiguousarray(to_points.swapaxes(2, 3), dtype=np.complex64)
         _, to_plate = self._free.receptances(
             footprints, self._cells, self._frequencies, loads=self._rig.masses
         )
         over_plate = np.asarray(to_plate.swapaxes(1, 2), dtype=np.complex64)
-        return Places(footprints[:, :2], between, to_tips, over_plate)
+        return Places(footprints[:, :2], between.astype(np.complex64), to_tips, over_plate)
 
     def mounts(self, eras: Sequence[Era]) -> Mounts:
         """What the score needs of ERAs, whose places do not matter."""

@@ -25,9 +25,9 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray
 from model.identification.derivatives import jacobian
 from model.identification.forward import PlateAt
-from model.identification.free_receptance import between, combined
 from model.identification.parameters import Space
 from model.identification.settled import SettledPattern, Touched
+from model.reduction.receptance import between, combined
 from model.structure.plate import Plate
 
 # m, of slopes by places (no closed form: `model.reduction.place_slopes`): right to 0.1 %, and
@@ -276,7 +276,7 @@ def _receptance(
     plate: PlateAt, alteration: Alteration, points: FloatArray, others: FloatArray
 ) -> ComplexArray:
     """Of the free plate between points and others, (n, m), truncated modes included if need be."""
-    functions, free = plate.functions.receptance, plate.model.free
+    functions, free = plate.functions.values, plate.model.free
     if alteration.is_of_modes:
         shapes, other_shapes = free.modes.shapes_at(points), free.modes.shapes_at(others)
         return np.asarray((shapes * functions[0, : shapes.shape[1]]) @ other_shapes.T)

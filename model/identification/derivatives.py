@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.forward import LEAST_LOSS, PlateAt
-from model.identification.free_receptance import between, combined
+from model.reduction.receptance import between, combined
 from model.structure.plate import LOSS_FREQUENCY
 
 AnyArray: TypeAlias = NDArray[np.floating[Any]] | NDArray[np.complexfloating[Any, Any]]
@@ -34,7 +34,7 @@ def jacobian(plate: PlateAt) -> ComplexArray:
 def by_mass_at(plate: PlateAt, points: FloatArray) -> ComplexArray:
     """Derivatives of the responses by a mass [kg] at points (p, 2) [m], (f, s, n, p)."""
     products = between(plate.model.free.modes, plate.located.footprints, points)
-    reach = plate.left @ combined(plate.functions.receptance, products)
+    reach = plate.left @ combined(plate.functions.values, products)
     return _outer(plate, reach, reach, _per_frequency(plate, len(points)))
 
 
@@ -51,11 +51,11 @@ def _by_plate(plate: PlateAt) -> Columns:
         n = plate.base.shape[1]
         return np.asarray(plate.scale * change[:, plate.model.observed, :n])[..., None]
 
-    by_stiffness = responses(functions.by_log_stiffness)
-    by_loss = responses(functions.by_log_loss)
+    by_stiffness = responses(functions.by_logarithms(1.0, 1.0))
+    by_loss = responses(functions.by_logarithms(plate.by_loss, plate.by_loss_of_rest))
     powers = np.log(plate.model.frequencies / LOSS_FREQUENCY)[:, None, None, None]
     return {
-        "thickness": 2 * by_stiffness - responses(functions.receptance),
+        "thickness": 2 * by_stiffness - responses(functions.values),
         "modulus": by_stiffness,
         "loss": by_loss,
         "loss_added": by_loss / max(plate.values.loss_factor, LEAST_LOSS),
@@ -67,7 +67,7 @@ def _by_modes(plate: PlateAt) -> Columns:
     modes, functions = plate.model.shifted_modes, plate.functions
     reach = plate.left @ plate.located.shapes[:, modes]
     by_stiffness = functions.by_mode[:, modes]
-    by_loss = functions.mode_loss[:, modes] * by_stiffness
+    by_loss = plate.by_mode_loss[:, modes] * by_stiffness
     return {
         "mode_shifts": _outer(plate, reach, reach, by_stiffness),
         "mode_losses": _outer(plate, reach, reach, by_loss),
@@ -81,7 +81,7 @@ def _by_places(plate: PlateAt) -> Columns:
     """
     model = plate.model
     n, moved = plate.base.shape[1], np.repeat(model.movable, 2)
-    rows = combined(plate.functions.receptance, plate.located.slopes)
+    rows = combined(plate.functions.values, plate.located.slopes)
     reach, own = plate.left @ rows.swapaxes(1, 2), plate.left[:, :, moved]
     ones = np.ones((len(model.omega), len(moved)))
     by_place = _outer(plate, own, reach, ones)

@@ -15,15 +15,11 @@ from typing import Self
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.identification.free_receptance import (
-    FrequencyFunctions,
-    Places,
-    combined,
-    places_of,
-)
 from model.identification.parameters import Space
+from model.identification.places import Places, places_of
 from model.identification.values import Values
 from model.reduction.free_plate import FreePlate
+from model.reduction.receptance import FreeReceptance, combined
 from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, attached_stiffness, footprints_of
 from model.structure.modal_elasticity import ModalElasticity, lowest_elastic
@@ -149,7 +145,9 @@ class ForwardModel:
 class PlateAt:
     """The plate of a forward model for one vector of parameters x (p,), a attachments on it.
 
-    values: of x; located: where all is; functions: of frequency; base (f, n): force of an ERA on
+    values: of x; located: where all is; functions: of frequency; by_loss, by_mode_loss (f, r) and
+    by_loss_of_rest (f,): change of the logarithm of their stiffness with that of the plate's loss
+    factor, and of all that a mode loses; base (f, n): force of an ERA on
     the plate per displacement of its base [N/m]; stiffness (f, a): of what is attached; receptance
     T, of the plate with its attachments, and left factor L (f, a, a); finger_slopes: by finger,
     derivatives of its dynamic stiffness by its parts (f, 4).
@@ -173,7 +171,7 @@ class PlateAt:
             np.zeros((len(w), len(model.pads))),
         ]
         self.stiffness = Z = np.concatenate(held, axis=1)
-        A = combined(self.functions.receptance, self.located.products)
+        A = combined(self.functions.values, self.located.products)
         # Nothing holds the plate at the sensors, the last ones.
         count = Z.shape[1] - len(model.pads)
         reaction = A[:, :, :count] * Z[:, None, :count]
@@ -204,7 +202,7 @@ class PlateAt:
     def _tips(self) -> list[Fingertip]:
         return [finger.fingertip for finger in self.model.fingers]
 
-    def _functions(self) -> FrequencyFunctions:
+    def _functions(self) -> FreeReceptance:
         model, values = self.model, self.values
         modes, theory = model.shifted_modes, model.elasticity
         eta = (
@@ -218,7 +216,6 @@ class PlateAt:
         rig, solved = model.rig.plate, model.free.plate
         thickness = values.thickness * rig.thickness / solved.thickness
         modulus = values.modulus * rig.material.E / solved.material.E
-        stiffer = modulus * thickness**2
         # Soft layers and air lose beside the plate's loss factor, and deviate with their mode.
         further = theory.losses.copy()
         further[modes] *= np.exp(values.mode_shifts + values.mode_losses)
@@ -226,20 +223,13 @@ class PlateAt:
         lossy = eigenvalues + 1j * (own + further)
         if theory.dispersion is not None:
             lossy = lossy + theory.dispersion.at(model.omega)
-        by_loss, by_mode_loss = (
+        self.by_loss, self.by_mode_loss = (
             np.divide(1j * each, lossy, out=np.zeros(lossy.shape, dtype=complex), where=lossy != 0)
             for each in (own, own + further)
         )
-        return FrequencyFunctions(
-            model.free,
-            model.omega,
-            np.asarray((1 + 1j * eta) * stiffer, dtype=complex),
-            thickness,
-            np.asarray(stiffer * lossy, dtype=complex),
-            by_loss,
-            by_mode_loss,
-            np.asarray(1j * eta / (1 + 1j * eta)),
-        )
+        self.by_loss_of_rest = np.asarray(1j * eta / (1 + 1j * eta))
+        stiffness = np.asarray(modulus * lossy, dtype=complex)
+        return model.free.receptance(model.omega, stiffness, eta, thickness, modulus)
 
     def _footprints(self) -> FloatArray:
         """Of ERAs, masses, additional masses, fingers and sensors, (a, 3) [m]."""

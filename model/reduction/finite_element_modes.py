@@ -8,7 +8,7 @@ from scipy import linalg
 from model.arrays import FloatArray
 from model.fem.mesh import DOF_PER_NODE, Mesh
 from model.fem.plate import RIGID_BODY_MODES, PlateMatrices, assemble, factorise, lowest_modes
-from model.reduction.truncation import RESIDUAL_ORDER, PointSolutions
+from model.reduction.truncation import RESIDUAL_ORDER
 from model.structure.footprint import as_footprints
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
@@ -17,7 +17,7 @@ _MAX_CACHE_BYTES = 256 << 20  # of solved points
 
 
 class FiniteElementModes:
-    """Modes of a free plate on a mesh, with a cache of solved points; see `free_plate.FreeModes`.
+    """Modes of a free plate on a mesh, with a cache of solved points (`receptance.FreeModes`).
 
     cut: all modes of omega² [rad²/s²] below it are solved; shift [rad²/s²]: of the factorisation.
     """
@@ -33,19 +33,12 @@ class FiniteElementModes:
         self.largest_truncated = 1 / (float(eigenvalues[min(kept, len(eigenvalues) - 1)]) + shift)
         self._solved: dict[tuple[float, ...], FloatArray] = {}
 
-    def solve_at(self, points: FloatArray) -> PointSolutions:
-        """Solve for forces at points [m] (n, 2), from the cache where possible."""
-        residuals = self._residuals(points)
-        return PointSolutions(
-            points, self.shapes_at(points), residuals, self.truncated_terms(points, points)
-        )
-
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
         return np.asarray(self._matrices.deflection_at(points) @ self._vectors)
 
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """Sums between points (n, 2) and others (m, 2), as in `PointSolutions`."""
+        """Sums between points (n, 2) and others (m, 2)."""
         own, other = self._residuals(points), self._residuals(others)
         heavy = np.array([self._matrices.mass @ each.T for each in other.swapaxes(0, 1)])
         terms = np.empty((2 * RESIDUAL_ORDER, len(own), len(other)))
@@ -54,16 +47,15 @@ class FiniteElementModes:
             terms[power - 1] = own[:, power // 2 - 1] @ heavy[(power + 1) // 2 - 1]
         return terms
 
-    def basis(self, attached: PointSolutions, points: FloatArray) -> FloatArray:
-        """Deflection at points of modes and residual vectors, (p, r + RESIDUAL_ORDER n)."""
-        (unknowns,) = self.unknowns(attached)
-        return np.asarray(self._matrices.deflection_at(points) @ unknowns)
+    def basis(self, points: FloatArray, others: FloatArray) -> FloatArray:
+        """Deflection at others of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
+        (unknowns,) = self.unknowns(points)
+        return np.asarray(self._matrices.deflection_at(others) @ unknowns)
 
-    def unknowns(self, attached: PointSolutions) -> tuple[FloatArray, ...]:
+    def unknowns(self, points: FloatArray) -> tuple[FloatArray, ...]:
         """The columns of `basis` in degrees of freedom, in one part."""
-        columns = RESIDUAL_ORDER * len(attached.points)
-        residuals = attached.residuals.transpose(2, 1, 0).reshape(self._matrices.dof, columns)
-        return (np.hstack([self._vectors, residuals]),)
+        residuals = self._residuals(points).swapaxes(0, 1).reshape(-1, self._matrices.dof)
+        return (np.hstack([self._vectors, residuals.T]),)
 
     def _residuals(self, points: FloatArray) -> FloatArray:
         """Residual vectors of forces at points or footprints, (n, RESIDUAL_ORDER, dof)."""

@@ -8,19 +8,19 @@ their number, independent of the mesh.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import TypeAlias
+from functools import cached_property
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.mesh import Mesh, check_frequencies
-from model.reduction.finite_element_modes import FiniteElementModes, finite_element_modes
-from model.reduction.spectral_modes import SpectralModes, spectral_modes
-from model.reduction.truncation import RESIDUAL_ORDER, PointSolutions, truncation_weights
+from model.reduction.finite_element_modes import finite_element_modes
+from model.reduction.receptance import FreeModes, FreeReceptance, between, combined
+from model.reduction.spectral_modes import spectral_modes
+from model.reduction.truncation import RESIDUAL_ORDER
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import (
     Era,
@@ -34,17 +34,6 @@ from model.structure.attachments import (
 from model.structure.footprint import as_footprints
 from model.structure.modal_elasticity import ModalElasticity, loss_factors
 from model.structure.plate import Plate
-
-FreeModes: TypeAlias = SpectralModes | FiniteElementModes
-"""Modes phi of a free plate up to a cut-off, and all truncated ones together by their sums.
-
-A truncated mode of eigenvalue lambda counts with u = 1 / (lambda + shift), in units of
-largest_truncated, u_c, that of the lowest [s²/rad²]. eigenvalues omega² (r,) [rad²/s²], and losses
-(r,), their imaginary part beside the plate's own loss factor; dispersion: how they change with
-frequency, None where they do not.
-"""
-
-_Functions: TypeAlias = Callable[[int], tuple[ComplexArray, ComplexArray]]
 
 FREQUENCY_MARGIN = 2.0
 """Modes are kept up to this multiple of frequency_max."""
@@ -78,16 +67,10 @@ class FreePlate:
         mesh carries, and for points off the plate.
         """
         omega = self._omega(frequencies)
-        attached = self.modes.solve_at(footprints_of(eras, loads))
         stiffness = attached_stiffness(eras, loads, omega)
         applied = on_diagonal(drive_forces(eras, omega), rows=stiffness.shape[1])
-        between = _between(attached, partial(self._modal_receptance, omega))
-        forces = coupled_forces(between, stiffness, applied)
-        modal_receptance, weights = self._modal_receptance(omega, RESIDUAL_ORDER)
-        modal = modal_receptance[:, :, None] * (attached.shapes.T @ forces)
-        residual = (weights[:, :, None, None] * forces[:, None]).reshape(len(omega), -1, len(eras))
-        coordinates = np.concatenate([modal, residual], axis=1)
-        displacement = _apply(self.modes.basis(attached, points), coordinates)
+        footprints = footprints_of(eras, loads)
+        _, displacement = self._moved(omega, footprints, stiffness, applied, points)
         return np.asarray(-(omega**2)[:, None, None] * displacement)
 
     def receptances(
@@ -97,45 +80,72 @@ class FreePlate:
         frequencies: FloatArray,
         *,
         loads: Sequence[Load] = (),
-        thickness: float = 1.0,
+        thickness: FloatArray | float = 1.0,
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Receptances [m/N] between places [m] (c, 2), (f, c, c), and to points (p, 2), (f, c, p).
+        """Receptances [m/N] between places (..., f, c, c), and from them to points (..., f, c, p).
 
-        Of the free plate with its loads, so many times as thick: a thin one, whose stiffness goes
-        as the cube of it. Layouts of ERAs at these places are then solved by systems as small as
-        their number of ERAs. Raises InputError as `acceleration`.
+        places (c, 2) or footprints (c, 3), points (p, 2) [m]; of the free plate with its loads, and
+        of plates so many times as thick (...). Layouts of ERAs at these places are then solved by
+        systems as small as their number of ERAs. Raises InputError as `acceleration`.
         """
-        omega = self._omega(frequencies)
-        attached = self.modes.solve_at(np.vstack([as_footprints(places), footprints_of(loads)]))
-        functions = partial(self._modal_receptance, omega, thickness=thickness)
-        basis = self.modes.basis(attached, points)
-        shapes, residual = np.split(basis, [len(self.modes.eigenvalues)], axis=1)
-        by_term = residual.reshape(-1, RESIDUAL_ORDER, len(attached.shapes)).T
-        modal, weights = functions(RESIDUAL_ORDER)
-        to_points = _apply(shapes, modal[:, :, None] * attached.shapes.T)
-        to_points += np.tensordot(weights, by_term, axes=(1, 1))
-        between = _between(attached, functions)
-        return _loaded(between, to_points, attached_stiffness((), loads, omega))
+        omega, count = self._omega(frequencies), len(places)
+        footprints = np.vstack([as_footprints(places), footprints_of(loads)])
+        stiffness = np.pad(attached_stiffness((), loads, omega), ((0, 0), (count, 0)))
+        applied = np.eye(len(footprints), count, dtype=complex)
+        to_places, to_points = self._moved(
+            omega, footprints, stiffness, applied, points, thickness=np.asarray(thickness)
+        )
+        return to_places[..., :count, :], to_points
+
+    def _moved(
+        self,
+        omega: FloatArray,
+        footprints: FloatArray,
+        stiffness: ComplexArray,
+        applied: ComplexArray,
+        points: FloatArray,
+        *,
+        thickness: FloatArray | float = 1.0,
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Displacement of attachments (..., f, a, m) and at points (..., f, m, p) by forces there.
+
+        footprints (a, 3) with dynamic stiffnesses (f, a), the forces applied to them ([f,] a, m).
+        """
+        eta, lossy = loss_factors(self.plate, omega), self._elasticity.stiffness(omega)
+        functions = self.receptance(omega, lossy, eta, thickness)
+        receptance = combined(functions.values, between(self.modes, footprints, footprints))
+        forces = coupled_forces(receptance, stiffness, applied)
+        # At points terms of residual vectors suffice, and only few are products of many points.
+        modal = functions.modal[..., None] * (self.modes.shapes_at(footprints).T @ forces)
+        terms = functions.truncated(RESIDUAL_ORDER)[..., None, None] * forces[..., None, :, :]
+        residual = terms.reshape(*terms.shape[:-3], -1, terms.shape[-1])
+        basis = self.modes.basis(footprints, points)
+        coordinates = np.concatenate([modal, residual], axis=-2).swapaxes(-1, -2)
+        return np.asarray(receptance @ forces), combined(coordinates, np.ascontiguousarray(basis.T))
+
+    def receptance(
+        self,
+        omega: FloatArray,
+        stiffness: ComplexArray,
+        loss_factor: FloatArray,
+        thickness: FloatArray | float = 1.0,
+        modulus: float = 1.0,
+    ) -> FreeReceptance:
+        """Functions of frequency of plates so many times as thick (...), and of another modulus.
+
+        stiffness (f, r): of modes [rad²/s²] at omega (f,) at that modulus, losses included;
+        loss_factor (f,): of truncated ones.
+        """
+        square = np.asarray(thickness)[..., None] ** 2
+        q = np.asarray((1 + 1j * loss_factor) * modulus * square, dtype=complex)
+        return FreeReceptance(
+            omega, thickness, q, stiffness, self.shift, self.modes.largest_truncated
+        )
 
     @cached_property
     def _elasticity(self) -> ModalElasticity:
         modes = self.modes
         return ModalElasticity.of(self.plate, modes.eigenvalues, modes.losses, modes.dispersion)
-
-    def _modal_receptance(
-        self, omega: FloatArray, terms: int, *, thickness: float = 1.0
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Receptance of each mode (f, r) [s²], and weights of the truncated ones, (f, terms).
-
-        1 / (h (h² ((1 + i eta) lambda + i loss) - omega²)) for an eigenvalue lambda at modal mass 1
-        of the plate h times as thick.
-        """
-        h = thickness
-        loss = (1 + 1j * loss_factors(self.plate, omega))[:, None]
-        shifted = np.asarray((omega / h) ** 2 / loss[:, 0] + self.shift, dtype=complex)
-        weights = truncation_weights(shifted, self.modes.largest_truncated, terms) / (loss * h**3)
-        receptance = 1 / (h * (h**2 * self._elasticity.stiffness(omega) - (omega**2)[:, None]))
-        return np.asarray(receptance, dtype=complex), np.asarray(weights, dtype=complex)
 
     def _omega(self, frequencies: FloatArray) -> FloatArray:
         """omega [rad/s] of frequencies [Hz]; raises InputError for those out of range."""
@@ -147,42 +157,6 @@ class FreePlate:
                 f"solved, got {frequencies.max():g} Hz; solve it with a higher frequency_max"
             )
         return 2 * np.pi * frequencies
-
-
-def _between(attached: PointSolutions, functions: _Functions) -> ComplexArray:
-    """Receptance between attachments, or its derivative, of functions of frequency (f, n, n)."""
-    modal, weights = functions(2 * RESIDUAL_ORDER)
-    by_modes = (modal[:, None, :] * attached.shapes) @ attached.shapes.T
-    return np.asarray(by_modes + np.tensordot(weights, attached.truncated_terms, axes=1))
-
-
-def _loaded(
-    between: ComplexArray, to_points: ComplexArray, stiffness: ComplexArray
-) -> tuple[ComplexArray, ComplexArray]:
-    """Receptances with the last attachments loaded by dynamic stiffnesses (f, l), of the others.
-
-    R - R_pl D (I + R_ll D)^-1 R_lp; places p, loads l, all receptances symmetric.
-    """
-    n = between.shape[1] - stiffness.shape[1]
-    if n == between.shape[1]:
-        return between, to_points
-    reaction = stiffness[:, :, None] * between[:, n:, :n]
-    forces = coupled_forces(between[:, n:, n:], stiffness, reaction).swapaxes(1, 2)
-    return (
-        between[:, :n, :n] - forces @ between[:, n:, :n],
-        to_points[:, :n] - forces @ to_points[:, n:],
-    )
-
-
-def _apply(basis: FloatArray, coordinates: ComplexArray) -> ComplexArray:
-    """A real basis (p, r) times complex coordinates (f, r, n): (f, n, p), in one real product."""
-    f, r, n = coordinates.shape
-    stacked = np.ascontiguousarray(coordinates.transpose(0, 2, 1)).view(float)
-    parts = stacked.reshape(f, n, r, 2).transpose(0, 1, 3, 2).reshape(-1, r)
-    product = (parts @ basis.T).reshape(f, n, 2, len(basis))
-    result = np.empty((f, n, len(basis)), dtype=complex)
-    result.real, result.imag = product[:, :, 0], product[:, :, 1]
-    return result
 
 
 def solve_free_plate(plate: Plate, mesh: PlateMesh, *, frequency_max: float = 500.0) -> FreePlate:

@@ -114,7 +114,7 @@ class ReducedPlate:
         residual = slice(own.stop, own.stop + len(transform))
         return tuple(
             np.hstack([each[:, own], each[:, residual] @ transform])
-            for each in modes.unknowns(modes.solve_at(self.origin.points))
+            for each in modes.unknowns(self.origin.points)
         )
 
     def projection_from(self, other: "ReducedPlate") -> FloatArray:
@@ -148,10 +148,11 @@ def reduce_plate(
 
 def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
     """Reduce a solved free plate for forces at the attachments [m] (n, 2)."""
-    attached = free.modes.solve_at(as_footprints(attachments))
+    attached = as_footprints(attachments)
     modes = len(free.modes.eigenvalues)
-    mass = _products(attached.truncated_terms, power=1)
-    shifted = _products(attached.truncated_terms, power=0)
+    truncated_terms = free.modes.truncated_terms(attached, attached)
+    mass = _products(truncated_terms, power=1)
+    shifted = _products(truncated_terms, power=0)
 
     # Orthonormal combinations of the residual vectors, then the eigenvectors among these.
     scale = 1 / np.sqrt(np.diagonal(mass))
@@ -174,7 +175,7 @@ def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
         np.concatenate([np.sqrt(free.modes.eigenvalues), omega]),
         np.concatenate([free.modes.losses, np.zeros(len(omega))]),
         shapes,
-        ReductionBasis(free, attached.points, attached.truncated_terms, residual_transform),
+        ReductionBasis(free, attached, truncated_terms, residual_transform),
         free.modes.dispersion and free.modes.dispersion.padded(len(omega)),
     )
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import FloatArray
-from model.reduction.truncation import RESIDUAL_ORDER, PointSolutions
+from model.reduction.truncation import RESIDUAL_ORDER
 from model.spectral.functions import CLASSES, deflections_by_class
 from model.spectral.local_compliance import (
     Unresolved,
@@ -39,7 +39,7 @@ class _Observed:
 
 
 class SpectralModes:
-    """Modes of a free plate in the polynomials of a mesh; see `FreeModes` of `free_plate`."""
+    """Modes of a free plate in the polynomials of a mesh; see `FreeModes` of `receptance`."""
 
     def __init__(
         self,
@@ -72,34 +72,28 @@ class SpectralModes:
         found._is_softer = True
         return found
 
-    def solve_at(self, points: FloatArray) -> PointSolutions:
-        """Solve for forces at points [m] (n, 2)."""
-        at = self._observe(points)
-        residuals = at.truncated[:, None] * self._powers[:RESIDUAL_ORDER]
-        return PointSolutions(points, at.shapes, residuals, self.truncated_terms(points, points))
-
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Mode shapes at points [m] (p, 2) or footprints (p, 3), (p, r)."""
         return self._observe(points).shapes
 
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """Sums between points (n, 2) and others (m, 2), as in `PointSolutions`."""
+        """Sums between points (n, 2) and others (m, 2)."""
         own, other = self._observe(points), self._observe(others)
         terms = (own.truncated * self._powers[:, None]) @ other.truncated.T
         terms[0] += self._local(own, other)
         return np.asarray(terms)
 
-    def basis(self, attached: PointSolutions, points: FloatArray) -> FloatArray:
-        """Deflection at points of modes and residual vectors, (p, r + RESIDUAL_ORDER n)."""
-        at, count = self._observe(points), len(attached.points)
-        extra = np.concatenate(attached.residuals.swapaxes(0, 1)) @ at.truncated.T
-        extra[:count] += self._local(self._observe(attached.points), at)
+    def basis(self, points: FloatArray, others: FloatArray) -> FloatArray:
+        """Deflection at others of modes and residual vectors, (m, r + RESIDUAL_ORDER n)."""
+        own, at = self._observe(points), self._observe(others)
+        extra = self._residuals(own) @ at.truncated.T
+        extra[: len(own.shapes)] += self._local(own, at)
         return np.hstack([at.shapes, extra.T])
 
-    def unknowns(self, attached: PointSolutions) -> tuple[FloatArray, ...]:
+    def unknowns(self, points: FloatArray) -> tuple[FloatArray, ...]:
         """The columns of `basis` by symmetry class, without the local compliance."""
         count, mode, rest, found = len(self.eigenvalues), 0, 0, []
-        residuals = np.concatenate(attached.residuals.swapaxes(0, 1))  # term by term
+        residuals = self._residuals(self._observe(points))
         for part in self._classes:
             modes, rests = len(part.eigenvalues), len(part.truncated)
             own = np.zeros((len(part.shapes), count + len(residuals)))
@@ -108,6 +102,10 @@ class SpectralModes:
             found.append(own)
             mode, rest = mode + modes, rest + rests
         return tuple(found)
+
+    def _residuals(self, at: _Observed) -> FloatArray:
+        """Residual vectors in truncated modes, term by term, (RESIDUAL_ORDER n, t)."""
+        return np.concatenate(at.truncated * self._powers[:RESIDUAL_ORDER, None])
 
     def _local(self, own: _Observed, other: _Observed) -> FloatArray:
         """Compliance in waves that the polynomials do not resolve, in units of u_c."""

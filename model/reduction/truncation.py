@@ -12,7 +12,6 @@ exactly. A Taylor series, the usual residual flexibility with its higher terms, 
 1 / |s u_c| with each term; this polynomial about four times as much.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -27,37 +26,22 @@ A field has this many terms, a receptance between points twice as many, from inn
 """
 
 
-@dataclass(frozen=True, eq=False)
-class PointSolutions:
-    """Points [m] (n, 2) where forces act on a free plate, with their residual vectors.
-
-    shapes: (n, r) of the modes; residuals: (n, RESIDUAL_ORDER, size), in truncated modes or degrees
-    of freedom; truncated_terms: sums of phi phi' (u / u_c)^j over the truncated modes, j = 1, 2,
-    ..., (2 RESIDUAL_ORDER, n, n).
-    """
-
-    points: FloatArray
-    shapes: FloatArray
-    residuals: FloatArray
-    truncated_terms: FloatArray
-
-
 def truncation_weights(
     shifted_eigenvalue: ComplexArray, largest: float, terms: int
 ) -> ComplexArray:
-    """Coefficients c with sum_j c_j (u / u_c)^j near u / (1 - s u) on (0, u_c]: (f, terms).
+    """Coefficients c with sum_j c_j (u / u_c)^j near u / (1 - s u) on (0, u_c], (..., terms).
 
-    shifted_eigenvalue: s (f,) [rad²/s²], |s u_c| below 1; largest: u_c. Weights have its unit.
+    shifted_eigenvalue: s (...) [rad²/s²], |s u_c| below 1; largest: u_c. Weights have its unit.
     """
     v, inverse = _interpolation(terms)
-    exact = 1 / (1 - largest * shifted_eigenvalue[:, None] * v)
+    exact = 1 / (1 - largest * shifted_eigenvalue[..., None] * v)
     return np.asarray(largest * exact @ inverse.T)
 
 
 def truncation_slopes(shifted_eigenvalue: ComplexArray, largest: float, terms: int) -> ComplexArray:
-    """Derivatives of `truncation_weights` by s: (f, terms)."""
+    """Derivatives of `truncation_weights` by s, (..., terms)."""
     v, inverse = _interpolation(terms)
-    exact = 1 / (1 - largest * shifted_eigenvalue[:, None] * v)
+    exact = 1 / (1 - largest * shifted_eigenvalue[..., None] * v)
     return np.asarray(largest**2 * (v * exact**2) @ inverse.T)
 
 

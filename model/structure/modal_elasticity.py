@@ -127,6 +127,18 @@ class ModalElasticity:
         return np.asarray(1j * self.losses + self.dispersion.at(omega))
 
 
+def modal_receptance(
+    stiffness: ComplexArray, omega: FloatArray, thickness: FloatArray | float = 1.0
+) -> ComplexArray:
+    """Receptance of modes of a complex stiffness (..., f, r) [rad²/s²], (..., f, r) [s²/kg].
+
+    1 / (h (h² stiffness - omega²)), of plates so many times as thick, thickness h (...): thin ones,
+    whose stiffness goes as the cube of it.
+    """
+    h = np.asarray(thickness)[..., None, None]
+    return np.asarray(1 / (h * (h**2 * stiffness - (omega**2)[:, None])), dtype=complex)
+
+
 def _powers(plate: Plate, omega: FloatArray) -> FloatArray:
     ratio = np.abs(omega) / (2 * np.pi * LOSS_FREQUENCY)
     return np.asarray(ratio**plate.loss_exponent)

@@ -22,7 +22,7 @@ from model.structure.attachments import (
     dynamic_stiffness,
     fingertip_loads,
 )
-from model.structure.modal_elasticity import ModalElasticity
+from model.structure.modal_elasticity import ModalElasticity, modal_receptance
 from model.table.question import Point, Question
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
@@ -169,13 +169,13 @@ def _response(
         ]
     )
     shapes = np.vstack([table.attachment_shapes, discs[:, 0]])
-    scale = plates.thickness[:, None]
     elasticity = ModalElasticity.of(
         table.plate, table.omega**2, table.losses, table.modal_dispersion
     )
     stiffness_of_modes = elasticity.stiffness(np.array([omega]))
     lost = 1j * plates.loss[:, None] * stiffness_of_modes.imag
-    modal = 1 / (((stiffness_of_modes.real + lost) * scale**2 - omega**2) * scale)
+    exact = (stiffness_of_modes.real + lost)[:, None]
+    modal = modal_receptance(exact, np.array([omega]), plates.thickness)[:, 0]
     receptance = np.asarray((modal[:, None, :] * shapes) @ shapes.T, dtype=complex)
     applied = np.zeros((*stiffness.shape, 1), dtype=complex)
     gains = np.array([complex(era.gain(np.array(frequency))) for era in table.eras])

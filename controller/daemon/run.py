@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import resource
 import signal
 import sys
 from collections.abc import Iterator
@@ -26,6 +27,7 @@ from model.table.table import LocalizationTable
 from model.table.table_cache import cached_table
 
 _IGNORED = (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+_MIN_ADDRESS_SPACE = 512  # MB; with less, libraries that it needs wait for memory for ever
 _SWITCH_INTERVAL = 0.001  # s; bounds how long another thread can delay the control loop
 
 _logger = logging.getLogger(__name__)
@@ -59,12 +61,7 @@ def run_daemon(path: Path, *, dashboard: str | None, trace: Path | None = None) 
         raise InputError(f"--dashboard: {error}") from error
     with ExitStack() as stack:
         stack.enter_context(_ignored_signals())
-        descriptors = allow_many_descriptors()
-        if descriptors < MIN_DESCRIPTORS:
-            raise InputError(
-                f"limit of open files must be at least {MIN_DESCRIPTORS}, got {descriptors}; raise "
-                "it (ulimit -n, LimitNOFILE=)"
-            )
+        _check_limits()
         if trace is not None:
             stack.enter_context(tracing(trace))
         config = load_daemon_config(path)
@@ -76,10 +73,30 @@ def run_daemon(path: Path, *, dashboard: str | None, trace: Path | None = None) 
         _run(config, lock, log=log, dashboard=address or config.section.dashboard)
 
 
+def _check_limits() -> None:
+    """Refuse to start where files or memory would run out."""
+    descriptors = allow_many_descriptors()
+    if descriptors < MIN_DESCRIPTORS:
+        raise InputError(
+            f"limit of open files must be at least {MIN_DESCRIPTORS}, got {descriptors}; raise it "
+            "(ulimit -n, LimitNOFILE=)"
+        )
+    space, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if space != resource.RLIM_INFINITY and space >> 20 < _MIN_ADDRESS_SPACE:
+        raise InputError(
+            f"limit of the address space must be at least {_MIN_ADDRESS_SPACE} MB, got "
+            f"{space >> 20} MB; raise it (ulimit -v, LimitAS=)"
+        )
+
+
 @contextmanager
 def _ignored_signals() -> Iterator[None]:
-    """Ignore signals that would end the daemon but request nothing of it, or too early."""
+    """Ignore signals that would end the daemon but request nothing of it, or too early.
+
+    SIGTERM ends it at once until it serves: nothing is open yet, and a library may be stuck.
+    """
     before = {number: signal.signal(number, signal.SIG_IGN) for number in _IGNORED}
+    before[signal.SIGTERM] = signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         yield
     finally:

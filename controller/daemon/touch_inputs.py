@@ -51,8 +51,12 @@ class TouchInputs:
         """Stop all sources, without waiting for one of a plug-in that does not end."""
         for task in self._running:
             task.cancel()
-        if self._running:
-            await asyncio.wait(self._running, timeout=_CLOSE_TIMEOUT)
+        if not self._running:
+            return
+        _, late = await asyncio.wait(self._running, timeout=_CLOSE_TIMEOUT)
+        for task in late:
+            _logger.warning("%s: does not end, continuing without it", task.get_name())
+            asyncio.tasks._unregister_task(task)  # else the end of the program would wait for it
 
     async def _run(self, touch_input: TouchInput) -> None:
         def deliver(frame: TouchFrame) -> None:

@@ -1,14 +1,17 @@
 """`era daemon` as a process over a pseudo-terminal: commands, locks, notices, children."""
 
 import asyncio
+import contextlib
+import signal
 import socket
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
 from controller.api.async_client import AsyncClient
-from daemon_bench import PATIENCE, far_end, until, until_state
+from daemon_bench import PATIENCE, far_end, until, until_state, write_daemon
 from daemon_process import (
     ERA,
     daemon_process,
@@ -43,6 +46,31 @@ async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> 
         assert b"Traceback" not in log
         assert (await era.status()).state == "OPERATION_ENABLED"
         await until(lambda: any(far.summary().levels))
+
+
+async def test_start_that_is_stuck_ends_by_sigterm(tmp_path: Path) -> None:
+    """In a library that looks at no signal, as one that waits for memory."""
+    stuck = (
+        "import ctypes, controller.daemon.run as daemon\nfrom controller.cli.main import main\n"
+        "def table(config):\n"
+        "    lock, mutex = ctypes.CDLL(None).pthread_mutex_lock, ctypes.create_string_buffer(64)\n"
+        "    print(flush=True)\n"
+        "    lock(mutex), lock(mutex)\n"
+        "daemon._table = table\nmain()"
+    )
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", stuck, "daemon", write_daemon(tmp_path, {"main": "sim://"})),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    assert process.stdout is not None
+    assert await asyncio.wait_for(process.stdout.readline(), PATIENCE)
+    process.terminate()
+    try:
+        assert await asyncio.wait_for(process.wait(), PATIENCE) == -signal.SIGTERM
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
 
 
 async def _get(port: int, path: str, *, host: str = "localhost") -> str:

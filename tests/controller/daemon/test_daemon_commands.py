@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import resource
 import socket
 import subprocess
 import sys
@@ -90,6 +91,17 @@ def test_daemon_refuses_to_start_with_few_descriptors(
     """Below 64 its own files and 40 clients would use them up."""
     monkeypatch.setattr("controller.daemon.run.allow_many_descriptors", lambda: 63)
     with pytest.raises(InputError, match="64, got 63"):
+        run_daemon(write_daemon(tmp_path, {"main": "sim://"}), dashboard=None)
+
+
+def test_daemon_refuses_to_start_with_little_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Within 300 MB of addresses a library waits for more of them for ever."""
+    limits = {resource.RLIMIT_AS: (300 << 20, resource.RLIM_INFINITY)}
+    others = resource.getrlimit
+    monkeypatch.setattr(resource, "getrlimit", lambda what: limits.get(what) or others(what))
+    with pytest.raises(InputError, match="512 MB, got 300 MB"):
         run_daemon(write_daemon(tmp_path, {"main": "sim://"}), dashboard=None)
 
 

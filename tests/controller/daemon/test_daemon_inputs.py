@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import random
 import socket
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -120,25 +121,31 @@ async def test_inputs_run_beside_each_other(
     assert (panels["a:"].ended, panels["c:"].ended) == (["x\x1b[2J"], ["z"])
 
 
-async def test_closing_waits_for_no_source_that_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_closing_waits_for_no_source_that_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """A plug-in that swallows its cancellation holds neither a reload nor the exit."""
-    release, started = asyncio.Event(), asyncio.Event()
+    started = asyncio.Event()
 
     class Stubborn(TouchSource):
         async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
             started.set()
-            while not release.is_set():
+            while True:
                 with contextlib.suppress(asyncio.CancelledError):
-                    await release.wait()
+                    await asyncio.sleep(60)
 
     monkeypatch.setattr("controller.daemon.config.open_source", lambda url: Stubborn())
     monkeypatch.setattr("controller.daemon.touch_inputs._CLOSE_TIMEOUT", 0.0)
-    inputs = TouchInputs(lambda frame: None, failed=lambda name, error: None)
-    inputs.start([TouchInput("left", "a:", TouchCalibration())])
-    await started.wait()
-    async with asyncio.timeout(20):
+
+    async def serve() -> None:
+        inputs = TouchInputs(lambda frame: None, failed=lambda name, error: None)
+        inputs.start([TouchInput("left", "a:", TouchCalibration())])
+        await started.wait()
         await inputs.close()
-    release.set()
+
+    program = threading.Thread(target=asyncio.run, args=(serve(),), daemon=True)
+    program.start()
+    program.join(20)
+    assert not program.is_alive()
 
 
 async def test_failed_input_is_restarted_after_growing_pauses(

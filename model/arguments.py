@@ -31,6 +31,21 @@ def expect_at_least(value: float, least: float, *, what: str) -> None:
         raise InputError(f"{what} must be finite and at least {least:g}, got {value}")
 
 
+def expect_values(
+    of: object, what: str, *, above: str = "", at_least: str = "", finite: str = ""
+) -> None:
+    """Raise InputError for attributes that are not finite, negative ones, or 0 where above it.
+
+    above, at_least, finite: names of attributes with spaces between.
+    """
+    for name in f"{above} {at_least} {finite}".split():
+        value, is_above = getattr(of, name), name in above.split()
+        if not math.isfinite(value) or (name not in finite.split() and value < 0):
+            raise InputError(f"{what}: {name} must be finite and not negative, got {value}")
+        if is_above and value == 0:
+            raise InputError(f"{what}: {name} must be above zero, got {value}")
+
+
 def expect_one_of(names: Iterable[str], value: object, *, what: str) -> None:
     """Raise InputError for anything but one of these names."""
     known = tuple(names)

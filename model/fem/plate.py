@@ -117,56 +117,31 @@ def direct_acceleration(
     return result
 
 
-@dataclass(frozen=True)
-class Modes:
-    """Natural frequencies [Hz] (n,), ascending, and mode shapes as deflections at the mesh nodes.
+def simply_supported_modes(
+    matrices: PlateMatrices, count: int, loads: Sequence[PointLoad] = ()
+) -> tuple[FloatArray, FloatArray]:
+    """Natural frequencies (n,) [Hz], ascending, and undamped modes (dof, n) of modal mass 1.
 
-    mode_shapes: (node_count, n), scaled to modal mass 1 [1/sqrt(kg)].
+    Without deflection on all four edges, where rotations are free. Raises InputError for a count
+    above what the mesh has.
     """
-
-    natural_frequencies: FloatArray
-    mode_shapes: FloatArray
-
-
-def modes(
-    matrices: PlateMatrices,
-    count: int,
-    *,
-    support: str,
-    eras: Sequence[Era] = (),
-    loads: Sequence[PointLoad] = (),
-) -> Modes:
-    """Solve for the lowest `count` undamped modes; of a free plate only the elastic ones.
-
-    support: `free`, `eras`, with their stiffness and bolt mass, or `simply-supported`: no
-    deflection on all four edges, rotations free. loads act with any. Raises InputError for a count
-    below 1 or above what the mesh has.
-    """
-    if count < 1:
-        raise InputError(f"modes must be 1 or more, got {count}")
-    stiffness, mass, mesh = matrices.stiffness, matrices.mass, matrices.mesh
-    attachments = [*loads, *(map(PointLoad.of_era, eras) if support == "eras" else ())]
-    if attachments:
-        touch = matrices.deflection_at(footprints_of(attachments))
-        springs = sparse.diags_array(np.array([load.stiffness for load in attachments]))
-        masses = sparse.diags_array(np.array([load.mass for load in attachments]))
-        stiffness = stiffness + touch.T @ springs @ touch
-        mass = mass + touch.T @ masses @ touch
+    mesh, touch = matrices.mesh, matrices.deflection_at(footprints_of(loads))
+    springs = sparse.diags_array(np.array([load.stiffness for load in loads], dtype=float))
+    masses = sparse.diags_array(np.array([load.mass for load in loads], dtype=float))
     is_free = np.ones((mesh.rows, mesh.columns, DOF_PER_NODE), dtype=bool)
-    if support == "simply-supported":
-        is_free[[0, -1], :, 0] = is_free[:, [0, -1], 0] = False
+    is_free[[0, -1], :, 0] = is_free[:, [0, -1], 0] = False
     free = np.flatnonzero(is_free)
-    rigid = RIGID_BODY_MODES if support == "free" else 0
     eigenvalues, vectors = lowest_modes(
-        sparse.csc_array(sparse.csc_array(stiffness)[free][:, free]),
-        sparse.csc_array(sparse.csc_array(mass)[free][:, free]),
-        count + rigid,
+        sparse.csc_array(
+            sparse.csc_array(matrices.stiffness + touch.T @ springs @ touch)[free][:, free]
+        ),
+        sparse.csc_array(sparse.csc_array(matrices.mass + touch.T @ masses @ touch)[free][:, free]),
+        count,
         shift=(2 * np.pi * matrices.plate.lowest_bending_frequency) ** 2,
     )
     whole = np.zeros((matrices.dof, count))
-    whole[free] = vectors[:, rigid:]
-    frequencies = np.sqrt(np.maximum(eigenvalues[rigid:], 0)) / (2 * np.pi)
-    return Modes(frequencies, whole[::DOF_PER_NODE])
+    whole[free] = vectors
+    return np.sqrt(np.maximum(eigenvalues, 0)) / (2 * np.pi), whole
 
 
 def lowest_modes(

@@ -12,14 +12,13 @@ The plate on its attachments is a low-rank correction of the free plate (Woodbur
 import cmath
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from itertools import pairwise
+from dataclasses import asdict, dataclass, replace
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arguments import expect_at_least
+from model.arguments import expect_values
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 
@@ -49,34 +48,16 @@ class Era:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        for key in ("x", "y", "stiffness", "damping", "bolt_mass", "stroke", "foot"):
-            if not math.isfinite(getattr(self, key)):
-                raise InputError(f"ERA {self.name}: {key} must be finite, got {getattr(self, key)}")
-        for key in ("stiffness", "stroke"):
-            if getattr(self, key) <= 0:
-                raise InputError(
-                    f"ERA {self.name}: {key} must be above zero, got {getattr(self, key)}"
-                )
-        for key in ("damping", "bolt_mass", "foot"):
-            if getattr(self, key) < 0:
-                raise InputError(
-                    f"ERA {self.name}: {key} must not be negative, got {getattr(self, key)}"
-                )
+        expect_values(
+            self,
+            f"ERA {self.name}",
+            above="stiffness stroke",
+            at_least="damping bolt_mass foot",
+            finite="x y",
+        )
         # A file gives lists; only tuples can be compared and hashed with the rest.
         gains = tuple((float(f), float(size), float(phase)) for f, size, phase in self.gains)
         object.__setattr__(self, "gains", gains)
-        for frequency, size, phase in gains:
-            if not (math.isfinite(frequency + size + phase) and frequency > 0 and size > 0):
-                raise InputError(
-                    f"ERA {self.name}: gains must be finite and above zero, got {size} with phase "
-                    f"{phase} at {frequency} Hz"
-                )
-        for (low, *_), (high, *_) in pairwise(gains):
-            if low >= high:
-                raise InputError(
-                    f"ERA {self.name}: frequencies of gains must ascend, got {high} Hz after "
-                    f"{low} Hz"
-                )
 
     def gain(self, frequencies: FloatArray) -> ComplexArray:
         """Complex gain at frequencies [Hz], of their shape; 1 without measured gains.
@@ -122,11 +103,8 @@ class Fingertip:
 
     def __post_init__(self) -> None:
         """Refuse values not finite or negative, no damping of the pulp, and no phalanx."""
-        for key in (field.name for field in fields(self)):
-            expect_at_least(getattr(self, key), 0.0, what=f"fingertip: {key}")
-        for key, unit in (("damping", "N s/m"), ("phalanx_mass", "kg")):
-            if getattr(self, key) == 0:
-                raise InputError(f"fingertip: {key} must be above 0 {unit}, got 0")
+        held = "stiffness contact_mass joint_stiffness joint_damping"
+        expect_values(self, "fingertip", above="damping phalanx_mass", at_least=held)
 
     def dynamic_stiffness(self, omega: FloatArray | ComplexArray) -> ComplexArray:
         """Force on the plate per displacement of the contact at omega [rad/s], of its shape [N/m].
@@ -217,12 +195,7 @@ class PointLoad:
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, and loads that add energy."""
-        for key in ("x", "y", "stiffness", "damping", "mass", "foot"):
-            value = getattr(self, key)
-            if not math.isfinite(value):
-                raise InputError(f"point load: {key} must be finite, got {value}")
-            if key not in ("x", "y") and value < 0:
-                raise InputError(f"point load: {key} must not be negative, got {value}")
+        expect_values(self, "point load", at_least="stiffness damping mass foot", finite="x y")
 
     @property
     def numbers(self) -> dict[str, float]:

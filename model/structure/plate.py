@@ -35,6 +35,7 @@ from bisect import bisect_left
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from model.arguments import expect_values
 from model.errors import InputError
 
 
@@ -52,9 +53,7 @@ class Material:
 
     def __post_init__(self) -> None:
         """Refuse values of no isotropic solid."""
-        for key, value in (("E", self.E), ("rho", self.rho)):
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(f"material {self.name}: {key} must be above zero, got {value}")
+        expect_values(self, f"material {self.name}", above="E rho")
         if not -1 < self.nu < 0.5:
             raise InputError(
                 f"material {self.name}: nu must be between -1 and 0.5, got {self.nu} (most solids: "
@@ -90,8 +89,7 @@ class Layer:
 
     def __post_init__(self) -> None:
         """Refuse a thickness that is not above zero."""
-        if not (math.isfinite(self.thickness) and self.thickness > 0):
-            raise InputError(f"layer: thickness must be above zero, got {self.thickness} m")
+        expect_values(self, "layer", above="thickness")
 
     def modulus(self, frequency: float) -> complex:
         """E (1 + i eta) [Pa] at a frequency [Hz]."""
@@ -183,8 +181,7 @@ class AirGap:
 
     def __post_init__(self) -> None:
         """Refuse a depth that is not above zero."""
-        if not (math.isfinite(self.depth) and self.depth > 0):
-            raise InputError(f"air gap: depth must be above zero, got {self.depth} m")
+        expect_values(self, "air gap", above="depth")
 
     def coupling_error(self, frequency: float) -> float:
         """Error of the response where friction couples modes, which is left out, at least [-].
@@ -243,27 +240,14 @@ class Plate:
 
     def __post_init__(self) -> None:
         """Refuse dimensions out of range."""
-        for key in ("length", "width", "thickness"):
-            value = getattr(self, key)
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(f"plate: {key} must be above zero, got {value} m")
+        expect_values(self, "plate", above="length width thickness")
         if not (math.isfinite(self.loss_factor) and 0 <= self.loss_factor < 1):
             raise InputError(
                 f"plate: loss_factor must be between 0 and 1, got {self.loss_factor} (0.01 is 1 %)"
             )
-        if not abs(self.loss_exponent) <= MAX_LOSS_EXPONENT:  # False for NaN
-            raise InputError(
-                f"plate: loss_exponent must be between -{MAX_LOSS_EXPONENT:g} and "
-                f"{MAX_LOSS_EXPONENT:g}, got {self.loss_exponent}"
-            )
         # A file gives lists; only tuples can be compared and hashed with the rest.
         deviations = tuple((float(a), float(b)) for a, b in self.mode_deviations)
         object.__setattr__(self, "mode_deviations", deviations)
-        if not all(abs(a) <= 0.5 and abs(b) <= 5 for a, b in deviations):
-            raise InputError(
-                "plate: logarithms of mode_deviations must be up to 0.5 of an eigenvalue and 5 of "
-                f"a loss factor, got {deviations}"
-            )
 
     @property
     def is_layered(self) -> bool:

@@ -129,9 +129,10 @@ def study_convergence(
             f"{checked.max():g} Hz; take lower frequencies or raise the limit"
         )
     reference = _reference(rig)
-    exact = _natural_frequencies(rig, reference)
+    solved = _solved(rig, reference)
+    exact = _natural_frequencies(rig, solved)
     supported = exact > _MIN_FREQUENCY_RATIO * rig.plate.lowest_bending_frequency
-    (exact_response,) = _responses(rig, _solved(rig, reference), rig.eras, frequencies=checked)
+    (exact_response,) = _responses(rig, solved, rig.eras, frequencies=checked)
     size = np.linalg.norm(exact_response, axis=2)
     errors = []
     for done, mesh in enumerate(meshes, start=1):
@@ -143,7 +144,7 @@ def study_convergence(
             MeshError(
                 mesh,
                 dof=mesh.dof,
-                frequency=_natural_frequencies(rig, mesh)[supported] / exact[supported] - 1,
+                frequency=_natural_frequencies(rig, free)[supported] / exact[supported] - 1,
                 response=(difference / size).max(axis=1),
                 estimate=_estimate(rig, free, checked),
             )
@@ -196,8 +197,9 @@ def _reference(rig: Rig) -> PlateMesh:
     return replace(automatic, nx=2 * automatic.nx, ny=2 * automatic.ny)
 
 
-def _natural_frequencies(rig: Rig, mesh: PlateMesh) -> FloatArray:
-    return natural_modes(rig, MODE_COUNT, support="eras", mesh=mesh).frequencies
+def _natural_frequencies(rig: Rig, free: FreePlate) -> FloatArray:
+    solved = natural_modes(rig, MODE_COUNT, support="eras", mesh=free.mesh, free=free)
+    return solved.frequencies
 
 
 def _responses(

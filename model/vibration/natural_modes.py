@@ -1,9 +1,9 @@
 """A plate on any mesh: natural modes for any support, and its response solved directly."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy import linalg
@@ -11,8 +11,14 @@ from scipy import linalg
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.mesh import Mesh
-from model.fem.plate import RIGID_BODY_MODES, assemble, direct_acceleration, modes
-from model.reduction.reduced_plate import ReducedPlate, reduce_plate
+from model.fem.plate import (
+    RIGID_BODY_MODES,
+    assemble,
+    direct_acceleration,
+    simply_supported_modes,
+)
+from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import PlateMesh, SpectralMesh
@@ -23,48 +29,53 @@ from model.structure.plate import Plate
 
 @dataclass(frozen=True, eq=False)
 class NaturalModes:
-    """Undamped modes: frequencies (n,) [Hz], ascending, and shapes (p, n) [1/sqrt(kg)] at points.
+    """Undamped modes: frequencies (n,) [Hz], ascending, and shapes by `at`.
 
-    mesh: that they were solved on.
+    basis: functions at points (p, m), of which the modes are columns of coordinates (m, n); mesh:
+    that they were solved on.
     """
 
     frequencies: FloatArray
-    at: Callable[[FloatArray], FloatArray]
+    basis: Callable[[FloatArray], Any]
+    coordinates: FloatArray
     mesh: PlateMesh
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """Shapes at points (p, 2) [m], (p, n) [1/sqrt(kg)]."""
+        return np.asarray(self.basis(points) @ self.coordinates)
+
+    def only(self, chosen: slice) -> "NaturalModes":
+        """Some of them."""
+        return replace(
+            self,
+            frequencies=self.frequencies[chosen],
+            coordinates=self.coordinates[:, chosen],
+        )
+
+
+_BEYOND = 4.0  # times what a mesh resolves: coarse ones are compared with others, too
 
 
 def natural_modes(
-    rig: Rig, count: int, *, support: str, mesh: PlateMesh | None = None
+    rig: Rig,
+    count: int,
+    *,
+    support: str,
+    mesh: PlateMesh | None = None,
+    free: FreePlate | None = None,
 ) -> NaturalModes:
     """Solve for the lowest modes of a rig, on a mesh, by default its own.
 
     support: free (elastic modes only), eras or simply-supported, for which polynomials over the
-    plate give way to finite elements. Raises InputError for a count below 1 or above what the mesh
-    has, and for a simply supported plate of layers.
+    plate give way to finite elements; free: its plate where it has been solved on the mesh. Raises
+    InputError for a count below 1 or above what the mesh has, and for a simply supported plate of
+    layers.
     """
-    chosen = rig.mesh if mesh is None else mesh
-    if isinstance(chosen, SpectralMesh):
-        if support != "simply-supported":
-            return _on_polynomials(rig, count, support=support, mesh=chosen)
-        if rig.plate.is_layered:
-            raise InputError(
-                "support must be free or eras for a plate of layers or with an air gap, got "
-                f"{support}: finite elements of it are not solved"
-            )
-        chosen = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
-    elements = chosen
-    matrices = assemble(rig.plate, elements)
-    solved = modes(matrices, count, support=support, eras=rig.eras, loads=rig.masses)
-
-    def shapes_at(points: FloatArray) -> FloatArray:
-        return np.asarray(elements.interpolation(points) @ solved.mode_shapes)
-
-    return NaturalModes(solved.natural_frequencies, shapes_at, elements)
-
-
-def _on_polynomials(rig: Rig, count: int, *, support: str, mesh: SpectralMesh) -> NaturalModes:
     if count < 1:
         raise InputError(f"modes must be 1 or more, got {count}")
+    chosen = mesh or rig.mesh
+    if support == "simply-supported":
+        return _simply_supported(rig, count, chosen)
     attached = list(rig.masses)
     if support == "eras":
         attached += [PointLoad.of_era(era) for era in rig.eras]
@@ -73,35 +84,44 @@ def _on_polynomials(rig: Rig, count: int, *, support: str, mesh: SpectralMesh) -
     rigid = RIGID_BODY_MODES - (gap is not None and gap.closed) if support == "free" else 0
     highest = rig.limits.frequency_max
     while True:
-        reduced = reduce_plate(rig.plate, mesh, footprints_of(attached), frequency_max=highest)
-        frequencies, coordinates = _modes_with(reduced, attached)
-        found = int((frequencies <= highest).sum()) - rigid
+        solved = free or solve_free_plate(rig.plate, chosen, frequency_max=highest)
+        modes = _modes_with(solved, attached)
+        found = int((modes.frequencies <= highest).sum()) - rigid
         if found >= count:
             break
-        if highest > mesh.highest_frequency(rig.plate):
+        if highest > _BEYOND * chosen.highest_frequency(rig.plate):
             raise InputError(
-                f"modes must be at most {found} with mesh {mesh}, got {count}; take fewer modes or "
-                "higher degrees"
+                f"modes must be at most {found} with mesh {chosen}, got {count}; take fewer modes "
+                "or a finer mesh"
             )
-        highest *= 1.5
-    chosen = slice(rigid, rigid + count)
-    return NaturalModes(
-        frequencies[chosen], partial(_shapes, reduced, coordinates[:, chosen]), mesh
-    )
+        highest, free = 1.5 * highest, None
+    return modes.only(slice(rigid, rigid + count))
 
 
-def _modes_with(reduced: ReducedPlate, attached: list[PointLoad]) -> tuple[FloatArray, FloatArray]:
-    """Frequencies [Hz] (r,) and coordinates (r, r) of the undamped plate with attachments."""
+def _modes_with(free: FreePlate, attached: list[PointLoad]) -> NaturalModes:
+    """All modes of the undamped plate with attachments, of the truncated ones some mixtures."""
+    reduced = reduce_free_plate(free, footprints_of(attached))
     phi = reduced.at(footprints_of(attached)).T
     elastic = ModalElasticity.of(reduced.plate, reduced.omega**2, reduced.losses).eigenvalues
     K = np.diag(elastic) + (phi * [load.stiffness for load in attached]) @ phi.T
     M = np.eye(len(K)) + (phi * [load.mass for load in attached]) @ phi.T
     squares, coordinates = linalg.eigh(K, M)
-    return np.sqrt(np.maximum(squares, 0)) / (2 * np.pi), coordinates
+    frequencies = np.sqrt(np.maximum(squares, 0)) / (2 * np.pi)
+    return NaturalModes(frequencies, reduced.at, coordinates, free.mesh)
 
 
-def _shapes(reduced: ReducedPlate, coordinates: FloatArray, points: FloatArray) -> FloatArray:
-    return np.asarray(reduced.at(points) @ coordinates)
+def _simply_supported(rig: Rig, count: int, mesh: PlateMesh) -> NaturalModes:
+    """Modes of finite elements, whose shapes are those of the nodes."""
+    if rig.plate.is_layered:
+        raise InputError(
+            "support must be free or eras for a plate of layers or with an air gap, got "
+            "simply-supported: finite elements of it are not solved"
+        )
+    if isinstance(mesh, SpectralMesh):
+        mesh = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
+    matrices = assemble(rig.plate, mesh)
+    frequencies, unknowns = simply_supported_modes(matrices, count, rig.masses)
+    return NaturalModes(frequencies, matrices.deflection_at, unknowns, mesh)
 
 
 Responder: TypeAlias = Callable[..., ComplexArray]

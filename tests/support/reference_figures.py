@@ -16,12 +16,12 @@ from model.design.layouts import layouts_of
 from model.design.problem import DesignProblem
 from model.design.search import LayoutSearch
 from model.drive_modes import DRIVE_MODES
-from model.fem.plate import assemble, modes
 from model.table.build import solve_table
 from model.table.query import query_table
 from model.table.question import Question
 from model.table.timing import Timing
 from model.version import NUMERICS_VERSION
+from model.vibration.natural_modes import natural_modes
 from paper_plate import make_paper_rig
 from small_table import small_problem
 
@@ -33,11 +33,8 @@ CONTACTS = {"quiet": ((0.22, 0.16), (0.05, 0.19)), "alone": ()}
 def reference_figures() -> dict[str, list[float]]:
     """Figures by name; levels and contrasts, found by searches, end in _db."""
     rig = make_paper_rig(12, 9)
-    matrices = assemble(rig.plate, rig.mesh)
     figures = {
-        f"natural_frequencies_{support}": modes(
-            matrices, 5, support=support, eras=rig.eras
-        ).natural_frequencies
+        f"natural_frequencies_{support}": natural_modes(rig, 5, support=support).frequencies
         for support in ("eras", "simply-supported")
     }
     table = solve_table(small_problem(), drive_mode="switched")

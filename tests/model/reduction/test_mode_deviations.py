@@ -5,15 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from model.config.document import ConfigError
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
-from model.rig.file import example_rig_path, load_rig
+from model.rig.file import example_rig_path, load_rig, parse_rig
 from model.rig.rig import Rig
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import footprints_of
-from model.structure.plate import LOSS_FREQUENCY, Plate
+from model.structure.plate import LOSS_FREQUENCY
 
 FREQUENCIES = np.array([65.0, 150.0, 240.0, 430.0])
 DEVIATIONS = ((0.02, 0.3), (0.0, 0.0), (-0.03, -0.4))
@@ -79,11 +80,9 @@ def test_plate_in_time_has_them(rig: Rig) -> None:
         assert error < 0.01
 
 
-@pytest.mark.parametrize(
-    "values",
-    [{"loss_exponent": 3.0}, {"loss_exponent": float("nan")}, {"mode_deviations": ((0.9, 0.0),)}],
-)
-def test_plate_refuses_what_is_no_deviation(rig: Rig, values: dict[str, float]) -> None:
-    """Exponents and deviations beyond what a plate may have are refused."""
-    with pytest.raises(InputError):
-        Plate(**{**vars(rig.plate), **values})
+@pytest.mark.parametrize("wrong", ["loss_exponent: 3", "modes: [[1.5, 1]]", "modes: [[1, 0]]"])
+def test_rig_file_refuses_what_is_no_deviation(wrong: str) -> None:
+    """Exponents and deviations beyond what a plate may have are refused where they are read."""
+    text = example_rig_path().read_text()
+    with pytest.raises(ConfigError):
+        parse_rig("rig.yaml", text.replace("loss_factor:", f"{wrong}\n  loss_factor:"))

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from functools import partial
 
 from controller.api.connection import Connection
-from controller.api.peer import credentials_of
+from controller.api.place import credentials_of
 from controller.api.rate_limit import RateLimiter
 
 MAX_CONNECTIONS = 32  # for all methods

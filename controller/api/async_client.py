@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
+from controller.api.calls import AsyncCalls
 from controller.api.channel import Channel
 from controller.api.client_protocol import (
-    DEFAULT_LEASE,
     RESPONSE_TIMEOUT,
     ConnectionLost,
     LeaseLost,
@@ -28,17 +28,17 @@ from controller.api.client_protocol import (
     touches_at,
 )
 from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.link import DaemonLink
 from controller.api.methods import (
+    DEFAULT_LEASE,
     METHODS,
     ArmResult,
-    EffectsResult,
-    HelloResult,
-    RenewResult,
+    ClearParams,
+    HelloParams,
     StatusResult,
-    StopResult,
 )
+from controller.api.place import find_socket
 from controller.api.schema import Empty, Message, Topic, headline
-from controller.api.socket_path import find_socket
 from drivers.pauses import pauses
 
 MAX_QUEUED_EVENTS = 1000  # not yet taken; the oldest is dropped
@@ -46,11 +46,13 @@ _MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.05, 0.5  # s
 _REPEATED_FOR = 0.3  # s; requests whose connection is lost, as by a daemon with many clients
 _RENEWAL_INTERVAL = 0.25  # s; within it a lost lease is noticed, however long it was
 
+_SILENCING = {name for name, method in METHODS.items() if method.silences}
+
 _T = TypeVar("_T")
 _ResultT = TypeVar("_ResultT", bound=Message)
 
 
-class AsyncClient:
+class AsyncClient(AsyncCalls):
     """A client of the daemon, made by `connect`; any number of calls may be pending.
 
     Without that its first call connects. A lost connection, and one without a response in time, is
@@ -116,57 +118,11 @@ class AsyncClient:
             self._channel.close()
         await asyncio.sleep(0)
 
-    async def hello(self, client: str) -> HelloResult:
-        """Introduce this client by another name; return what the daemon drives."""
-        result = await self._call(HelloResult, "hello", client=client)
-        self._name = client
-        return result
-
-    async def status(self) -> StatusResult:
-        """Return the state of the daemon, the amplifiers and the plate."""
-        return await self._call(StatusResult, "status")
-
-    async def arm(self, owner: str, *, lease_s: float = DEFAULT_LEASE) -> ArmResult:
-        """Switch high voltage on until the lease expires; `armed` renews it by itself."""
-        return await self._call(ArmResult, "arm", owner=owner, lease_s=lease_s)
-
-    async def renew(self, lease: str) -> RenewResult:
-        """Extend the lease by its full length from now."""
-        return await self._call(RenewResult, "renew", lease=lease)
-
-    async def disarm(self) -> None:
-        """Ramp to silence and switch high voltage off."""
-        await self._call(Empty, "disarm")
-        self._release()
-
-    async def stop(self) -> StopResult:
-        """Quick stop, latched until `clear`.
-
-        Raises NotSilent unless every amplifier is confirmed silent.
-        """
-        self._release()
-        return await self._call(StopResult, "stop")
-
-    async def clear(self) -> None:
-        """Acknowledge a stop, or a fault whose cause is gone, as this client has seen it.
-
-        One that came after its last `status`, `stop` or state event is not: RpcError.
-        """
-        await self._call(Empty, "clear", epoch=None if self._seen is None else self._seen[1])
-
-    async def forget(self) -> None:
-        """Discard what was learned of the plate; answers are those of the table as built."""
-        await self._call(Empty, "forget")
-
     async def touch(
         self, positions: Sequence[tuple[float, float]], *, source: str = "python"
     ) -> None:
         """Report all fingers of a source, at x, y [m]; valid for 150 ms, so repeat it."""
         await self._call(Empty, "touch", source=source, touches=touches_at(positions))
-
-    async def effects(self) -> EffectsResult:
-        """List the effects."""
-        return await self._call(EffectsResult, "effects")
 
     async def play(
         self, effect: str, position: tuple[float, float], *, level_db_sl: float | None = None
@@ -248,7 +204,7 @@ class AsyncClient:
             async with asyncio.timeout(timeout):
                 while not self._events and not self._is_closed:
                     self._changed.clear()
-                    if self._channel is None or self._channel.lost is not None:
+                    if self._channel is None or not self._channel.is_open:
                         await self._within_timeout(
                             self._repeated(
                                 self._connected,
@@ -265,10 +221,22 @@ class AsyncClient:
         return event
 
     async def call(self, method: str, params: Message, result: type[_ResultT]) -> _ResultT:
-        """Call any method and return its result."""
-        if self._lease_lost is not None and method not in ("stop", "disarm"):
+        """Call any method and return its result.
+
+        What `clear` acknowledges is what this client has seen, in its last `status`, `stop` or
+        state event.
+        """
+        if self._lease_lost is not None and method not in _SILENCING:
             raise self._lease_lost.with_traceback(None)
+        if isinstance(params, ClearParams) and params.epoch is None and self._seen is not None:
+            params = params.model_copy(update={"epoch": self._seen[1]})
+        if method == "stop":
+            self._release()
         found = await self._within_timeout(self._send(method, params))
+        if method in _SILENCING:
+            self._release()
+        elif isinstance(params, HelloParams):
+            self._name = params.client
         read = read_result(found, result)
         self._see(self._connections, getattr(read, "epoch", None))
         return read
@@ -323,11 +291,10 @@ class AsyncClient:
         async with self._connecting:
             if self._is_closed:
                 raise Unreachable(f"this client of the daemon at {self.path} is closed")
-            if self._channel is None or self._channel.lost is not None:
+            if self._channel is None or not self._channel.is_open:
                 connection = self._connections + 1
-                channel = await Channel.open(
-                    self.path,
-                    name=self._name,
+                channel = Channel(
+                    await DaemonLink.open(self.path, self._name),
                     on_event=partial(self._received, connection),
                     on_lost=self._changed.set,
                 )

@@ -16,14 +16,10 @@ from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 from controller.api.async_client import AsyncClient
-from controller.api.client_protocol import (
-    DEFAULT_LEASE,
-    RESPONSE_TIMEOUT,
-    Notification,
-    Unreachable,
-)
+from controller.api.calls import Calls
+from controller.api.client_protocol import RESPONSE_TIMEOUT, Notification, Unreachable
 from controller.api.jsonrpc import RpcError
-from controller.api.methods import ArmResult
+from controller.api.methods import DEFAULT_LEASE, METHODS, ArmResult
 
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
@@ -41,7 +37,7 @@ def _blocking(
     return call
 
 
-class Client:
+class Client(Calls):
     """A client of the daemon, made by `connect`, for any thread; see `AsyncClient`."""
 
     def __init__(self, client: AsyncClient, loop: "_LoopThread") -> None:
@@ -82,16 +78,7 @@ class Client:
             self._loop.run(self._client.close())
             self._loop.close()
 
-    hello = _blocking(AsyncClient.hello)
-    status = _blocking(AsyncClient.status)
-    arm = _blocking(AsyncClient.arm)
-    renew = _blocking(AsyncClient.renew)
-    disarm = _blocking(AsyncClient.disarm)
-    stop = _blocking(AsyncClient.stop)
-    clear = _blocking(AsyncClient.clear)
-    forget = _blocking(AsyncClient.forget)
     touch = _blocking(AsyncClient.touch)
-    effects = _blocking(AsyncClient.effects)
     play = _blocking(AsyncClient.play)
     subscribe = _blocking(AsyncClient.subscribe)
     unsubscribe = _blocking(AsyncClient.unsubscribe)
@@ -123,6 +110,11 @@ class Client:
             work.close()
             raise Unreachable(f"this client of the daemon at {self.path} is closed")
         return self._loop.run(work)
+
+
+for _name in METHODS:
+    if not hasattr(Client, _name):
+        setattr(Client, _name, _blocking(getattr(AsyncClient, _name)))
 
 
 class _LoopThread:

@@ -20,7 +20,6 @@ from model.arguments import shown
 from model.errors import InputError, first_problem
 
 RESPONSE_TIMEOUT = 5.0  # s; arming takes longest, some tenths of a second
-DEFAULT_LEASE = 10.0  # s
 
 _MessageT = TypeVar("_MessageT", bound=Message)
 
@@ -82,7 +81,7 @@ def read_line(line: bytes) -> Mapping[str, Any] | Notification:
         raise _not_understood() from error
 
 
-def result_of(response: Mapping[str, Any]) -> Any:
+def result_of(response: Any) -> Any:
     """The result of a response; raises the RpcError that it holds instead."""
     try:
         if "error" not in response:

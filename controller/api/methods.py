@@ -33,6 +33,7 @@ from controller.api.schema import (
     TouchPoint,
 )
 
+DEFAULT_LEASE = 10.0  # s
 MAX_TOUCHES = 64  # per frame; a panel reports ten, a forearm some more
 
 
@@ -101,7 +102,7 @@ class ArmParams(Message):
     """Who arms, and how long the lease lasts without renewal."""
 
     owner: Name
-    lease_s: Annotated[float, Field(ge=MIN_LEASE, le=MAX_LEASE)]
+    lease_s: Annotated[float, Field(ge=MIN_LEASE, le=MAX_LEASE)] = DEFAULT_LEASE
 
 
 class ArmResult(Message):
@@ -192,7 +193,8 @@ class UnsubscribeParams(Message):
 class Method(NamedTuple):
     """A method of the API, and how its requests are treated.
 
-    is_limited: whether they count in a client's rate; in_reserve: whether they are served to
+    is_limited: whether they count in a client's rate; silences: whether they end what plays;
+    in_reserve: whether they are served to
     clients in reserve; needs_reply: whether they are carried out only for a client that gets the
     reply; is_repeated: whether clients send them again if the connection is lost, after which they
     may have been carried out; over_http: whether they need no lasting connection.
@@ -202,6 +204,7 @@ class Method(NamedTuple):
     result: type[Message]
     summary: str
     is_limited: bool = True
+    silences: bool = False
     in_reserve: bool = False
     needs_reply: bool = False
     is_repeated: bool = True
@@ -230,6 +233,7 @@ METHODS: dict[str, Method] = {
         DisarmParams,
         Empty,
         "ramp to silence and switch high voltage off; any client may",
+        silences=True,
         in_reserve=True,
     ),
     "stop": Method(
@@ -238,6 +242,7 @@ METHODS: dict[str, Method] = {
         "quick stop, latched until clear; any client may, at any time; error 1006 unless every "
         "amplifier is confirmed silent",
         is_limited=False,
+        silences=True,
         in_reserve=True,
     ),
     "clear": Method(

@@ -236,7 +236,7 @@ class ApiServer:
             return _for_one_who_stays(
                 connection, connection.silenced, lambda: handle(connection, call.params)
             )
-        connection.silenced += call.method in ("stop", "disarm")
+        connection.silenced += method.silences
         return handle(connection, call.params)
 
     async def _finish(

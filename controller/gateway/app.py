@@ -27,6 +27,7 @@ from controller.api.jsonrpc import (
     error_line,
     read_params,
     read_request,
+    request_line,
     unknown_method,
 )
 from controller.api.methods import METHODS, DisarmParams, RequestedBy, StatusResult
@@ -34,7 +35,7 @@ from controller.api.rate_limit import RateLimiter
 from controller.gateway.access import SUBPROTOCOL, Access
 from controller.gateway.bridge import bridge, client_name
 from controller.gateway.field import DrawnField
-from controller.gateway.link import KeptLink, request_of
+from controller.gateway.kept_links import KeptLink
 from controller.gateway.metrics import exposition
 from controller.gateway.openapi import HTTP_METHODS, HTTP_STATUS, openapi
 from controller.gateway.settings import Settings
@@ -151,7 +152,7 @@ class Gateway:
 
     async def _silence(self, name: str, method: str, params: bytes) -> Any:
         """The result of a stop or disarm of a client; raises RpcError and Unreachable."""
-        read = read_request(request_of(name, method, params))
+        read = read_request(request_line(name, method, params))
         given = read_params(_SILENCING[method], read)
         given = given.model_copy(update={"client": given.client or name})
         async with contextlib.nullcontext() if method == "stop" else self._disarms:

@@ -10,8 +10,8 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import RpcError, read_request
+from controller.api.link import DaemonLink
 from controller.gateway.field import DrawnField
-from controller.gateway.link import DaemonLink
 
 SEND_TIMEOUT = 5.0  # s; for one frame
 _LAST_FRAMES = 0.1  # s; for those that a browser which is given up has sent
@@ -42,7 +42,7 @@ async def bridge(socket: WebSocket, daemon: Path, field: DrawnField) -> None:
                         ways.create_task(_draw(socket, field))
             finally:
                 await _silence(socket, link)
-    except* Unreachable:
+    except* (RpcError, Unreachable):
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # closed already
             await socket.close(NO_DAEMON, "the daemon does not respond")
     except* (TimeoutError, RuntimeError, WebSocketDisconnect):
@@ -59,7 +59,7 @@ async def _to_daemon(socket: WebSocket, link: DaemonLink) -> None:
         if text is None or "\n" in text:
             await socket.close(UNSUPPORTED_DATA, "send text frames of one line")
             raise WebSocketDisconnect(UNSUPPORTED_DATA)
-        await link.send(text.encode())
+        await link.send(text.encode() + b"\n")
 
 
 async def _silence(socket: WebSocket, link: DaemonLink) -> None:
@@ -70,7 +70,7 @@ async def _silence(socket: WebSocket, link: DaemonLink) -> None:
                 text = (await socket.receive()).get("text") or ""
                 line = text.encode()
                 if b"\n" not in line and _method_of(line) in _SILENCING:
-                    link.write(line)
+                    link.write(line + b"\n")
 
 
 def _method_of(line: bytes) -> str:

@@ -50,7 +50,7 @@ def gateway(
     from controller.gateway.installed import require_gateway
 
     require_gateway()
-    from controller.api.socket_path import find_socket
+    from controller.api.place import find_socket
     from controller.gateway.serving import serve
     from controller.gateway.settings import Settings, read_token
 

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from controller.api.client_protocol import Notification, read_line, result_of
+from controller.api.jsonrpc import request_line
+from controller.api.link import DaemonLink
 from controller.api.schema import PlayedTone
-from controller.gateway.link import DaemonLink, request_of
 from model.arrays import ComplexArray, lattice
 from model.finger.perception import detection_threshold
 from model.reduction.free_plate import solve_free_plate
@@ -122,7 +123,7 @@ class DrawnField:
         link = await DaemonLink.open(self._daemon, "gateway")
         try:
             rig_text = json.loads(link.hello)["result"]["rig_text"]
-            await link.send(request_of("gateway", "subscribe", _TOPICS))
+            await link.send(request_line("gateway", "subscribe", _TOPICS))
             while True:
                 received = read_line(await link.next_line())
                 if isinstance(received, Notification):

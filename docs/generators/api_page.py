@@ -51,6 +51,8 @@ def _rows(prefix: str, model: type[Message], models: dict[str, type[Message]]) -
     for name, field in model.model_fields.items():
         kind = _kind(field.rebuild_annotation(), models)
         optional = "" if field.is_required() else "optional"
+        if prefix == "→ " and isinstance(field.default, float):
+            optional += f", by default {field.default:g}"
         notes = "; ".join(part for part in (field.description, optional) if part)
         yield f"| {prefix}`{name}` | {kind} | {notes} |"
 

@@ -37,7 +37,22 @@ def _tree(thing: Any) -> ast.stmt:
     tree = ast.parse(textwrap.dedent(inspect.getsource(thing))).body[0]
     if isinstance(tree, ast.ClassDef):
         tree.body = [_unwrapped(thing, member) for member in tree.body]
+        for base in thing.__bases__:
+            tree.body += _of_stub(base)
     return tree
+
+
+def _of_stub(base: type) -> list[ast.stmt]:
+    """The members of a class in the stub file of its module, if there is one."""
+    stub = Path(inspect.getfile(base)).with_suffix(".pyi") if base is not object else Path("none")
+    if not stub.is_file():
+        return []
+    (found,) = (
+        each
+        for each in ast.parse(stub.read_text("utf-8")).body
+        if isinstance(each, ast.ClassDef) and each.name == base.__name__
+    )
+    return found.body
 
 
 def _unwrapped(kind: type, member: ast.stmt) -> ast.stmt:

@@ -14,19 +14,18 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import pytest
 
 import controller
 from controller.api.async_client import AsyncClient
-from controller.api.channel import Channel
 from controller.api.client import Client
 from controller.api.client_protocol import ConnectionLost, LeaseLost, Unreachable
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError, event_line
+from controller.api.link import DaemonLink
 from controller.api.methods import METHODS
-from controller.api.peer import check_peer
-from controller.api.socket_path import SYSTEM_SOCKET, find_socket
+from controller.api.place import SYSTEM_SOCKET, check_peer, find_socket
 from daemon_bench import PLACE, next_event, ready_daemon, running_daemon, until_state
 from model.errors import InputError
 
@@ -237,7 +236,7 @@ def test_client_subscribes_again_with_the_rate_of_each_topic(tmp_path: Path) -> 
     """A later subscription to another topic does not change it."""
     done = b'{"jsonrpc":"2.0","id":%d,"result":{}}\n'
     with (
-        responding(tmp_path / "s", HELLO, done % 2, done % 3) as received,
+        responding(tmp_path / "s", HELLO, done % 1, done % 2) as received,
         Client.connect(tmp_path / "s") as era,
     ):
         era.subscribe("amplifiers", rate_hz=2.0)
@@ -276,12 +275,12 @@ async def test_stop_is_repeated_while_no_daemon_runs(
 ) -> None:
     """It may be restarting: the stop reaches it at its return."""
     async with ready_daemon(tmp_path) as (bench, era):
-        open_channel, refusing = Channel.open, [tmp_path / "none"]
+        open_link, refusing = DaemonLink.open, [tmp_path / "none"]
 
-        async def open_later(path: Path, **options: Any) -> Channel:
-            return await open_channel(refusing.pop() if refusing else path, **options)
+        async def open_later(path: Path, name: str) -> DaemonLink:
+            return await open_link(refusing.pop() if refusing else path, name)
 
-        monkeypatch.setattr(Channel, "open", open_later)
+        monkeypatch.setattr(DaemonLink, "open", open_later)
         async with AsyncClient(bench.socket, name="late", timeout=10) as late:
             await late.stop()
         assert not refusing
@@ -339,7 +338,7 @@ def test_stop_names_the_amplifiers_that_are_not_silent(tmp_path: Path) -> None:
         "rear": {"silence": "watchdog_elapsed", "may_play_for_s": None, "cause": "link lost"},
     }
     error = {"code": 1006, "message": "-", "data": {"what": "-", "amplifiers": amplifiers}}
-    line = json.dumps({"jsonrpc": "2.0", "id": 2, "error": error}).encode() + b"\n"
+    line = json.dumps({"jsonrpc": "2.0", "id": 1, "error": error}).encode() + b"\n"
     with responding(tmp_path / "s", HELLO, line), Client.connect(tmp_path / "s") as era:
         with pytest.raises(NotSilent, match=r"side.*0\.25 s.*rear") as caught:
             era.stop()
@@ -407,7 +406,7 @@ def test_clients_use_the_socket_of_the_environment(
 ) -> None:
     """It is taken whether or not a daemon is there; a given path goes first."""
     monkeypatch.setenv("ERA_HAPTICS_SOCKET", str(tmp_path / "own.sock"))
-    monkeypatch.setattr("controller.api.socket_path.SYSTEM_SOCKET", tmp_path)  # exists
+    monkeypatch.setattr("controller.api.place.SYSTEM_SOCKET", tmp_path)  # exists
     assert find_socket(None) == tmp_path / "own.sock"
     assert find_socket("given.sock") == Path("given.sock")
 

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import api_page
+import client_stub
 from controller.api.jsonrpc import (
     ErrorCode,
     InvalidRequest,
@@ -185,10 +186,10 @@ def test_response_has_the_members_of_the_specification() -> None:
 )
 def test_request_line_is_read_as_written(params: Message) -> None:
     """Requests of the client have the same id and parameters at the server."""
-    request = read_request(request_line(7, "any", params))
+    line = request_line(7, "any", params.model_dump_json(exclude_none=True).encode())
+    request = read_request(line)
     assert request.id == 7
     assert read_params(type(params), request) == params
-    assert not read_request(request_line(None, "any", params)).expects_response
 
 
 @given(st.binary(max_size=200))
@@ -228,3 +229,8 @@ def test_reference_page_is_up_to_date() -> None:
     """The page holds what the generator writes from the models; run it after a change."""
     page = api_page.PAGE.read_text("utf-8")
     assert insert(page, api_page.reference(), writer=api_page.WRITER) == page
+
+
+def test_stub_of_the_clients_is_up_to_date() -> None:
+    """Editors and mypy see of each method what is registered of it."""
+    assert client_stub.stub() == client_stub.STUB.read_text("utf-8")

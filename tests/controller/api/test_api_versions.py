@@ -12,10 +12,10 @@ import pytest
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
 from controller.api.client_protocol import Unreachable
+from controller.api.link import DaemonLink
 from controller.api.methods import METHODS
 from controller.api.topics import TOPICS, EventParams
 from controller.gateway.field import DrawnField
-from controller.gateway.link import DaemonLink
 from daemon_bench import PLACE, holding, running_daemon, until_state
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from controller.api.socket_path import default_socket
+from controller.api.place import default_socket
 from controller.daemon.config import load_daemon_config
 from controller.daemon.config_kind import DAEMON
 from controller.daemon.config_sections import DaemonSection

@@ -9,10 +9,11 @@ from unittest.mock import AsyncMock
 
 import pytest
 
+from controller.api import link
 from controller.api.async_client import AsyncClient
 from controller.api.client_protocol import Unreachable
 from controller.api.schema import API_VERSION
-from controller.gateway import bridge, link
+from controller.gateway import bridge
 from controller.gateway.field import DrawnField
 from daemon_bench import PATIENCE
 from gateway_bench import TOKEN, GatewayProcess, ScriptedDaemon, gateway_process, wait_for_daemon

@@ -1,0 +1,67 @@
+"""Signatures of the clients' methods that are made from the registry of the API's methods.
+
+`python docs/generators/client_stub.py` writes controller/api/calls.pyi.
+"""
+
+import inspect
+import types
+from pathlib import Path
+from typing import Annotated, Any, Union, get_args, get_origin
+
+import controller.api
+from controller.api.calls import BY_HAND, signature_of
+from controller.api.methods import METHODS
+from controller.api.schema import Empty
+
+STUB = Path(controller.api.__file__).with_name("calls.pyi")
+
+
+def stub() -> str:
+    """The whole file."""
+    made = {name: method for name, method in METHODS.items() if name not in BY_HAND}
+    results = sorted({each.result.__name__ for each in made.values() if each.result is not Empty})
+    lines = [
+        "# Written by docs/generators/client_stub.py.",
+        "",
+        "import inspect",
+        "",
+        "from controller.api.methods import (",
+        *(f"    {name}," for name in sorted(["Method", *results])),
+        ")",
+        "",
+        "BY_HAND: tuple[str, ...]",
+        "",
+        "def signature_of(method: Method) -> inspect.Signature: ...",
+    ]
+    for kind, keyword in (("AsyncCalls", "async def"), ("Calls", "def")):
+        lines += ["", f"class {kind}:"]
+        for name, method in made.items():
+            signature = signature_of(method)
+            result = "None" if method.result is Empty else method.result.__name__
+            lines.append(f"    {keyword} {name}({_parameters(signature)}) -> {result}: ...")
+    return "\n".join(lines) + "\n"
+
+
+def _parameters(signature: inspect.Signature) -> str:
+    parts: list[str] = []
+    for each in signature.parameters.values():
+        if each.kind is each.KEYWORD_ONLY and "*" not in parts:
+            parts.append("*")
+        kind = "" if each.annotation is each.empty else f": {_kind(each.annotation)}"
+        parts.append(
+            each.name + kind + ("" if each.default is each.empty else f" = {each.default!r}")
+        )
+    return ", ".join(parts)
+
+
+def _kind(annotation: Any) -> str:
+    """A type as Python."""
+    if get_origin(annotation) is Annotated:
+        return _kind(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, types.UnionType):
+        return " | ".join(map(_kind, get_args(annotation)))
+    return "None" if annotation is type(None) else str(annotation.__name__)
+
+
+if __name__ == "__main__":
+    STUB.write_text(stub(), encoding="utf-8")

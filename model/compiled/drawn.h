@@ -278,6 +278,11 @@ INLINE lanes some(const float *from) {
     return found;
 }
 
+/* sum + (re + i im) f. */
+INLINE value add_scaled(value sum, value f, float re, float im) {
+    return (value){sum.re + re * f.re - im * f.im, sum.im + re * f.im + im * f.re};
+}
+
 /* sensed (points): squared amplitudes to threshold of a tone on a group of plates. */
 SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, value *found, value *force) {
     const draws *by = of->by;
@@ -312,10 +317,10 @@ SHARED void sense(lanes *sensed, const tones *of, size_t tone, size_t group, val
         for (size_t j = 0; j <= a; j++) {
             value f = force[j];
             const float *re = T + 2 * j * padded + i, *im = re + padded;
-            s0.re += re[0] * f.re - im[0] * f.im, s0.im += re[0] * f.im + im[0] * f.re;
-            s1.re += re[1] * f.re - im[1] * f.im, s1.im += re[1] * f.im + im[1] * f.re;
-            s2.re += re[2] * f.re - im[2] * f.im, s2.im += re[2] * f.im + im[2] * f.re;
-            s3.re += re[3] * f.re - im[3] * f.im, s3.im += re[3] * f.im + im[3] * f.re;
+            s0 = add_scaled(s0, f, re[0], im[0]);
+            s1 = add_scaled(s1, f, re[1], im[1]);
+            s2 = add_scaled(s2, f, re[2], im[2]);
+            s3 = add_scaled(s3, f, re[3], im[3]);
         }
         found[i] = s0;
         if (last > 0) found[i + 1] = s1;

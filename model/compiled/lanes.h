@@ -58,9 +58,15 @@ INLINE lanes chosen(mask where, lanes a, lanes b) { /* a there, else b */
     return (lanes)((where & (mask)a) | (~where & (mask)b));
 }
 
-INLINE lanes larger(lanes a, lanes b) { return chosen(a > b, a, b); }
+INLINE lanes larger(lanes a, lanes b) {
+    for (int l = 0; l < LANES; l++) a[l] = a[l] > b[l] ? a[l] : b[l];
+    return a;
+}
 
-INLINE lanes smaller(lanes a, lanes b) { return chosen(a < b, a, b); }
+INLINE lanes smaller(lanes a, lanes b) {
+    for (int l = 0; l < LANES; l++) a[l] = a[l] < b[l] ? a[l] : b[l];
+    return a;
+}
 
 INLINE lanes root(lanes a) { /* 0 for what rounding made negative */
     lanes found;
@@ -88,8 +94,10 @@ static const value ZERO;
 
 /* Exchange rows and columns: each step deals all values out like cards of two halves. */
 INLINE void transpose(lanes *rows) {
+#pragma GCC unroll 4
     for (int step = 1; step < LANES; step *= 2) {
         lanes next[LANES];
+#pragma GCC unroll 8
         for (int i = 0; i < LANES / 2; i++) {
             lanes a = rows[i], b = rows[i + LANES / 2];
             next[2 * i] = mixed(a, b, LOW), next[2 * i + 1] = mixed(a, b, HIGH);

@@ -105,7 +105,7 @@ desk-test: .venv/installed-test
 qt-test: .venv/installed-qt
 	$(BIN)/pytest -q tests/integration/test_qt_application.py
 
-# The whole chain in virtual time, thousands of seeds; `make test` takes twelve short ones.
+# The whole chain in virtual time, thousands of seeds; `make test` takes seven short ones.
 # Others: make soak SOAK='--minutes 10 --wire serial', or one again: make soak SOAK='--seed 17'
 soak: .venv/installed-test
 	$(BIN)/python tests/support/soak.py $(SOAK)

@@ -37,7 +37,7 @@ from sim.witness.witness import OperatorCommand, Witness
 from small_table import small_table
 from virtual_sockets import VirtualSocketsLoop
 from wires import WIRES
-from witness_config import witness_config
+from witness_config import tell_first, witness_config
 
 PATIENCE = 180.0  # s; generous, for a loaded machine
 PLACE = (0.1, 0.1)
@@ -186,7 +186,7 @@ def judged(daemon: Daemon, far: FarSide) -> Witness:
     controller, down = daemon._controller, dict[str, list[tuple[str, int]]]()
     for command in get_args(OperatorCommand):
         tell = partial(witness.operator_command, command=command)
-        _tell_first(controller, command, lambda *_, tell=tell: tell(clock.now()))
+        tell_first(controller, command, lambda *_, tell=tell: tell(clock.now()))
 
     def touched(frame: TouchFrame) -> None:
         down[frame.source] = [(frame.source, touch.id) for touch in frame.touches]
@@ -194,27 +194,16 @@ def judged(daemon: Daemon, far: FarSide) -> Witness:
             clock.now(), [one for each in down.values() for one in each], is_answerable=False
         )
 
-    _tell_first(controller, "deliver", touched)
+    tell_first(controller, "deliver", touched)
     for link in witness.wires:
         witness.opened(link, clock.now())
     for device in far.devices.values():
-        _tell_first(
+        tell_first(
             device,
             "inject_fault",
             lambda *_: [witness.faults(clock.now(), each, are_on=True) for each in witness.wires],
         )
     return witness
-
-
-def _tell_first(owner: Any, method: str, tell: Callable[..., object]) -> None:
-    """Let somebody be told of each call of a method, before it is carried out."""
-    carry_out = getattr(owner, method)
-
-    def told(*arguments: Any) -> Any:
-        tell(*arguments)
-        return carry_out(*arguments)
-
-    setattr(owner, method, told)
 
 
 @asynccontextmanager

@@ -1,7 +1,7 @@
 """One soak run: the whole chain in virtual time, from touch frames to the plate, as its plan says.
 
-Everything between the table and the plate is the project's own: controller, ledgers, lines, codecs,
-far ends and amplifiers. Only the lines are memory, and the clock is virtual.
+Everything between the table and the plate is the project's own: supervisor, control loop, ledgers,
+lines, codecs, far ends and amplifiers. Only the lines are memory, and the clock is virtual.
 """
 
 import asyncio
@@ -9,23 +9,22 @@ import hashlib
 import logging
 import random
 from collections import Counter
-from collections.abc import Callable, Coroutine, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from functools import cache
-from typing import Any, TextIO
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, TextIO, get_args
 
+from controller.api.jsonrpc import RpcError
+from controller.daemon.states import DaemonEvent, DaemonState, Trigger
+from controller.daemon.supervisor import Supervisor
 from controller.loop.loop import Controller
 from controller.loop.observer import Applied, Observer
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
-from drivers.host.amplifier import Amplifier
-from drivers.host.members import GroupState
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from memory_machine import live_in_memory
-from model.rig.rig import Channel, Rig
-from model.table.table import LocalizationTable
 from newest_contact import BuzzNewestContact
 from paper_plate import make_paper_rig
 from rig_on_wire import far_side
@@ -36,6 +35,8 @@ from small_table import small_table
 from soak_judges import Checks, SoakWitness, SourceContacts
 from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual
+from wires import on_two_amplifiers
+from witness_config import tell_first
 
 _RELEASE = 0.020  # s; from the last finger up to zero
 _ON_THE_WIRE = 0.002  # s; through driver, adapter and back
@@ -50,7 +51,6 @@ _GAPS_BETWEEN_FEEDS = 8 * 4 * 0.00175  # s
 _PATTERN = 0.25  # s; from a touch to its pattern
 _NOTICED = 0.3  # s; from an unplugged wire to the controller's reaction
 _TIMERS_MAX = 2_000
-_PAUSES = (0.1, 0.2, 0.4, 0.8, 1.6)  # s; between attempts to open
 _QUIET_END = 1.0  # s; duration of the check for silence after closing
 
 
@@ -84,23 +84,6 @@ class Trace:
         self._hash.update(line.encode())
         if self._file is not None:
             self._file.write(line)
-
-
-@cache
-def _table() -> LocalizationTable:
-    return small_table()
-
-
-def make_soak_rig(amplifiers: int) -> Rig:
-    """The paper's plate with its ERAs on one amplifier, or two on each of two."""
-    rig = make_paper_rig(12, 9)
-    if amplifiers == 1:
-        return rig
-    wiring = {
-        era.name: Channel(("west", "east")[number % 2], number // 2)
-        for number, era in enumerate(rig.eras)
-    }
-    return replace(rig, wiring=wiring, amplifiers={"west": "sim://", "east": "sim://"})
 
 
 def run_plan(plan: Plan, *, trace: TextIO | None = None) -> Outcome:
@@ -143,16 +126,13 @@ class _Run:
         self.loop = loop
         loop.set_exception_handler(self._unhandled)
         self.operation = live_in_memory()
-        self.rig = make_soak_rig(self.plan.amplifiers)
+        rig = make_paper_rig(12, 9)
+        self.rig = rig if self.plan.amplifiers == 1 else on_two_amplifiers(rig)
         self.contacts = SourceContacts()
-        self.arm_requests = 0
-        self.is_ending = False
         self.stalled_for = 0.0
         self.turning = asyncio.Event()  # unless the control loop stalls
         self.turning.set()
-        self.lost = asyncio.Event()
         self.running: asyncio.Task[None] | None = None
-        self.controller: Controller | None = None
         self.tasks: list[asyncio.Task[Any]] = []
         lines, names = self.plan.lines, [*self.rig.amplifiers]
         wires = {
@@ -182,7 +162,7 @@ class _Run:
             self.checks.violations = self.violations
             for name, device in far.devices.items():
                 self._listen(name, device)
-            self.serving = asyncio.create_task(self._serve())
+            self._host()
             await self._play()
             await self._end()
             self.checks.check()
@@ -194,6 +174,44 @@ class _Run:
         if left:
             names = sorted(str(task.get_coro()) for task in left)
             self.checks.violate(f"{len(left)} tasks are left: {names}")
+
+    def _host(self) -> None:
+        """Start a host: a supervisor with its control loop; the witness is told what they do."""
+        supervisor = self.supervisor = Supervisor(
+            state_changed=(lambda old, new: self.note("state", new.state),),
+            link_changed=self._link_changed,
+            alive=lambda: None,
+        )
+        controller = self.controller = Controller(
+            self.rig,
+            small_table(),
+            lines=Lines,
+            intent_source=BuzzNewestContact(),
+            urls=self.far.urls,
+            connected=supervisor.connected,
+            observer=supervisor.observe(
+                Observer(
+                    pattern_applied=self._applied,
+                    refused=lambda why: self.note("observer refused", why),
+                )
+            ),
+        )
+        for command in get_args(OperatorCommand):
+            tell_first(controller, command, partial(self.witness.operator_command, command))
+        tell_first(controller, "open", self.witness.opens)
+        controller.release = partial(self._released, controller.release)  # type: ignore[method-assign]
+        controller.run = partial(self._run_on, controller.run)  # type: ignore[method-assign]
+        self.hosting = asyncio.create_task(supervisor.run(controller))
+
+    async def _released(self, release: Callable[[], Awaitable[None]]) -> None:
+        try:
+            await release()
+        finally:
+            self.witness.closes()
+
+    def _link_changed(self, change: str, lost: Sequence[str], message: str) -> None:
+        self.note("link", change, message)
+        self.counts["links lost"] += change == "lost"
 
     def _release(self, preceding: int = _BYTES) -> float:
         """How long after the last finger the plate may play, without faults [s].
@@ -259,75 +277,62 @@ class _Run:
             is_new = not was_touched and now < self.contacts.last and sequence.gesture == "hold"
             must_be_felt = is_new and self._must_be_felt()
             self.witness.touched(must_be_felt=must_be_felt)
-            if self.controller is not None:
-                frame = TouchFrame(
-                    sequence.source, now + stamp, tuple(Touch(*touch) for touch in touches)
-                )
-                self.controller.deliver(frame)
+            placed = tuple(Touch(*touch) for touch in touches)
+            with suppress(DriverError):  # not opened yet; a daemon ignores it as well
+                self.controller.deliver(TouchFrame(sequence.source, now + stamp, placed))
             self.counts["touches that must be felt"] += must_be_felt
+
+    @property
+    def _is_armed(self) -> bool:
+        return self.supervisor.operation.state is DaemonState.OPERATION_ENABLED
 
     def _must_be_felt(self) -> bool:
         """Whether a first touch now must lead to a pattern."""
         at = self.loop.time() - START
-        is_armed = self.controller is not None and self.controller.group.state is GroupState.ARMED
-        return is_armed and self.plan.is_calm(at - 0.1, at + _PATTERN)
+        return self._is_armed and self.plan.is_calm(at - 0.1, at + _PATTERN)
 
     def _expect_loss(self, number: int) -> None:
-        """Check that an armed controller detects an unplugged wire in time."""
-        controller = self.controller
-        if controller is None or controller.group.state is not GroupState.ARMED:
-            return
-        if number and len(self.plan.lines) == 1:
+        """Check that an armed host detects an unplugged wire in time."""
+        if not self._is_armed or (number and len(self.plan.lines) == 1):
             return  # a shared line is unplugged at its first amplifier
-
-        running = self.running
+        host, running = self.supervisor, self.running
 
         def look() -> None:
-            if running is None or self.running is not running:
-                return  # stalled meanwhile
-            if self.controller is controller and controller.group.state is GroupState.ARMED:
+            is_other = running is None or self.running is not running  # stalled meanwhile
+            if self.supervisor is host and self._is_armed and not is_other:
                 self.checks.violate("a wire is unplugged and the controller still armed")
 
         self.loop.call_later(_NOTICED, look)
 
     async def _operate(self, action: OperatorAction) -> None:
-        controller = self.controller
         if action.what == "kill":
             await self._kill()
         elif action.what == "stall":
             self._stall(action.lasts)
-        elif controller is None:
-            if self.plan.is_calm(action.at - 0.4, action.at):
-                self.checks.violate("could not be opened without a fault")
         elif action.what == "ready":
             await self.turning.wait()  # as in a process, whose stall also keeps requests waiting
-            if controller.group.state is not GroupState.ARMED:
-                if not await self._call("clear", controller.clear):  # what nobody had seen yet
-                    await self._call("clear", controller.clear)
-                await self._call("arm", controller.arm)
+            if not self._is_armed:
+                if not await self._request("clear"):  # what nobody had seen yet
+                    await self._request("clear")
+                await self._request("arm")
             at = self.loop.time() - START
-            is_calm = self.plan.is_calm(action.at - 0.1, at)
-            if controller.group.state is GroupState.LOST and controller is self.controller:
-                self._lost("while disarmed")
-            elif is_calm and controller.group.state is not GroupState.ARMED:
-                self.checks.violate("could not be armed without a fault")
+            if self.plan.is_calm(action.at - 0.1, at) and not self._is_armed:
+                state = self.supervisor.operation
+                self.checks.violate(f"could not be armed without a fault: {state}")
         else:
-            await self._call(action.what, getattr(controller, action.what))
+            await self._request(action.what)
 
-    async def _call(
-        self, name: OperatorCommand, call: Callable[[], Coroutine[Any, Any, None]]
-    ) -> bool:
-        """Run an operator command; a refusal is a valid outcome, False."""
-        self.witness.operator_command(name)
-        self.arm_requests += name == "arm"
+    async def _request(self, what: str) -> bool:
+        """Carry out a request of an operator; a refusal is a valid outcome, False."""
         try:
-            await call()
-        except DriverError as problem:
-            self.note("refused", name, type(problem).__name__, problem)
+            if what == "stop":
+                await self.supervisor.stop("as told")
+            else:
+                await self.supervisor.handle(DaemonEvent(Trigger[what.upper()], "as told"))
+        except (DriverError, RpcError) as problem:
+            self.note("refused", what, type(problem).__name__, problem)
             return False
-        finally:
-            self.arm_requests -= name == "arm"
-        self.note("done", name)
+        self.note("done", what)
         return True
 
     async def _kill(self) -> None:
@@ -335,52 +340,24 @@ class _Run:
         self.operation.kill_host()
         self.loop.kill_hosts()
         self.witness.closes()
-        self.serving.cancel()
-        await asyncio.gather(self.serving, return_exceptions=True)
-        self.serving = asyncio.create_task(self._serve())
+        work = [self.hosting, *self.supervisor._tasks]
+        for task in work:
+            task.cancel()
+        await asyncio.gather(*work, return_exceptions=True)
+        await self.controller.release()
+        self._host()
 
     def _stall(self, lasts: float) -> None:
         """Stall the control loop for a time [s], unless it arms."""
-        if self.running is not None and not self.arm_requests:
+        is_arming = self.supervisor.operation.state is DaemonState.SWITCHED_ON
+        if self.running is not None and not is_arming:
             self.stalled_for = lasts
             self.running.cancel()
 
-    def _lost(self, what: str) -> None:
-        """Have the amplifiers opened again after a loss."""
-        self.note("lost", what)
-        self.counts["links lost"] += 1
-        self.lost.set()
-
-    async def _serve(self) -> None:
-        """Open, and open again after a loss, as a daemon does; the control loop runs on."""
-        pauses: Iterator[float] = iter(_PAUSES)
-        controller = self._make_controller()
-        turning = asyncio.create_task(self._run_on(controller))
-        try:
-            while not self.is_ending:
-                self.witness.opens()
-                self.lost.clear()
-                try:
-                    await controller.open()
-                    pauses = iter(_PAUSES)
-                    self.note("open")
-                    self.controller = controller
-                    await self.lost.wait()
-                except DriverError as problem:
-                    self._lost(f"{type(problem).__name__} {problem}")
-                finally:
-                    self.controller = None
-                    await controller.release()
-                    self.witness.closes()
-                await asyncio.sleep(next(pauses, _PAUSES[-1]))
-        finally:
-            turning.cancel()
-            await asyncio.gather(turning, return_exceptions=True)
-
-    async def _run_on(self, controller: Controller) -> None:
+    async def _run_on(self, run: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Run the control loop, across stalls."""
         while True:
-            self.running = asyncio.create_task(controller.run())
+            self.running = asyncio.create_task(run())
             try:
                 await self.running
                 return
@@ -389,9 +366,6 @@ class _Run:
                     self.running.cancel()
                     raise
                 lasts, self.stalled_for = self.stalled_for, 0.0
-            except Exception as error:
-                self.checks.violate(f"the control loop ended with {error!r}")
-                raise
             finally:
                 self.running = None
             self.turning.clear()
@@ -403,33 +377,6 @@ class _Run:
                 self.witness.set_stalled(False)
                 self.turning.set()
 
-    def _make_controller(self) -> Controller:
-        return Controller(
-            self.rig,
-            _table(),
-            lines=Lines,
-            intent_source=BuzzNewestContact(),
-            urls=self.far.urls,
-            connected=self._connected,
-            observer=Observer(
-                pattern_applied=self._applied,
-                refused=lambda why: self.note("observer refused", why),
-                link_lost=self._lost,
-            ),
-        )
-
-    def _connected(self, amplifiers: Mapping[str, Amplifier]) -> None:
-        for amplifier in amplifiers.values():
-            amplifier.listeners.append(self._amplifier_event)
-
-    def _amplifier_event(self, event: Values) -> None:
-        """Stop all at a fault that an amplifier reports while armed or arming, as a daemon does."""
-        controller = self.controller
-        if not event["fault"] or controller is None:
-            return
-        if self.arm_requests or controller.group.state is GroupState.ARMED:
-            self._spawn(self._call("stop", controller.stop))
-
     def _applied(self, applied: Applied) -> None:
         self.counts["patterns"] += 1
         drive = dict(sorted(applied.drive.items()))
@@ -437,16 +384,9 @@ class _Run:
 
     async def _end(self) -> None:
         """Close all, and check for silence and for tasks left."""
-        self.is_ending = True
-        self.witness.operator_command("disarm")
-        if self.controller is not None:
-            await self.controller.close()
-            self.lost.set()
-        else:
-            self.serving.cancel()
-        await asyncio.gather(self.serving, return_exceptions=True)
-        await asyncio.gather(*self.tasks, return_exceptions=True)
-        for task in self.tasks:
+        await self.supervisor.close("the plan has ended")
+        await asyncio.gather(self.hosting, *self.tasks, return_exceptions=True)
+        for task in (self.hosting, *self.tasks):
             error = None if task.cancelled() else task.exception()
             if error is not None:
                 self.checks.violate(f"{task.get_coro()} ended with {error!r}")

@@ -25,7 +25,7 @@ KINDS: Mapping[str, Sequence[int | None]] = {
 
 SOURCES = ("panel", "table", "page")
 BEGIN = 0.5  # s; all wires are open by then
-SETTLED = 3.0  # s; maximum recovery time after a fault
+SETTLED = 7.0  # s; maximum recovery time after a fault: a pause before a reopening, of 5 s at most
 
 FRAME_FAULTS: Sequence[FaultKind] = (
     "drop",

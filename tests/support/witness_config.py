@@ -1,6 +1,6 @@
 """Configure a witness by the URLs of amplifiers, and show it what they play."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from sim.amplifier.contract import Amplifier
@@ -43,3 +43,14 @@ def sense(witness: Witness, now: float, name: str, amplifier: Amplifier) -> None
         if tone.transition.last
     }
     witness.levels(now, name, levels, frequencies=frequencies)
+
+
+def tell_first(owner: Any, method: str, tell: Callable[..., object]) -> None:
+    """Let somebody be told of each call of a method, before it is carried out."""
+    carry_out = getattr(owner, method)
+
+    def told(*arguments: Any) -> Any:
+        tell(*arguments)
+        return carry_out(*arguments)
+
+    setattr(owner, method, told)

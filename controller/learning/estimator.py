@@ -3,14 +3,14 @@
     python -m controller.learning.estimator
 
 A process of its own, at a lower priority, so that the control loop does not wait for it. It reads
-messages from standard input and ends with it.
+requests from standard input, answers each on standard output, and ends with its input.
 """
 
 import contextlib
 import os
-import select
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,51 +85,37 @@ class Estimator:
             learned.change,
         )
 
-    def take(self, pattern: SettledPattern) -> Estimate:
-        """Take a pattern; raises ValueError for one of no plate, and nothing is learned of it."""
-        found = self._learned.take(pattern)
+    def take(self, pattern: SettledPattern) -> list[Reply]:
+        """Take a pattern; of one of no plate nothing is learned, and a note says so."""
+        learned = self._learned
+        try:
+            found = learned.take(pattern)
+        except ValueError as error:  # InputError and LinAlgError are such
+            note = Note(f"a pattern is not used: {error}")
+            return [note, Estimate(pattern.time, False, False, "", learned.has_changed, None)]
         report, table = found.report, found.table
         if table is not None:
             self._is_saved = self._is_refreshed = False
-        return Estimate(
+        estimate = Estimate(
             pattern.time,
             report.alarm,
             report.is_held,
             "" if report.explanation is None else str(report.explanation),
-            self._learned.has_changed,
+            learned.has_changed,
             None if table is None else self._prepared(table, whole=False),
         )
+        return [estimate]
 
-    def nothing_of(self, pattern: SettledPattern) -> Estimate:
-        """The estimate of a pattern that has shown nothing."""
-        learned = self._learned
-        return Estimate(
-            pattern.time,
-            alarm=False,
-            is_held=False,
-            explanation="",
-            has_changed=learned.has_changed,
-            answers=None,
-        )
-
-    @property
-    def next_chore(self) -> float | None:
-        """When [s] something is to be saved or prepared; None for never."""
-        moments = [
-            *(() if self._is_saved else (self._saved_at + _SAVE_INTERVAL,)),
-            *(() if self._is_refreshed else (self._refreshed_at + _REFRESH_INTERVAL,)),
-        ]
-        return min(moments, default=None)
-
-    def do_chore(self) -> Refreshed | Note | None:
-        """Save what was learned, or prepare answers whole, where that is due."""
+    def chores(self) -> list[Reply]:
+        """Save what was learned, and prepare answers whole, where that is due."""
         now = self._now()
-        if not self._is_saved and now >= self._saved_at + _SAVE_INTERVAL:
-            return self.save()
-        if self._is_refreshed or now < self._refreshed_at + _REFRESH_INTERVAL:
-            return None
-        self._refreshed_at, self._is_refreshed = now, True
-        return Refreshed(self._prepared(self._learned.current, whole=True), self._robust())
+        note = self.save() if now >= self._saved_at + _SAVE_INTERVAL else None
+        done: list[Reply] = [] if note is None else [note]
+        if not self._is_refreshed and now >= self._refreshed_at + _REFRESH_INTERVAL:
+            self._refreshed_at, self._is_refreshed = now, True
+            whole = self._prepared(self._learned.current, whole=True)
+            done.append(Refreshed(whole, self._robust()))
+        return done
 
     def save(self) -> Note | None:
         """Write what was learned; where that fails, say so once, and try again later."""
@@ -172,14 +158,6 @@ def why_only_alarms(rig: Rig) -> str:
     return ""
 
 
-def replies(estimator: Estimator, pattern: SettledPattern) -> list[Reply]:
-    """What an estimator replies to a pattern: a note, too, where nothing can be learned of it."""
-    try:
-        return [estimator.take(pattern)]
-    except ValueError as error:  # InputError and LinAlgError are such
-        return [Note(f"a pattern is not used: {error}"), estimator.nothing_of(pattern)]
-
-
 def _set_aside(file: Path) -> str:
     """Rename the file of another plate; what was done, or why not."""
     old = file.with_name(f"{file.name}.old")
@@ -193,62 +171,36 @@ def _set_aside(file: Path) -> str:
 def _main() -> None:
     with contextlib.suppress(OSError):
         os.nice(_NICE)
-    output = os.fdopen(os.dup(1), "wb", buffering=0)
+    output = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # for what a plugin prints
-
-    def send(message: Reply) -> None:
-        left = memoryview(packed(message))
-        while left:
-            left = left[output.write(left) or 0 :]
-
-    start = _read()
-    if not isinstance(start, Start):
-        return
+    estimator: Estimator | None = None
     try:
-        estimator = Estimator(start)
-        send(estimator.ready())
-    except InputError as error:
-        send(Note(str(error), is_final=True))
-        return
-    try:
-        while True:
-            due = estimator.next_chore
-            if _has_input(None if due is None else max(0.0, due - time.monotonic())):
-                pattern = _read()
-                if not isinstance(pattern, SettledPattern):
-                    return
-                for reply in replies(estimator, pattern):
-                    send(reply)
-            elif (done := estimator.do_chore()) is not None:
-                send(done)
+        for request in _requests():
+            replies: list[Reply]
+            if isinstance(request, Start):
+                try:
+                    estimator = Estimator(request)
+                    replies = [estimator.ready()]
+                except InputError as error:
+                    replies = [Note(str(error), is_final=True)]
+            else:
+                assert estimator is not None  # noqa: S101  started first
+                replies = estimator.chores() if request is None else estimator.take(request)
+            output.write(packed(replies))
+            output.flush()
     except BrokenPipeError:
         return
     finally:
-        estimator.save()
+        if estimator is not None:
+            estimator.save()
 
 
-def _has_input(timeout: float | None) -> bool:
-    return bool(select.select([0], [], [], timeout)[0])
-
-
-def _read() -> Request | None:
-    """The next request; None at the end of the input."""
-    head = _read_exactly(HEAD)
-    if head is None:
-        return None
-    content = _read_exactly(int.from_bytes(head, "big"))
-    request: Request | None = None if content is None else unpacked(content)
-    return request
-
-
-def _read_exactly(count: int) -> bytes | None:
-    content = bytearray()
-    while len(content) < count:
-        piece = os.read(0, count - len(content))
-        if not piece:
-            return None
-        content += piece
-    return bytes(content)
+def _requests() -> Iterator[Request]:
+    """Requests until the end of the input."""
+    while len(head := sys.stdin.buffer.read(HEAD)) == HEAD:
+        length = int.from_bytes(head, "big")
+        if len(content := sys.stdin.buffer.read(length)) == length:
+            yield unpacked(content)
 
 
 if __name__ == "__main__":

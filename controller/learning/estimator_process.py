@@ -12,18 +12,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from controller.learning.messages import (
-    HEAD,
-    Estimate,
-    Note,
-    Ready,
-    Refreshed,
-    Reply,
-    Request,
-    Start,
-    packed,
-    unpacked,
-)
+from controller.learning.messages import HEAD, Note, Reply, Request, Start, packed, unpacked
 from drivers import clock
 from drivers.pauses import Backoff
 from model.identification.settled import SettledPattern
@@ -34,6 +23,7 @@ MAX_WAITING = 16
 
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _BUFFER = 1 << 22  # bytes; more than most messages have
+_CHORES = 5.0  # s; after which it is to do what else is due, and so shows that it lives
 _CLOSE_TIMEOUT = 0.3  # s
 
 _logger = logging.getLogger(__name__)
@@ -68,28 +58,23 @@ class EstimatorProcess:
         self,
         start: Start,
         *,
-        received: Callable[[Ready | Estimate | Refreshed | Note], None],
+        received: Callable[[Reply], None],
         failed: Callable[[str, bool], None],
         timeouts: EstimatorTimeouts = DEFAULT_TIMEOUTS,
     ) -> None:
         self._start, self._timeouts = start, timeouts
         self._received, self._failed = received, failed
         self._waiting: asyncio.Queue[SettledPattern] = asyncio.Queue(MAX_WAITING)
-        self._replied: asyncio.Future[None] | None = None
-        self._refusal = ""
-        self._has_replied = False
+        self._has_estimated = False
         self._is_over = False
         self.pid: int | None = None
         """Of the process that runs now."""
 
     def hand(self, pattern: SettledPattern) -> bool:
         """Hand over a pattern; False where too many wait already, or none will be estimated."""
-        if self._is_over:
+        if self._is_over or self._waiting.full():
             return False
-        try:
-            self._waiting.put_nowait(pattern)
-        except asyncio.QueueFull:
-            return False
+        self._waiting.put_nowait(pattern)
         return True
 
     @property
@@ -102,16 +87,15 @@ class EstimatorProcess:
         timeouts, failures = self._timeouts, 0
         backoff = Backoff(first=timeouts.pause, maximum=timeouts.max_pause)
         while True:
-            started_at, self._has_replied = clock.now(), False
+            started_at, self._has_estimated = clock.now(), False
             try:
                 reason = await self._run_one()
             except OSError as error:
                 reason = f"cannot be started: {error}"
-            failures = 1 if self._has_replied else failures + 1
-            is_final = bool(self._refusal) or failures >= timeouts.max_failures
-            self._is_over = is_final
-            self._failed(self._refusal or reason, is_final)
-            if is_final:
+            failures = 1 if self._has_estimated else failures + 1
+            self._is_over = self._is_over or failures >= timeouts.max_failures
+            self._failed(reason, self._is_over)
+            if self._is_over:
                 return
             await asyncio.sleep(backoff.pause(ran_for=clock.now() - started_at))
 
@@ -128,87 +112,59 @@ class EstimatorProcess:
             start_new_session=True,  # Ctrl-C is handled by the daemon
         )
         self.pid = process.pid
-        receiving = asyncio.create_task(self._receive(process))
         try:
-            return await self._serve(process, receiving)
+            return await self._serve(process)
         except asyncio.CancelledError:
             await _let_end(process)  # it keeps what it has learned
             raise
         finally:
             self.pid = None
-            receiving.cancel()
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
             await process.wait()
-            await asyncio.gather(receiving, return_exceptions=True)
 
-    async def _serve(
-        self, process: asyncio.subprocess.Process, receiving: "asyncio.Task[None]"
-    ) -> str:
+    async def _serve(self, process: asyncio.subprocess.Process) -> str:
         """Hand over what waits, one after the other; why that ended."""
         request: Request = self._start
-        limit = self._timeouts.start
+        chores_at = clock.now() + _CHORES
         while True:
-            reason = await self._exchange(process, receiving, request, limit)
-            if reason:
-                return reason
-            getting = asyncio.create_task(self._waiting.get())
+            is_pattern = isinstance(request, SettledPattern)
+            limit = self._timeouts.estimate if is_pattern else self._timeouts.start
             try:
-                await asyncio.wait({getting, receiving}, return_when=asyncio.FIRST_COMPLETED)
-            finally:
-                getting.cancel()
-            if not getting.done() or getting.cancelled():
-                return await _end_of(process, receiving)
-            request, limit = getting.result(), self._timeouts.estimate
-
-    async def _exchange(
-        self,
-        process: asyncio.subprocess.Process,
-        receiving: "asyncio.Task[None]",
-        request: Request,
-        limit: float,
-    ) -> str:
-        """Send a request and wait for its reply; why there is none, or nothing."""
-        assert process.stdin is not None  # noqa: S101  a pipe was requested
-        self._replied = asyncio.get_running_loop().create_future()
-        process.stdin.write(packed(request))
-        await asyncio.wait(
-            {self._replied, receiving}, timeout=limit, return_when=asyncio.FIRST_COMPLETED
-        )
-        if self._replied.done():
-            return self._refusal
-        if receiving.done():
-            return await _end_of(process, receiving)
-        return f"no reply within {limit:g} s"
-
-    async def _receive(self, process: asyncio.subprocess.Process) -> None:
-        """Pass on replies until the end of its output."""
-        assert process.stdout is not None  # noqa: S101  a pipe was requested
-        with contextlib.suppress(asyncio.IncompleteReadError):
-            while True:
-                head = await process.stdout.readexactly(HEAD)
-                content = await process.stdout.readexactly(int.from_bytes(head, "big"))
-                reply: Reply = unpacked(content)
-                if isinstance(reply, Note) and reply.is_final:
-                    self._refusal = reply.text
-                else:
+                async with asyncio.timeout(limit):
+                    content = await _exchange(process, packed(request))
+                    if content is None:
+                        return f"exited with status {await process.wait()}"
+            except TimeoutError:
+                return f"no reply within {limit:g} s"
+            try:
+                for reply in unpacked(content):
+                    if isinstance(reply, Note) and reply.is_final:
+                        self._is_over = True
+                        return reply.text
                     self._received(reply)
-                if not isinstance(reply, Refreshed | Note) or self._refusal:
-                    self._has_replied = self._has_replied or isinstance(reply, Estimate)
-                    if self._replied is not None and not self._replied.done():
-                        self._replied.set_result(None)
+            except Exception as error:
+                _logger.exception("plate: a reply could not be taken")
+                return f"a reply could not be taken: {failure_text(error)}"
+            self._has_estimated = self._has_estimated or is_pattern
+            request = None
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(max(0.0, chores_at - clock.now())):
+                    request = await self._waiting.get()
+            if request is None:
+                chores_at = clock.now() + _CHORES
 
 
-async def _end_of(process: asyncio.subprocess.Process, receiving: "asyncio.Task[None]") -> str:
-    """How a process ended whose replies have, or why the daemon could not take one."""
-    if receiving.done() and (error := receiving.exception()) is not None:
-        _logger.error("plate: a reply could not be taken", exc_info=error)
-        return f"a reply could not be taken: {failure_text(error)}"
+async def _exchange(process: asyncio.subprocess.Process, request: bytes) -> bytes | None:
+    """Send a request; its reply, None at the end of the output."""
+    assert process.stdin is not None  # noqa: S101  pipes were requested
+    assert process.stdout is not None  # noqa: S101
+    process.stdin.write(request)
     try:
-        async with asyncio.timeout(_CLOSE_TIMEOUT):
-            return f"exited with status {await process.wait()}"
-    except TimeoutError:
-        return "closed its output"
+        head = await process.stdout.readexactly(HEAD)
+        return await process.stdout.readexactly(int.from_bytes(head, "big"))
+    except asyncio.IncompleteReadError:
+        return None
 
 
 async def _let_end(process: asyncio.subprocess.Process) -> None:

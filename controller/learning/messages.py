@@ -1,7 +1,7 @@
 """Messages between the daemon and its estimator, in Python's pickle format.
 
-A message is its length, 8 bytes, and its pickle. Both sides are the same program, and nobody else
-has their pipes.
+A message is its length, 8 bytes, and its pickle. The estimator answers each request by one message,
+a list of replies. Both sides are the same program, and nobody else has their pipes.
 """
 
 import io
@@ -86,7 +86,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Refreshed:
-    """Answers prepared whole while nothing was to be done, and robust ones of that plate."""
+    """Answers prepared whole while nothing else was to be done, and robust ones of that plate."""
 
     answers: Answers
     robust: Answers
@@ -100,11 +100,13 @@ class Note:
     is_final: bool = False
 
 
-Request: TypeAlias = Start | SettledPattern
+Request: TypeAlias = Start | SettledPattern | None
+"""None: to save and prepare what is due."""
+
 Reply: TypeAlias = Ready | Estimate | Refreshed | Note
 
 
-def packed(message: Request | Reply) -> bytes:
+def packed(message: Request | list[Reply]) -> bytes:
     """A message with its length."""
     content = pickle.dumps(message, protocol=5)
     return len(content).to_bytes(HEAD, "big") + content

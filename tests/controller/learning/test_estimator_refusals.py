@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from controller.learning.answers_in_use import AnswersInUse
-from controller.learning.estimator import Estimator, replies
+from controller.learning.estimator import Estimator
 from controller.learning.messages import HEAD, Answers, Estimate, Note, Start, packed, unpacked
 from controller.loop.loop import Controller
 from drivers.contents import Layer, Tone
@@ -36,7 +36,7 @@ def test_pattern_of_nothing_is_noted_and_leaves_no_file(tmp_path: Path) -> None:
     found = estimator(file)
     count = len(small_table().eras)
     nothing = SettledPattern(1.0, 110.0, np.full(count, 1e-5 + 0j), np.zeros(count, dtype=complex))
-    note, estimate = replies(found, nothing)
+    note, estimate = found.take(nothing)
     assert isinstance(note, Note)
     assert not note.is_final
     assert isinstance(estimate, Estimate)
@@ -74,8 +74,9 @@ def test_folder_without_room_is_noted_once(tmp_path: Path, monkeypatch: pytest.M
         clock[0] = float(second)
         if second == 40:
             errors[0] = OSError(30, "Read-only file system")
-        notes.append(found.do_chore())
-    assert [isinstance(note, Note) for note in notes] == [True, False, False, True, False]
+        notes.append(found.chores())
+    assert [len(each) for each in notes] == [1, 0, 0, 1, 0]
+    assert all(isinstance(note, Note) for each in notes for note in each)
 
 
 def test_files_of_writers_that_were_killed_are_removed(tmp_path: Path) -> None:
@@ -115,9 +116,9 @@ def test_answers_of_another_table_are_refused() -> None:
 
 def test_message_has_its_length_before_it() -> None:
     """Eight bytes, the largest first; then what it is made of again."""
-    message = packed(Note("the plate settles", is_final=True))
+    message = packed([Note("the plate settles", is_final=True)])
     assert int.from_bytes(message[:HEAD], "big") == len(message) - HEAD
-    assert unpacked(message[HEAD:]) == Note("the plate settles", is_final=True)
+    assert unpacked(message[HEAD:]) == [Note("the plate settles", is_final=True)]
 
 
 def test_no_command_comes_by_a_message() -> None:

@@ -53,7 +53,10 @@ class Playback:
     all_voices: list[tuple[Voice, ...]] = field(init=False)
     """Voices by channel, the oldest first."""
     _layers: dict[int, _Layer] = field(default_factory=dict)
-    _changes_at: float = math.inf  # s; before, advancing changes nothing
+    changes_at: float = field(default=math.inf, init=False)
+    """Before this time [s] advancing changes nothing."""
+    tokens: Mapping[int, int] = field(default_factory=dict, init=False)
+    """Token of each layer that plays."""
 
     def __post_init__(self) -> None:
         """Start silent."""
@@ -93,7 +96,7 @@ class Playback:
 
     def advance(self, time: float) -> None:
         """Carry out what is due by a time: ends of `valid_for`, sets that wait, faded voices."""
-        if time < self._changes_at:
+        if time < self.changes_at:
             return
         while self.next_due <= time:
             self.carry_out(*min(self.dues))
@@ -125,16 +128,18 @@ class Playback:
                 self.all_voices[channel] = tuple(kept)
 
     def _note_changes(self) -> None:
-        """Note when a voice has faded, or a layer ends or starts, next."""
+        """Note what plays, and when a voice has faded, or a layer ends or starts, next."""
         first = math.inf
         for layer in self._layers.values():
             first = min(first, layer.ends, math.inf if layer.waiting is None else layer.waiting[0])
-        self.next_due = first
+        self.next_due, tokens = first, {}
         for voices in self.all_voices:
             for voice in voices:
                 if not voice.transition.last and voice.transition.end < first:
                     first = voice.transition.end
-        self._changes_at = first
+                if not voice.has_ended:
+                    tokens[voice.layer] = self._layers[voice.layer].token
+        self.changes_at, self.tokens = first, tokens
 
     def add_ends(self, layer: int, time: float) -> None:
         """Add copies of the voices of a layer that end by themselves at a time [s].
@@ -211,16 +216,6 @@ class Playback:
     def peak(self, channel: int, time: float) -> float:
         """Return a bound of the amplitude from a time on: all voices at their largest at once."""
         return sum(voice.transition.peak(time) for voice in self.all_voices[channel])
-
-    @property
-    def tokens(self) -> Mapping[int, int]:
-        """Token of each layer that plays."""
-        lasting: dict[int, int] = {}
-        for voices in self.all_voices:
-            for voice in voices:
-                if not voice.has_ended:
-                    lasting[voice.layer] = self._layers[voice.layer].token
-        return lasting
 
     @property
     def waiting(self) -> tuple[LayerSet, ...]:

@@ -27,6 +27,7 @@ from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.dialogue import Staged
+from drivers.host.jobs import Priority
 from drivers.host.sensors import Reading, Sensor, measure_tones, read_sensors
 from drivers.host.stop import Stopped
 from drivers.host.timing import HEARTBEAT
@@ -105,7 +106,7 @@ class BlockingAmplifier:
 
     def status(self) -> dict[str, Any]:
         """Read state, fault and levels, with the keys of `era amp status`."""
-        return status_rows(self._wait(self._amplifier.read_status()))
+        return status_rows(self._wait(self._amplifier.request("GetStatus", {})))
 
     def faults(self) -> list[dict[str, Any]]:
         """Read latched and past faults, newest first, with the keys of `era amp status`."""
@@ -113,7 +114,8 @@ class BlockingAmplifier:
 
     def heartbeat(self) -> dict[str, Any]:
         """Feed the watchdog; CommandRefused if the amplifier is no longer armed."""
-        return status_rows(self._wait(self._amplifier.ping()))
+        values = {"session": self._amplifier.session}
+        return status_rows(self._wait(self._amplifier.request("Ping", values, Priority.HEARTBEAT)))
 
     def sensors(self) -> tuple[Sensor, ...]:
         """Read what its sensors measure, and where; empty if it has none."""

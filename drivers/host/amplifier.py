@@ -192,17 +192,13 @@ class Amplifier(Dialogue):
             status = await self.read_status(Priority.SILENCE)
         self.may_be_armed = False
 
-    async def ping(self) -> Values:
-        """Feed the watchdog; returns the status. Raises CommandRefused if it is not armed."""
-        values = {"session": self.session}
-        status = await self.line.submit(self, Priority.HEARTBEAT, "Ping", values)
-        if status["state"] != ENABLED:
-            raise self.disarmed(status)
-        return status
+    def ping(self) -> "asyncio.Future[Values]":
+        """Feed the watchdog; the future has the status, CommandRefused if it is not armed."""
+        return self.line.submit(self, Priority.HEARTBEAT, "Ping", {"session": self.session})
 
-    async def read_status(self, priority: Priority = Priority.OTHER) -> Values:
+    def read_status(self, priority: Priority = Priority.OTHER) -> "asyncio.Future[Values]":
         """Read the status, which feeds nothing."""
-        return await self.line.submit(self, priority, "GetStatus", {})
+        return self.line.submit(self, priority, "GetStatus", {})
 
     async def clear(self) -> Values:
         """Acknowledge the newest stop or fault that was shown.

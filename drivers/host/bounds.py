@@ -15,25 +15,22 @@ from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
 from drivers.voices import Voice, amplitude_of, amplitudes_of, steepest
 
-_RAMP, _STEP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["envelope_step"], QUANTITIES["level"]
-_FREQUENCY, _VALID_FOR = QUANTITIES["frequency"], QUANTITIES["valid_for"]
+_PER_RAMP, _PER_STEP = QUANTITIES["ramp"].per_unit, QUANTITIES["envelope_step"].per_unit
+_PER_FULL, _PER_HERTZ = QUANTITIES["level"].per_unit, QUANTITIES["frequency"].per_unit
+_PER_VALID_FOR = QUANTITIES["valid_for"].per_unit
 
 
 @dataclass(slots=True)
 class Path:
-    """Magnitudes after a commit, in full levels: at its start, then a step [s] apart.
+    """Magnitudes after a commit, in full levels: at its start, then a step [s] apart until end [s].
 
     is_cosine: between the two along a raised cosine, else along straight lines.
     """
 
     step: float
     magnitudes: tuple[float, ...]
+    end: float
     is_cosine: bool
-
-    @property
-    def end(self) -> float:
-        """Time of the last magnitude [s] after the commit."""
-        return self.step * (len(self.magnitudes) - 1)
 
     def along(self, times: Sequence[float]) -> list[float]:
         """Return upper bounds of the magnitude at times [s] after the commit."""
@@ -55,6 +52,7 @@ class Path:
 class ChannelBounds:
     """What a channel may play once layers are committed, between two times [s].
 
+    all_layers: these and those that wait.
     steady: sum of the largest magnitudes of voices that the set does not change; paths: of those
     that it changes or starts; rise: of the level, at the most [full levels/s].
     """
@@ -63,6 +61,7 @@ class ChannelBounds:
         self,
         playback: Playback,
         layers: Mapping[int, LayerSet],
+        all_layers: Sequence[LayerSet],
         channel: int,
         time: float,
         *,
@@ -87,22 +86,25 @@ class ChannelBounds:
             else:
                 skips = command is not None and (command.is_driven or command.skip_ending)
                 self._fade(voice, one, None if skips else voice.ending)
-        for one in (*layers.values(), *playback.waiting):
+        for one in all_layers:
             command = _command_of(one, channel)
             if command is None or not command.is_driven:
                 continue
             if one.after:
                 self._lead_later(one, command)
             elif one.layer not in continued:
-                self._lead(command.frequency / _FREQUENCY.per_unit, (0j,), one, command)
+                self._lead(command.frequency / _PER_HERTZ, (0j,), one, command)
 
     @property
     def rise(self) -> float:
         """Steepest rise of the level [full levels/s]; of one frequency also by interference."""
-        return sum(
-            several[0][0] if len(several) == 1 else sum(change for _, change in several)
-            for several in self._rises.values()
-        )
+        steepest = 0.0
+        for several in self._rises.values():
+            if len(several) == 1:
+                steepest += several[0][0]
+            else:
+                steepest += sum([change for _, change in several])
+        return steepest
 
     def along(self, times: Sequence[float]) -> list[list[float]]:
         """Return upper bounds at times [s] after the commit: what is steady, and each path."""
@@ -123,22 +125,22 @@ class ChannelBounds:
         # Also where it does not change: another voice of its frequency may cease to cancel it.
         self._note(voice.frequency, *ways)
         if one is not None and not voice.has_ended:
-            self._note(voice.frequency, _steepest_from(points, None, 0j, _ramp_of(one)))
+            self._note(voice.frequency, _steepest_from(points, None, 0j, one.ramp / _PER_RAMP))
 
     def _fade(self, voice: Voice, one: LayerSet, ending: Envelope | None) -> None:
         """Add a voice that falls silent, along its ending or the ramp of the set."""
         starts = voice.transition.points(self._time)
-        self._note(voice.frequency, _steepest_from(starts, ending, 0j, _ramp_of(one)))
-        self._add_path(starts, ending, 0.0, _ramp_of(one))
+        self._note(voice.frequency, _steepest_from(starts, ending, 0j, one.ramp / _PER_RAMP))
+        self._add_path(starts, ending, 0.0, one.ramp / _PER_RAMP)
 
     def _lead(
         self, frequency: float, starts: Sequence[complex], one: LayerSet, command: Command
     ) -> None:
         """Add a voice that a command leads from one of some amplitudes; its ending may follow."""
         self._note_way(frequency, starts, one, command)
-        ending, last = _peak(command.ending), command.level / _LEVEL.per_unit
-        path = self._add_path(starts, command.onset, max(last, ending), _ramp_of(one))
-        if one.valid_for and _VALID_FOR.from_wire(one.valid_for) < path.end:  # it may begin amid
+        ending, last = _peak(command.ending), command.level / _PER_FULL
+        path = self._add_path(starts, command.onset, max(last, ending), one.ramp / _PER_RAMP)
+        if one.valid_for and one.valid_for / _PER_VALID_FOR < path.end:  # it may begin amid
             path.magnitudes = tuple(max(each, ending) for each in path.magnitudes)
 
     def _add_path(
@@ -147,7 +149,8 @@ class ChannelBounds:
         """Add the way along an envelope, or a ramp [s] without one, to a magnitude."""
         between = map(abs, amplitudes_of(onset))
         magnitudes = (max(map(abs, starts)), *between, last)
-        path = Path(_step_of(onset, ramp), magnitudes, len(magnitudes) == 2)
+        step, steps = ramp if onset is None else onset.step / _PER_STEP, len(magnitudes) - 1
+        path = Path(step, magnitudes, step * steps, steps == 1)
         self.paths.append(path)
         return path
 
@@ -156,12 +159,12 @@ class ChannelBounds:
 
         It may continue a voice of its layer from wherever that is then, or let it fade.
         """
-        frequency = command.frequency / _FREQUENCY.per_unit
+        frequency = command.frequency / _PER_HERTZ
         starts = [0j]
         for voice in self._voices:
             if voice.layer == one.layer and not voice.has_ended:
                 points = voice.transition.points(self._time)
-                self._note(voice.frequency, _steepest_from(points, None, 0j, _ramp_of(one)))
+                self._note(voice.frequency, _steepest_from(points, None, 0j, one.ramp / _PER_RAMP))
                 starts += points if voice.frequency == frequency else ()
         self._note_way(frequency, starts, one, command)
         self.steady += max(*map(abs, _course(command)), _peak(command.ending))
@@ -171,7 +174,7 @@ class ChannelBounds:
     ) -> None:
         """Note how fast a command leads, and its ending from wherever it is by then."""
         course = _course(command)
-        ways = [_steepest_from(starts, command.onset, course[-1], _ramp_of(one))]
+        ways = [_steepest_from(starts, command.onset, course[-1], one.ramp / _PER_RAMP)]
         if command.ending is not None:
             ways.append(_steepest_from((*starts, *course), command.ending, 0j, math.inf))
         self._note(frequency, *ways)
@@ -213,8 +216,9 @@ def all_bounds(
 ) -> list[ChannelBounds]:
     """Return what each channel may play if layers are committed between two times [s]."""
     named = {one.layer: one for one in layers if not one.renew}
+    every = (*named.values(), *playback.waiting)
     return [
-        ChannelBounds(playback, named, channel, time, until=until)
+        ChannelBounds(playback, named, every, channel, time, until=until)
         for channel in range(playback.channels)
     ]
 
@@ -236,15 +240,8 @@ def _steepest_from(
     knots = amplitudes_of(envelope)
     course = (*knots, last)
     ways = chain(product(starts, course[:1]), pairwise(course))
-    return steepest(ways, _step_of(envelope, ramp), is_cosine=not knots)
-
-
-def _step_of(envelope: Envelope | None, ramp: float) -> float:
-    return ramp if envelope is None else _STEP.from_wire(envelope.step)
-
-
-def _ramp_of(one: LayerSet) -> float:
-    return _RAMP.from_wire(one.ramp)
+    step = ramp if envelope is None else envelope.step / _PER_STEP
+    return steepest(ways, step, is_cosine=not knots)
 
 
 def _peak(envelope: Envelope | None) -> float:

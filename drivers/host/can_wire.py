@@ -66,7 +66,7 @@ class CanWire(Wire):
             number = self._numbers.get(address, self._sequence) % NUMBER_MAX + 1
             self._numbers[address] = number
         if name != "Hello":
-            kind, words = MESSAGES[name].number, MESSAGES[name].request.pack(values)
+            kind, words = MESSAGES[name].number, MESSAGES[name].request.append([], values)
         frames = [CanFrame(REQUEST + address, data) for data in segments(number, kind, words)]
         self._sent.extend(frames)
         if name == "Hello":

@@ -198,7 +198,7 @@ class Dialogue:
     ) -> Staged:
         """Have the ledger admit a set, and cut it into parts; raises CommandRefused."""
         moment = self._time()
-        takes = self._times.get("Set") or self.exchange_time("Set")
+        takes = self.exchange_time("Set")
         # Longest time from the admission of a set until it is committed.
         delay = max(COMMIT_DELAY, ATTEMPTS * len(self.line.members) * takes)
         admitted = self.ledger.admit(layers, moment, delay=delay)
@@ -237,7 +237,8 @@ class Dialogue:
         Raises for what plays or feeds, while it must not go out: LinkError while degraded or beside
         another host, CommandRefused once a status has shown that it is not armed any more.
         """
-        takes = self._times.get(name) or self.exchange_time(name)
+        takes = self._times.get(name)
+        takes = self.exchange_time(name) if takes is None else takes
         if name == "Set" and takes > FAST:  # much shorter, nearly always
             words = SET_WORDS + len(values["stream"])
             takes = self.line.wire.exchange_time(words, TAKEN_WORDS)
@@ -300,6 +301,8 @@ class Dialogue:
                 feeding.plays, feeding.fade = sent_at, 0.0
         if message.reply is _STATUS:
             self._note_status(name, values, reply, sent_at, now)
+            if name == "Ping" and reply["state"] != ENABLED:
+                raise self.disarmed(reply)
         elif name == "Set" and reply["played"]:
             self._confirm(values["token"], now)
 
@@ -343,7 +346,8 @@ class Dialogue:
         if name in _SILENCING:
             self._ledger.silenced(_RAMP.from_wire(values["ramp"]), sent_at, now)
             return
-        self._confirm(status["token"], now)
+        if self._ledger.doubt or self._admitted or status["token"] != self.committed:
+            self._confirm(status["token"], now)
         if not self.session or name in ("Arm", "Clear") or status["state"] != ENABLED:
             return
         # A status after a request that feeds says nothing of how the watchdog runs down.
@@ -351,7 +355,7 @@ class Dialogue:
         if not status["flags"] >> STATUS_FLAGS["high_voltage"] & 1:
             problem = "high voltage must be on, got off"
         elif not fed:
-            left = _LEFT.from_wire(status["watchdog_left"])
+            left = status["watchdog_left"] / _LEFT.per_unit
             problem = self.feeding.problem(left, sent_at, now)
         problem = problem or self._ledger.problem_of(status, sent_at, now)
         if problem is None:

@@ -165,7 +165,7 @@ class Group(Members):
             self.check_none_since(before)
             await amplifier.ping()
         elif name not in self._readings or self._readings[name].done():
-            reading = asyncio.ensure_future(amplifier.read_status(Priority.READING))
+            reading = amplifier.read_status(Priority.READING)
             reading.add_done_callback(_seen)
             self._readings[name] = reading
 

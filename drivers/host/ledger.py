@@ -9,6 +9,7 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 from drivers.contents import Layer
 from drivers.errors import CommandRefused
@@ -28,6 +29,15 @@ _WEAK = 0.25  # largest measuring error, relative to a weak level
 _logger = logging.getLogger(__name__)
 
 
+class Doubt(NamedTuple):
+    """A set that was sent at a time [s]; before: what vibrated then."""
+
+    token: int
+    layers: tuple[LayerSet, ...]
+    sent_at: float
+    before: Vibration | None
+
+
 class Ledger:
     """The ledger of one amplifier, at first silent.
 
@@ -40,14 +50,10 @@ class Ledger:
         self.adopt(capabilities)  # which refuses limits that are none
         self._budget = Budget(limits)
 
-    @property
-    def doubt(self) -> int:
-        """Token of the set that was committed and is not confirmed; 0: none."""
-        return 0 if self._doubt is None else self._doubt[0]
-
     def adopt(self, capabilities: Values) -> None:
         """Go on with other capabilities, silent; what was spent of on-time and duty stays spent."""
         self.limits, self.capabilities = wire_limits(self._configured, capabilities), capabilities
+        self._is_measured = has_feature(capabilities, "levels_measured")
         self._rounding = Rounding(self.limits, capabilities)
         self.forget()
 
@@ -55,7 +61,8 @@ class Ledger:
         """Start anew: the amplifier is silent, armed or not."""
         self.playback = playback_of(self.capabilities)
         self.lag = 0.0  # s; by which what plays may be later than `playback` says
-        self._doubt: tuple[int, tuple[LayerSet, ...], float, Vibration | None] | None = None
+        self.doubt: Doubt | None = None
+        """What was committed and is not confirmed."""
 
     def go_on_from(self, earlier: "Ledger") -> None:
         """Count the vibrations of an earlier ledger of the same rig, as after a reconnection."""
@@ -74,8 +81,9 @@ class Ledger:
             requested = self._rounding.layers(layers)
             if not is_vibrating(*requested):
                 return self._silence(requested, now, delay)
-            if self._doubt is not None:
-                raise CommandRefused(f"set {self.doubt} must be confirmed first; read the status")
+            if self.doubt is not None:
+                token = self.doubt.token
+                raise CommandRefused(f"set {token} must be confirmed first; read the status")
             self._check_sums(requested, now, delay)
             return self._within_budget(requested, now, delay)
         except CommandRefused:
@@ -91,21 +99,21 @@ class Ledger:
 
         Again, where its commit is repeated: it may have played since the first time.
         """
-        if self._doubt is not None and self._doubt[0] == token:
+        if self.doubt is not None and self.doubt.token == token:
             return
         before: Vibration | None = None
         if is_vibrating(*layers):
             is_timed = not self._budget.is_unlimited
             lasts = max(map(_lasts, layers)) if is_timed else 0.0
             before = self._budget.sent(now, lasts=lasts)
-        self._doubt = token, layers, now, before
+        self.doubt = Doubt(token, layers, now, before)
 
     def confirmed(self, now: float) -> None:
         """Note at a time [s] that the set in doubt plays, since it was sent at the earliest."""
-        if self._doubt is None:
+        if self.doubt is None:
             return
-        token, layers, sent_at, _ = self._doubt
-        self._doubt = None
+        token, layers, sent_at, _ = self.doubt
+        self.doubt = None
         playback = self.playback
         if playback.next_due == math.inf and playback.is_settled(sent_at - self.lag):
             self.lag = 0.0
@@ -121,13 +129,13 @@ class Ledger:
 
     def refused(self) -> None:
         """Note that the set in doubt was not played."""
-        if self._doubt is not None:
-            self._budget.restore(self._doubt[3])
-            self._doubt = None
+        if self.doubt is not None:
+            self._budget.restore(self.doubt.before)
+            self.doubt = None
 
     def silenced(self, ramp: float, sent_at: float, now: float) -> None:
         """Note that all layers fall silent along a ramp [s], by a request sent at a time [s]."""
-        self._doubt = None
+        self.doubt = None
         self.lag = self.playback.uncertainty = max(self.lag, now - sent_at)
         self.playback.silence(sent_at, ramp)
         if not self._budget.is_unlimited:
@@ -135,7 +143,7 @@ class Ledger:
 
     def resolve(self, token: int, now: float) -> None:
         """Resolve the doubt by the token that the amplifier says it committed last."""
-        if self._doubt is not None and token == self._doubt[0]:
+        if self.doubt is not None and token == self.doubt.token:
             self.confirmed(now)
         else:
             self.refused()
@@ -147,7 +155,8 @@ class Ledger:
         from above alone: their commit is known as an interval.
         """
         playback = self.playback
-        playback.advance(now - self.lag)
+        if now - self.lag >= playback.changes_at:
+            playback.advance(now - self.lag)
         if len(status["levels"]) != playback.channels:
             return f"levels must be {playback.channels}, got {len(status['levels'])}"
         if len(status["tokens"]) != self.capabilities["layers"]:
@@ -159,7 +168,6 @@ class Ledger:
                 if token != expected.get(layer, 0):
                     return f"token of layer {layer} must be {expected.get(layer, 0)}, got {token}"
         late, tolerance = sent_at - self.lag, _STEPS * max(self.capabilities["level_step"], 1)
-        is_measured = has_feature(self.capabilities, "levels_measured")
         for channel, level in enumerate(status["levels"]):
             highest, is_settled = 0.0, is_steady
             for voice in playback.all_voices[channel]:
@@ -178,7 +186,7 @@ class Ledger:
             low = 0
             if is_settled:
                 low = round(min(playback.level(channel, now), 1.0) * _LEVEL.per_unit)
-            if is_measured:
+            if self._is_measured:
                 error = round(_MEASURING_ERROR * _LEVEL.per_unit)
                 low -= min(error, round(_WEAK * low))
                 high += min(error, round(_WEAK * high))
@@ -193,7 +201,7 @@ class Ledger:
         left = math.floor(min(self._budget.fade_left(now), _RAMP.high) * _RAMP.per_unit)
         silent = tuple(replace(one, ramp=min(one.ramp, left)) for one in layers)
         try:
-            if self._doubt is None:
+            if self.doubt is None:
                 self._check_sums(silent, now, delay)
                 return silent
         except CommandRefused:
@@ -223,7 +231,7 @@ class Ledger:
         """Return why layers must not play from a time between two on [s]; None if they may."""
         bounds = all_bounds(self.playback, layers, late, until=until)
         levels, power = worst(bounds)
-        highest = _LEVEL.from_wire(self.limits.level)
+        highest = self.limits.level / _LEVEL.per_unit
         for channel, (bound, level) in enumerate(zip(bounds, levels, strict=True)):
             if bound.rise > self.limits.slew * TOLERANCE:
                 text = (

@@ -97,6 +97,7 @@ _LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
 _STEP, _FREQUENCY = QUANTITIES["envelope_step"], QUANTITIES["frequency"]
 _VALID_FOR_MAX = _VALID_FOR.high
+_ENDS = ("min", "max")
 
 
 class Rounding:
@@ -108,6 +109,7 @@ class Rounding:
         self._layers: int = capabilities["layers"]
         self._ramp_max = _RAMP.from_wire(capabilities["ramp_max"])
         self._level_max = limits.level / _LEVEL.per_unit
+        self._steps = [_STEP.from_wire(capabilities[f"envelope_step_{end}"]) for end in _ENDS]
 
     def layers(self, layers: Sequence[Layer]) -> tuple[LayerSet, ...]:
         """Return layers in integers of the wire; raises CommandRefused with channel and reason."""
@@ -187,7 +189,7 @@ class Rounding:
 
     def _envelope(self, shape: Shape, channel: int) -> Envelope:
         can, limits = self._can, self._limits
-        low, high = map(_STEP.from_wire, (can["envelope_step_min"], can["envelope_step_max"]))
+        low, high = self._steps
         if not low <= shape.step <= high:
             text = f"step of an envelope must be {low:g} to {high:g} s, got {shape.step!r} s"
             raise _refused(channel, text)

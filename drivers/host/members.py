@@ -326,8 +326,9 @@ class Members:
 
 def is_lost(amplifier: Amplifier) -> bool:
     """Whether it cannot be reached: its line is gone, or it is mute beyond its watchdog."""
-    is_over = clock.now() >= amplifier.feeding.lost_from
-    return amplifier.line.loss is not None or (amplifier.silence_cause is not None and is_over)
+    if amplifier.silence_cause is None or amplifier.line.loss is not None:
+        return amplifier.line.loss is not None
+    return clock.now() >= amplifier.feeding.lost_from
 
 
 def _merged(refusals: Mapping[str, CommandRefused]) -> CommandRefused:

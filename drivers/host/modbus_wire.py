@@ -150,7 +150,7 @@ class ModbusWire(Wire):
         """Return a request whose write goes first."""
         message = MESSAGES[name]
         tag = self._number % 0xFFFF + 1
-        registers = (tag, *message.request.pack(values))
+        registers = (tag, *message.request.append([], values))
         return _Request(name, tag, self._adu(unit, message.number * BOX, registers))
 
     def _arrival(self, request: _Request, response: ModbusResponse) -> Arrival | None:

@@ -54,7 +54,7 @@ class SerialWire(Wire):
             frame = Frame(HELLO, address, self._sequence, b"", NEUTRAL)
         else:
             message = MESSAGES[name]
-            payload = pack_words(message.request.pack(values))
+            payload = pack_words(message.request.append([], values))
             frame = Frame(message.number, address, self._sequence, payload, VERSION)
         self._pending = None if address == BROADCAST else frame
         self.counters.frames_out += 1

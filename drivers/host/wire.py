@@ -109,7 +109,7 @@ def read_reply(kind: int, received: int, words: Sequence[int]) -> Arrival:
         if received == NAK:
             return read_nak(words)
         record = BY_NUMBER[kind].reply if kind in BY_NUMBER else IDENTITY
-        return Reply(record.unpack(words, is_strict=False))
+        return Reply(record.read(words)[0])  # what follows is ignored
     except Refusal as refusal:
         return Broken(str(refusal))
 

@@ -190,19 +190,6 @@ class Numbers:
                 raise ValueError(_out_of_range(self.name, self.quantity, number))
         words.extend(numbers)
 
-    def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
-        """Read the integers."""
-        end = at + int(values[self.count])
-        if end > len(words):
-            raise IndexError
-        numbers = list(words[at:end])
-        low, high = self.quantity.minimum, self.quantity.maximum
-        for number in numbers:
-            if not low <= number <= high:
-                raise Refusal(_out_of_range(self.name, self.quantity, number))
-        values[self.name] = numbers
-        return end
-
 
 @dataclass(frozen=True, slots=True)
 class Rows:
@@ -258,8 +245,10 @@ class Record:
         for field in fields:
             self.names += dict(field.parts) if isinstance(field, Bits) else [field.name]
 
-    def append(self, words: list[int], *rows: Mapping[str, Any]) -> None:
-        """Append the words of values, by row; ValueError for one out of range, KeyError for none.
+    def append(self, words: list[int], *rows: Mapping[str, Any]) -> list[int]:
+        """Append the words of values, by row, and return all.
+
+        ValueError for one out of range, KeyError for none.
 
         Numbers and shared words, nearly all, without a call: every set has dozens of them.
         """
@@ -281,12 +270,11 @@ class Record:
                 words.append(word)
             else:
                 field.pack(values, words)
+        return words
 
     def pack(self, values: Mapping[str, Any]) -> list[int]:
         """Return the words of values."""
-        words: list[int] = []
-        self.append(words, values)
-        return words
+        return self.append([], values)
 
     def read(self, words: Sequence[int], at: int = 0) -> tuple[Values, int]:
         """Read the values from an index on, and the index behind them; raises Refusal."""
@@ -313,6 +301,15 @@ class Record:
                     if word:
                         raise Refusal(f"unused bits beside {field.parts[0][0]} must be 0")
                     at += 1
+                elif isinstance(field, Numbers):
+                    quantity, end = field.quantity, at + int(values[field.count])
+                    if end > len(words):
+                        raise IndexError
+                    numbers = values[field.name] = list(words[at:end])
+                    for number in numbers:
+                        if not quantity.minimum <= number <= quantity.maximum:
+                            raise Refusal(_out_of_range(field.name, quantity, number))
+                    at = end
                 else:
                     at = field.unpack(words, at, values)
         except IndexError:

@@ -125,7 +125,7 @@ def test_check_that_fails_refuses_and_leaves_silence_possible() -> None:
     play(ledger, 1, 0.0, Layer(0, (tone(),)))
     broken = replace(tone(1), onset=object())  # type: ignore[arg-type]
     refusal(ledger, Layer(1, (broken,)))
-    assert ledger.doubt == 0
+    assert ledger.doubt is None
     assert ledger.playback.tokens == {0: 1}
     assert ledger.admit([Layer(0, ())], 1.0)
 
@@ -202,11 +202,12 @@ def test_doubt_admits_silence_only_until_it_is_resolved() -> None:
     ledger = Ledger(WIDE, CAN)
     layer = Layer(0, (tone(),))
     ledger.sent(7, ledger.admit([layer], 0.0), 0.0)
-    assert ledger.doubt == 7
+    assert ledger.doubt is not None
+    assert ledger.doubt.token == 7
     refusal(ledger, layer)
     assert ledger.admit([Layer(0, ())], 1.0)
     ledger.resolve(6, 1.0)
-    assert (ledger.doubt, ledger.playback.level(0, 1.0)) == (0, 0.0)
+    assert (ledger.doubt, ledger.playback.level(0, 1.0)) == (None, 0.0)
     ledger.sent(8, ledger.admit([layer], 1.0), 1.0)
     ledger.resolve(8, 1.01)
     assert ledger.playback.level(0, 2.0) == pytest.approx(0.5)

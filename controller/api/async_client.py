@@ -35,7 +35,6 @@ from controller.api.methods import (
     ArmResult,
     ClearParams,
     HelloParams,
-    StatusResult,
 )
 from controller.api.place import find_socket
 from controller.api.schema import Empty, Message, Topic, headline
@@ -94,13 +93,6 @@ class AsyncClient(AsyncCalls):
         client = cls(find_socket(path), name=name, timeout=timeout)
         await client._within_timeout(client._repeated(client._connected))
         return client
-
-    async def keep_connected(self) -> None:
-        """Connect again after every loss, until cancelled, so that no call has to wait for it."""
-        while True:
-            with suppress(Unreachable, RpcError):
-                await self._within_timeout(self._connected())
-            await asyncio.sleep(_MAX_RETRY_INTERVAL)
 
     async def __aenter__(self) -> Self:
         return self
@@ -168,7 +160,7 @@ class AsyncClient(AsyncCalls):
             lease = await asyncio.shield(arming)
         except asyncio.CancelledError:
             with suppress(RpcError, Unreachable):  # if refused, another client's lease
-                await self._disarm((await arming).lease)
+                await self.disarm(lease=(await arming).lease)
             raise
         self._lease, self._lease_lost = lease, None
         self._renewing = asyncio.create_task(self._keep_renewing(lease), name="lease")
@@ -184,7 +176,7 @@ class AsyncClient(AsyncCalls):
         if lease is None:  # ended by a call of this client
             return
         try:
-            await self._disarm(lease.lease)
+            await self.disarm(lease=lease.lease)
         except RpcError as error:
             if error.code not in (ErrorCode.LEASE, ErrorCode.WRONG_STATE):
                 raise
@@ -325,9 +317,6 @@ class AsyncClient(AsyncCalls):
             self._renewing.cancel()
             self._renewing = None
 
-    async def _disarm(self, lease: str) -> None:
-        await self._within_timeout(self._send("disarm", make_params("disarm", lease=lease)))
-
     async def _keep_renewing(self, lease: ArmResult) -> None:
         """Renew a lease until it is lost, over a new connection if need be."""
         loop = asyncio.get_running_loop()
@@ -357,9 +346,7 @@ class AsyncClient(AsyncCalls):
     async def _why_lost(self, reason: RpcError | Unreachable | None) -> LeaseLost:
         """The loss of the lease with the daemon's cause, if available."""
         try:
-            found = await self._within_timeout(self._send("status", Empty()))
-            status = read_result(found, StatusResult)
-            self._see(self._connections, status.epoch)
+            status = await self.status()
         except (RpcError, Unreachable):
             return LeaseLost(str(reason))
         return LeaseLost(headline(status.state, status.cause))

@@ -20,8 +20,6 @@ SHARE = 0.25  # of the event loop's time, for those that touch, and for the othe
 BURST = 0.02  # s of processor time, saved up
 MAX_DEFERRAL = 0.003  # s; of a turn by touches, which may follow each other without a gap
 _RECHECK = 0.0005  # s; of a turn that is deferred
-MAX_EXCESS = 3  # requests beyond a client's rate, after which it pauses
-PAUSE = 0.001  # s
 
 
 class Turns:
@@ -44,36 +42,22 @@ class Turns:
         self._serve = serve
         self._is_first = is_first
         self._processor_time = processor_time
-        share = partial(RateLimiter, SHARE, burst=BURST, clock=clock)
-        self._first = _Lane(self._take, share(), is_busy=is_busy, clock=clock)
-        self._others = _Lane(self._take, share(), is_busy=is_busy, clock=clock)
-        self._urgent: deque[Connection] = deque()
-        self._is_urgent_due = False
+        first, others = (RateLimiter(SHARE, burst=BURST, clock=clock) for _ in range(2))
+        lane = partial(_Lane, self._take, is_busy=is_busy, clock=clock)
+        self._first, self._others = lane(first), lane(others)
+        self._urgent = lane(others, is_urgent=True)  # within no limit, but counted
 
     def add(self, connection: Connection) -> None:
         """Serve a client that has lines."""
+        lanes = (self._first, self._others, self._urgent)
+        is_waiting = any(connection in lane.waiting for lane in lanes)
         if connection.is_urgent:
             for lane in (self._first, self._others):
                 with contextlib.suppress(ValueError):
                     lane.waiting.remove(connection)
-            if connection not in self._urgent:
-                self._urgent.append(connection)
-            if not self._is_urgent_due:
-                self._is_urgent_due = True
-                asyncio.get_running_loop().call_soon(self._take_urgent)
-        elif not connection.is_paused and not any(
-            connection in lane.waiting for lane in (self._first, self._others)
-        ):
+            self._urgent.add(connection)
+        elif not is_waiting:
             (self._first if self._is_first(connection) else self._others).add(connection)
-
-    def _take_urgent(self) -> None:
-        """Serve clients whose input may hold a stop, within no limit, but counted."""
-        try:
-            self._take(self._urgent, self._others.budget)
-        finally:
-            self._is_urgent_due = bool(self._urgent)
-            if self._is_urgent_due:
-                asyncio.get_running_loop().call_soon(self._take_urgent)
 
     def _take(self, waiting: deque[Connection], budget: RateLimiter) -> None:
         """Serve a line of each connection, round and round, until the turn's time is up."""
@@ -84,31 +68,19 @@ class Turns:
             self._serve(connection)
             reading_time += connection.reading_time
             connection.reading_time = 0.0
-            if connection.excess >= MAX_EXCESS and not connection.is_urgent:
-                self._pause(connection)
-            elif connection.has_lines:
+            if connection.has_lines:
                 self.add(connection)
             connection.close_if_finished()
             if time.perf_counter() >= end:
                 break
         budget.spend(self._processor_time() - began_at + reading_time)
 
-    def _pause(self, connection: Connection) -> None:
-        """Serve a client that exceeds its rate a little at a time, so that it delays no one."""
-        connection.is_paused = True
-        asyncio.get_running_loop().call_later(PAUSE, self._resume, connection)
-
-    def _resume(self, connection: Connection) -> None:
-        connection.is_paused = False
-        connection.excess = 0
-        if connection.has_lines:
-            self.add(connection)
-
 
 class _Lane:
     """Clients that wait, and when their next turn is.
 
-    take: takes a turn; budget: of processor time; is_busy: whether turns wait.
+    take: takes a turn; budget: of processor time; is_busy: whether turns wait; is_urgent: whether
+    they wait for nothing.
     """
 
     def __init__(
@@ -118,12 +90,14 @@ class _Lane:
         *,
         is_busy: Callable[[], bool],
         clock: Callable[[], float],
+        is_urgent: bool = False,
     ) -> None:
         self.waiting: deque[Connection] = deque()
-        self.budget = budget
+        self._budget = budget
         self._take = take
         self._is_busy = is_busy
         self._clock = clock
+        self._is_urgent = is_urgent
         self._is_turn_scheduled = False
         self._deferred_since: float | None = None
 
@@ -137,24 +111,28 @@ class _Lane:
         """Schedule a turn unless one is: after a delay [s], or in the next iteration but one.
 
         Data that arrived meanwhile and what it wakes, such as the control loop for a touch, run
-        first.
+        first, unless the turn is urgent.
         """
         if not self.waiting or self._is_turn_scheduled:
             return
         self._is_turn_scheduled = True
         loop = asyncio.get_running_loop()
-        if delay > 0:
+        if self._is_urgent:
+            loop.call_soon(self._take_turn)
+        elif delay > 0:
             loop.call_later(delay, self._take_turn)
         else:
             loop.call_soon(loop.call_soon, self._take_turn)
 
     def _take_turn(self) -> None:
         self._is_turn_scheduled = False
-        delay = self._delay()
-        if delay <= 0:
-            self._deferred_since = None
-            self._take(self.waiting, self.budget)
-        self._schedule(delay)
+        delay = 0.0 if self._is_urgent else self._delay()
+        try:
+            if delay <= 0:
+                self._deferred_since = None
+                self._take(self.waiting, self._budget)
+        finally:  # whatever fails: a stop may wait
+            self._schedule(delay)
 
     def _delay(self) -> float:
         """Return the time [s] by which the turn that is due has to wait, 0 for none."""
@@ -164,4 +142,4 @@ class _Lane:
                 self._deferred_since = now
             if now - self._deferred_since < MAX_DEFERRAL:
                 return _RECHECK
-        return self.budget.pause()
+        return self._budget.pause()

@@ -5,9 +5,8 @@
 import json
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from datetime import datetime
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,28 +14,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-import drivers.by_hand.cli
 from drivers.errors import CommandRefused, LinkError
-from model.counting import counted
+from model.commands.options import JsonOption
 from model.errors import InputError
 from registry.suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from controller.api.client import Client
-    from controller.api.client_protocol import Notification
-    from controller.api.methods import ArmResult, StatusResult
-    from controller.api.schema import LearningSummary, RigSummary
-
-app = typer.Typer()
-
-EXIT_STATUS = {**drivers.by_hand.cli.EXIT_STATUS, InputError: 2}
-"""Exit status by error class."""
+    from controller.api.methods import ArmResult
+    from controller.api.schema import RigSummary
 
 Socket = Annotated[
     Path | None,
     typer.Option("--socket", metavar="PATH", help="Socket of the daemon; default: the usual path."),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 
 DASHBOARD = "127.0.0.1:8137"
 """Default address of the page, as of `era gateway`."""
@@ -48,7 +39,7 @@ _LEASE_CHECK_INTERVAL = 0.5  # s
 _REPEAT_INTERVAL = 0.05  # s; a touch that is not repeated for 150 ms is lifted
 
 
-class _DashboardCommand(TyperCommand):
+class DashboardCommand(TyperCommand):
     """Makes the value of `--dashboard` optional."""
 
     def parse_args(self, context: Any, arguments: list[str]) -> list[str]:
@@ -61,7 +52,6 @@ class _DashboardCommand(TyperCommand):
         return super().parse_args(context, filled)
 
 
-@app.command(cls=_DashboardCommand)
 def daemon(
     config: Annotated[
         Path,
@@ -94,15 +84,15 @@ def daemon(
     run_daemon(config, dashboard=dashboard, trace=trace)
 
 
-@app.command()
-def status(socket: Socket = None, as_json: Json = False) -> None:
+def status(socket: Socket = None, as_json: JsonOption = False) -> None:
     """Show daemon, amplifiers and contacts. Exit status 0 in a fault, too."""
+    from controller.cli.shown import show_status
+
     with _client(socket) as era:
         status = era.status()
     typer.echo(status.model_dump_json() if as_json else show_status(status))
 
 
-@app.command()
 def arm(
     lease: Annotated[
         float, typer.Option(metavar="S", min=1, max=60, help="Lease without renewal.")
@@ -112,7 +102,7 @@ def arm(
         bool, typer.Option("--once", help="Exit at once and let the lease expire.")
     ] = False,
     socket: Socket = None,
-    as_json: Json = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Switch the high voltage on. Stays and renews the lease; Ctrl-C disarms."""
     with _client(socket) as era:
@@ -131,23 +121,17 @@ def arm(
                 typer.echo("ready: disarmed")
 
 
-def _call(method: str, text: str) -> None:
-    """Add the command of a method of the API, which shows the state after it."""
+def of_method(method: str) -> Callable[..., None]:
+    """The command of a method of the API, which shows the state after it."""
 
-    @app.command(method, help=text)
-    def call(socket: Socket = None, as_json: Json = False) -> None:
+    def call(socket: Socket = None, as_json: JsonOption = False) -> None:
         with _client(socket) as era:
             getattr(era, method)()
             _print_state(era, as_json=as_json)
 
-
-_call("disarm", "Ramp to silence, then switch the high voltage off.")
-_call("stop", "Quick-stop all amplifiers, latched until era clear. Not an emergency stop.")
-_call("clear", "Acknowledge a stop, or a fault whose cause has gone. Stays disarmed.")
-_call("forget", "Discard what was learned of the plate, and learn anew.")
+    return call
 
 
-@app.command()
 def touch(
     at: Annotated[
         list[str] | None, typer.Argument(metavar="[X,Y ...]", help="Fingers on the plate [m].")
@@ -162,7 +146,7 @@ def touch(
         float, typer.Option("--for", metavar="S", min=0, max=3600, help="Duration.")
     ] = 1.0,
     socket: Socket = None,
-    as_json: Json = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Put fingers on the plate for a while. The last one is the target, the others are quiet.
 
@@ -170,6 +154,7 @@ def touch(
     """
     import asyncio
 
+    from controller.cli.shown import show_status
     from controller.sources.capture import read_capture, replay_capture
     from model.config.points import parse_point
 
@@ -199,7 +184,6 @@ def _hold(era: "Client", positions: list[tuple[float, float]], end: float) -> No
         time.sleep(min(left, _REPEAT_INTERVAL))
 
 
-@app.command()
 def watch(
     topics: Annotated[
         list[str] | None,
@@ -221,6 +205,7 @@ def watch(
 
     from controller.api.schema import Topic
     from controller.api.topics import TOPICS
+    from controller.cli.shown import show_event
 
     selected = topics or _DEFAULT_TOPICS
     unknown = [topic for topic in selected if topic not in TOPICS]
@@ -290,107 +275,3 @@ def _print_state(era: "Client", *, as_json: bool) -> None:
         )
     else:
         typer.echo(headline(status.state, status.cause))
-
-
-def show_event(event: "Notification", *, ahead: float) -> str:
-    """Format an event; ahead: offset of the wall clock to the daemon's [s]."""
-    from drivers.by_hand.cli import in_words
-
-    at = datetime.fromtimestamp(event.time + ahead).isoformat(timespec="milliseconds")[11:]
-    lost = f"  ({event.lost} lost)" if event.lost else ""
-    return f"{at}  {event.topic:10s} {in_words(event.data)}{lost}"
-
-
-def _show_learning(learning: "LearningSummary") -> list[str]:
-    """Format what is learned of the plate."""
-    state = learning.state.replace("_", " ")
-    lines = [f"  plate {state.upper() if learning.robust else state}: {learning.cause}"]
-    if learning.robust:
-        lines.append("    answers are robust ones, of a plate that is not known")
-    if learning.remedy:
-        lines.append(f"    remedy: {learning.remedy}")
-    if learning.readings:
-        last = learning.last_estimate_s
-        ago = "" if last is None else f", last estimated {last:.0f} s ago"
-        took = learning.latency_ms.median
-        within = "" if took is None else f", median {took:.0f} ms after a measurement"
-        lines.append(
-            f"    {counted(learning.readings, 'pattern')} measured{ago}; "
-            f"{counted(learning.corrections, 'correction')} of answers{within}"
-        )
-    return lines
-
-
-def show_status(status: "StatusResult") -> str:
-    """Format a status."""
-    from controller.api.schema import headline
-
-    lines = [headline(status.state, status.cause)]
-    if status.remedy:
-        lines.append(f"  remedy: {status.remedy}")
-    if status.lost_for_s is not None:
-        watchdog = (
-            "one without a watchdog plays on until it is switched off"
-            if status.watchdog_s is None
-            else f"its watchdog silences it after {status.watchdog_s:g} s without heartbeats"
-        )
-        lines.append(
-            f"  ASSUME ENERGISED: a lost amplifier may still be playing; {watchdog}"
-            if status.assume_energised
-            else f"  unreachable for {status.lost_for_s:.1f} s: {watchdog}, unconfirmed"
-        )
-    if status.armed_by is not None and status.lease_left_s is not None:
-        lines.append(f"  armed by {status.armed_by}, {status.lease_left_s:.1f} s left")
-    for contact in status.contacts:
-        level = "" if contact.level_db_sl is None else f" {contact.level_db_sl:.1f} dB SL"
-        promised = contact.robust_felt_contrast_db
-        contrast = "" if promised is None else f", at least {promised:.1f} dB over the others"
-        effect = "" if contact.effect is None else f", effect {contact.effect}"
-        if contact.feels not in (None, contact.effect):
-            effect += f", feels {contact.feels}"
-        others = contact.foreign_level_db_sl
-        effect += "" if others is None else f", others at most {others:.1f} dB SL"
-        verdict = "" if contact.verdict in (None, "own") else f", {contact.verdict}"
-        held_back = verdict if contact.held_back is None else f"{verdict}: {contact.held_back}"
-        load = "" if contact.load == 1 else f", load {contact.load:.1f}"
-        lines.append(
-            f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "
-            f"{contact.role or 'not driven'}{level}{contrast}{effect}{held_back}{load}"
-        )
-    if status.silence_reason is not None and status.contacts:
-        lines.append(f"  silent: {status.silence_reason}")
-    elif status.contacts and status.state == "READY_TO_SWITCH_ON":
-        lines.append("  silent: not armed; arm with era arm")
-    if status.learning is not None:
-        lines += _show_learning(status.learning)
-    for era, tone in status.drive.items():
-        lines.append(
-            f"  ERA {era}: {tone.frequency_hz:g} Hz, level {tone.level:.3f}, {tone.phase_deg:g} deg"
-        )
-    for amplifier in status.amplifiers:
-        parts = [amplifier.state] if amplifier.state else []
-        if amplifier.degraded:
-            parts.append("does not reply, may play")
-        if amplifier.lost:
-            parts.append("LOST")
-        if amplifier.closed_with_lost:
-            parts.append("closed because another was lost")
-        if amplifier.fault not in (None, "NONE"):
-            parts.append(f"fault {amplifier.fault}")
-        if amplifier.temperature_c is not None:
-            parts.append(f"{amplifier.temperature_c:.1f} degC")
-        if amplifier.reply_age_s is not None:
-            parts.append(f"last reply {amplifier.reply_age_s:.2f} s ago")
-        else:
-            parts.append("no reply yet")
-        lines.append(f"  amplifier {amplifier.name} ({amplifier.url}): {', '.join(parts)}")
-    latency = status.latency_ms
-    if latency.median is not None:
-        lines.append(
-            f"  latency of {counted(latency.count, 'command')}: median {latency.median:.2f} ms, "
-            f"99 % {latency.p99:.2f} ms, 99.9 % {latency.p999:.2f} ms"
-        )
-    for reason, count in status.rejected_touches.items():
-        lines.append(f"  rejected touches, {reason.replace('_', ' ')}: {count}")
-    lines.append(f"  state {status.state}, up for {status.uptime_s:.0f} s")
-    return "\n".join(lines)

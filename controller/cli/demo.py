@@ -1,4 +1,4 @@
-"""`era demo` and the group `era rig`."""
+"""`era demo`: the whole chain on a simulated plate."""
 
 import json
 from pathlib import Path
@@ -6,30 +6,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-import drivers.by_hand.cli
-from controller.cli.layout import layout_app
-from controller.cli.rig import rig_app
-from model.commands.options import ExactOption, SeedOption, next_line, seed_of_plate
+from model.commands.options import ExactOption, JsonOption, SeedOption, next_line, seed_of_plate
 from model.counting import counted
 from model.errors import InputError
 
 if TYPE_CHECKING:
     from controller.demo.touch_row import TouchRow
 
-app = typer.Typer()
-app.add_typer(layout_app, name="layout")
-app.add_typer(rig_app, name="rig")
 
-EXIT_STATUS = {**drivers.by_hand.cli.EXIT_STATUS, InputError: 2}
-"""Exit status by error class."""
-
-
-@app.callback()
-def _controller() -> None:
-    """Keep `demo` a command of its own while it is the only one."""
-
-
-@app.command()
 def demo(
     rig_file: Annotated[
         Path | None,
@@ -54,9 +38,7 @@ def demo(
     ),
     exact: ExactOption = False,
     seed: SeedOption = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
-    ] = False,
+    as_json: JsonOption = False,
     dashboard: Annotated[
         bool,
         typer.Option(

@@ -13,6 +13,7 @@ from controller.cli.plate_by_amplifiers import (
     measured_line,
     require_untouched,
     rig_of_file,
+    shown_progress,
 )
 from model.commands.options import JsonOption, next_line
 from model.errors import InputError
@@ -189,12 +190,9 @@ def _measured_by_device(
     rig: "Rig", settings: "DeviceSettings", *, is_shown: bool
 ) -> "MeasuredPlate":
     """Measure by a sound card, with a progress bar on a terminal."""
-    from contextlib import nullcontext
-
-    from model.commands.options import progress_bar
     from model.identification.measured_plate import measure_by_device
 
-    with progress_bar("runs") if is_shown else nullcontext(_ignore) as progress:
+    with shown_progress("runs", is_shown=is_shown) as progress:
         return measure_by_device(rig, settings, progress=progress)
 
 
@@ -203,7 +201,3 @@ def _refuse(given: Mapping[str, object], *, rule: str) -> None:
     for name, value in given.items():
         if value is not None:
             raise InputError(f"{name} {rule}")
-
-
-def _ignore(done: int, of: int) -> None:
-    """Show nothing."""

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from model.commands.options import JsonOption
 from model.counting import counted
 
 if TYPE_CHECKING:
@@ -19,20 +20,13 @@ layout_app = typer.Typer(no_args_is_help=True, help="Check a surface layout.")
 FAILED = 1
 
 
-@layout_app.callback()
-def _group() -> None:
-    """Keep `check` a command of its own while it is the only one."""
-
-
 @layout_app.command()
 def check(
     layout_file: Annotated[
         Path, typer.Argument(metavar="LAYOUT", help="Layout file, e.g. LAYOUT.yaml.")
     ],
     table_file: Annotated[Path, typer.Argument(metavar="TABLE", help="Table file, e.g. T.npz.")],
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
-    ] = False,
+    as_json: JsonOption = False,
     picture: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="PICTURE", help="Picture to write, e.g. P.png."),

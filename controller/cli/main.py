@@ -23,15 +23,7 @@ from typer.main import get_group
 from model.errors import reworded
 from registry.plugins import failed_plugin, failure_text
 
-COMMANDS = (
-    *(
-        "controller.cli.demo",
-        "controller.cli.daemon",
-        "drivers.by_hand.cli",
-        "controller.gateway.cli",
-    ),
-    *("model.cli", "controller.report.cli", "sim.cli"),
-)
+COMMANDS = ("controller.cli.commands", "drivers.by_hand.cli", "model.cli", "sim.cli")
 """Modules with commands, by name: packages beside this one do not import each other."""
 
 SECTIONS = {

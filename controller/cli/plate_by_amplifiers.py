@@ -1,8 +1,8 @@
 """Measuring the plate on the table by the amplifiers of its rig, as commands do."""
 
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,19 +63,26 @@ def measured_by_amplifiers(
 
     from controller.diagnosis.plate_measurement import PlateSelfMeasurement
     from drivers.opening import Lines
-    from model.commands.options import progress_bar
 
     at = _urls_of(rig, urls)
 
     async def measure() -> "MeasuredPlate":
-        with ExitStack() as shown:
-            on_step = shown.enter_context(progress_bar("steps")) if is_shown else _ignore
+        with shown_progress("steps", is_shown=is_shown) as on_step:
             found = await PlateSelfMeasurement(
                 rig, Lines, at, level=level, is_quick=is_quick, on_step=on_step
             ).run()
             return found.as_measured
 
     return asyncio.run(measure())
+
+
+def shown_progress(
+    unit: str, *, is_shown: bool
+) -> AbstractContextManager[Callable[[int, int], None]]:
+    """A progress bar of units in plural, or nothing, which yields its update(done, total)."""
+    from model.commands.options import progress_bar
+
+    return progress_bar(unit) if is_shown else nullcontext(lambda done, total: None)
 
 
 def _urls_of(rig: "Rig", texts: Sequence[str]) -> dict[str, str]:
@@ -122,7 +129,3 @@ def measured_json(measured: "MeasuredPlate") -> dict[str, object]:
         "measure_time_s": measured.duration,
         **measured.details,
     }
-
-
-def _ignore(done: int, of: int) -> None:
-    """Show nothing."""

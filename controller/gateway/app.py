@@ -100,7 +100,13 @@ class Gateway:
         """Keep what it has of the daemon for all browsers, until cancelled."""
         async with asyncio.TaskGroup() as own:
             own.create_task(self.field.run())
-            own.create_task(self._own.keep_connected())
+            own.create_task(self._keep_connected())
+
+    async def _keep_connected(self) -> None:
+        """Connect again after every loss, so that no stop has to wait for it."""
+        while True:
+            with contextlib.suppress(RpcError, Unreachable):
+                await self._own.next_event()  # it subscribes to none
 
     async def _metrics(self, _: Request) -> Response:
         """The daemon's status for Prometheus, read once for all who need it: it needs no token."""

@@ -17,7 +17,7 @@ import controller.demo.run
 import controller.demo.scene
 import live_demonstration
 from controller.api.client import Client
-from controller.cli.demo import app
+from controller.cli.commands import app
 from controller.cli.main import run
 from controller.demo.recorder import TouchRecorder
 from controller.demo.scene import Scene, layout_of_people
@@ -172,7 +172,7 @@ def is_running(pid):
 
 def far_end_of(pid):
     """The process that a running demonstration started for its amplifiers."""
-    for _ in range(100):
+    for _ in range(1200):
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
         if children:
             return int(children[0])

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from controller.cli.demo import app
+from controller.cli.commands import app
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from rig_on_wire import far_side

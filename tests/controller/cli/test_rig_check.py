@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from controller.cli.demo import app
+from controller.cli.commands import app
 from examples.make_measured import record_responses, scanning_grid
 from model.calibration.responses_file import write_responses_csv, write_responses_uff
 from model.rig.file import load_rig

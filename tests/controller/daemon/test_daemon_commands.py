@@ -13,8 +13,10 @@ import pytest
 from typer.testing import CliRunner
 
 from controller.api.client_protocol import Notification
-from controller.cli.daemon import app, show_event, touch
+from controller.cli.commands import app
+from controller.cli.daemon import touch
 from controller.cli.main import run
+from controller.cli.shown import show_event
 from controller.daemon.run import run_daemon
 from daemon_bench import ready_daemon, write_daemon
 from drivers.errors import CommandError
@@ -135,7 +137,7 @@ def test_stop_exits_with_3_and_names_amplifiers_unless_all_are_silent(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Success only if every amplifier is confirmed silent, or else the unconfirmed ones."""
-    modules = ["controller.cli.daemon"]
+    modules = ["controller.cli.commands"]
     with ScriptedDaemon(tmp_path) as daemon:
         command = ["stop", "--socket", str(daemon.socket)]
         assert run(command, modules) == 0

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from controller.api.jsonrpc import ErrorCode
-from controller.cli.daemon import show_status
+from controller.cli.shown import show_status
 from controller.daemon.dashboard_process import gateway_options
 from controller.gateway.settings import read_token
 from daemon_bench import (

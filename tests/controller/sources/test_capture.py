@@ -122,7 +122,7 @@ async def test_replay_capture_raises_when_the_system_refuses() -> None:
 
 def test_era_touch_sends_a_capture(tmp_path: Path) -> None:
     """To the UDP port of the daemon's source; fingers and a capture exclude each other."""
-    commands = ["controller.cli.daemon"]
+    commands = ["controller.cli.commands"]
     path = tmp_path / "taps.tuio"
     write_capture(path, [RecordedDatagram(0.0, b"one"), RecordedDatagram(0.0, b"two")])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:

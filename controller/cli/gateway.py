@@ -8,17 +8,7 @@ import typer
 
 from model.errors import InputError
 
-app = typer.Typer()
 
-EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2}
-
-
-@app.callback()
-def _only_commands() -> None:
-    """Keep `gateway` a subcommand although it is the only one."""
-
-
-@app.command()
 def gateway(
     listen: Annotated[
         str, typer.Option(metavar="HOST:PORT", help="Address to listen on; port 0: any free one.")

@@ -7,17 +7,7 @@ import typer
 
 from model.errors import InputError
 
-app = typer.Typer()
 
-EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2}
-
-
-@app.callback()
-def _only_commands() -> None:
-    """Keep `report` a command although it is the only one."""
-
-
-@app.command()
 def report(
     configs: Annotated[
         list[Path] | None,

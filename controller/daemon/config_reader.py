@@ -15,6 +15,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from controller.child import child_command
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from model.errors import InputError
 
@@ -29,11 +30,7 @@ def read_in_child(file: Path) -> DaemonConfig:
     """
     try:
         done = subprocess.run(  # noqa: S603  our own module
-            # -P: do not import a folder named controller in the working directory
-            [
-                *(sys.executable, "-P", "-m", "controller.daemon.child_main", str(os.getpid())),
-                *("controller.daemon.config_reader", str(file)),
-            ],
+            child_command("controller.daemon.config_reader", str(file)),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C is handled by the daemon

@@ -12,14 +12,12 @@ from controller.api.server import ApiServer
 from controller.daemon.active_layout import ActiveLayout
 from controller.daemon.api_service import ApiService
 from controller.daemon.api_views import amplifier_statuses
-from controller.daemon.config import DaemonConfig
+from controller.daemon.config import DaemonConfig, changed_keys, reload_problem
 from controller.daemon.config_reader import read_in_child
 from controller.daemon.dashboard_process import gateway_options, keep_gateway
 from controller.daemon.fault_dumps import FaultDumps
 from controller.daemon.log import LogThread
-from controller.daemon.message_recorder import MessageRecorder
 from controller.daemon.publisher import EventPublisher
-from controller.daemon.reload import changed_keys, reload_problem
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from controller.daemon.states import ENERGISED, DaemonState, Operation
@@ -69,14 +67,12 @@ class Daemon:
         self._log = log
         self._manager = manager
         self._dashboard = dashboard
-        self._loop = asyncio.get_running_loop()
         self._reloads: set[asyncio.Task[None]] = set()
         self._reload_lock = asyncio.Lock()
         self._is_reload_pending = False
         self._shutdown = asyncio.Event()
         self._shutdown_cause = "the daemon is shutting down"
-        self._recorder = MessageRecorder()
-        self._dumps = FaultDumps(self._recorder)
+        self._dumps = FaultDumps()
         self._supervisor = Supervisor(
             state_changed=(
                 lambda old, new: self._publisher.state_changed(old, new),
@@ -270,7 +266,7 @@ class Daemon:
 
     def _connected(self, amplifiers: Mapping[str, Amplifier]) -> None:
         """Follow amplifiers whose lines have been opened."""
-        self._recorder.follow(amplifiers)
+        self._dumps.follow(amplifiers)
         self._supervisor.connected(amplifiers)
 
     def _deliver(self, frame: TouchFrame) -> None:

@@ -12,6 +12,7 @@ import secrets
 import sys
 from pathlib import Path
 
+from controller.child import child_command, ended
 from drivers import clock
 from drivers.pauses import Backoff
 from model.errors import InputError
@@ -50,33 +51,20 @@ async def keep_gateway(options: list[str]) -> None:
         started_at = clock.now()
         try:
             process = await asyncio.create_subprocess_exec(
-                # -P: do not import a folder named controller in the working directory
-                *(sys.executable, "-P", "-m", "controller.daemon.child_main"),
-                *(str(os.getpid()), *_GATEWAY, *options),
+                *child_command(*_GATEWAY, *options),
                 stdin=asyncio.subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl-C is handled by the daemon
             )
         except OSError as error:
             _logger.warning("gateway: start failed: %s", error)
         else:
-            _logger.warning("gateway: exited with status %d", await _wait(process))
+            try:
+                _logger.warning("gateway: exited with status %d", await process.wait())
+            except asyncio.CancelledError:
+                with contextlib.suppress(ProcessLookupError):
+                    process.terminate()
+                await ended(process, _TERMINATE_TIMEOUT)
+                raise
         pause = backoff.pause(ran_for=clock.now() - started_at)
         _logger.info("gateway: restarting in %g s", pause)
         await asyncio.sleep(pause)
-
-
-async def _wait(process: asyncio.subprocess.Process) -> int:
-    """Wait for a process to exit; terminate it when cancelled."""
-    try:
-        return await process.wait()
-    except asyncio.CancelledError:
-        with contextlib.suppress(ProcessLookupError):
-            process.terminate()
-        try:
-            async with asyncio.timeout(_TERMINATE_TIMEOUT):
-                await process.wait()
-        except TimeoutError:
-            with contextlib.suppress(ProcessLookupError):
-                process.kill()
-            await process.wait()
-        raise

@@ -1,35 +1,75 @@
-"""Fault dumps: the last messages of all links as a file of JSON lines."""
+"""The last messages of all lines, and fault dumps of them: files of JSON lines."""
 
 import json
 import logging
 import os
 import threading
 import time
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from controller.daemon.message_recorder import MessageRecord, MessageRecorder
 from drivers import clock
+from drivers.host.amplifier import Amplifier
+from drivers.host.line import Line
 
 DUMP_PATTERN = "era-fault-*.jsonl"
 """File names of dumps."""
 
 MAX_DUMPS = 20  # files in a folder; the oldest are deleted
+MAX_RECORDS = 400  # over all lines: the last seconds under load, ten seconds at rest
 _MIN_INTERVAL = 1.0  # s; one dump for faults that come together
 
 _logger = logging.getLogger(__name__)
 
 
+class MessageRecord(NamedTuple):
+    """One message: time [s], amplifier or line, way, name of the message, and its content."""
+
+    time_s: float
+    link: str
+    way: str
+    message: str
+    content: object = ""
+
+
 class FaultDumps:
-    """Writes recorded messages in a thread, since a disk may be slow, full or gone.
+    """Keeps the last messages unformatted, and writes them in a thread: a disk may be slow or gone.
 
     One dump at a time, so that a hanging disk costs one thread.
     """
 
-    def __init__(self, recorder: MessageRecorder) -> None:
-        self._recorder = recorder
+    def __init__(self) -> None:
+        self.records: deque[MessageRecord] = deque(maxlen=MAX_RECORDS)
         self._written_at = float("-inf")
         self._writer: threading.Thread | None = None
+
+    def follow(self, amplifiers: Mapping[str, Amplifier]) -> None:
+        """Record the messages of the lines of amplifiers, by name, from now on."""
+        by_line: dict[Line, dict[int, str]] = {}
+        for name, amplifier in amplifiers.items():
+            by_line.setdefault(amplifier.line, {})[amplifier.address] = name
+        for line, names in by_line.items():
+            line.seen = partial(self._seen, line.name, names)
+
+    def _seen(
+        self,
+        line: str,
+        names: Mapping[int, str],
+        way: str,
+        address: int,
+        message: str,
+        content: object = "",
+    ) -> None:
+        """Record a message; a stop depends on no record."""
+        try:
+            link = names.get(address, line)
+            self.records.append(MessageRecord(clock.now(), link, way, message, content))
+        except Exception:
+            _logger.exception("recorder failed")
 
     def write(self, folder: Path, *, cause: str) -> None:
         """Write a dump unless one was written within the last second."""
@@ -39,7 +79,7 @@ class FaultDumps:
         if self._writer is not None and self._writer.is_alive():
             _logger.warning("dump in %s skipped: previous dump still being written", folder)
             return
-        records = self._recorder.records()
+        records = [*self.records]
 
         def write() -> None:
             try:
@@ -63,9 +103,8 @@ def write_dump(folder: Path, records: Iterable[MessageRecord], *, cause: str) ->
     opened = open(path, "x", encoding="utf-8", opener=_owner_only)  # noqa: SIM115
     try:
         with opened as stream:
-            stream.write(json.dumps({"cause": cause, "unix_time_s": time.time()}) + "\n")
-            for record in records:
-                stream.write(json.dumps(_as_json(record)) + "\n")
+            for line in ({"cause": cause, "unix_time_s": time.time()}, *map(_as_json, records)):
+                stream.write(json.dumps(line, default=_content) + "\n")
     except OSError:
         path.unlink(missing_ok=True)
         raise
@@ -82,12 +121,9 @@ def _owner_only(path: str, flags: int) -> int:
 
 
 def _as_json(record: MessageRecord) -> dict[str, object]:
-    line: dict[str, object] = {
-        "time_s": round(record.time, 6),
-        "link": record.link,
-        "way": record.direction,
-        "message": record.message,
-    }
-    if record.content:
-        line["content"] = record.content
-    return line
+    return {key: value for key, value in record._asdict().items() if value != ""}
+
+
+def _content(arrival: Any) -> object:
+    """What an arrival on a wire says."""
+    return arrival.values if hasattr(arrival, "values") else asdict(arrival)

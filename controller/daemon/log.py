@@ -1,7 +1,7 @@
 """The daemon's log: JSON lines, written by a thread.
 
 Logging never blocks: lines go into a bounded queue; lines that do not fit or cannot be written are
-counted. Each logging call in the code is limited to a few lines a second; the next line says how
+lost. Each logging call in the code is limited to a few lines a second; the next line says how
 many were skipped. JSON escapes control characters, so that messages cannot forge lines.
 """
 
@@ -91,76 +91,44 @@ class RateLimitFilter(logging.Filter):
 
 
 class LogThread(logging.Handler):
-    """Writes the log until it is closed; `lost` counts lines that could not be written.
+    """Writes the log until it is closed; `lines` are those that wait for that.
 
-    file: appended to; None for standard error. A failing file is reopened for every line, one that
-    was renamed or removed before the next line. listener: called with records from level info on in
-    the thread that logs them.
+    file: opened to append each line, whatever has become of it; None for standard error. listener:
+    called with records from level info on in the thread that logs them.
     """
 
     def __init__(self, file: Path | None) -> None:
         super().__init__()
         self.setFormatter(JsonFormatter())
-        self.lost = 0
         self.listener: Callable[[logging.LogRecord], None] | None = None
+        self.lines: queue.Queue[str | None] = queue.Queue(_MAX_QUEUED)
         self._file = file
-        self._lines: queue.Queue[str | None] = queue.Queue(_MAX_QUEUED)
         self._thread = threading.Thread(target=self._write_all, name="log", daemon=True)
         self._thread.start()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Queue the line of a record; never blocks."""
-        try:
-            self._lines.put_nowait(self.format(record))
+        with contextlib.suppress(Exception):  # a full queue, or a failing log, stops nothing
+            self.lines.put_nowait(self.format(record))
             if self.listener is not None and record.levelno >= logging.INFO:
                 self.listener(record)
-        except Exception:  # a full queue, or a failing log, must not stop the program
-            self.lost += 1
 
     def close(self) -> None:
         """Write the queued lines, within a time limit."""
         super().close()
-        try:
-            self._lines.put(None, timeout=_CLOSE_TIMEOUT)
-        except queue.Full:
-            return
-        self._thread.join(_CLOSE_TIMEOUT)
+        with contextlib.suppress(queue.Full):
+            self.lines.put(None, timeout=_CLOSE_TIMEOUT)
+            self._thread.join(_CLOSE_TIMEOUT)
 
     def _write_all(self) -> None:
-        stream: TextIO | None = None
-        while (line := self._lines.get()) is not None:
-            try:
-                if stream is not None and self._is_replaced(stream):
-                    self._close_file(stream)
-                    stream = None
-                if stream is None:
-                    stream = self._open()
+        errors = contextlib.nullcontext(sys.stderr)
+        while (line := self.lines.get()) is not None:
+            with (
+                contextlib.suppress(OSError, ValueError),  # the disk may have space again
+                errors if self._file is None else open_log_file(self._file) as stream,
+            ):
                 stream.write(f"{line}\n")
                 stream.flush()
-            except (OSError, ValueError):
-                self.lost += 1
-                self._close_file(stream)
-                stream = None  # the disk may have space again
-        self._close_file(stream)
-
-    def _open(self) -> TextIO:
-        if self._file is None:
-            return sys.stderr
-        return open_log_file(self._file)
-
-    def _is_replaced(self, stream: TextIO) -> bool:
-        """Whether the file has another inode than the open one, as after its rotation."""
-        if self._file is None:
-            return False
-        try:
-            return os.fstat(stream.fileno()).st_ino != self._file.stat().st_ino
-        except FileNotFoundError:
-            return True
-
-    def _close_file(self, stream: TextIO | None) -> None:
-        if stream is not None and self._file is not None:
-            with contextlib.suppress(OSError, ValueError):
-                stream.close()
 
 
 def start_log(file: Path | None, *, level: str) -> LogThread:

@@ -15,6 +15,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from controller.child import ended
 from controller.demo.touch_row import FingerVibration, Position
 from controller.plate_control import PlateControl
 from drivers.errors import LinkError
@@ -149,8 +150,4 @@ async def _read_urls(process: asyncio.subprocess.Process, *, count: int) -> dict
 async def _terminate(process: asyncio.subprocess.Process) -> None:
     with contextlib.suppress(ProcessLookupError):
         process.terminate()
-        try:
-            await asyncio.wait_for(process.wait(), EXIT_TIMEOUT)
-        except TimeoutError:
-            process.kill()
-            await process.wait()
+    await ended(process, EXIT_TIMEOUT)

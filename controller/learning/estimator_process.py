@@ -8,10 +8,10 @@ import asyncio
 import contextlib
 import logging
 import os
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from controller.child import child_command, ended
 from controller.learning.messages import HEAD, Note, Reply, Request, Start, packed, unpacked
 from drivers import clock
 from drivers.pauses import Backoff
@@ -102,26 +102,24 @@ class EstimatorProcess:
     async def _run_one(self) -> str:
         """Run one process to its end; why it ended."""
         process = await asyncio.create_subprocess_exec(
-            # -P: do not import a folder named controller in the working directory
-            *(sys.executable, "-P", "-m", "controller.daemon.child_main"),
-            *(str(os.getpid()), "controller.learning.estimator"),
+            *child_command("controller.learning.estimator"),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             env={**os.environ, **_ONE_THREAD},
             limit=_BUFFER,
             start_new_session=True,  # Ctrl-C is handled by the daemon
         )
-        self.pid = process.pid
+        self.pid, timeout = process.pid, 0.0
         try:
             return await self._serve(process)
         except asyncio.CancelledError:
-            await _let_end(process)  # it keeps what it has learned
+            timeout = _CLOSE_TIMEOUT  # it keeps what it has learned
             raise
         finally:
             self.pid = None
-            with contextlib.suppress(ProcessLookupError):
-                process.kill()
-            await process.wait()
+            assert process.stdin is not None  # noqa: S101  a pipe was requested
+            process.stdin.close()
+            await ended(process, timeout)
 
     async def _serve(self, process: asyncio.subprocess.Process) -> str:
         """Hand over what waits, one after the other; why that ended."""
@@ -165,12 +163,3 @@ async def _exchange(process: asyncio.subprocess.Process, request: bytes) -> byte
         return await process.stdout.readexactly(int.from_bytes(head, "big"))
     except asyncio.IncompleteReadError:
         return None
-
-
-async def _let_end(process: asyncio.subprocess.Process) -> None:
-    """End the input of a process, and wait a moment for its end."""
-    assert process.stdin is not None  # noqa: S101  a pipe was requested
-    process.stdin.close()
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(_CLOSE_TIMEOUT):
-            await process.wait()

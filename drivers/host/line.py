@@ -54,6 +54,8 @@ class Line:
         self.name = name
         self.loss: str | None = None
         self.members: dict[int, Dialogue] = {}
+        self.seen: Callable[[str, int, str, object], None] = lambda *message: None
+        """Called with each message: out, in, event or none; address, name, content. Must return."""
         self._port = port
         self._queue = JobQueue()
         self._current: Job | None = None
@@ -109,6 +111,7 @@ class Line:
             trace.frame(Direction.IN, data, self.name, lambda: ", ".join(map(repr, arrivals)))
         for arrival in arrivals:
             if isinstance(arrival, Event | OtherHost | Several):
+                self.seen("event", arrival.address, type(arrival).__name__, arrival)
                 if (member := self.members.get(arrival.address)) is not None:
                     member.note_unasked(arrival)
                 continue
@@ -120,6 +123,8 @@ class Line:
                 self._go_on(job, arrival.data)
             else:
                 self._current = None
+                address = BROADCAST if job.member is None else job.member.address
+                self.seen("in", address, type(arrival).__name__, arrival)
                 self._end(job, arrival)
         if self._queue.jobs:
             self.pump()
@@ -173,6 +178,7 @@ class Line:
             if member is not None:
                 address = member.address
                 job.longer = member.next_request(job.name, job.values)
+            self.seen("out", address, job.name, job.values)
             data = self.wire.request(address, job.name, job.values)
             now = job.sent_at = self.time()
             begins = max(now, self._sent_until)  # behind what is still on its way
@@ -342,6 +348,7 @@ class Line:
         member = job.member
         if member is None:
             return
+        self.seen("none", member.address, "no reply", "")
         was_cut = job.priority is Priority.READING and self.time() - job.sent_at < job.timeout
         if was_cut or self._must_yield(job):
             job.attempts += 1

@@ -8,18 +8,25 @@ import socket
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from controller.daemon.fault_dumps import DUMP_PATTERN, MAX_DUMPS, FaultDumps, write_dump
+from controller.daemon.fault_dumps import (
+    DUMP_PATTERN,
+    MAX_DUMPS,
+    FaultDumps,
+    MessageRecord,
+    write_dump,
+)
 from controller.daemon.latency import LatencyStatistics
 from controller.daemon.log import JsonFormatter, LogThread, RateLimitFilter
-from controller.daemon.message_recorder import MessageRecord, MessageRecorder
 from controller.daemon.service_manager import ServiceManager
 from controller_bench import BenchLines, FarEnd
 from drivers import clock
+from drivers.host.wire import Reply
 from registry.limits import GuardLimits
 from virtual_loop import in_virtual_time
 
@@ -78,14 +85,14 @@ def wait_until(holds: Callable[[], object]) -> None:
 
 
 def test_log_loses_lines_only_while_disk_is_full(logger: logging.Logger, tmp_path: Path) -> None:
-    """/dev/full refuses every byte: lost lines are counted, and later ones are written."""
+    """/dev/full refuses every byte: these lines are lost, and later ones are written."""
     file = tmp_path / "log"
     file.symlink_to("/dev/full")
     thread = LogThread(file)
     logger.addHandler(thread)
     for _ in range(10):
         logger.warning("lost")
-    wait_until(lambda: thread.lost == 10)
+    wait_until(thread.lines.empty)
     file.unlink()
     logger.warning("written")
     thread.close()
@@ -95,7 +102,7 @@ def test_log_loses_lines_only_while_disk_is_full(logger: logging.Logger, tmp_pat
 def test_log_does_not_block_while_disk_hangs(
     logger: logging.Logger, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """During a write that does not return, lines are queued up to a bound and then counted."""
+    """During a write that does not return, lines are queued up to a bound."""
     hangs, released = threading.Event(), threading.Event()
 
     class Hanging(io.StringIO):
@@ -111,7 +118,7 @@ def test_log_does_not_block_while_disk_hangs(
     assert hangs.wait(20)
     for _ in range(3000):
         logger.warning("more")
-    assert thread.lost == 1000
+    assert thread.lines.qsize() == 2000
     thread.close()
     released.set()
 
@@ -216,7 +223,7 @@ def test_dump_is_json_lines_for_owner_only(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "folder"
     records = [
         MessageRecord(1.5, "main", "out", "Arm", {"watchdog": 250, "session": 9}),
-        MessageRecord(1.6, "main", "in", "Reply", {"state": 6, "levels": [5000, 0]}),
+        MessageRecord(1.6, "main", "in", "Reply", Reply({"state": 6, "levels": [5000, 0]})),
         MessageRecord(1.7, "main", "none", "no reply"),
     ]
     for _ in range(MAX_DUMPS + 2):
@@ -248,18 +255,16 @@ def test_latency_percentiles_are_values_that_occurred() -> None:
 async def test_failing_recorder_prevents_no_stop() -> None:
     """The wire gets the Stop, and the caller its outcome."""
 
-    class FailingRecorder(MessageRecorder):
-        fails = False
+    class Full(deque[MessageRecord]):
+        def append(self, record: MessageRecord) -> None:
+            raise MemoryError
 
-        def add(self, link: str, direction: str, message: str, content: object = "") -> None:
-            if self.fails:
-                raise MemoryError
-
-    far_end, recorder = FarEnd(), FailingRecorder()
+    far_end, recorder = FarEnd(), FaultDumps()
     host = await BenchLines({"main": far_end}).amplifier("", LIMITS, name="main")
     recorder.follow({"main": host})
     await host.open()
-    recorder.fails = True
+    assert recorder.records
+    recorder.records = Full()
     assert (await host.stop()).is_confirmed
     assert far_end.requests("Stop")
 
@@ -287,7 +292,7 @@ def test_dump_that_fails_is_only_logged(
 ) -> None:
     """A file in place of the folder raises nothing at the daemon."""
     (tmp_path / "dumps").write_text("in the way", "utf-8")
-    FaultDumps(MessageRecorder()).write(tmp_path / "dumps", cause="arc")
+    FaultDumps().write(tmp_path / "dumps", cause="arc")
     wait_for_writers()
     (warning,) = caplog.messages
     assert str(tmp_path / "dumps") in warning
@@ -307,7 +312,7 @@ def test_dumps_use_one_thread_when_disk_hangs(
         released.wait(20)
         return tmp_path
 
-    dumps = FaultDumps(MessageRecorder())
+    dumps = FaultDumps()
     with monkeypatch.context() as patched, caplog.at_level(logging.WARNING):
         patched.setattr("controller.daemon.fault_dumps.write_dump", hang)
         for now[0] in (0.0, 10.0, 20.0):

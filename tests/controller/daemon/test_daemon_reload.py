@@ -13,9 +13,14 @@ from typing import Any
 
 import pytest
 
-from controller.daemon.config import DaemonConfig, load_daemon_config
+from controller.child import child_command
+from controller.daemon.config import (
+    DaemonConfig,
+    changed_keys,
+    load_daemon_config,
+    reload_problem,
+)
 from controller.daemon.config_reader import read_in_child
-from controller.daemon.reload import changed_keys, reload_problem
 from daemon_bench import ENABLED, ready_daemon
 from model.errors import InputError
 from model.rig.file import example_rig_path
@@ -213,8 +218,9 @@ def test_reading_a_configuration_in_a_child_is_bounded_in_time(
 
 def test_child_ends_by_none_of_the_daemons_own_signals() -> None:
     """A signal to the whole service reopens the log or does nothing; SIGTERM ends a child."""
-    command = [sys.executable, "-P", "-u", "-m", "controller.daemon.child_main", str(os.getpid())]
-    with subprocess.Popen([*command, "http.server", "0"], stdout=subprocess.PIPE) as child:
+    command = child_command("http.server", "0")
+    quick = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=quick) as child:
         assert child.stdout is not None
         child.stdout.readline()  # it serves
         for number in (signal.SIGHUP, signal.SIGUSR1, signal.SIGTERM):

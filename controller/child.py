@@ -1,10 +1,12 @@
-"""`python -m controller.daemon.child_main PARENT MODULE ...`: run a module until its parent exits.
+"""Child processes that end with their parent: `python -m controller.child PARENT MODULE ...`.
 
 PARENT is the process number of the starting process. On Linux the kernel terminates the module when
 that process exits, however it exits. Signals to the daemon that reach its children as well, as
 those of `systemctl kill` do, have no effect on them.
 """
 
+import asyncio
+import contextlib
 import ctypes
 import os
 import runpy
@@ -12,6 +14,23 @@ import signal
 import sys
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
+
+
+def child_command(module: str, *arguments: str) -> list[str]:
+    """The command of a module as a child of this process."""
+    # -P: do not import a folder named controller in the working directory
+    command = [sys.executable, "-P", "-m", "controller.child", str(os.getpid())]
+    return [*command, module, *arguments]
+
+
+async def ended(process: asyncio.subprocess.Process, timeout: float) -> None:
+    """Wait for the end of a process that was asked to end; kill it after a time [s]."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(timeout):
+            await process.wait()
+    with contextlib.suppress(ProcessLookupError):
+        process.kill()
+    await process.wait()
 
 
 def _main() -> None:

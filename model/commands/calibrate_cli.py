@@ -10,6 +10,7 @@ import typer
 from model.commands.options import JsonOption, MeshOption, RigArgument, next_line
 from model.counting import counted
 from model.errors import InputError
+from model.files.replacing import check_ending, check_picture, check_place
 
 NO_FIT = 1  # exit status
 
@@ -42,7 +43,6 @@ def calibrate(
     from model.config.document import read_document
     from model.diagnosis.consistency import check_consistency
     from model.files.array_file import whole_or_nothing
-    from model.files.replacing import check_ending, check_picture, check_place
     from model.rig.file import rig_of
 
     check_place(output, example="rig2.yaml")

@@ -8,6 +8,7 @@ import typer
 
 from model.commands.options import next_line
 from model.errors import InputError
+from model.files.replacing import check_ending
 
 config_app = typer.Typer(help="Create and check configuration files.", no_args_is_help=True)
 
@@ -23,7 +24,6 @@ def init(
     """
     from model.config.kinds import kind_called
     from model.files.array_file import whole_or_nothing
-    from model.files.replacing import check_ending
 
     made = kind_called(kind)
     check_ending(file, ".yaml", ".yml", what=f"a {kind} file")

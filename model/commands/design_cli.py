@@ -2,7 +2,6 @@
 
 import json
 import time
-from dataclasses import asdict, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,14 +16,14 @@ from model.commands.options import (
     MeshOption,
     RigArgument,
     next_line,
+    progress_bar,
 )
+from model.config.units import LENGTH, STIFFNESS, Dimension, quantity
 from model.counting import counted
+from model.errors import InputError
 
 if TYPE_CHECKING:
-    from model.config.document import Value
-    from model.config.units import Dimension
     from model.design.run import Machines
-    from model.rig.uncertainty import Uncertainty
 
 MAX_STIFFNESSES, MAX_ERAS = 9, 32
 
@@ -73,13 +72,6 @@ def design(
         str, typer.Option(metavar="LENGTH", help="Least distance of two ERAs.")
     ] = "30 mm",
     lowest: LowestOption = 20.0,
-    uncertainty: Annotated[
-        str,
-        typer.Option(
-            metavar="KEY=VALUE,...",
-            help="Parameters of the rig's uncertainty, e.g. gain=0.01,phase_deg=1; default: rig.",
-        ),
-    ] = "",
     stiffness: Annotated[
         str,
         typer.Option(
@@ -87,12 +79,6 @@ def design(
             help="Stiffnesses of which new ERAs get the best; default: that of the rig's.",
         ),
     ] = "",
-    worth: Annotated[
-        float,
-        typer.Option(
-            metavar="DB", min=0.0, help="Fewer ERAs, if a further one buys less contrast than this."
-        ),
-    ] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of contact sets and starts.")] = 0,
     starts: Annotated[int, typer.Option(min=1, max=64, help="Number of starts.")] = 4,
     workers: Annotated[
@@ -103,26 +89,18 @@ def design(
     as_json: JsonOption = False,
 ) -> None:
     """Find or rank places of ERAs for the best robust felt contrast."""
-    from model.commands.options import progress_bar
     from model.config.document import read_document
-    from model.config.units import LENGTH
     from model.design.area import area_of
     from model.design.contacts import contact_rule
     from model.design.layouts import supported_layouts
     from model.design.outcome import summary, write_design
     from model.design.problem import DesignProblem
-    from model.design.run import Runner, rank_layouts, search_layouts, worthwhile_count
-    from model.errors import InputError
+    from model.design.run import Runner, rank_layouts, search_layouts
     from model.rig.file import rig_of
 
     machines = _machines(cluster, workers)
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)
-    if uncertainty:
-        document = replace(
-            document, data={**document.data, "uncertainty": _changed(rig.uncertainty, uncertainty)}
-        )
-        rig = rig_of(document, mesh=mesh)
     counts = _counts(eras or str(len(rig.eras)))
     kept = tuple(name.strip() for name in keep.split(",") if name.strip())
     own = [era.name for era in rig.eras]
@@ -149,9 +127,6 @@ def design(
     if given:
         found = rank_layouts(given, finalists=finalists, runner=runner)
     else:
-        if worth > 0:  # by the first start, which has a layout for each number
-            fewer = worthwhile_count(search_layouts(problems, starts=1, runner=runner), worth)
-            problems = [replace(each, count=fewer) for each in problems]
         found = search_layouts(problems, starts=starts, runner=runner)
     files = [str(path) for path in write_design(output, found, document.data)]
     result = {**summary(found), "time_s": time.perf_counter() - started, "files": files}
@@ -170,7 +145,6 @@ def design(
 def _machines(address: str | None, workers: int | None) -> "Machines":
     """The cluster at an address, or processes. Raises InputError for both."""
     from model.cluster import check_address, on_cluster
-    from model.errors import InputError
     from model.processes import on_processes
 
     if address is None:
@@ -183,8 +157,6 @@ def _machines(address: str | None, workers: int | None) -> "Machines":
 
 def _counts(text: str) -> list[int]:
     """Numbers of ERAs of N or LO-HI."""
-    from model.errors import InputError
-
     low, _, high = text.partition("-")
     ends = [each.strip() for each in (low, high or low)]
     if not all(each.isdecimal() and 1 <= int(each) <= MAX_ERAS for each in ends):
@@ -192,33 +164,8 @@ def _counts(text: str) -> list[int]:
     return list(range(int(ends[0]), int(ends[1]) + 1)) or [int(ends[0])]
 
 
-def _changed(before: "Uncertainty", text: str) -> dict[str, "Value"]:
-    """The section of an uncertainty in which KEY=VALUE,... are replaced; raises InputError."""
-    from pydantic import ValidationError
-
-    from model.errors import InputError, first_problem
-    from model.rig.sections import UncertaintySection
-
-    section: dict[str, Value] = asdict(before)
-    for each in text.split(","):
-        key, equals, value = each.partition("=")
-        if not equals or key.strip() not in section:
-            raise InputError(
-                f"--uncertainty must be KEY=VALUE,... of {', '.join(section)}, got {text[:80]!r}"
-            )
-        section[key.strip()] = value.strip()
-        try:
-            UncertaintySection.model_validate({key.strip(): value.strip()})
-        except ValidationError as error:
-            raise InputError(f"--uncertainty: {key.strip()} {first_problem(error)[1]}") from None
-    return section
-
-
-def _quantity(text: str, dimension: "Dimension", option: str) -> float:
+def _quantity(text: str, dimension: Dimension, option: str) -> float:
     """The value of an option in its SI unit."""
-    from model.config.units import quantity
-    from model.errors import InputError
-
     try:
         return quantity(text, dimension)
     except ValueError as error:
@@ -227,9 +174,6 @@ def _quantity(text: str, dimension: "Dimension", option: str) -> float:
 
 def _stiffnesses(text: str) -> list[float] | list[None]:
     """Stiffnesses [N/m] of a list with commas, ascending; None for that of the rig's."""
-    from model.config.units import STIFFNESS
-    from model.errors import InputError
-
     found = [_quantity(each, STIFFNESS, "--stiffness") for each in text.split(",") if each.strip()]
     if (
         any(each <= 0 for each in found)

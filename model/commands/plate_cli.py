@@ -8,7 +8,17 @@ from typing import Annotated
 
 import typer
 
-from model.commands.options import JsonOption, MeshOption, RigArgument, SizeOption, next_line
+from model.commands.options import (
+    JsonOption,
+    MeshOption,
+    RigArgument,
+    SizeOption,
+    figure_size,
+    next_line,
+    progress_bar,
+)
+from model.config.points import parse_frequencies, parse_pair
+from model.files.replacing import check_picture
 
 plate_app = typer.Typer(help="Compute modes and vibration maps of a plate.")
 
@@ -91,9 +101,6 @@ def plate_map(
     import numpy as np
 
     from model.commands.drive_option import beyond_limits, parse_drives
-    from model.commands.options import figure_size
-    from model.config.points import parse_pair
-    from model.files.replacing import check_picture
     from model.rig.file import load_rig
     from model.structure.support import support_problem
     from model.vibration.excitation import G
@@ -164,8 +171,6 @@ def convergence(
 
     Print errors of natural frequencies and of responses.
     """
-    from model.commands.options import progress_bar
-    from model.config.points import parse_frequencies
     from model.rig.file import load_rig
     from model.vibration.convergence import (
         FOOT,

@@ -6,11 +6,11 @@ import sys
 from typing import Any
 
 from model.commands.options import JsonOption, RigArgument
+from model.errors import InputError
 
 
 def materials(as_json: JsonOption = False) -> None:
     """List known materials with their sources."""
-    from model.errors import InputError
     from model.structure.materials import known_material, material_names
 
     known, problems = {}, []

@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from model.commands.options import JsonOption, MeshOption, RigArgument, next_line
+from model.commands.options import JsonOption, MeshOption, RigArgument, next_line, progress_bar
+from model.config.points import parse_frequencies, parse_pair
 from model.counting import counted
+from model.errors import InputError
+from model.files.replacing import begins_with, check_ending, check_place, check_replaceable
 
 if TYPE_CHECKING:
     from model.spectral.mesh import PlateMesh
@@ -36,11 +39,7 @@ def build(
     as_json: JsonOption = False,
 ) -> None:
     """Solve the plate and write its table."""
-    from model.commands.options import progress_bar
-    from model.config.points import parse_frequencies, parse_pair
     from model.drive_modes import DRIVE_MODES
-    from model.errors import InputError
-    from model.files.replacing import begins_with, check_ending, check_place, check_replaceable
     from model.finger.grid import Grid
     from model.rig.file import load_rig
     from model.table.build import TableProblem, solve_table

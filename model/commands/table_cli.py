@@ -7,6 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from model.commands.options import JsonOption, TableArgument
+from model.config.points import parse_point
+from model.errors import InputError
 from model.rig.uncertainty import Uncertainty
 
 table_app = typer.Typer(help="Build, query and check localization tables.")
@@ -70,8 +72,6 @@ def query(
     Or with --own a vibration for each of several fingers. Print frequency, level and phase of each
     ERA, and predicted levels and contrast.
     """
-    from model.config.points import parse_point
-    from model.errors import InputError
     from model.table.file import load_table
     from model.table.query import prepared_timing, query_as_json
     from model.table.question import Question
@@ -166,7 +166,6 @@ def _answer(
     as_json: bool,
 ) -> None:
     """Answer several contents at once."""
-    from model.config.points import parse_point
     from model.table.file import load_table
     from model.table.query import answer_as_json
     from model.table.request import ANY_BAND, Finger, Request
@@ -207,7 +206,6 @@ def _answer(
 
 def _band(text: str) -> tuple[float, float]:
     """Lowest and highest frequency [Hz] of LOW-HIGH, or of one frequency."""
-    from model.errors import InputError
 
     low, _, high = text.partition("-")
     try:
@@ -240,7 +238,6 @@ def _query_batch(
 
     defaults: of keys that lines leave out.
     """
-    from model.errors import InputError
     from model.files.regular_file import regular_file
     from model.table.file import load_table
     from model.table.query import query_batch

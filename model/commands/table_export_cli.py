@@ -8,7 +8,17 @@ from typing import Annotated
 
 import typer
 
-from model.commands.options import FolderOption, JsonOption, SizeOption, TableArgument, next_line
+from model.commands.options import (
+    FolderOption,
+    JsonOption,
+    SizeOption,
+    TableArgument,
+    figure_size,
+    next_line,
+    progress_bar,
+)
+from model.errors import InputError
+from model.files.replacing import check_ending, check_place
 
 
 class Format(StrEnum):
@@ -41,7 +51,6 @@ def plot(
     as_json: JsonOption = False,
 ) -> None:
     """Draw weak cells, levels, contrast and an answer."""
-    from model.commands.options import figure_size, progress_bar
     from model.figures import save_figure
     from model.figures.table_pictures import table_figures
     from model.table.file import load_table
@@ -81,8 +90,6 @@ def export(
 
     docs/reference/table-file.md describes the content.
     """
-    from model.errors import InputError
-    from model.files.replacing import check_ending, check_place
     from model.table.export import export_csv, export_mat
     from model.table.file import load_table
 

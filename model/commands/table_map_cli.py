@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from model.commands.options import JsonOption, SizeOption, TableArgument, next_line
+from model.commands.options import (
+    JsonOption,
+    SizeOption,
+    TableArgument,
+    figure_size,
+    next_line,
+    progress_bar,
+)
+from model.config.points import parse_pair, parse_point
+from model.files.replacing import check_picture, check_place
 
 if TYPE_CHECKING:
     from model.table.contrast_map import ContrastMap
@@ -37,9 +46,6 @@ def contrast_map(
     as_json: JsonOption = False,
 ) -> None:
     """Map the promised contrast of every place to given quiet fingers."""
-    from model.commands.options import figure_size, progress_bar
-    from model.config.points import parse_pair, parse_point
-    from model.files.replacing import check_picture, check_place
     from model.finger.grid import Grid
     from model.table.contrast_map import map_contrast
     from model.table.file import load_table

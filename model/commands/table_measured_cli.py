@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from model.commands.options import progress_bar
 from model.counting import counted
 from model.errors import InputError
+from model.files.replacing import check_picture
 
 if TYPE_CHECKING:
     from model.table.promise_at_sensors import MeasuredVerification
@@ -24,8 +26,6 @@ def verify_by_measuring(
     as_json: bool,
 ) -> None:
     """Measure promises of a table; exit with 1 where too few are kept."""
-    from model.commands.options import progress_bar
-    from model.files.replacing import check_picture
     from model.rig.file import load_rig
     from model.table.file import load_table
     from model.table.table_check import check_by_measuring, plain_rig

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from model.commands.options import JsonOption, TableArgument, next_line
+from model.commands.options import JsonOption, TableArgument, next_line, progress_bar
+from model.errors import InputError
+from model.files.replacing import begins_with
 
 if TYPE_CHECKING:
     from model.table.verify import Verification
@@ -20,7 +22,6 @@ def show(
     as_json: JsonOption = False,
 ) -> None:
     """Show levels, weak cells, contrast and origin of a table."""
-    from model.commands.options import progress_bar
     from model.table.file import load_table
     from model.table.overview import find_overview, summarize
 
@@ -84,8 +85,6 @@ def verify(
     Use the direct solver and the plate in time; with --device play patterns and compare what
     accelerometers measure with what nine of ten plates promise. Exit with 1 if a check fails.
     """
-    from model.errors import InputError
-    from model.files.replacing import begins_with
     from model.table.file import ZIP
 
     if rig_file is not None and begins_with(rig_file, ZIP) and not begins_with(table_file, ZIP):
@@ -117,7 +116,6 @@ def verify(
 def _verify_by_solving(
     table_file: Path, rig_file: Path, *, samples: int, seed: int, as_json: bool
 ) -> None:
-    from model.commands.options import progress_bar
     from model.rig.file import load_rig
     from model.table.file import load_table
     from model.table.verify import verify_table

@@ -2,11 +2,12 @@
 
 import math
 import re
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from model.arrays import FloatArray
 from model.errors import InputError
+
+if TYPE_CHECKING:
+    from model.arrays import FloatArray
 
 # More is a typing error.
 MAX_FREQUENCIES = 2000
@@ -49,11 +50,13 @@ def parse_pair(text: str, *, what: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def parse_frequencies(text: str) -> FloatArray:
+def parse_frequencies(text: str) -> "FloatArray":
     """Frequencies (f,) [Hz] from `LO:HI:STEP`, both ends included, or from a list `60,110,250`.
 
     Raises InputError for anything else, and for a frequency given twice.
     """
+    import numpy as np  # which other commands do without
+
     try:
         if ":" in text:
             low, high, step = (float(part) for part in text.split(":"))

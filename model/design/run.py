@@ -188,15 +188,6 @@ def rank_layouts(
     return _design(best_by(judged, lambda each: each.mean_db), judged + rest, [], runner)
 
 
-def worthwhile_count(design: Design, worth: float) -> int:
-    """The number of ERAs up to which each further one buys at least so much contrast [dB]."""
-    means = {count: layout.mean_db for count, layout in design.by_count.items()}
-    for count in sorted(means):
-        if count >= design.problem.count or means.get(count + 1, 0.0) - means[count] < worth:
-            return count
-    return design.problem.count
-
-
 def _design(best: Layout, layouts: list[Layout], starts: list[Layout], runner: Runner) -> Design:
     """The result of layouts, of which some were judged, the best among them."""
     judged = [each for each in layouts if each.judged is not None]

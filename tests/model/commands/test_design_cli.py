@@ -13,7 +13,6 @@ from model.config.document import read_document
 from model.design import problem, search
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
-from model.rig.uncertainty import Uncertainty
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 
@@ -76,28 +75,6 @@ def test_the_best_of_several_stiffnesses_is_written(small, tmp_path: Path) -> No
         era.name: best for era in rig.eras if era.name != "NE"
     }
     assert rig.era("NE").stiffness == load_rig(RIG).era("NE").stiffness
-
-
-@pytest.mark.long
-def test_a_design_for_better_drives_says_so_in_its_rig(small, tmp_path: Path) -> None:
-    """Drives good to 1 %, all else as in the rig's file; more contrast than without."""
-    arguments = ("--eras", "4", "--starts", "1", "--json", "-o")
-    usual = design(*arguments, str(tmp_path / "usual"))
-    known = "gain=0.01, phase_deg=1, thickness=0.1 %, damping=1.05, fingertip=0.1"
-    better = design(*arguments, str(tmp_path / "better"), "--uncertainty", known)
-    assert better.exit_code == 0, better.output
-    rig = load_rig(tmp_path / "better" / "rig.yaml")
-    assert rig.uncertainty == Uncertainty(0.01, 1.0, 0.001, 0.1, 1.05, 0.1)
-    means = [json.loads(each.stdout)["contrast_db"]["mean"] for each in (usual, better)]
-    assert means[1] > means[0] + 1
-
-
-@pytest.mark.long
-def test_eras_that_buy_too_little_are_left_out(small, tmp_path: Path) -> None:
-    """Of at most four, where no ERA beyond those that support the plate buys 40 dB."""
-    result = design("--eras", "4", "--worth", "40", "--starts", "1", "-o", str(tmp_path), "--json")
-    assert result.exit_code == 0, result.output
-    assert len(json.loads(result.stdout)["eras"]) == 3
 
 
 def test_given_layouts_are_ranked_and_the_best_written(small, tmp_path: Path) -> None:

@@ -2,7 +2,9 @@
 
 import asyncio
 import math
+from collections.abc import Coroutine
 from dataclasses import replace
+from typing import Any
 
 from drivers import clock
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout, Preempted
@@ -110,12 +112,16 @@ class Amplifier(Dialogue):
                 f"{self.line.name}; give each its own: era amp address --serial-number"
             )
 
-    async def arm(self, session: int, watchdog: float = WATCHDOG) -> Values:
+    def arm(self, session: int, watchdog: float = WATCHDOG) -> Coroutine[Any, Any, Values]:
         """Switch the high voltage on at level zero; watchdog [s]. Returns the status.
 
-        It is identified anew: it may have lost its supply, and come back with other limits.
+        It is identified anew: it may have lost its supply, and come back with other limits. What
+        silences it from this call on comes first, also before this is awaited.
         """
-        before, began = self.silences, clock.now()
+        return self._arm(session, watchdog, self.silences)
+
+    async def _arm(self, session: int, watchdog: float, before: int) -> Values:
+        began = clock.now()
         await self.identify(timeout=REPLY_TIMEOUT)  # before the watchdogs of others that are armed
         wire = _WATCHDOG.to_wire(watchdog)
         low, high = (self.capabilities[f"watchdog_{end}"] for end in ("min", "max"))

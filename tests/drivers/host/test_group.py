@@ -10,7 +10,14 @@ import pytest
 
 from armed_group import grouped, layer, losing, tone, with_group
 from drivers.contents import Tone
-from drivers.errors import CommandRefused, LinkDegraded, LinkError, LinkTimeout, Preempted
+from drivers.errors import (
+    CommandRefused,
+    DriverError,
+    LinkDegraded,
+    LinkError,
+    LinkTimeout,
+    Preempted,
+)
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.host.wire import Broken
@@ -484,6 +491,21 @@ async def test_exchange_that_is_aborted_is_no_fault(group: Group, ends: list[Mem
     assert sent - began <= 0.0081
     assert (ends[0].levels("a"), ends[1].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
     assert not group.is_set_incomplete
+
+
+@grouped(("a",))
+async def test_nothing_is_armed_by_what_a_stop_of_the_same_moment_overtakes(
+    group: Group, ends: list[MemoryLine], wire: str
+) -> None:
+    """The stop comes between the call and the first request of it: no Arm goes out."""
+    await group.disarm()
+    ends[0].sent.clear()
+    arming, stops = asyncio.ensure_future(group.arm()), list[Awaitable[object]]()
+    ends[0].loop.call_soon(lambda: stops.append(group.stop()))
+    with pytest.raises(DriverError):
+        await arming
+    await stops[0]
+    assert "1:3" not in {each for _, each in ends[0].sent}
 
 
 @grouped(("a",), wire="serial")

@@ -25,11 +25,10 @@ from drivers.host.timing import HEARTBEAT, loss_detection_time
 from long_form import shortly
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
+from rig_on_wire import WIRES, HostedRig, rig_on_wire
 from sim.far_ends.wires import Wire
 from sim.faults.fault_window import FaultKind, FaultWindow
 from virtual_loop import in_virtual_time
-from wires import WIRES
-from words_bench import HostedRig, rig_on_wire
 
 WATCHDOG = 0.25  # s
 THREE_HEARTBEATS = 0.150  # s

@@ -10,11 +10,10 @@ from pathlib import Path
 import pytest
 
 from drivers.protocol.table import BY_NUMBER
-from firmware_pair import Pair, Sent
 from firmware_requests import RandomHost
 from judged_line import judged
 from long_form import shortly
-from moved_firmware import LINES, RATE, FirmwareEnd, MovedFirmware
+from moved_firmware import LINES, RATE, FirmwareEnd, MovedFirmware, Pair, Sent
 from sim.amplifier.contract import Amplifier
 
 REQUESTS = 600

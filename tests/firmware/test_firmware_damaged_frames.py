@@ -20,8 +20,7 @@ from drivers.codec.can_bus.segments import REQUEST, segments
 from drivers.codec.modbus.adu import framed
 from drivers.protocol.table import MESSAGES, STATES, STATUS_FLAGS
 from firmware_requests import RandomHost
-from firmware_script import request
-from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware
+from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware, request
 from mutation import damage
 
 COUNT = int(os.environ.get("FRAMES", "1000"))

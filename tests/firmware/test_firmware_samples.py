@@ -8,10 +8,9 @@ import pytest
 from cobs import cobs
 
 import hand_written as hand
-from firmware_script import PER_MS, Script, apply, arm, replay, request
 from hand_written import tone as command
 from model.arrays import FloatArray
-from moved_firmware import RATE, SERIAL, MovedFirmware
+from moved_firmware import PER_MS, RATE, SERIAL, MovedFirmware, Script, apply, arm, replay, request
 
 TOLERANCE = 6e-5  # of full level: two steps of a 16-bit sample, and phases over seconds
 

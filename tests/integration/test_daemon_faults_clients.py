@@ -13,9 +13,8 @@ import patient_daemon
 from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import RpcError
 from daemon_bench import PATIENCE, far_end, holding, until
-from daemon_process import DaemonProcess, daemon_process, play, plays_on, run_era
+from daemon_process import DaemonProcess, Journal, daemon_process, loudness, play, plays_on, run_era
 from floods import flood
-from journal import Journal, loudness
 from long_form import shortly
 
 pytestmark = pytest.mark.alone

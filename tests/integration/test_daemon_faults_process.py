@@ -24,16 +24,18 @@ from daemon_bench import far_end, holding, until, until_state
 from daemon_process import (
     REACTION,
     WATCHDOG,
+    Journal,
     armed,
     daemon_process,
     disarmed,
+    loudness,
     play,
     plays_on,
     ready,
+    silent_from,
 )
-from journal import Journal, loudness, silent_from
 from sim.faults.fault_window import FaultWindow
-from tuio_panel import free_port, panel
+from tuio_messages import free_port, panel
 
 pytestmark = pytest.mark.real_time
 

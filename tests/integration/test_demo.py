@@ -26,7 +26,7 @@ from installed_program import ERA
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from patient_daemon import wait_long
-from touch_schedule import write_schedule
+from tuio_messages import write_schedule
 from virtual_sockets import run_virtual_on_sockets
 
 ERA_NAMES = {"SW", "SE", "NE", "NW"}

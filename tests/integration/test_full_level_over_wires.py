@@ -12,10 +12,9 @@ from long_form import shortly
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from newest_contact import BuzzNewestContact
-from rig_on_wire import far_side
+from rig_on_wire import WIRES, far_side
 from set_table import SetTable
 from virtual_loop import in_virtual_time
-from wires import WIRES
 
 
 @pytest.mark.parametrize("of_rig", [False, True])

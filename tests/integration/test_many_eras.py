@@ -15,7 +15,7 @@ from long_form import shortly
 from model.rig.file import load_rig
 from model.table.build import build_table
 from model.table.question import Question
-from touch_schedule import write_schedule
+from tuio_messages import write_schedule
 from virtual_sockets import run_virtual_on_sockets
 
 EXAMPLES = Path(model.__file__).parents[1] / "examples"

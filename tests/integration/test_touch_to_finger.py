@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 
 from felt_assertions import CHECKS, Truth, response_differences, rounding
-from felt_chain import Heard, Played, play_stream
+from felt_chain import Heard, Played, Stream, play_stream
 from long_form import shortly
 from model.finger.grid import Grid
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import build_table
 from rig_files import TWO_AMPLIFIERS, write_rig
-from touch_stream import Stream
 
 PLACES = {
     "A": (0.07, 0.06),

@@ -14,9 +14,9 @@ from drivers.protocol.table import FAULTS
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
 from rig_files import TWO_AMPLIFIERS, write_rig
+from rig_on_wire import LIMITS, layer, memory_line, rig_in_memory
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
-from words_bench import LIMITS, layer, memory_line, rig_in_memory
 
 
 @in_virtual_time

@@ -24,14 +24,13 @@ from model.errors import InputError
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
 from registry.limits import GuardLimits
-from rig_on_wire import far_side
+from rig_on_wire import WIRES, far_side
 from sim.cli import app
 from sim.far_ends.wires import Wire
 from sim.witness.capture import read_capture
 from sim.witness.config import parse_config
 from sim.witness.witness import Witness
 from sim.witness_relay import parse_endpoint, relays
-from wires import WIRES
 from witness_config import witness_config
 
 

@@ -32,11 +32,10 @@ from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from rig_files import write_rig
-from rig_on_wire import FarSide, far_side
+from rig_on_wire import WIRES, FarSide, far_side
 from sim.witness.witness import OperatorCommand, Witness
 from small_table import small_table
 from virtual_sockets import VirtualSocketsLoop
-from wires import WIRES
 from witness_config import tell_first, witness_config
 
 PATIENCE = 180.0  # s; generous, for a loaded machine

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import FloatArray
+from model.structure.attachments import Fingertip, FingertipLoad
 from model.transients.base_motion import Motion, Term, along_lines, raised_cosine
 
 
@@ -106,3 +107,23 @@ BASES = (
     shaped_base(STROKE, 110.0, start=0.0, step=0.005, knots=(0, 0.3, 0.5j, -0.8, 0.4 - 0.2j, 0)),
 )
 """Ramps on two bases, an envelope on another, and one at rest."""
+
+
+FINGERTIP = Fingertip(
+    stiffness=1000.0,
+    damping=2.0,
+    contact_mass=0.0002,
+    phalanx_mass=0.005,
+    joint_stiffness=500.0,
+    joint_damping=2.0,
+)
+
+
+def resting(
+    *places: tuple[float, float], fingertip: Fingertip = FINGERTIP
+) -> dict[str, FingertipLoad]:
+    """Fingers at places [m], with ids a, b, ..."""
+    return {
+        chr(ord("a") + number): FingertipLoad(x, y, fingertip)
+        for number, (x, y) in enumerate(places)
+    }

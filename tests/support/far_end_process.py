@@ -12,7 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from drivers.contents import Layer, Tone
+from drivers.host.amplifier import Amplifier
+from drivers.opening import Lines
 from model.rig.file import example_rig_path
+from registry.limits import GuardLimits
 
 PATIENCE = 180  # s; for a loaded machine, not an expectation
 
@@ -67,3 +71,20 @@ async def far_end_process(rig: Path, *options: str) -> AsyncIterator[FarEndProce
             if process.returncode is None:
                 process.kill()
                 await process.wait()
+
+
+SESSION = 9
+
+
+@asynccontextmanager
+async def playing(url: str, tone: Tone, *, watchdog: float) -> AsyncIterator[Amplifier]:
+    """Open, arm and play without a ramp; watchdog [s]: of which it falls silent after this."""
+    lines = Lines()
+    try:
+        amplifier = await lines.amplifier(url, GuardLimits(40, 500, 1), name=url)
+        await amplifier.open()
+        await amplifier.arm(SESSION, watchdog)
+        await amplifier.stage(1, [Layer(0, (tone,), ramp=0.0)], now=True)
+        yield amplifier
+    finally:
+        await lines.close()

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from felt_chain import LEVEL_DB_SL, ONSET, SENSORS, Heard, Played
+from felt_chain import LEVEL_DB_SL, ONSET, SENSORS, Heard, Played, Situation, Stream
 from model.arrays import ComplexArray, FloatArray
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import contrast_db, felt_part, mean_level_db_sl
@@ -27,7 +27,6 @@ from model.transients.base_motion import BaseEnvelope, shaped
 from model.vibration.natural_modes import direct_responder
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
-from touch_stream import Situation, Stream
 
 STROKE = 100e-6  # m; of every ERA in the example
 JUDGED_UP_TO = 25.0  # dB; no model predicts what a quiet finger feels beyond that

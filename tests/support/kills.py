@@ -29,15 +29,17 @@ from daemon_process import (
     STARTING,
     WATCHDOG,
     DaemonProcess,
+    Journal,
     NotServing,
     daemon_process,
+    energised,
+    loudness,
+    silent_from_of,
 )
-from journal import Journal, energised, loudness, silent_from_of
 from model.rig.file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
-from rig_on_wire import far_side
+from rig_on_wire import WIRES, far_side
 from sim.far_ends.wires import Wire
-from wires import WIRES
 
 READY = "READY_TO_SWITCH_ON"
 LIMIT = WATCHDOG + REACTION  # s; on the amplifier's clock, from its last sign of life

@@ -1,15 +1,30 @@
 """The firmware in this process, on a clock that its caller moves: nothing of it takes real time."""
 
 import ctypes
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from cobs import cobs
 
+import hand_written as hand
 from drivers import clock
 from drivers.codec.can_bus.adapter_text import SLCAN, TextReader
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
+from drivers.codec.serial_line.frame import (
+    Frame,
+    FrameReader,
+    encode_frame,
+    pack_words,
+    unpack_words,
+)
+from drivers.protocol.records import Record, Values
+from drivers.protocol.table import BY_NUMBER, EVENT, EVENT_RECORD, NAK, NAK_RECORD, VERSION
 from model.arrays import FloatArray
+from sim.amplifier.contract import Amplifier
+from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 RATE = 16000
 """Samples per second and channel."""
@@ -97,3 +112,99 @@ class FirmwareEnd:
             data = pack_frames(self._reader.feed(data))
         if data:
             self._send(data)
+
+
+class Sent(NamedTuple):
+    """What an amplifier sends: number of the message, what else its frame says, its words."""
+
+    number: int
+    frame: tuple[int, ...]
+    words: tuple[int, ...]
+
+    def values(self) -> Values:
+        """Return the values of its record."""
+        records: Mapping[int, Record] = {NAK: NAK_RECORD, EVENT: EVENT_RECORD}
+        record = records.get(self.number) or BY_NUMBER[self.number].reply
+        return record.unpack(self.words, is_strict=False)
+
+
+class Pair:
+    """Firmware and simulated amplifier on a serial line, at one time [s] that the caller moves."""
+
+    def __init__(self, firmware: MovedFirmware, amplifier: Amplifier) -> None:
+        self.firmware, self.amplifier = firmware, amplifier
+        self.time = 0.0
+        self._requests = 0
+        self._out: list[bytes] = []
+        self._far = SerialAmplifiers({1: amplifier}, self._out.append)
+
+    @property
+    def moment(self) -> float:
+        """The time, a little later with each request, so that what is due then has happened."""
+        return self.time + 1e-9 * self._requests
+
+    def ask(self, number: int, words: Sequence[int]) -> tuple[list[Sent], list[Sent]]:
+        """Return what each sends upon a request with a message's number."""
+        data = encode_frame(Frame(number, 1, self._requests % 65536, pack_words(words), VERSION))
+        self._requests += 1
+        self.firmware.move(self.time)
+        self.firmware.receive(SERIAL, data)
+        self.amplifier.tick(self.moment)
+        self._far.receive(data, self.moment)
+        made, expected = self.firmware.sent(SERIAL), b"".join(self._out)
+        self._out.clear()
+        return _of_frames(made), _of_frames(expected)
+
+
+def _of_frames(data: bytes) -> list[Sent]:
+    return [
+        Sent(
+            frame.type,
+            (frame.is_reply, frame.version, frame.sequence),
+            unpack_words(frame.payload),
+        )
+        for frame in FrameReader().feed(data)
+    ]
+
+
+PER_MS = RATE // 1000
+SESSION = 9
+
+Script = Sequence[tuple[float, bytes]]
+"""Requests by time [ms]."""
+
+
+def request(kind: int, *words: int) -> bytes:
+    """A request to address 1; kind: the number of its message."""
+    return hand.frame(kind, words, sequence=7)
+
+
+def arm(watchdog_ms: int = 2000) -> bytes:
+    """An Arm of the session."""
+    return request(hand.ARM, SESSION, watchdog_ms)
+
+
+def apply(token: int, *commands: Sequence[int], ramp_ms: int = 0) -> bytes:
+    """A set of layer 0 that plays at once."""
+    layer = hand.layer(0, *commands, ramp=ramp_ms)
+    return request(hand.SET, *hand.part(token, layer, session=SESSION, now=True))
+
+
+def replay(
+    folder: Path, script: Script, until_ms: float
+) -> tuple[FloatArray, list[tuple[int, tuple[int, ...]]]]:
+    """The samples of a script, and type and words of each reply; events are left out."""
+    firmware = MovedFirmware(folder)
+    sent = b""
+    for at, frame in script:
+        firmware.move(at / 1000)
+        firmware.receive(SERIAL, frame)
+        sent += firmware.sent(SERIAL)
+    firmware.move(until_ms / 1000)
+    frames = [cobs.decode(part) for part in (sent + firmware.sent(SERIAL)).split(b"\0") if part]
+    replies = [
+        (frame[0], struct.unpack(f"<{len(frame[5:-4]) // 2}H", frame[5:-4]))
+        for frame in frames
+        if frame[0] & hand.REPLY
+    ]
+    return firmware.samples(), replies

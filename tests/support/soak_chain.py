@@ -27,7 +27,7 @@ from drivers.protocol.records import Values
 from memory_machine import live_in_memory
 from newest_contact import BuzzNewestContact
 from paper_plate import make_paper_rig
-from rig_on_wire import far_side
+from rig_on_wire import far_side, on_two_amplifiers
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.wires import Wire
 from sim.witness.witness import OperatorCommand
@@ -35,7 +35,6 @@ from small_table import small_table
 from soak_judges import Checks, SoakWitness, SourceContacts
 from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual
-from wires import on_two_amplifiers
 from witness_config import tell_first
 
 _RELEASE = 0.020  # s; from the last finger up to zero

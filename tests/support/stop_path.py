@@ -23,9 +23,8 @@ from controller.daemon.service_manager import ServiceManager
 from controller.daemon.states import DaemonEvent, Trigger
 from controller_bench import BenchLines, FarEnd
 from daemon_bench import READY, daemon_table, until, write_daemon
-from served_api import request
+from served_api import Wire, request
 from virtual_loop import run_virtual
-from wire_of_memory import Wire
 
 _OWN = tuple(str(Path(package.__path__[0])) for package in (controller, drivers))
 

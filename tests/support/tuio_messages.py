@@ -1,9 +1,16 @@
-"""TUIO messages and bundles as a sender makes them, by python-osc."""
+"""TUIO as a sender makes it, by python-osc; captures of it, and a panel of a daemon."""
 
+import socket
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
+
+from controller.sources.capture import RecordedDatagram, write_capture
+from controller.sources.touch import Touch, TouchFrame
+from controller.sources.tuio import tuio_datagram
 
 
 def message(*arguments: Any, address: str = "/tuio/2Dcur") -> Any:
@@ -35,3 +42,32 @@ def frame(*touches: tuple[int, float, float], fseq: int = -1, source: str = "tab
         *(cursor(*touch) for touch in touches),
         message("fseq", fseq),
     )
+
+
+def free_port() -> int:
+    """Find a free UDP port."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+def panel(port: int) -> str:
+    """The lines of a daemon's file for a TUIO panel."""
+    return f'touch: [{{name: panel, url: "tuio:127.0.0.1:{port}?timeout=0.15"}}]\n'
+
+
+FRAME = 1 / 50  # s
+
+
+def write_schedule(
+    path: Path, schedule: Sequence[tuple[int, float, float, float, float]], seconds: float
+) -> Path:
+    """Write a TUIO capture of fingers: id, down and up [s], place in TUIO's coordinates."""
+    datagrams = []
+    for number in range(round(seconds / FRAME)):
+        now = number * FRAME
+        touches = tuple(Touch(id, x, y) for id, down, up, x, y in schedule if down <= now < up)
+        frame = TouchFrame("test", now, touches)
+        datagrams.append(RecordedDatagram(now, tuio_datagram(frame, number + 1)))
+    write_capture(path, datagrams)
+    return path

@@ -10,9 +10,8 @@ from typer.testing import CliRunner, Result
 from controller.cli.commands import app
 from memory_machine import live_in_memory
 from model.rig.rig import Rig
-from rig_on_wire import far_side
+from rig_on_wire import WIRES, far_side
 from virtual_loop import run_virtual
-from wires import WIRES
 
 PORT = "serial:///dev/memory0?baud=921600"
 """Where that line is."""

@@ -20,8 +20,7 @@ from controller.api.hub import Hub
 from controller.api.schema import MAX_RATE, Message
 from controller.api.topics import ContactsEvent, LogEvent
 from drivers.garbage_collection import no_long_collections
-from served_api import ServedApi, request
-from wire_of_memory import Wire
+from served_api import ServedApi, Wire, request
 
 
 async def iterate() -> None:

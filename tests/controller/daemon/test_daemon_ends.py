@@ -20,9 +20,9 @@ from daemon_bench import (
     until,
     until_state,
 )
+from daemon_process import Journal, energised, silent_from
 from drivers import clock
 from drivers.host.amplifier import WATCHDOG
-from journal import Journal, energised, silent_from
 from rig_files import TWO_AMPLIFIERS
 from sim.faults.fault_window import FaultWindow
 from virtual_sockets import in_virtual_time_on_sockets

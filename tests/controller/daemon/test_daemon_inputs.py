@@ -19,11 +19,11 @@ from controller.sources.calibration import TouchCalibration
 from controller.sources.touch import Touch, TouchFrame, TouchSource
 from controller.sources.tuio import tuio_datagram
 from daemon_bench import ready_daemon, until
+from daemon_process import Journal
 from drivers import clock
-from journal import Journal
 from model.errors import InputError
 from model.structure.plate import Material, Plate
-from tuio_panel import free_port, panel
+from tuio_messages import free_port, panel
 from virtual_sockets import in_virtual_time_on_sockets
 
 PLATE = Plate(0.4, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))

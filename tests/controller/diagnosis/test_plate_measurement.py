@@ -28,12 +28,11 @@ from model.structure.attachments import PointLoad
 from model.table.build import build_table
 from model.table.question import Question
 from model.vibration.natural_modes import direct_responder
-from rig_on_wire import FarSide, far_side
+from rig_on_wire import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers
 from sim.bench import bench
 from sim.plant.accelerometer import Accelerometer
 from sim.sensors.recorder import Accelerometers
 from virtual_loop import run_virtual
-from wires import SHARED_WIRES, WIRES, on_two_amplifiers
 
 NOISE = 0.01  # m/s²/sqrt(Hz), of each foot: a thousandth of what it hears in a reading
 FINGERS = (

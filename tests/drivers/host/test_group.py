@@ -8,7 +8,6 @@ from collections.abc import Awaitable, Callable, Sequence
 
 import pytest
 
-from armed_group import grouped, layer, losing, tone, with_group
 from drivers.contents import Tone
 from drivers.errors import (
     CommandRefused,
@@ -25,7 +24,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import STATES
 from virtual_loop import in_virtual_time
-from words_line import KINDS, MemoryLine, unaltered
+from words_line import KINDS, MemoryLine, grouped, layer, losing, tone, unaltered, with_group
 
 
 @pytest.fixture(params=KINDS)

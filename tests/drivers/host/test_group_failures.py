@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from armed_group import grouped, layer, losing, tone, with_group
 from drivers.contents import Shape
 from drivers.errors import CommandRefused, DriverError
 from drivers.host.group import Group
@@ -16,7 +15,7 @@ from drivers.host.sensors import read_measured
 from drivers.protocol.records import Refusal, Values
 from sim.amplifier.contract import Amplifier as FarEnd
 from virtual_loop import in_virtual_time
-from words_line import MemoryLine
+from words_line import MemoryLine, grouped, layer, losing, tone, with_group
 
 
 def altered(

@@ -5,7 +5,6 @@ from collections.abc import Callable
 
 import pytest
 
-from armed_group import grouped, layer, tone, with_group
 from drivers.contents import Layer, Shape
 from drivers.errors import DriverError, LinkTimeout
 from drivers.host.dialogue import SILENCING
@@ -14,7 +13,7 @@ from drivers.host.modbus_wire import ModbusWire
 from drivers.host.serial_wire import SerialWire
 from drivers.host.wire import Wire
 from virtual_loop import in_virtual_time
-from words_line import MemoryLine
+from words_line import MemoryLine, grouped, layer, tone, with_group
 
 REACTION = 0.0099  # s; a reply may begin 10 ms after its request (docs/decisions/0061)
 

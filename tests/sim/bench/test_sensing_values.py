@@ -14,11 +14,10 @@ from drivers.protocol.table import READING_STATES
 from model.fem.plate import assemble, direct_acceleration
 from model.rig.rig import Rig
 from plate_in_time import apart
+from rig_on_wire import layer, on_two_amplifiers, rig_in_memory
 from sim.bench.bench import Bench
 from sim.plant.accelerometer import Accelerometer
 from virtual_loop import in_virtual_time
-from wires import on_two_amplifiers
-from words_bench import layer, rig_in_memory
 
 SESSION = 9
 

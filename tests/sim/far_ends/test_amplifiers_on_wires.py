@@ -12,11 +12,10 @@ from drivers.protocol.table import FAULTS, STATES
 from memory_machine import live_in_memory
 from model.errors import InputError
 from model.rig.rig import Rig
+from rig_on_wire import SHARED_WIRES, WIRES, layer, on_two_amplifiers, rig_on_wire
 from sim.far_ends.wires import Wire, assign_wires
 from sim.faults.fault_window import FaultKind, FaultWindow
 from virtual_loop import VirtualLoop, in_virtual_time
-from wires import SHARED_WIRES, WIRES, on_two_amplifiers
-from words_bench import layer, rig_on_wire
 
 DEFAULTS = Wire("serial")
 URLS = {

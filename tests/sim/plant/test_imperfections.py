@@ -11,6 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bench_driving import arm, keep_alive, play
+from driven_bases import FINGERTIP
 from driven_bases import motion_of as sampled
 from drivers.contents import Tone
 from drivers.playback import Playback, Voice
@@ -22,7 +23,6 @@ from model.rig.rig import Channel, Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import Fingertip
 from plate_in_time import lock_in
-from resting_fingers import FINGERTIP
 from sim.bench.bench import Bench
 from sim.plant.imperfections import (
     ChannelErrors,

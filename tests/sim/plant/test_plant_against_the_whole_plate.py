@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
 
-from driven_bases import BASES, STROKE, Base
+from driven_bases import BASES, STROKE, Base, resting
 from model.arrays import ComplexArray, FloatArray
 from model.fem.plate import assemble, direct_acceleration
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
@@ -16,7 +16,6 @@ from model.structure.attachments import Era, FingertipLoad, footprints_of
 from model.transients.base_motion import Term
 from paper_plate import make_paper_rig
 from plate_in_time import apart, lock_in
-from resting_fingers import resting
 from sim.plant.plant import Plant
 from whole_plate import WholePlate, whole_plate
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from driven_bases import faded_base, shaped_base
+from driven_bases import FINGERTIP, faded_base, resting, shaped_base
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.finger.perception import felt_part
@@ -15,7 +15,6 @@ from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_p
 from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, footprints_of
 from model.transients.base_motion import Term
-from resting_fingers import FINGERTIP, resting
 from sim.plant.plant import Plant
 from sim.plant.sampled import SampledPlant
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from drivers.contents import Tone
-from far_end_process import far_end_process
-from playing import SESSION, playing
+from far_end_process import SESSION, far_end_process, playing
 from recordings import read_recording
 from rig_files import write_rig
 

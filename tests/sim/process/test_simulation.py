@@ -15,9 +15,9 @@ from bench_driving import play
 from controller.cli.main import run
 from drivers.contents import Tone
 from drivers.protocol.table import QUANTITIES, STATES
+from far_end_process import playing
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
-from playing import playing
 from sim.bench.bench import Bench
 from sim.control.context import SimulationContext
 from sim.process.view import PlateView, draw

@@ -18,8 +18,7 @@ from long_form import in_turn, shortly
 from random_group import RandomGroup
 from sim.witness.capture import Violation
 from virtual_loop import run_virtual
-from witness_scenarios import SCENARIOS
-from witnessed_chain import WITNESSED, play
+from witnessed_chain import SCENARIOS, WITNESSED, play
 from words_line import KINDS
 
 SWELL = Shape(0.01, (0.1 + 0j, 0.3 + 0j, 0.1 + 0j))

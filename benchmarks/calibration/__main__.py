@@ -1,10 +1,11 @@
-"""How far a calibration's intervals hold: `python -m benchmarks.calibration [PLATES]`."""
+"""How far a calibration's intervals hold: `python -m benchmarks.calibration [PLATES] [FORM]`."""
 
 import sys
 
 from benchmarks.calibration import intervals
 
-PLATES = 200
+PLATES, FORM = "200", "usual"
 
 if __name__ == "__main__":
-    intervals.main(int(sys.argv[1]) if len(sys.argv) > 1 else PLATES)
+    plates, form = [*sys.argv[1:], *(PLATES, FORM)[len(sys.argv) - 1 :]]
+    intervals.main(int(plates), form)

@@ -4,10 +4,10 @@ Solved with finite elements of fourth order (Q4, strips along the edges) and a s
 frequency, where the product uses modes of polynomials; with form errors that the rig's description
 cannot express.
 
-    python -m benchmarks.calibration.hidden_plates FOLDER COUNT FORM
+    python -m benchmarks.calibration.hidden_plates FOLDER FIRST COUNT FORM
 
-writes what sensors read of each plate as CSV, and its true values as JSON: calibration runs in
-another process and has the CSV alone.
+writes what sensors read of each plate as CSV, three, four, six and twelve of them in turn, and its
+true values as JSON: calibration runs in another process and has the CSV alone.
 """
 
 import json
@@ -191,14 +191,18 @@ def gain_deviations(rig: Rig, true: ComplexArray) -> FloatArray:
     return np.abs([off.real / known.gain, off.imag / np.radians(known.phase_deg)])
 
 
+def sensors_of(seed: int) -> int:
+    """How many sensors a plate has."""
+    return list(CHOSEN)[seed % len(CHOSEN)]
+
+
 def main() -> None:
-    folder, count, form = Path(sys.argv[1]), int(sys.argv[2]), FORMS[sys.argv[3]]
+    folder, first, count = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
     rig = load_rig(RIG)
-    for seed in range(count):
-        hidden = draw_plate(rig, form, seed=seed)
-        for sensors in CHOSEN:
-            responses = measure(hidden, rig, seed=seed, count=sensors)
-            write_responses_csv(folder / f"{seed}-{sensors}.csv", responses, rig)
+    for seed in range(first, first + count):
+        hidden = draw_plate(rig, FORMS[sys.argv[4]], seed=seed)
+        responses = measure(hidden, rig, seed=seed, count=sensors_of(seed))
+        write_responses_csv(folder / f"{seed}.csv", responses, rig)
         gains = true_gains(hidden)
         truth = {
             "values": true_values(hidden),

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.calibration.hidden_plates import CHOSEN, FORMS, gain_deviations
+from benchmarks.calibration.hidden_plates import CHOSEN, gain_deviations, sensors_of
 from benchmarks.setting import RIG
 from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
@@ -24,6 +24,7 @@ from model.errors import InputError
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 
+_CHUNK, _SHOWN = 20, 100  # plates
 _NORMAL = 1.645  # standard errors either side: 90 %
 
 
@@ -51,40 +52,46 @@ def deviations(
     return by_kind
 
 
-def show(form: str, count: int) -> None:
-    """Print a table of kinds of values by the number of sensors."""
+def main(count: int, form: str) -> None:
+    """Print tables of kinds of values by the number of sensors, of a hundred plates and more."""
     rig = load_rig(RIG)
     held: dict[tuple[str, int], list[float]] = defaultdict(list)
     sizes: dict[tuple[str, int], list[float]] = defaultdict(list)
     refused = 0
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        program = [sys.executable, "-m", "benchmarks.calibration.hidden_plates"]
-        subprocess.run([*program, name, str(count), form], check=True)
-        for seed in range(count):
-            truth = json.loads((folder / f"{seed}.json").read_text())
-            for sensors in CHOSEN:
-                measured = read_functions(folder / f"{seed}-{sensors}.csv")
+    for first in range(0, count, _CHUNK):
+        some = min(_CHUNK, count - first)
+        with tempfile.TemporaryDirectory() as name:
+            program = [sys.executable, "-m", "benchmarks.calibration.hidden_plates"]
+            subprocess.run([*program, name, str(first), str(some), form], check=True)
+            for seed in range(first, first + some):
+                measured = read_functions(Path(name) / f"{seed}.csv")
+                truth = json.loads((Path(name) / f"{seed}.json").read_text())
                 try:
                     found = deviations(rig, responses_of(measured, rig), truth)
                 except InputError as error:
                     refused += 1
-                    print(f"plate {seed}, {sensors} sensors refused: {error}", flush=True)
+                    print(f"plate {seed} refused: {error}", flush=True)
                     continue
                 for kind, (off, size) in found.items():
-                    held[kind, sensors] += (off < _NORMAL).tolist()
-                    sizes[kind, sensors].append(size)
-    print(f"form errors {form}: {count} plates, {refused} calibrations refused")
+                    held[kind, sensors_of(seed)] += (off < _NORMAL).tolist()
+                    sizes[kind, sensors_of(seed)].append(size)
+        if (first + some) % _SHOWN == 0 or first + some == count:
+            print(f"form errors {form}: {first + some} plates, {refused} refused")
+            show(held, sizes)
+
+
+def show(
+    held: dict[tuple[str, int], list[float]], sizes: dict[tuple[str, int], list[float]]
+) -> None:
+    """Print shares of intervals that hold, and median standard errors."""
     print("intervals of 90 % that hold the truth (median standard error), by sensors")
-    print(f"{'':>12} " + " ".join(f"{sensors:>16d}" for sensors in CHOSEN))
+    print(f"{'':>12} " + " ".join(f"{column!s:>16}" for column in (*CHOSEN, "all")))
     for kind in dict.fromkeys(kind for kind, _ in held):
-        cells = [
-            f"{100 * np.mean(held[kind, n]):5.1f} % ({100 * np.median(sizes[kind, n]):.2f} %)"
-            for n in CHOSEN
-        ]
+        cells = []
+        for columns in (*([n] for n in CHOSEN), list(CHOSEN)):
+            shares, errors = (
+                np.concatenate([each[kind, n] for n in columns if each[kind, n]] or [[np.nan]])
+                for each in (held, sizes)
+            )
+            cells.append(f"{100 * np.mean(shares):5.1f} % ({100 * np.median(errors):.2f} %)")
         print(f"{kind:>12} " + " ".join(f"{cell:>16}" for cell in cells), flush=True)
-
-
-def main(count: int) -> None:
-    for form in FORMS:
-        show(form, count)

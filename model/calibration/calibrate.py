@@ -28,13 +28,13 @@ from model.calibration.fitted_rig import (
     standard_error,
     uncertainty_of,
 )
-from model.calibration.form_errors import SENSOR_SCALE, SIDE, form_model
 from model.calibration.held_out import hold_out, initial_responses, relative_error
 from model.calibration.responses import Responses
-from model.calibration.sensed_plate import STARTS, Parameters, sensed_plate
+from model.calibration.sensed_plate import STARTS, sensed_plate
 from model.calibration.variable_projection import modal_assurance, row_rms
 from model.choice import best_by, best_of, ranked_by
 from model.errors import InputError
+from model.identification.parameters import KINDS
 from model.rig.rig import Rig
 
 _STARTS = 2  # those with the least misfit of shapes
@@ -53,38 +53,30 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
     values = responses.values.copy()
     values[:, dead_eras] = np.nan
     check_enough_sensors(alive, responses)
-    parameters = Parameters.of(rig)
-    problem = Problem(
-        rig,
-        form_model(rig, responses.points, responses.frequencies),
-        parameters,
-        values,
-        np.ones(len(parameters.rows), dtype=bool),
-        np.ones(len(alive), dtype=bool),
-    )
+    plate = sensed_plate(rig, responses.points, responses.frequencies, has_form=True)
+    free = np.ones(len(plate.parameters.rows), dtype=bool)
+    problem = Problem(plate, values, free, np.ones(len(alive), dtype=bool))
 
     # All scales are free at first, so that a wrong one does not bias the fit.
     part = problem.at(alive)
-    fit = _first_fit(part, responses.points[alive], responses.frequencies)
+    fit = _first_fit(part)
     unlike = sensors_off_model(part, fit)
     if unlike.any():
         alive[alive] = ~unlike
         check_enough_sensors(alive, responses)
         part = problem.at(alive)
-        fit = first_fit(part, fit.x)
-    fit = solve(part, replace(fit, scales=fit.scales / np.median(fit.scales)))
-    if all_scales:
-        free_scales = part.free_scales
-    else:
-        middle = np.median(fit.scales)
-        error = fit.scales_error / np.abs(middle)
-        off = np.abs(fit.scales / middle - 1)
-        free_scales = off > np.maximum(_WRONG_SCALE, _SIGNIFICANCE * error)
-        fit = replace(fit, scales=np.where(free_scales, fit.scales / middle, 1.0))
+        fit = first_fit(part, part.x(fit.z))
+    fit = solve(part, replace(fit, z=part.at_scales(fit.z, _relative(part.scales(fit.z)))))
+    free_scales = part.free_scales
+    if not all_scales:
+        scales = _relative(part.scales(fit.z))
+        error = part.scale_errors(fit) / np.abs(np.median(part.scales(fit.z)))
+        free_scales = np.abs(scales - 1) > np.maximum(_WRONG_SCALE, _SIGNIFICANCE * error)
+        fit = replace(fit, z=part.at_scales(fit.z, np.where(free_scales, scales, 1.0)))
     points = responses.points[alive]
     problem, found = _identified(replace(part, free_scales=free_scales), fit)
     if all_scales:
-        found = _with_median_scale_one(found)
+        found = _with_median_scale_one(problem, found)
     _check_sides(problem, found)
     _check_outliers(problem, found)
     names = tuple(name for name, live in zip(responses.sensors, alive, strict=True) if live)
@@ -101,16 +93,20 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
     )
 
 
-def _first_fit(problem: Problem, points: FloatArray, frequencies: FloatArray) -> Fit:
+def _relative(scales: FloatArray) -> FloatArray:
+    """Scales of sensors to their median."""
+    return np.asarray(scales / np.median(scales))
+
+
+def _first_fit(problem: Problem) -> Fit:
     """Fit from several starts, since a fit finds only the nearest minimum; return the best."""
-    parameters = problem.parameters
-    plate = sensed_plate(problem.rig, points, frequencies)
+    parameters = problem.plate.parameters
 
     def misfit(model: ComplexArray) -> float:
         return float(np.nanmedian(1 - modal_assurance(problem.values, model)))
 
     starts = [parameters.moved(*start) for start in STARTS]
-    nearest = ranked_by(starts, lambda x: -misfit(plate.responses(x)))
+    nearest = ranked_by(starts, lambda x: -misfit(problem.plate.responses(x)))
     fits = [first_fit(problem, x) for x in nearest[:_STARTS]]
     return best_by(fits, lambda fit: -misfit(fit.predicted))
 
@@ -119,14 +115,15 @@ def _identified(problem: Problem, start: Fit) -> tuple[Problem, Fit]:
     """Hold parameters that the data determine less than their prior does, and fit again."""
     fit = solve(problem, start)
     while True:
-        excess = np.where(problem.free, fit.x_error, 0)
+        excess = np.where(problem.free, problem.x(fit.error), 0)
         # Values of a plate that does not fit are meaningless.
         if not excess.max() > 1 or _fit_error(problem, fit) > MAX_FIT_ERROR:
             return problem, fit
         free = problem.free.copy()
         free[best_of(excess)] = False
-        problem = replace(problem, free=free)
-        fit = solve(problem, replace(fit, x=np.where(free, fit.x, 0.0)))
+        problem, z = replace(problem, free=free), fit.z.copy()
+        z[problem.plate.parameters.numbers] *= free
+        fit = solve(problem, replace(fit, z=z))
 
 
 def _fit_error(problem: Problem, fit: Fit) -> float:
@@ -149,12 +146,11 @@ def _check_sides(problem: Problem, fit: Fit) -> None:
     """Raise InputError where the responses fit a plate of another size better."""
     if _fit_error(problem, fit) > MAX_FIT_ERROR:
         return
-    plate = problem.rig.plate
-    for key, side, off in zip(
-        ("length", "width"), (plate.length, plate.width), fit.form[problem.model.sides], strict=True
-    ):
-        if abs(off) > _MAX_SIDE:
-            found = side + SIDE * float(off)
+    plate, space = problem.plate.parameters.rig.plate, problem.model.space
+    offs = space.values(fit.z, "side").tolist()
+    for key, side, off in zip(("length", "width"), (plate.length, plate.width), offs, strict=True):
+        if abs(off) > _MAX_SIDE * KINDS["side"].std:
+            found = side + off
             raise InputError(
                 f"plate.{key} must be that of the measured plate, got {1e3 * side:.4g} mm in the "
                 f"rig while responses fit {1e3 * found:.4g} mm, as it looks; measure it, and "
@@ -162,14 +158,17 @@ def _check_sides(problem: Problem, fit: Fit) -> None:
             )
 
 
-def _with_median_scale_one(fit: Fit) -> Fit:
+def _with_median_scale_one(problem: Problem, fit: Fit) -> Fit:
     """Attribute the common scale of sensors to the gains, which do not tell them apart."""
-    middle = float(np.median(fit.scales))
-    common = SENSOR_SCALE * math.sqrt(math.pi / (2 * len(fit.scales)))  # of a median
+    scales = problem.scales(fit.z)
+    middle = float(np.median(scales))
+    common = KINDS["sensor_scale"].std * math.sqrt(math.pi / (2 * len(scales)))  # of a median
+    error = fit.error.copy()
+    error[problem.model.space.groups["sensor_scale"]] /= abs(middle)
     return replace(
         fit,
-        scales=fit.scales / middle,
-        scales_error=fit.scales_error / abs(middle),
+        z=problem.at_scales(fit.z, scales / middle),
+        error=error,
         gains=fit.gains * middle,
         gains_error=np.hypot(fit.gains_error, common * np.abs(fit.gains)) * abs(middle),
     )
@@ -185,15 +184,15 @@ def _report(
     dead_sensors: tuple[str, ...],
     dead_eras: tuple[str, ...],
 ) -> Calibration:
-    before = problem.rig
+    fitted, x, scales = problem.plate.parameters, problem.x(fit.z), problem.scales(fit.z)
+    before = fitted.rig
     rig = rig_of_fit(problem, fit)
     responses, gains = predicted_by(rig, problem, points, fit)
     eras = tuple(
         replace(era, gains=gain_rows(gains[:, number], frequencies) or era.gains)
         for number, era in enumerate(rig.eras)
     )
-    fitted = problem.parameters
-    at_bound = np.abs(fitted.bounds - fit.x).min(axis=0) < 1e-6
+    at_bound = np.abs(fitted.bounds - x).min(axis=0) < 1e-6
     parameters = tuple(
         FittedParameter(
             row,
@@ -204,8 +203,8 @@ def _report(
         )
         for row, value, error, free, bound in zip(
             fitted.rows,
-            fitted.values(fit.x),
-            fitted.slopes(fit.x) * fit.x_error,
+            fitted.values(x),
+            fitted.slopes(x) * problem.x(fit.error),
             problem.free,
             at_bound,
             strict=True,
@@ -224,7 +223,7 @@ def _report(
         scales=tuple(
             SensorScale(name, float(scale), float(error))
             for name, scale, error, free in zip(
-                names, fit.scales, fit.scales_error, problem.free_scales, strict=True
+                names, scales, problem.scale_errors(fit), problem.free_scales, strict=True
             )
             if free
         ),
@@ -235,7 +234,7 @@ def _report(
         held_out=held_out,
         sensors=names,
         frequencies=frequencies,
-        measured=problem.values / fit.scales,
+        measured=problem.values / scales,
         before=initial_responses(problem),
         after=gains[:, :, None] * responses,
     )

@@ -59,5 +59,6 @@ def sensors_off_model(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     inner = np.abs((model.conj() * values).sum(axis=(0, 1)))
     power = (np.abs(model) ** 2).sum(axis=(0, 1)) * (np.abs(values) ** 2).sum(axis=(0, 1))
     coherence = inner / np.sqrt(np.maximum(power, 1e-300))
-    relative = np.abs(fit.scales / np.median(fit.scales))
+    scales = problem.scales(fit.z)
+    relative = np.abs(scales / np.median(scales))
     return np.asarray((relative < _DEAD_SCALE) | (coherence < _DEAD_COHERENCE))

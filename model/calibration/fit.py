@@ -1,10 +1,10 @@
 """Maximum a posteriori fit of a rig's parameters, with the form errors of its plate.
 
-    d_fes = g_fe s_s a_fes(x, t) + noise,    t ~ N(0, 1),  s ~ N(1, tolerance)
+    d_fes = g_fe a_fes(z) + noise
 
-d measured, a of the model, g a complex gain of every frequency and ERA, s a real scale of every
-sensor, t form errors (`model.calibration.form_errors`). Gains are projected out
-(`model.calibration.variable_projection`); x, s and t are searched.
+d measured, a of the model as sensors of some scales read it, g a complex gain of every frequency
+and ERA. Gains are projected out (`model.calibration.variable_projection`); z is searched: the
+rig's values, which no prior holds, scales of sensors and form errors, which tolerances hold.
 
 Noise has a constant part and a part in proportion to the response, both estimated from the
 residuals. A first fit has no form errors and leaves outliers out, the worst of a row first, since
@@ -14,25 +14,28 @@ above 1. With gains projected out of J this is the Schur complement, so that of 
 
     var g_fe = sigma_fe² + (dg_fe/dz) C (dg_fe/dz)^T
 
-sigma of the noise, z all that is searched: scales that sensors have in common are part of it.
+sigma of the noise: scales that sensors have in common are part of it.
 """
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.form_errors import SENSOR_SCALE, FormModel
-from model.calibration.sensed_plate import Parameters
+from model.calibration.sensed_plate import SensedPlate
 from model.calibration.variable_projection import project_gains, projection_slopes, row_rms
-from model.identification.least_squares import Loss, search
-from model.rig.rig import Rig
+from model.identification.derivatives import jacobian
+from model.identification.forward import ForwardModel
+from model.identification.least_squares import Found, search
+from model.identification.parameters import FORM, Space
 
 _MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
 _PEAK = 3.0  # times the median of a row; twice that is rare on a plate
+_ROBUST = math.sqrt(2)  # one standard deviation of each part
 _ROUNDS = 8
 _SETTLED = 0.1  # of the noise between two rounds
 _LEAST_LEFT = 0.1  # of a value's noise: residuals with less tell nothing of it
@@ -42,15 +45,13 @@ _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong b
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A rig with the model of its plate, and the measured values (f, e, s), NaN where none.
+    """The plate of a rig with its form errors, and the measured values (f, e, s), NaN where none.
 
-    free (n,), free_scales (s,): masks of the parameters to be fitted, and of the scales without a
+    free (n,), free_scales (s,): masks of the rig's values to be fitted, and of the scales without a
     tolerance; has_form: whether form errors are fitted, or held at zero.
     """
 
-    rig: Rig
-    model: FormModel
-    parameters: Parameters
+    plate: SensedPlate
     values: ComplexArray
     free: NDArray[np.bool_]
     free_scales: NDArray[np.bool_]
@@ -60,62 +61,84 @@ class Problem:
         """Select some of the sensors (s,)."""
         return replace(
             self,
-            model=self.model.at(kept),
+            plate=self.plate.at_some(kept),
             values=self.values[:, :, kept],
             free_scales=self.free_scales[kept],
         )
 
-    @property
-    def searched(self) -> NDArray[np.bool_]:
-        """Mask of what is searched: free x, all scales, form errors."""
-        scales = np.ones(len(self.free_scales), dtype=bool)
-        return np.concatenate([self.free, scales, np.full(len(self.model.std), self.has_form)])
+    @cached_property
+    def model(self) -> ForwardModel:
+        """The model of what is fitted."""
+        model = self.plate.model
+        if self.has_form:
+            return model
+        space = model.space.without("place", "mode_shifts", *(set(FORM) - {"sensor_scale"}))
+        return replace(model, space=space, last_places={})
 
-    def split(self, z: FloatArray) -> list[FloatArray]:
-        """Parameters x, scales and form errors of z."""
-        n = len(self.free)
-        return np.split(z, [n, n + len(self.free_scales)])
+    @property
+    def frequencies(self) -> FloatArray:
+        """Of the values (f,) [Hz]."""
+        return self.model.frequencies
+
+    @cached_property
+    def searched(self) -> NDArray[np.bool_]:
+        """Mask (p,) of what is searched."""
+        found = self.model.space.uncertain.copy()
+        found[self.plate.parameters.numbers] = self.free
+        return found
+
+    def x(self, z: FloatArray) -> FloatArray:
+        """The rig's values (n,) of parameters z (p,)."""
+        return z[self.plate.parameters.numbers]
+
+    def scales(self, z: FloatArray) -> FloatArray:
+        """Scales of sensors (s,) of parameters z (p,)."""
+        return 1 + self.model.space.values(z, "sensor_scale")
+
+    def scale_errors(self, fit: "Fit") -> FloatArray:
+        """Standard errors of the scales that no tolerance holds (s,), 0 of others."""
+        return self.free_scales * self.model.space.values(fit.error, "sensor_scale")
+
+    def at_scales(self, z: FloatArray, scales: FloatArray) -> FloatArray:
+        """Parameters z (p,) with other scales of sensors (s,)."""
+        found, own = z.copy(), self.model.space.groups["sensor_scale"]
+        found[own] = (scales - 1) / self.model.space.std[own]
+        return found
 
     def responses(self, z: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """Responses (f, e, s) as sensors read them, and derivatives by what is searched of z."""
-        x, scales, form = self.split(z)
-        plain, by = self.model.responses(self.parameters, x, form, has_form=self.has_form)
-        by_scale = plain[None] * np.eye(len(scales))[:, None, None, :]
-        by_x, by_form = np.split(by * scales, [len(x)])
-        return plain * scales, np.concatenate([by_x[self.free], by_scale, by_form])
+        """Responses (f, e, s) as sensors read them, and derivatives (n, f, e, s) by n searched."""
+        plate = self.model.at(z)
+        by_z = jacobian(plate)[..., self.searched].transpose(3, 0, 2, 1)
+        return np.swapaxes(plate.responses, 1, 2), by_z
 
     def tolerances(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rows (m, z) that hold scales and form errors, in tolerances, and their targets (m,)."""
-        n, s, t = len(self.free), len(self.free_scales), len(self.model.std)
-        scales = np.where(self.free_scales, 0, 1 / SENSOR_SCALE)
-        size = np.concatenate([np.zeros(n), scales, np.full(t, float(self.has_form))])
-        rows = np.diag(size)[size > 0]
-        targets = rows[:, n : n + s].sum(axis=1)
+        """Rows (m, n) that hold what is searched of scales and form errors; their targets (m,)."""
+        space = self.model.space
+        held = space.uncertain.copy()
+        held[self.plate.parameters.numbers] = False
+        held[space.groups["sensor_scale"]] = ~self.free_scales
+        rows, targets = np.eye(space.size)[held], np.zeros(held.sum())
         if self.free_scales.all():
             # Gains determine a common scale; the mean is held.
-            mean = np.zeros((1, len(start)))
-            mean[0, n : n + s] = _HOLD / s
+            mean = np.zeros((1, space.size))
+            own = space.groups["sensor_scale"]
+            mean[0, own] = _HOLD * space.std[own] / len(self.free_scales)
             rows, targets = np.vstack([rows, mean]), np.append(targets, mean @ start)
-        return rows, targets
+        return rows[:, self.searched], targets
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Result of a fit.
 
-    x, x_error (n,); scales, scales_error (s,); gains, gains_error (f, e), NaN where unmeasured, the
-    latter of magnitudes, phases_error (f, e) [rad]; form, form_error (t,): form errors in their
-    tolerances; predicted (f, e, s): with gains and scales; noise (f, e): standard deviation of a
-    value; used (f, e, s): mask of values without outliers; chi2: sum of squares per degree of
-    freedom.
+    z, error (p,): parameters with their standard errors; gains, gains_error (f, e), NaN where
+    unmeasured, the latter of magnitudes, phases_error (f, e) [rad]; predicted (f, e, s): with gains
+    and scales; noise (f, e): standard deviation of a value; used (f, e, s): mask of values without
+    outliers; chi2: sum of squares per degree of freedom.
     """
 
-    x: FloatArray
-    x_error: FloatArray
-    scales: FloatArray
-    scales_error: FloatArray
-    form: FloatArray
-    form_error: FloatArray
+    z: FloatArray
+    error: FloatArray
     gains: ComplexArray
     gains_error: FloatArray
     phases_error: FloatArray
@@ -124,94 +147,77 @@ class Fit:
     used: NDArray[np.bool_]
     chi2: float
 
-    def at(self, kept: NDArray[np.bool_], model: FormModel) -> "Fit":
-        """Select some of the sensors (s,) as the start of another fit."""
-        return replace(
-            self,
-            scales=self.scales[kept],
-            used=self.used[:, :, kept],
-            form=model.select(self.form, kept),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """Where a search ended: z, with the derivatives of the residuals by what is searched."""
-
-    z: FloatArray
-    jacobian: FloatArray
-    residual: FloatArray
+    def at(self, kept: NDArray[np.bool_], space: Space) -> "Fit":
+        """Select some of the sensors (s,) of a space as the start of another fit."""
+        own = np.ones(space.size, dtype=bool)
+        for kind in ("sensor_gain", "sensor_phase", "sensor_scale"):
+            own[space.groups[kind]] = kept
+        own[space.groups["sensor_place"]] = np.repeat(kept, 2)
+        return replace(self, z=self.z[own], used=self.used[:, :, kept])
 
 
 def first_fit(problem: Problem, x: FloatArray) -> Fit:
     """Fit from starting values x (n,), all scales free and no form errors, despite outliers."""
-    scales = np.ones(len(problem.free_scales))
-    problem = replace(problem, has_form=False, free_scales=scales > 0)
-    z = np.concatenate([x, scales, np.zeros(len(problem.model.std))])
+    free = np.ones(len(problem.free_scales), dtype=bool)
+    problem = replace(problem, has_form=False, free_scales=free)
+    z = problem.plate.parameters.full(x)
     used = np.isfinite(problem.values)
     # Without residuals to judge by, peaks of a row are clipped at first.
     clipped = replace(problem, values=_without_peaks(problem.values, used))
     noise = 0.05 * row_rms(clipped.values, used)
-    found = _search(clipped, z, used / noise[:, :, None], loss="soft_l1")
+    z, found = _search(clipped, z, used / noise[:, :, None], robust=_ROBUST)
     for number in range(_ROUNDS):
-        raw = _deviation(problem, found.z, used / noise[:, :, None])
+        raw = _deviation(problem, z, used / noise[:, :, None])
         noise = _noise_of(problem.values, raw, used)
         kept = _without_worst(raw / noise[:, :, None], used)
         is_settled = number > 0 and bool((kept == used).all())
         used = kept
-        loss: Loss = "linear" if is_settled else "soft_l1"
-        found = _search(problem, found.z, used / noise[:, :, None], loss=loss)
+        robust = None if is_settled else _ROBUST
+        z, found = _search(problem, z, used / noise[:, :, None], robust=robust)
         if is_settled:
             break
-    return _result(problem, found, noise, used)
+    return _result(problem, z, found, noise, used)
 
 
 def solve(problem: Problem, start: Fit) -> Fit:
     """Fit parameters, scales and form errors, from those of another fit."""
-    z = np.concatenate([start.x, start.scales, start.form])
-    noise, used = start.noise, start.used
+    z, noise, used = start.z, start.noise, start.used
     finite = np.isfinite(problem.values)
     for _ in range(_ROUNDS):
-        weight = used / noise[:, :, None]
-        found = _search(problem, z, weight)
-        z, before = found.z, noise
+        weight, before = used / noise[:, :, None], noise
+        z, found = _search(problem, z, weight)
         raw = _deviation(problem, z, weight)
-        noise = _noise_of(problem.values, raw, used, _noise_left(problem, found, weight))
+        noise = _noise_of(problem.values, raw, used, _noise_left(problem, z, found, weight))
         # What form errors explain comes back.
         kept = finite & ~(raw > _MAX_DEVIATION * np.sqrt(2) * noise[:, :, None])
         is_settled = bool((kept == used).all() and (np.abs(noise / before - 1) < _SETTLED).all())
         used = kept
         if is_settled:
             break
-    return _result(problem, _search(problem, z, used / noise[:, :, None]), noise, used)
+    return _result(problem, *_search(problem, z, used / noise[:, :, None]), noise, used)
 
 
 def _search(
-    problem: Problem, start: FloatArray, weight: FloatArray, *, loss: Loss = "linear"
-) -> _Found:
-    searched, inside = problem.searched, weight > 0
-    tolerances, targets = problem.tolerances(start)
+    problem: Problem, start: FloatArray, weight: FloatArray, *, robust: float | None = None
+) -> tuple[FloatArray, Found]:
+    """Parameters (p,), and what the search of some of them ended with."""
+    searched, inside, space = problem.searched, weight > 0, problem.model.space
 
     def full(y: FloatArray) -> FloatArray:
         whole = start.copy()
         whole[searched] = y
         return whole
 
-    def linearised(y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        z = full(y)
-        model, by_z = problem.responses(z)
+    def linearised(y: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        model, by_z = problem.responses(full(y))
         _, left = project_gains(model, problem.values, weight)
         _, slopes = projection_slopes(model, by_z, problem.values, weight)
-        data, rows = left[inside], slopes[:, inside].T
-        return (
-            np.concatenate([data.real, data.imag, tolerances @ z - targets]),
-            np.vstack([rows.real, rows.imag, tolerances[:, searched]]),
-        )
+        return left[inside], slopes[:, inside].T
 
-    bounds = np.full((2, len(start)), [[-np.inf], [np.inf]])
-    bounds[:, : len(problem.free)] = problem.parameters.bounds
-    found = search(linearised, start[searched], bounds[:, searched], loss=loss)
-    return _Found(full(found.x), np.asarray(found.jac), np.asarray(found.fun))
+    bounds = np.array([space.lower, space.upper])[:, searched]
+    prior = problem.tolerances(start)
+    found = search(linearised, start[searched], bounds, prior=prior, robust=robust)
+    return full(found.y), found
 
 
 def _deviation(problem: Problem, z: FloatArray, weight: FloatArray) -> FloatArray:
@@ -221,13 +227,13 @@ def _deviation(problem: Problem, z: FloatArray, weight: FloatArray) -> FloatArra
     return np.abs(problem.values - np.nan_to_num(gains)[:, :, None] * model)
 
 
-def _noise_left(problem: Problem, found: _Found, weight: FloatArray) -> FloatArray:
+def _noise_left(problem: Problem, z: FloatArray, found: Found, weight: FloatArray) -> FloatArray:
     """Share (f, e, s) of each value's noise that is left in its residual: 1 - its leverage.
 
     That is of its row's gain, and of all that is searched, for which tolerances leave less.
     """
     inside = weight > 0
-    model, _ = problem.responses(found.z)
+    model, _ = problem.responses(z)
     by_gain = np.abs(weight * model) ** 2
     total = by_gain.sum(axis=2, keepdims=True)
     left = 1 - by_gain / np.where(total > 0, total, 1)
@@ -239,20 +245,22 @@ def _noise_left(problem: Problem, found: _Found, weight: FloatArray) -> FloatArr
     return np.asarray(left)
 
 
-def _result(problem: Problem, found: _Found, noise: FloatArray, used: NDArray[np.bool_]) -> Fit:
+def _result(
+    problem: Problem, z: FloatArray, found: Found, noise: FloatArray, used: NDArray[np.bool_]
+) -> Fit:
     searched, weight = problem.searched, used / noise[:, :, None]
     rows = int(used.any(axis=2).sum())
-    freedom = max(len(found.residual) - 2 * rows - int(searched.sum()), 1)
-    chi2 = float((found.residual**2).sum()) / freedom
+    freedom = max(len(found.residuals) - 2 * rows - int(searched.sum()), 1)
+    chi2 = float((found.residuals**2).sum()) / freedom
     size = np.linalg.norm(found.jacobian, axis=0)
     size[size == 0] = 1e-300
     _, strength, directions = np.linalg.svd(found.jacobian / size, full_matrices=False)
     seen = strength > 1e-9 * strength[0]
     blind = (np.abs(directions[~seen]) > 1e-6).any(axis=0)
     root = directions[seen].T / strength[seen] / size[:, None] * math.sqrt(max(chi2, 1.0))
-    errors = np.zeros(len(found.z))
-    errors[searched] = np.where(blind, np.inf, np.linalg.norm(root, axis=1))
-    model, by_z = problem.responses(found.z)
+    error = np.zeros(len(z))
+    error[searched] = np.where(blind, np.inf, np.linalg.norm(root, axis=1))
+    model, by_z = problem.responses(z)
     gains, _ = project_gains(model, problem.values, weight)
     by_gain, _ = projection_slopes(model, by_z, problem.values, weight)
     power = (np.abs(weight * model) ** 2).sum(axis=2)
@@ -263,15 +271,9 @@ def _result(problem: Problem, found: _Found, noise: FloatArray, used: NDArray[np
         np.sqrt(of_noise + (np.tensordot(root.T, part, axes=1) ** 2).sum(axis=0))
         for part in (relative.real, relative.imag)
     )
-    x, scales, form = problem.split(found.z)
-    x_error, scales_error, form_error = problem.split(errors)
     return Fit(
-        x,
-        x_error,
-        scales,
-        np.where(problem.free_scales, scales_error, 0.0),
-        form,
-        form_error,
+        z,
+        error,
         gains,
         np.abs(gains) * magnitude,
         phase,

@@ -11,9 +11,10 @@ from scipy.special import ndtr
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import FittedParameter, HeldOut, MovedEra
 from model.calibration.fit import Fit, Problem
-from model.calibration.form_errors import mass_scale_error
 from model.calibration.sensed_plate import Parameter, sensed_plate
 from model.calibration.variable_projection import project_gains
+from model.identification.form_errors import MASS_CELLS
+from model.identification.parameters import KINDS
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import Gain
@@ -25,11 +26,12 @@ _HELD, _HALF_WIDTH = 0.9, 1.645  # share that an interval holds, in standard err
 # Relative error of values by idealisations of the model: viscous instead of hysteretic damping
 # changes the loss factor by 0.15 %, other values by less.
 _MODEL_ERROR = 2e-3
+_FOREIGN_MASS = KINDS["foreign_mass"].std * math.sqrt(math.prod(MASS_CELLS))  # of the plate's
 
 
 def rig_of_fit(problem: Problem, fit: Fit) -> Rig:
     """Rig with fitted values, and ERAs at the places where they clearly are; gains unchanged."""
-    rig = problem.parameters.rig_at(fit.x)
+    rig = problem.plate.parameters.rig_at(problem.x(fit.z))
     moves = {moved.name: moved.after for moved in moved_eras(problem, fit)}
     eras = tuple(
         replace(era, x=moves[era.name][0], y=moves[era.name][1]) if era.name in moves else era
@@ -40,10 +42,10 @@ def rig_of_fit(problem: Problem, fit: Fit) -> Rig:
 
 def moved_eras(problem: Problem, fit: Fit) -> tuple[MovedEra, ...]:
     """List the ERAs that are off their places by several standard errors."""
-    rig, model, found = problem.rig, problem.model, []
+    rig, space, found = problem.plate.parameters.rig, problem.model.space, []
     sides = np.array([rig.plate.length, rig.plate.width])
-    places, errors = model.places(fit.form), model.places(fit.form_error)
-    for era, place, error in zip(rig.eras, places.T, errors.T, strict=True):
+    places, errors = (space.values(x, "place").reshape(-1, 2) for x in (fit.z, fit.error))
+    for era, place, error in zip(rig.eras, places, errors, strict=True):
         clear = np.abs(place) > _CLEAR * error
         at = np.clip(np.array([era.x, era.y]) + np.where(clear, place, 0), 0, sides)
         if np.abs(at - [era.x, era.y]).max() > 0:
@@ -62,9 +64,9 @@ def predicted_by(
     rig: Rig, problem: Problem, points: FloatArray, fit: Fit
 ) -> tuple[ComplexArray, ComplexArray]:
     """Responses (f, e, s) of a rig at points (s, 2) [m], and its gains (f, e) that fit best."""
-    model = sensed_plate(rig, points, problem.model.frequencies).responses()
+    model = sensed_plate(rig, points, problem.frequencies).responses()
     weight = fit.used / fit.noise[:, :, None]
-    gains, _ = project_gains(model * fit.scales, problem.values, weight)
+    gains, _ = project_gains(model * problem.scales(fit.z), problem.values, weight)
     return model, gains
 
 
@@ -81,8 +83,14 @@ def standard_error(rig: Rig, parameter: Parameter, value: float, error: float) -
     """Standard error of a value by that of a fit, by the model's, and of the mass it goes by."""
     share = _MODEL_ERROR
     if parameter.kind != "loss_factor":
-        share = math.hypot(share, mass_scale_error(rig))
+        share = math.hypot(share, _mass_scale_error(rig))
     return math.hypot(error, share * value)
+
+
+def _mass_scale_error(rig: Rig) -> float:
+    """Standard error of the whole mass, relative: all that is fitted but losses scales with it."""
+    sides = KINDS["side"].std / np.array([rig.plate.length, rig.plate.width])
+    return float(np.hypot(_FOREIGN_MASS, np.linalg.norm(sides)))
 
 
 def uncertainty_of(
@@ -101,7 +109,8 @@ def uncertainty_of(
     express, and at least the median error at held-out sensors, which is that of the field. What is
     not identified keeps the value of the rig before.
     """
-    errors = problem.parameters.slopes(fit.x) * fit.x_error
+    rows = problem.plate.parameters
+    errors = rows.slopes(problem.x(fit.z)) * problem.x(fit.error)
     relative = {
         kind: [
             math.hypot(float(error) / one.value, _MODEL_ERROR)
@@ -113,8 +122,8 @@ def uncertainty_of(
     whole = {
         "modulus": 1,
         "loss_factor": 1,
-        "stiffness": len(problem.rig.eras),
-        "damping": len(problem.rig.eras),
+        "stiffness": len(rows.rig.eras),
+        "damping": len(rows.rig.eras),
     }
     known = {kind: len(values) == whole[kind] for kind, values in relative.items()}
 

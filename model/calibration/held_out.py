@@ -33,17 +33,16 @@ def hold_out(
     unseen = np.zeros(count, dtype=bool)
     unseen[candidates[evenly_spaced]] = True
     part = problem.at(~unseen)
-    seen = solve(part, fit.at(~unseen, problem.model))
-    rig = rig_of_fit(part, seen)
-    everywhere = replace(seen, used=fit.used & ~unseen, noise=fit.noise, scales=fit.scales)
-    responses, gains = predicted_by(rig, problem, points, everywhere)
-    predicted = gains[:, :, None] * responses * fit.scales
+    seen = solve(part, fit.at(~unseen, problem.model.space))
+    rig, scales = rig_of_fit(part, seen), problem.scales(fit.z)
+    responses, gains = predicted_by(rig, problem, points, replace(fit, used=fit.used & ~unseen))
+    predicted = gains[:, :, None] * responses * scales
     size = row_rms(problem.values)
     which = fit.used & unseen
     return HeldOut(
         tuple(name for name, out in zip(names, unseen, strict=True) if out),
         relative_error(
-            problem.values, initial_responses(problem) * fit.scales, size, unseen[None, None]
+            problem.values, initial_responses(problem) * scales, size, unseen[None, None]
         ),
         relative_error(problem.values, predicted, size, which),
         float(np.median((np.abs(predicted - problem.values) / size[:, :, None])[which])),
@@ -52,11 +51,9 @@ def hold_out(
 
 def initial_responses(problem: Problem) -> ComplexArray:
     """Responses (f, e, s) of the rig before the fit, with its gains."""
-    gains = np.column_stack([era.gain(problem.model.frequencies) for era in problem.rig.eras])
-    start = np.zeros(len(problem.free))
-    none = np.zeros(len(problem.model.std))
-    responses, _ = problem.model.responses(problem.parameters, start, none)
-    return np.asarray(gains[:, :, None] * responses)
+    rig = problem.plate.parameters.rig
+    gains = np.column_stack([era.gain(problem.frequencies) for era in rig.eras])
+    return np.asarray(gains[:, :, None] * problem.plate.responses())
 
 
 def relative_error(

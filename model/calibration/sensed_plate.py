@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.fem.mesh import check_frequencies
 from model.identification.derivatives import jacobian
+from model.identification.form_errors import reduced_modes
 from model.identification.forward import ForwardModel, PlateAt, Sensor
 from model.identification.identified_rig import rig_with
-from model.identification.parameters import Space, space_of
+from model.identification.parameters import FORM, KINDS, Space, space_of
 from model.identification.values import Values
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -30,6 +31,8 @@ _STIFFNESS_STD = 0.10  # of its logarithm
 _LOSS_STD, _MIN_LOSS_STD = 0.7, 0.003  # of itself, and at least
 _DAMPING_STD, _MIN_DAMPING_RATIO_STD = 0.7, 0.015
 _BOLT_STD = 0.05  # of the plate's mass that an ERA carries
+_MODE_SHIFT = 0.003  # of an eigenvalue: theory and mesh
+_LOWEST, _HIGHEST = 0.1, 1.2  # of modes that shift: of the lowest frequency, of the highest tone
 _UNITS = {
     "modulus": "Pa",
     "loss_factor": "",
@@ -89,12 +92,14 @@ class Parameters:
     rows: tuple[Parameter, ...]
 
     @classmethod
-    def of(cls, rig: Rig, sensors: tuple[str, ...] = ()) -> "Parameters":
-        """Those of a rig with sensors by name."""
+    def of(
+        cls, rig: Rig, sensors: tuple[str, ...] = (), *, form_modes: int | None = None
+    ) -> "Parameters":
+        """Those of a rig with sensors by name; form_modes: that may shift, beside form errors."""
         rows = [Parameter("modulus", ""), Parameter("loss_factor", "")]
         for era in rig.eras:
             rows += [Parameter(kind, era.name) for kind in ("stiffness", "damping", "bolt_mass")]
-        return cls(rig, _space(rig, sensors), tuple(rows))
+        return cls(rig, _space(rig, sensors, form_modes), tuple(rows))
 
     @cached_property
     def numbers(self) -> IntArray:
@@ -157,7 +162,14 @@ class SensedPlate:
 
         And of its ERAs and masses.
         """
-        parameters = Parameters.of(rig, tuple(sensor.name for sensor in self.model.sensors))
+        names = tuple(sensor.name for sensor in self.model.sensors)
+        shifting = None
+        if self.model.form is not None:
+            natural = np.sqrt(np.maximum(self.model.modes.eigenvalues, 0)) / (2 * np.pi)
+            highest = _HIGHEST * self.model.frequencies.max()
+            lowest = _LOWEST * rig.plate.lowest_bending_frequency
+            shifting = int(((natural > lowest) & (natural < highest)).sum())
+        parameters = Parameters.of(rig, names, form_modes=shifting)
         eras = tuple(replace(era, gains=()) for era in rig.eras)
         model = replace(self.model, rig=replace(rig, eras=eras), space=parameters.space)
         return SensedPlate(parameters, model)
@@ -178,23 +190,33 @@ class SensedPlate:
         return np.swapaxes(plate.responses, 1, 2), np.swapaxes(by_x, 2, 3)
 
 
-def sensed_plate(rig: Rig, points: FloatArray, frequencies: FloatArray) -> SensedPlate:
+def sensed_plate(
+    rig: Rig, points: FloatArray, frequencies: FloatArray, *, has_form: bool = False
+) -> SensedPlate:
     """Solve a rig's free plate once, for sensors at points (s, 2) [m] and frequencies (f,) [Hz].
 
-    Raises InputError for frequencies too high for its mesh.
+    has_form: whether it may have form errors. Raises InputError for frequencies too high for its
+    mesh.
     """
     check_frequencies(rig.plate, rig.mesh, frequencies)
     sensors = [Sensor(f"sensor {n}", x=x, y=y) for n, (x, y) in enumerate(points.tolist())]
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(max(frequencies.max(), 200.0)))
+    form = reduced_modes(rig, free) if has_form else None
     parameters = Parameters.of(rig)
-    model = ForwardModel(rig, sensors, frequencies, parameters.space, free)
+    model = ForwardModel(rig, sensors, frequencies, parameters.space, free, form=form)
     return SensedPlate(parameters, model).of(rig)
 
 
-def _space(rig: Rig, sensors: tuple[str, ...]) -> Space:
-    """A space with priors of a plate that was not measured, all else known."""
+def _space(rig: Rig, sensors: tuple[str, ...], form_modes: int | None) -> Space:
+    """A space with priors of a plate that was not measured, all else known but form errors."""
     plate, count = rig.plate, len(rig.eras)
-    space = space_of(rig, sensors, Uncertainty.none(), mode_count=0)
+    space = space_of(
+        rig,
+        sensors,
+        Uncertainty.none(),
+        mode_count=form_modes or 0,
+        form_of=None if form_modes is None else len(sensors),
+    )
     share, loss = plate.mass / count, plate.loss_factor
     damping, bolt = np.array([(era.damping, era.bolt_mass) for era in rig.eras]).T
     # Bounds and deviations are relative to the mass that an ERA carries.
@@ -215,6 +237,10 @@ def _space(rig: Rig, sensors: tuple[str, ...]) -> Space:
         ),
         "bolt_mass": (_BOLT_STD * share, -bolt, np.maximum(5 * share - bolt, bolt)),
     }
+    if form_modes is not None:
+        # Places may leave the plate, whose shapes go on by their slopes.
+        kinds |= {kind: (KINDS[kind].std, -np.inf, np.inf) for kind in (*FORM, "place")}
+        kinds["mode_shifts"] = (_MODE_SHIFT, -np.inf, np.inf)
     columns = np.repeat([[0.0], [-np.inf], [np.inf]], space.size, axis=1)
     for kind, (std, lower, upper) in kinds.items():
         part = space.groups[kind]

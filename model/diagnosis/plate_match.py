@@ -11,7 +11,6 @@ parameters of the rig, near its values: a large deviation is evidence against th
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +27,6 @@ _GAIN_TOLERANCE = 0.08  # standard deviation over frequency, of itself
 MAX_FIT_ERROR = 0.2  # largest relative rms error of an acceptable plate
 MODEL_ERROR = 0.05  # of a row's rms: scales and positions of sensors, and what is not modelled
 _ROBUST = 2.0  # standard deviations
-
-_Number = TypeVar("_Number", np.float64, np.complex128)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +78,7 @@ def match_plate(
     count = len(parameters.rows)
     inside, driven = weight > 0, list(drives)
 
-    def linearised(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def linearised(z: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         model, by_x = plate.slopes(z[:count])
         model = model[:, driven]
         slopes = np.zeros((len(z), *model.shape), dtype=complex)
@@ -105,12 +102,9 @@ def match_plate(
         by_size = (projected.conj() * by_gain).real / size
         wander = ((size / gains - 1) / _GAIN_TOLERANCE)[rows]
         by_wander = (by_size - size * by_gains[:, None] / gains) / gains / _GAIN_TOLERANCE
-        data = _robust(left[inside])
-        by_data = _robust_slopes(left[inside], by_left[:, inside])
-        of_wander = _robust_slopes(wander, by_wander[:, rows])
         return (
-            np.concatenate([data.real, data.imag, _robust(wander), z]),
-            np.hstack([by_data.real, by_data.imag, of_wander, np.eye(len(z))]).T,
+            np.concatenate([left[inside], wander]),
+            np.hstack([by_left[:, inside], by_wander[:, rows]]).T,
         )
 
     bounds = np.hstack([parameters.bounds, np.tile([[-8.0], [8.0]], len(used))])
@@ -120,11 +114,11 @@ def match_plate(
         model = plate.responses(moved)[:, driven]
         ratio = np.log(np.maximum(size / row_rms(np.where(rows[:, :, None], model, np.nan)), 1e-6))
         levels = [np.median(ratio[rows[:, e], e]) for e in used]
-        found.append(search(linearised, np.concatenate([moved, levels]), bounds))
-    best = best_by(found, lambda each: -float(each.cost))
-    z = best.x[:count]
+        found.append(search(linearised, np.concatenate([moved, levels]), bounds, robust=_ROBUST))
+    best = best_by(found, lambda each: -each.cost)
+    z = best.y[:count]
     gains = np.full(values.shape[1], np.nan)
-    gains[used] = np.exp(_GAIN_STD * best.x[count:])
+    gains[used] = np.exp(_GAIN_STD * best.y[count:])
     responses = plate.responses(z)
     model = responses[:, driven]
     _, residual = project_gains(
@@ -136,25 +130,9 @@ def match_plate(
         parameters,
         z,
         gains,
-        float(best.cost),
+        best.cost,
         math.sqrt(float((share**2).mean())) if len(share) else math.inf,
         float(np.median(share)) if len(share) else math.inf,
         responses,
         np.asarray(model * gains[:, None]),
     )
-
-
-def _robust(left: NDArray[_Number]) -> NDArray[_Number]:
-    """Residuals [standard deviations] (m,) whose squares are a soft L1 loss."""
-    return np.asarray(left * np.sqrt(2 / (1 + _hypotenuse(left))))
-
-
-def _robust_slopes(left: NDArray[_Number], slopes: NDArray[_Number]) -> NDArray[_Number]:
-    """Derivatives of `_robust` for those of its argument, (n, m)."""
-    root = _hypotenuse(left)
-    grown = (left.conj() * slopes).real / (2 * _ROBUST**2 * root * (1 + root))
-    return np.asarray(np.sqrt(2 / (1 + root)) * (slopes - left * grown))
-
-
-def _hypotenuse(left: NDArray[_Number]) -> FloatArray:
-    return np.asarray(np.sqrt(1 + (np.abs(left) / _ROBUST) ** 2))

@@ -27,7 +27,7 @@ from model.identification.derivatives import jacobian
 from model.identification.forward import PlateAt
 from model.identification.parameters import Space
 from model.identification.settled import SettledPattern, Touched
-from model.reduction.receptance import between, combined
+from model.reduction.receptance import TERMS, combined
 from model.structure.plate import Plate
 
 # m, of slopes by places (no closed form: `model.reduction.place_slopes`): right to 0.1 %, and
@@ -276,8 +276,9 @@ def _receptance(
     plate: PlateAt, alteration: Alteration, points: FloatArray, others: FloatArray
 ) -> ComplexArray:
     """Of the free plate between points and others, (n, m), truncated modes included if need be."""
-    functions, free = plate.functions.values, plate.model.free
+    modes = plate.model.modes
+    found = modes.shapes_at(points) @ plate.solved(modes.shapes_at(others))[0]
     if alteration.is_of_modes:
-        shapes, other_shapes = free.modes.shapes_at(points), free.modes.shapes_at(others)
-        return np.asarray((shapes * functions[0, : shapes.shape[1]]) @ other_shapes.T)
-    return np.asarray(combined(functions, between(free.modes, points, others))[0])
+        return np.asarray(found)
+    truncated = combined(plate.functions.truncated(TERMS), modes.truncated_terms(points, others))
+    return np.asarray(found + truncated[0])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.forward import LEAST_LOSS, PlateAt
-from model.reduction.receptance import between, combined
+from model.reduction.receptance import TERMS, combined
 from model.structure.plate import LOSS_FREQUENCY
 
 AnyArray: TypeAlias = NDArray[np.floating[Any]] | NDArray[np.complexfloating[Any, Any]]
@@ -33,9 +33,16 @@ def jacobian(plate: PlateAt) -> ComplexArray:
 
 def by_mass_at(plate: PlateAt, points: FloatArray) -> ComplexArray:
     """Derivatives of the responses by a mass [kg] at points (p, 2) [m], (f, s, n, p)."""
-    products = between(plate.model.free.modes, plate.located.footprints, points)
-    reach = plate.left @ combined(plate.functions.values, products)
+    reach = reach_to(plate, points)
     return _outer(plate, reach, reach, _per_frequency(plate, len(points)))
+
+
+def reach_to(plate: PlateAt, points: FloatArray) -> ComplexArray:
+    """How forces at points (p, 2) [m] move what is attached, (f, a, p)."""
+    modes, functions = plate.model.modes, plate.functions
+    truncated = modes.truncated_terms(plate.located.footprints, points)
+    by_modes = plate.reach @ modes.shapes_at(points).T
+    return np.asarray(by_modes + plate.left @ combined(functions.truncated(TERMS), truncated))
 
 
 Columns: TypeAlias = dict[str, ComplexArray]
@@ -44,18 +51,24 @@ Columns: TypeAlias = dict[str, ComplexArray]
 
 def _by_plate(plate: PlateAt) -> Columns:
     """By thickness, modulus and loss factor of the whole plate."""
-    functions, products = plate.functions, plate.located.products
+    functions, reach, n = plate.functions, plate.reach, plate.base.shape[1]
+    seen, driven = reach[:, plate.model.observed], reach[:, :n].swapaxes(1, 2)
 
-    def responses(changed: ComplexArray) -> ComplexArray:
-        change = plate.left @ combined(changed, products) @ plate.left.swapaxes(1, 2)
-        n = plate.base.shape[1]
-        return np.asarray(plate.scale * change[:, plate.model.observed, :n])[..., None]
+    def responses(of_modes: ComplexArray | float, of_rest: ComplexArray | float) -> ComplexArray:
+        """By what changes logarithms of the stiffness of modes (f, r), and of all else (f,)."""
+        change = (seen * (of_modes * functions.elastic)[:, None]) @ driven
+        if plate.bending is not None:
+            change += seen @ (plate.bending * np.reshape(of_rest, (-1, 1, 1))) @ driven
+        rest = functions.by_logarithms(0.0, of_rest)[:, -TERMS:]
+        further = _attached(plate, combined(rest, plate.located.truncated))
+        return np.asarray(plate.scale * (further - functions.thickness**3 * change))[..., None]
 
-    by_stiffness = responses(functions.by_logarithms(1.0, 1.0))
-    by_loss = responses(functions.by_logarithms(plate.by_loss, plate.by_loss_of_rest))
+    by_stiffness = responses(1.0, 1.0)
+    by_loss = responses(plate.by_loss, plate.by_loss_of_rest)
+    by_mass = plate.scale * _attached(plate, plate.free_receptance)
     powers = np.log(plate.model.frequencies / LOSS_FREQUENCY)[:, None, None, None]
     return {
-        "thickness": 2 * by_stiffness - responses(functions.values),
+        "thickness": 2 * by_stiffness - by_mass[..., None],
         "modulus": by_stiffness,
         "loss": by_loss,
         "loss_added": by_loss / max(plate.values.loss_factor, LEAST_LOSS),
@@ -63,14 +76,40 @@ def _by_plate(plate: PlateAt) -> Columns:
     }
 
 
+def _attached(plate: PlateAt, change: ComplexArray) -> ComplexArray:
+    """Change of T at sensors and ERAs (f, s, n) by one of the free receptance (f, a, a)."""
+    left = plate.left
+    return np.asarray(
+        left[:, plate.model.observed] @ change @ left[:, : plate.base.shape[1]].swapaxes(1, 2)
+    )
+
+
 def _by_modes(plate: PlateAt) -> Columns:
     modes, functions = plate.model.shifted_modes, plate.functions
-    reach = plate.left @ plate.located.shapes[:, modes]
-    by_stiffness = functions.by_mode[:, modes]
-    by_loss = plate.by_mode_loss[:, modes] * by_stiffness
+    reach = plate.reach[:, :, modes]
+    by_stiffness = -(functions.thickness**3) * functions.elastic[:, modes]
     return {
         "mode_shifts": _outer(plate, reach, reach, by_stiffness),
-        "mode_losses": _outer(plate, reach, reach, by_loss),
+        "mode_losses": _outer(plate, reach, reach, plate.by_mode_loss[:, modes] * by_stiffness),
+    }
+
+
+def _by_form(plate: PlateAt) -> Columns:
+    """By foreign mass and what stretches the plate, which couple its modes."""
+    model, functions, n = plate.model, plate.functions, plate.base.shape[1]
+    if model.form is None:
+        return {}
+    reach = plate.reach @ model.form.cells.T
+    share = model.rig.plate.mass * functions.thickness
+    by_mass = _outer(plate, reach, reach, share * _per_frequency(plate, reach.shape[-1]))
+    seen, driven = plate.reach[:, model.observed], plate.reach[:, :n].swapaxes(1, 2)
+    factor = -(functions.q * functions.thickness)[:, None, None] * plate.scale
+    stretched = [factor * (seen @ slope @ driven) for slope in model.form.stiffening]
+    sides = np.array([model.rig.plate.length, model.rig.plate.width])
+    return {
+        "foreign_mass": by_mass - by_mass.mean(axis=-1, keepdims=True),
+        "side": np.stack(stretched[:2], axis=-1) / sides,
+        "poisson": stretched[2][..., None],
     }
 
 
@@ -81,17 +120,21 @@ def _by_places(plate: PlateAt) -> Columns:
     """
     model = plate.model
     n, moved = plate.base.shape[1], np.repeat(model.movable, 2)
-    rows = combined(plate.functions.values, plate.located.slopes)
+    located, functions = plate.located, plate.functions
+    rows = located.shape_slopes @ plate.moved
+    rows = rows + combined(functions.truncated(TERMS), located.truncated_slopes)
     reach, own = plate.left @ rows.swapaxes(1, 2), plate.left[:, :, moved]
     ones = np.ones((len(model.omega), len(moved)))
     by_place = _outer(plate, own, reach, ones)
     by_place += _outer(plate, reach, own, ones)
+    places, of_masses, of_sensors = np.split(by_place, [2 * n, 2 * (n + model.mass_count)], axis=-1)
     masses = np.empty((*by_place.shape[:-1], model.mass_count, 3), dtype=complex)
-    masses[..., 1:] = by_place[..., 2 * n :].reshape(masses[..., 1:].shape)
+    masses[..., 1:] = of_masses.reshape(masses[..., 1:].shape)
     by_mass = _per_frequency(plate, model.mass_count)
-    masses[..., 0] = _held(plate, model.movable[n:], -by_mass)
+    masses[..., 0] = _held(plate, model.movable[n : n + model.mass_count], -by_mass)
     return {
-        "place": by_place[..., : 2 * n],
+        "place": places,
+        "sensor_place": of_sensors,
         "masses": masses.reshape(*by_place.shape[:-1], -1),
     }
 
@@ -134,13 +177,23 @@ def _by_gains(plate: PlateAt) -> Columns:
         "drag": by_drive * by_drag[:, None, None],
         "sensor_gain": by_sensor,
         "sensor_phase": 1j * by_sensor,
+        "sensor_scale": _by_scale(plate),
     }
+
+
+def _by_scale(plate: PlateAt) -> ComplexArray:
+    """By the scale of each sensor, which may be zero."""
+    count = len(plate.values.sensor_scales)
+    plain = plate.values.sensor_gains[:, None] * plate.drive[:, None]
+    plain = plain * plate.receptance[:, plate.model.observed, : plate.base.shape[1]]
+    return np.asarray(plain[..., None] * np.eye(len(plate.model.observed), count)[:, None])
 
 
 _GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {
     _by_plate: ("thickness", "modulus", "loss", "loss_added", "loss_exponent"),
     _by_modes: ("mode_shifts", "mode_losses"),
-    _by_places: ("place", "masses"),
+    _by_places: ("place", "masses", "sensor_place"),
+    _by_form: ("foreign_mass", "side", "poisson"),
     _by_attachments: (
         "stiffness",
         "damping",
@@ -149,7 +202,10 @@ _GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {
         "bolt_mass",
         "fingers",
     ),
-    _by_gains: ("gain", "phase", "inertia", "drag", "sensor_gain", "sensor_phase"),
+    _by_gains: (
+        *("gain", "phase", "inertia", "drag"),
+        *("sensor_gain", "sensor_phase", "sensor_scale"),
+    ),
 }
 
 

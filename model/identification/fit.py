@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 from model.identification.derivatives import jacobian
 from model.identification.forward import ForwardModel
 from model.identification.least_squares import search
@@ -55,12 +55,16 @@ class Problem:
         own = self.measurement.std
         return own if self.extra_noise is None else np.hypot(own, self.extra_noise)
 
-    def linearised(self, x: FloatArray) -> Linearised:
-        """Residuals and their derivatives."""
+    def residuals(self, x: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """Residuals in standard deviations (n,) and their derivatives (n, p)."""
         m = self.measurement
         plate = self.model.at(x)
         J = jacobian(plate)[m.rows, m.at, m.eras] / self.std[:, None]
-        found = (plate.responses[m.rows, m.at, m.eras] - m.values) / self.std
+        return (plate.responses[m.rows, m.at, m.eras] - m.values) / self.std, J
+
+    def linearised(self, x: FloatArray) -> Linearised:
+        """The same in real and imaginary parts."""
+        found, J = self.residuals(x)
         residuals = np.concatenate([found.real, found.imag])
         return Linearised(x, residuals, np.concatenate([J.real, J.imag]))
 
@@ -80,13 +84,12 @@ def solve(
         x[searched] = y
         return x
 
-    def linearised(y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        now = problem.linearised(full(y))
-        prior = np.eye(len(searched))
-        return np.append(now.residuals, y), np.vstack([now.jacobian[:, searched], prior])
+    def linearised(y: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        residuals, J = problem.residuals(full(y))
+        return residuals, J[:, searched]
 
     bounds = np.array([space.lower, space.upper])[:, searched]
     found = search(
         linearised, start[searched], bounds, evaluations=evaluations, tolerance=_CONVERGED
     )
-    return problem.linearised(full(found.x))
+    return problem.linearised(full(found.y))

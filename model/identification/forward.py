@@ -15,11 +15,12 @@ from typing import Self
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
+from model.identification.form_errors import ReducedModes
 from model.identification.parameters import Space
-from model.identification.places import Places, places_of
+from model.identification.places import Modes, Places, places_of
 from model.identification.values import Values
 from model.reduction.free_plate import FreePlate
-from model.reduction.receptance import FreeReceptance, combined
+from model.reduction.receptance import TERMS, FreeReceptance, combined
 from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, attached_stiffness, footprints_of
 from model.structure.modal_elasticity import ModalElasticity, lowest_elastic
@@ -53,7 +54,7 @@ class ForwardModel:
     """A rig's plate, as it was solved, on its attachments, with sensors and fingers.
 
     frequencies (f,) [Hz]; free: of the rig's plate, solved for its own thickness and modulus or
-    others; space: what may differ.
+    others; space: what may differ; form: the plate in coordinates in which it may have form errors.
     """
 
     rig: Rig
@@ -62,6 +63,7 @@ class ForwardModel:
     space: Space
     free: FreePlate
     fingers: Sequence[RestingFinger] = ()
+    form: ReducedModes | None = None
     last_places: dict[bytes, Places] = field(default_factory=dict)
 
     @cached_property
@@ -85,19 +87,24 @@ class ForwardModel:
             after += not sensor.era
         return np.array(found, dtype=int)
 
+    @property
+    def modes(self) -> Modes:
+        """The modes that the plate moves in."""
+        return self.form or self.free.modes
+
     @cached_property
     def shifted_modes(self) -> IntArray:
         """Numbers of the modes whose eigenvalues may shift, the lowest elastic ones, ascending."""
-        return lowest_elastic(self.free.modes.eigenvalues, len(self.space.indices("mode_shifts")))
+        return lowest_elastic(self.modes.eigenvalues, len(self.space.indices("mode_shifts")))
 
     @cached_property
     def elasticity(self) -> ModalElasticity:
         """Eigenvalues and loss factors of the modes as the rig has them."""
         return ModalElasticity.of(
             self.free.plate,
-            self.free.modes.eigenvalues,
-            self.free.modes.losses,
-            self.free.modes.dispersion,
+            self.modes.eigenvalues,
+            self.modes.losses,
+            self.modes.dispersion,
         )
 
     @cached_property
@@ -118,12 +125,14 @@ class ForwardModel:
 
     @cached_property
     def movable(self) -> IntArray:
-        """Numbers of the attachments that may move: ERAs and additional masses."""
-        if not self.space.of("place", "masses").any():
+        """Numbers of the attachments that may move: ERAs, additional masses, sensors off ERAs."""
+        if not self.space.of("place", "masses", "sensor_place").any():
             return np.array([], dtype=int)
         first = len(self.rig.eras) + len(self.rig.masses)
         movable = [*range(len(self.rig.eras)), *range(first, first + self.mass_count)]
-        return np.array(movable, dtype=int)
+        last = first + self.mass_count + len(self.fingers)
+        sensors = range(last, last + len(self.space.indices("sensor_place")) // 2)
+        return np.array([*movable, *sensors], dtype=int)
 
     def with_frequencies(self, frequencies: FloatArray) -> Self:
         """The same at other frequencies (f,) [Hz]."""
@@ -133,13 +142,44 @@ class ForwardModel:
         """The plate for parameters x (p,)."""
         return PlateAt(self, x)
 
-    def places(self, footprints: FloatArray) -> Places:
-        """Solution for all attachments (a, 3) [m]; the last one is kept."""
+    def places(self, values: Values) -> Places:
+        """Solution for all attachments where they are; the last one is kept.
+
+        Of a plate with form errors by slopes from the rig's places, which may leave the plate.
+        """
+        footprints = self._footprints(values)
+        if self.form is not None:
+            nominal = self._footprints(Values.of(self.rig, self.space, np.zeros(self.space.size)))
+            return self._solved(nominal).moved(footprints, self.movable)
+        footprints[:, :2] = np.clip(footprints[:, :2], 0, self._sides)
+        return self._solved(footprints)
+
+    def _solved(self, footprints: FloatArray) -> Places:
         key = footprints.tobytes()
         if key not in self.last_places:
             self.last_places.clear()
-            self.last_places[key] = places_of(self.free, footprints, self.movable)
+            self.last_places[key] = places_of(self.modes, footprints, self.movable, self._sides)
         return self.last_places[key]
+
+    @property
+    def _sides(self) -> FloatArray:
+        return np.array([self.rig.plate.length, self.rig.plate.width])
+
+    def _footprints(self, values: Values) -> FloatArray:
+        """Of ERAs, masses, additional masses, fingers and sensors, (a, 3) [m]."""
+        feet = [era.foot for era in self.rig.eras]
+        fingers = np.array([(each.x, each.y) for each in self.fingers]).reshape(-1, 2)
+        points = np.vstack([values.masses[:, 1:], fingers])
+        pads = self.pads.copy()
+        pads[: len(values.sensor_places), :2] += values.sensor_places
+        return np.vstack(
+            [
+                np.column_stack([values.places, feet]),
+                footprints_of(self.rig.masses),
+                np.column_stack([points, np.zeros(len(points))]),
+                pads,
+            ]
+        )
 
 
 class PlateAt:
@@ -147,16 +187,18 @@ class PlateAt:
 
     values: of x; located: where all is; functions: of frequency; by_loss, by_mode_loss (f, r) and
     by_loss_of_rest (f,): change of the logarithm of their stiffness with that of the plate's loss
-    factor, and of all that a mode loses; base (f, n): force of an ERA on
-    the plate per displacement of its base [N/m]; stiffness (f, a): of what is attached; receptance
-    T, of the plate with its attachments, and left factor L (f, a, a); finger_slopes: by finger,
-    derivatives of its dynamic stiffness by its parts (f, 4).
+    factor, and of all that a mode loses; bending (f, r, r), added (r, r): stiffness and mass
+    between modes by form errors; base (f, n): force of an ERA on the plate per displacement of its
+    base [N/m]; stiffness (f, a): of what is attached; free_receptance A, receptance T, of the plate
+    with its attachments, and left factor L (f, a, a); moved (f, r, a): coordinates of the free
+    plate by a force at each; finger_slopes: by finger, derivatives of its dynamic stiffness by its
+    parts (f, 4).
     """
 
     def __init__(self, model: ForwardModel, x: FloatArray) -> None:
         self.model, self.values = model, Values.of(model.rig, model.space, x)
         self.functions = self._functions()
-        self.located = model.places(self._footprints())
+        self.located = model.places(self.values)
         w, values = model.omega[:, None], self.values
         self.base = values.stiffness + 1j * w * values.damping
         loads = [
@@ -171,7 +213,8 @@ class PlateAt:
             np.zeros((len(w), len(model.pads))),
         ]
         self.stiffness = Z = np.concatenate(held, axis=1)
-        A = combined(self.functions.values, self.located.products)
+        shapes, moved = self.located.shapes, self.solved(self.located.shapes)
+        A = shapes @ moved + combined(self.functions.truncated(TERMS), self.located.truncated)
         # Nothing holds the plate at the sensors, the last ones.
         count = Z.shape[1] - len(model.pads)
         reaction = A[:, :, :count] * Z[:, None, :count]
@@ -179,6 +222,23 @@ class PlateAt:
         self.left = np.repeat(np.eye(Z.shape[1], dtype=complex)[None], len(w), axis=0)
         self.left[:, :, :count] -= reaction
         self.receptance = A - reaction @ A[:, :count]
+        self.free_receptance, self.moved = A, moved
+
+    @cached_property
+    def reach(self) -> ComplexArray:
+        """How a force on each mode of the free plate moves what is attached, (f, a, r) [s²/kg]."""
+        return self.left @ self.moved.swapaxes(1, 2)
+
+    def solved(self, shapes: FloatArray) -> ComplexArray:
+        """Coordinates of the free plate by forces where shapes are (a, r), (f, r, a) [s²/kg]."""
+        functions = self.functions
+        if self.bending is None:
+            return np.asarray(functions.modal[:, :, None] * shapes.T)
+        h, omega2 = functions.thickness, (self.model.omega**2)[:, None]
+        system = h**2 * self.bending - omega2[:, None] * self.added
+        diagonal = np.arange(len(shapes.T))
+        system[:, diagonal, diagonal] += h**2 * functions.elastic - omega2
+        return np.asarray(np.linalg.solve(system, shapes.T.astype(complex)) / h)
 
     @cached_property
     def lag(self) -> ComplexArray:
@@ -186,11 +246,19 @@ class PlateAt:
         return self.values.lag(self.model.frequencies)
 
     @cached_property
+    def drive(self) -> ComplexArray:
+        """Force of each drive on the plate per unit of what it plays, times -omega² (f, n)."""
+        values, model = self.values, self.model
+        force = self.base * values.drive_gains * model.drive_gains * self.lag
+        return np.asarray(-(model.omega**2)[:, None] * force)
+
+    @cached_property
     def scale(self) -> ComplexArray:
         """What turns T at sensors and ERAs into responses, (f, s, n)."""
-        drive = self.base * self.values.drive_gains * self.model.drive_gains * self.lag
-        drive *= -(self.model.omega**2)[:, None]
-        return np.asarray(self.values.sensor_gains[:, None] * drive[:, None])
+        gains = self.values.sensor_gains
+        if len(self.values.sensor_scales):
+            gains = gains * self.values.sensor_scales
+        return np.asarray(gains[:, None] * self.drive[:, None])
 
     @cached_property
     def responses(self) -> ComplexArray:
@@ -228,23 +296,14 @@ class PlateAt:
             for each in (own, own + further)
         )
         self.by_loss_of_rest = np.asarray(1j * eta / (1 + 1j * eta))
+        self.bending: ComplexArray | None = None
+        if model.form is not None:
+            stretched = np.einsum("g,grq->rq", values.stretch, model.form.stiffening)
+            self.bending = ((1 + 1j * eta) * modulus)[:, None, None] * stretched
+            shares = rig.mass * values.foreign_mass[:, None]
+            self.added = model.form.cells.T @ (shares * model.form.cells)
         stiffness = np.asarray(modulus * lossy, dtype=complex)
         return model.free.receptance(model.omega, stiffness, eta, thickness, modulus)
-
-    def _footprints(self) -> FloatArray:
-        """Of ERAs, masses, additional masses, fingers and sensors, (a, 3) [m]."""
-        model, values = self.model, self.values
-        feet = [era.foot for era in model.rig.eras]
-        fingers = np.array([(each.x, each.y) for each in model.fingers]).reshape(-1, 2)
-        points = np.vstack([values.masses[:, 1:], fingers])
-        return np.vstack(
-            [
-                np.column_stack([values.places, feet]),
-                footprints_of(model.rig.masses),
-                np.column_stack([points, np.zeros(len(points))]),
-                model.pads,
-            ]
-        )
 
 
 def _finger(

@@ -33,11 +33,12 @@ def plate_with(plate: Plate, values: Values) -> Plate:
 
 def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
     """The rig with identified values; additional masses come after its own."""
+    places = np.clip(values.places, 0, [rig.plate.length, rig.plate.width])
     eras = tuple(
         replace(
             era,
-            x=float(values.places[number, 0]),
-            y=float(values.places[number, 1]),
+            x=float(places[number, 0]),
+            y=float(places[number, 1]),
             stiffness=float(values.stiffness[number]),
             damping=float(max(values.damping[number], 0.0)),
             bolt_mass=float(max(values.bolt_mass[number], 0.0)),

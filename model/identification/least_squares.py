@@ -1,37 +1,62 @@
-"""Nonlinear least squares with exact derivatives, for every fit of a plate."""
+"""Nonlinear least squares with exact derivatives and priors, for every fit of a plate."""
 
 from collections.abc import Callable
-from typing import Literal, TypeAlias
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import OptimizeResult, least_squares
+from scipy.optimize import least_squares
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
 
-Loss: TypeAlias = Literal["linear", "soft_l1"]
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Where a search ended: y (n,), and half the sum of squares that it minimised.
+
+    residuals (2 m + k,), jacobian (2 m + k, n): real parts of all m values, imaginary parts, then
+    the k rows of the prior; without robust weights.
+    """
+
+    y: FloatArray
+    cost: float
+    residuals: FloatArray
+    jacobian: FloatArray
 
 
 def search(
-    linearised: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    linearised: Callable[[FloatArray], tuple[ComplexArray, ComplexArray]],
     start: FloatArray,
     bounds: FloatArray,
     *,
-    loss: Loss = "linear",
+    prior: tuple[FloatArray, FloatArray] | None = None,
+    robust: float | None = None,
     evaluations: int = 60,
     tolerance: float = 1e-8,
-) -> OptimizeResult:
-    """Minimize residuals (m,) with derivatives (m, n), from a start (n,) within bounds (2, n).
+) -> Found:
+    """Minimize complex residuals (m,) with derivatives (m, n), from a start within bounds (2, n).
 
-    evaluations: at most; a plate that fits takes ten. tolerance: of the sum of squares, relative.
-    The derivatives of the result are those of the residuals, whatever the loss.
+    All in standard deviations. prior: rows (k, n) and what they are to give (k,), by default each
+    argument by itself and zero; robust: standard deviations from which a residual counts as its
+    magnitude, not its square. evaluations: at most; a plate that fits takes ten. tolerance: of the
+    sum of squares, relative.
     """
+    rows, targets = (np.eye(len(start)), np.zeros(len(start))) if prior is None else prior
     last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+
+    def real(y: FloatArray, scale: float | None) -> tuple[FloatArray, FloatArray]:
+        left, slopes = linearised(y)
+        if scale is not None:
+            left, slopes = _softened(left, slopes, scale)
+        return (
+            np.concatenate([left.real, left.imag, rows @ y - targets]),
+            np.vstack([slopes.real, slopes.imag, rows]),
+        )
 
     def both(y: FloatArray) -> tuple[FloatArray, FloatArray]:
         key = y.tobytes()
         if key not in last:
             last.clear()
-            last[key] = linearised(y)
+            last[key] = real(y, robust)
         return last[key]
 
     def residuals(y: FloatArray) -> FloatArray:
@@ -45,12 +70,20 @@ def search(
         np.clip(start, bounds[0] + 1e-9, bounds[1] - 1e-9),
         jacobian,
         bounds=(bounds[0], bounds[1]),
-        loss=loss,
         x_scale="jac",
         max_nfev=evaluations,
         xtol=1e-7,
         ftol=tolerance,
     )
-    if loss != "linear":
-        found.jac = jacobian(found.x)  # which it has scaled
-    return found
+    plain = both(found.x) if robust is None else real(found.x, None)
+    return Found(found.x, float(found.cost), *plain)
+
+
+def _softened(
+    left: ComplexArray, slopes: ComplexArray, scale: float
+) -> tuple[ComplexArray, ComplexArray]:
+    """Residuals (m,) whose squares are a soft L1 loss, and their derivatives (m, n)."""
+    root = np.sqrt(1 + (np.abs(left) / scale) ** 2)
+    weight = np.sqrt(2 / (1 + root))
+    grown = (left.conj()[:, None] * slopes).real / (2 * scale**2 * root * (1 + root))[:, None]
+    return weight * left, weight[:, None] * (slopes - left[:, None] * grown)

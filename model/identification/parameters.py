@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import FloatArray
+from model.identification.form_errors import MASS_CELLS
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.plate import MAX_LOSS_EXPONENT
@@ -75,8 +76,17 @@ KINDS = {
     "mode_losses": Kind(0.5),
     # Of each group of a finger's load.
     "fingers": Kind(0.5),
+    # Form errors: a ruler's, a cutter's, and 1 % of the plate's mass over all cells, as its shares.
+    "sensor_scale": Kind(0.01),
+    "sensor_place": Kind(0.5e-3, *_LENGTH),
+    "foreign_mass": Kind(0.01 / math.sqrt(math.prod(MASS_CELLS))),
+    "side": Kind(0.5e-3, *_LENGTH),
+    "poisson": Kind(0.015, "", "", 1.0),
 }
 """Kinds of parameters; of some a rig's `uncertainty` states the standard deviation instead."""
+
+FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson")
+"""Kinds of which a plate with form errors alone has parameters."""
 
 _AT_EDGE = 1e-6  # m
 
@@ -112,6 +122,10 @@ class Space:
             chosen[self.groups[kind]] = True
         return chosen & self.uncertain
 
+    def without(self, *kinds: str) -> "Space":
+        """The same where all of these kinds is known."""
+        return replace(self, std=np.where(self.of(*kinds), 0.0, self.std))
+
     @cached_property
     def as_built(self) -> "Space":
         """The same of a plate that was not measured, where the rig states less."""
@@ -143,13 +157,15 @@ def space_of(
     masses: int = 0,
     fingers: int = 0,
     mode_count: int = MODE_SHIFTS,
+    form_of: int | None = None,
 ) -> Space:
     """Parameters of a rig with sensors by name, with additional masses and fingers on it.
 
     uncertainty: of the rig; a modulus is known where the thickness is, the damping of each ERA and
     mode where that of all is. Its `common_gain` is no parameter: sensors may be those that it was
     found by, and tell nothing more of it. drives_lag: whether bases follow what is played with a
-    lag that nothing states; mode_count: elastic modes of the model, of which the lowest may shift.
+    lag that nothing states; mode_count: elastic modes that may shift; form_of: number of sensors
+    beside ERAs of a plate with form errors.
     """
     plate, eras = rig.plate, [era.name for era in rig.eras]
     builder = _Builder()
@@ -200,12 +216,18 @@ def space_of(
         lower=np.tile([0.0, -1.5, -1.5], masses),
         upper=np.tile([np.inf, 1.5, 1.5], masses),
     )
-    modes = range(1, min(mode_count, MODE_SHIFTS) + 1)
+    modes = range(1, mode_count + 1)
     add("mode_shifts", [f"stiffness of mode {number}" for number in modes])
     of_mode = KINDS["mode_losses"].std * lossy
     add("mode_losses", [f"loss of mode {number}" for number in modes], of_mode)
     resting = range(1, fingers + 1)
     add("fingers", [f"{part} of finger {n}" for n in resting for part in FINGER_PARTS])
+    has_form = form_of is not None
+    add("sensor_scale", [f"scale of sensor {name}" for name in sensors if has_form])
+    add("sensor_place", [f"{axis} of sensor {n}" for n in range(form_of or 0) for axis in "xy"])
+    add("foreign_mass", [f"mass {n}" for n in range(math.prod(MASS_CELLS)) if has_form])
+    add("side", ["length", "width"] if has_form else [])
+    add("poisson", ["Poisson's ratio"] if has_form else [])
     return builder.space()
 
 

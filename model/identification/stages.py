@@ -18,9 +18,10 @@ from model.identification.fit import Linearised, Problem, solve
 from model.identification.forward import ForwardModel, Sensor
 from model.identification.identified_rig import plate_with
 from model.identification.measurement import Measurement
-from model.identification.parameters import Space, inwards, space_of
+from model.identification.parameters import MODE_SHIFTS, Space, inwards, space_of
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig
+from model.structure.modal_elasticity import lowest_elastic
 from model.structure.plate import Plate
 
 _EXTRA_NOISE = 0.05  # of the rms at each frequency
@@ -69,7 +70,7 @@ class Setting:
             self.rig.uncertainty,
             drives_lag=self.measurement.drives_lag,
             masses=masses,
-            mode_count=int((self.free.modes.eigenvalues > 0).sum()),
+            mode_count=len(lowest_elastic(self.free.modes.eigenvalues, MODE_SHIFTS)),
         )
         return ForwardModel(self.rig, sensors, self.measurement.tones, space, self.free)
 

@@ -19,7 +19,10 @@ class Values:
     y [m]; mode_shifts, mode_losses: logarithms of the factors of the lowest modes' eigenvalues and
     loss factors beside the rig's; drive_gains (n,), sensor_gains (s,): complex, those of the drives
     beside the rig's; fingers (k, 4): logarithms of FINGER_PARTS; inertia [1/kHz²], drag [1/kHz]
-    (n,): of the drives, by which they lag.
+    (n,): of the drives, by which they lag. Of a plate with form errors, else empty: sensor_scales
+    (s,), real, sensor_places (s, 2) [m]: how far sensors are from theirs; foreign_mass (c,): in
+    cells, as shares of the plate's and none in all; stretch (3,): of length and width, relative,
+    and what is added to Poisson's ratio.
     """
 
     thickness: float
@@ -38,6 +41,10 @@ class Values:
     fingers: FloatArray
     inertia: FloatArray
     drag: FloatArray
+    sensor_scales: FloatArray
+    sensor_places: FloatArray
+    foreign_mass: FloatArray
+    stretch: FloatArray
 
     @classmethod
     def of(cls, rig: Rig, space: Space, x: FloatArray) -> Self:
@@ -52,6 +59,7 @@ class Values:
         sides = np.array([plate.length, plate.width])
         masses = own("masses").reshape(-1, 3)
         masses[:, 1:] = np.clip(masses[:, 1:] + sides / 2, 0, sides)
+        cells = own("foreign_mass")
         return cls(
             thickness=float(np.exp(own("thickness")[0])),
             modulus=float(np.exp(own("modulus")[0])),
@@ -60,7 +68,7 @@ class Values:
             stiffness=k * np.exp(own("stiffness")),
             damping=c * np.exp(own("damping") + own("damping_each")) + own("damping_added"),
             bolt_mass=m + own("bolt_mass"),
-            places=np.clip(at + own("place").reshape(n, 2), 0, sides),
+            places=at + own("place").reshape(n, 2),
             masses=masses,
             mode_shifts=own("mode_shifts"),
             mode_losses=own("mode_losses"),
@@ -69,6 +77,10 @@ class Values:
             fingers=own("fingers").reshape(-1, 4),
             inertia=own("inertia"),
             drag=own("drag"),
+            sensor_scales=1 + own("sensor_scale"),
+            sensor_places=own("sensor_place").reshape(-1, 2),
+            foreign_mass=cells - (cells.mean() if len(cells) else 0.0),
+            stretch=np.append(own("side") / sides[: len(own("side"))], own("poisson")),
         )
 
     def lag(self, frequencies: FloatArray) -> ComplexArray:

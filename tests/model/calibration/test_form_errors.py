@@ -1,5 +1,6 @@
 """Form errors of a plate: their derivatives, and intervals that hold the truth despite them."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,13 +17,17 @@ from benchmarks.calibration.hidden_plates import (
 )
 from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
-from model.calibration.form_errors import form_model
-from model.calibration.sensed_plate import Parameters, sensed_plate
+from model.calibration.sensed_plate import sensed_plate
+from model.identification.form_errors import MASS_CELLS, reduced_modes
+from model.reduction.free_plate import solve_free_plate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
+from model.spectral.mesh import stretched
 from model.structure.attachments import PointLoad
 
 FREQUENCIES = np.arange(50.0, 491.0, 40.0)
+
+CELL = 10
 
 
 @pytest.fixture(scope="module")
@@ -31,21 +36,85 @@ def rig() -> Rig:
     return load_rig(example_rig_path())
 
 
-def test_form_model_without_form_errors_is_the_sensed_plate(rig: Rig) -> None:
-    """A solve of all modes at once, and the correction of low rank of the free plate, agree.
+def _longer(rig: Rig) -> Rig:
+    """The rig with a plate 1 mm longer, all that is on it moved and grown in proportion.
 
-    The one has residual vectors for waves that are not resolved, the other their sums.
+    No response tells of a factor on all masses, springs and dampers.
+    """
+    share = 1 + 1e-3 / rig.plate.length
+    plate = replace(rig.plate, length=share * rig.plate.length)
+    eras = tuple(
+        replace(
+            era,
+            x=share * era.x,
+            stiffness=share * era.stiffness,
+            damping=share * era.damping,
+            bolt_mass=share * era.bolt_mass,
+        )
+        for era in rig.eras
+    )
+    masses = tuple(replace(one, x=share * one.x, mass=share * one.mass) for one in rig.masses)
+    return replace(rig, plate=plate, mesh=stretched(rig.mesh, plate), eras=eras, masses=masses)
+
+
+def _of_another_ratio(rig: Rig) -> Rig:
+    """The rig with 0.02 more of Poisson's ratio."""
+    material = replace(rig.plate.material, nu=rig.plate.material.nu + 0.02)
+    return replace(rig, plate=replace(rig.plate, material=material))
+
+
+def _heavier_in_one_cell(rig: Rig) -> Rig:
+    """The rig with 0.5 % of its plate's mass taken from all of it, and put on a cell."""
+    plate, (n, m) = rig.plate, MASS_CELLS
+    material = replace(plate.material, rho=0.995 * plate.material.rho)
+    x, y = (CELL % n + 0.5) / n * plate.length, (CELL // n + 0.5) / m * plate.width
+    load = PointLoad(x, y, mass=0.005 * plate.mass)
+    return replace(rig, plate=replace(plate, material=material), masses=(*rig.masses, load))
+
+
+def _moved(rig: Rig) -> Rig:
+    """The rig with its first ERA half a millimetre inwards along both sides."""
+    first = replace(rig.eras[0], x=rig.eras[0].x + 5e-4, y=rig.eras[0].y + 5e-4)
+    return replace(rig, eras=(first, *rig.eras[1:]))
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "other"),
+    [
+        ("side", [1e-3, 0.0], _longer),
+        ("poisson", [0.02], _of_another_ratio),
+        ("foreign_mass", 0.005 * np.eye(48)[CELL], _heavier_in_one_cell),
+        ("place", [5e-4, 5e-4, *[0.0] * 6], _moved),
+        ("sensor_place", np.tile([5e-4, -5e-4], 12), lambda rig: rig),
+    ],
+    ids=["longer", "another ratio", "heavier in one cell", "ERA moved", "sensors moved"],
+)
+def test_form_errors_are_those_of_a_plate_solved_anew(
+    rig: Rig, kind: str, values: list[float] | FloatArray, other: Callable[[Rig], Rig]
+) -> None:
+    """They move the responses as on a plate that is built so, to a fifth of what that changes.
+
+    ERAs move by slopes alone here, and a mass couples modes up to twice the highest frequency.
+    Without form errors responses in coordinates of the reduced plate are those of the free plate's
+    modes, also with a mass on it and where modes deviate from their theory.
     """
     points = SENSORS * [rig.plate.length, rig.plate.width]
-    deviations = ((0.02, 0.3), (-0.01, 0.0))
-    plate = replace(rig.plate, loss_exponent=0.3, mode_deviations=deviations)
-    rig = replace(rig, plate=plate, masses=(PointLoad(0.1, 0.05, mass=0.004),))
-    model = form_model(rig, points, FREQUENCIES)
-    parameters = Parameters.of(rig)
-    start = np.zeros(len(parameters.rows))
-    found, _ = model.responses(parameters, start, np.zeros(len(model.std)))
-    expected = sensed_plate(rig, points, FREQUENCIES).responses()
-    np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
+    rig = replace(rig, masses=(PointLoad(0.1, 0.05, mass=0.004),))
+    plate = replace(rig.plate, loss_exponent=0.3, mode_deviations=((0.02, 0.3), (-0.01, 0.0)))
+    rig = replace(rig, plate=plate)
+    sensed = sensed_plate(rig, points, FREQUENCIES, has_form=True)
+    nominal = sensed_plate(rig, points, FREQUENCIES).responses()
+    np.testing.assert_allclose(sensed.responses(), nominal, atol=2e-5 * np.abs(nominal).max())
+
+    space, z = sensed.model.space, np.zeros(sensed.model.space.size)
+    z[space.groups[kind]] = values / space.std[space.groups[kind]]
+    found = np.swapaxes(sensed.model.at(z).responses, 1, 2)
+    built = other(rig)
+    points = points * [built.plate.length / plate.length, 1]
+    if kind == "sensor_place":
+        points += np.array([5e-4, -5e-4])
+    change = sensed_plate(built, points, FREQUENCIES).responses() - nominal
+    np.testing.assert_allclose(found - nominal, change, atol=0.2 * np.abs(change).max())
 
 
 def test_stiffening_does_not_depend_on_rounding(rig: Rig) -> None:
@@ -53,14 +122,13 @@ def test_stiffening_does_not_depend_on_rounding(rig: Rig) -> None:
 
     Relative to the modes' own stiffness, as couplings are that move a mode's frequency.
     """
-    points = SENSORS[:3] * [rig.plate.length, rig.plate.width]
 
     def couplings(share: float) -> FloatArray:
         material = replace(rig.plate.material, E=rig.plate.material.E * (1 + share))
         other = replace(rig, plate=replace(rig.plate, material=material))
-        model = form_model(other, points, FREQUENCIES)
-        size = np.sqrt(model.eigenvalues + 4e4)  # of a rigid body on springs of some 30 Hz
-        return np.abs(model.stiffening) / np.outer(size, size)
+        modes = reduced_modes(other, solve_free_plate(other.plate, other.mesh))
+        size = np.sqrt(modes.eigenvalues + 4e4)  # of a rigid body on springs of some 30 Hz
+        return np.abs(modes.stiffening) / np.outer(size, size)
 
     exact = couplings(0.0)
     for share in (1e-11, 2e-11, 3e-11):

@@ -10,8 +10,7 @@ import pytest
 from extrapolated import extrapolated_slopes
 from model.arrays import ComplexArray, FloatArray
 from model.calibration import fit
-from model.calibration.form_errors import form_model
-from model.calibration.sensed_plate import Parameters, sensed_plate
+from model.calibration.sensed_plate import sensed_plate
 from model.diagnosis import plate_match
 from model.identification import least_squares
 from model.rig.rig import Rig
@@ -36,18 +35,12 @@ def fit_a_rig(*, has_form: bool) -> None:
     """Search without form errors and with all sensor scales free, or with all but one held."""
     free_scales = np.ones(len(POINTS), dtype=bool)
     free_scales[1:] = not has_form
-    parameters = Parameters.of(RIG)
-    problem = fit.Problem(
-        RIG,
-        form_model(RIG, POINTS, FREQUENCIES),
-        parameters,
-        measured(RIG),
-        np.ones(len(parameters.rows), dtype=bool),
-        free_scales,
-    )
-    found = fit.first_fit(problem, np.zeros(len(parameters.rows)))
+    plate = sensed_plate(RIG, POINTS, FREQUENCIES, has_form=True)
+    count = len(plate.parameters.rows)
+    problem = fit.Problem(plate, measured(RIG), np.ones(count, dtype=bool), free_scales)
+    found = fit.first_fit(problem, np.zeros(count))
     if has_form:
-        fit.solve(problem, replace(found, scales=np.ones(len(POINTS))))
+        fit.solve(problem, replace(found, z=problem.at_scales(found.z, np.ones(len(POINTS)))))
 
 
 def match_a_plate() -> None:
@@ -89,10 +82,16 @@ def test_jacobians_of_searches_are_exact(
     assert checked
 
 
-def test_derivatives_found_are_those_of_the_residuals_whatever_the_loss() -> None:
-    """A line through four points, one of them far off, whose weight in the loss is small."""
+def test_residuals_found_are_without_the_robust_weights() -> None:
+    """A line through four points, one of them far off, whose weight in the sum is small."""
     A, values = np.array([[1.0], [2.0], [3.0], [4.0]]), np.array([1.0, 2.0, 3.0, 40.0])
     found = least_squares.search(
-        lambda x: (A @ x - values, A), np.zeros(1), np.array([[-9.0], [9.0]]), loss="soft_l1"
+        lambda x: (A @ x - values + 0j, A + 0j),
+        np.zeros(1),
+        np.array([[-9.0], [9.0]]),
+        prior=(np.zeros((0, 1)), np.zeros(0)),
+        robust=0.1,
     )
-    np.testing.assert_allclose(found.jac, A)
+    assert found.y[0] < 2.0  # 7.1 by least squares
+    np.testing.assert_allclose(found.jacobian, np.vstack([A, 0 * A]))
+    np.testing.assert_allclose(found.residuals[:4], A @ found.y - values)

@@ -235,12 +235,12 @@ static int answer_from(answered *to, const plates *on, const rules *by, const qu
     const size_t most = contents * of->bands * 2 * (by->candidates + contents / 2);
     candidates from = {0, integers(memory, most), integers(memory, most), integers(memory, most), floats(memory, most),
                        floats(memory, 2 * most * n)};
-    to->is_limited = find_candidates(&from, on, by, of, rows, count, memory);
-    if (count < of->rows && (!from.count || (to->is_limited && !of->is_strict)) && of->is_ranked) {
+    int is_limited = find_candidates(&from, on, by, of, rows, count, memory);
+    if (count < of->rows && (!from.count || (is_limited && !of->is_strict)) && of->is_ranked) {
         from.count = 0; /* among all frequencies */
-        to->is_limited = find_candidates(&from, on, by, of, of->row, of->rows, memory);
+        is_limited = find_candidates(&from, on, by, of, of->row, of->rows, memory);
     }
-    if (!from.count || (of->is_strict && to->is_limited)) return NOT_REACHED;
+    if (!from.count || (of->is_strict && is_limited)) return NOT_REACHED;
     const float *columns = columns_of(of->fine_points, k * of->fine, on->r, memory);
     const size_t draws = of->judging->count;
     float *own = floats(memory, from.count * draws + LANES);
@@ -262,16 +262,53 @@ static int answer_from(answered *to, const plates *on, const rules *by, const qu
     return FOUND;
 }
 
-static int guarded(answered *to, const plates *on, const rules *by, const question *of, arena *memory) {
+/* Rows that any band holds, and bands counted among these. */
+SHARED void find_rows(question *of, const int *bands, arena *memory) {
+    const int ends = of->contents * of->bands * 2;
+    int most = 0;
+    for (int i = 1; i < ends; i += 2) most = bands[i] > most ? bands[i] : most;
+    int *before = integers(memory, most + 1);
+    of->row = integers(memory, most), of->band = integers(memory, ends);
+    for (int at = 0; at < most; at++) {
+        int is_held = 0;
+        for (int i = 0; i < ends; i += 2) is_held |= bands[i] <= at && at < bands[i + 1];
+        before[at] = of->rows;
+        if (is_held) of->row[of->rows++] = at;
+    }
+    before[most] = of->rows;
+    for (int i = 0; i < ends; i++) of->band[i] = before[bands[i]];
+}
+
+static int guarded(results *found, const plates *table, const raster *read, const rules *by, const asked *given,
+                   arena *memory) {
     jmp_buf failed;
     memory->failed = &failed;
-    return setjmp(failed) ? NO_MEMORY : answer_from(to, on, by, of, memory);
+    if (setjmp(failed)) return NO_MEMORY;
+    const size_t contents = given->contents, k = given->fingers;
+    const tips at = read_tips(read, given->places, k, memory);
+    plates on = *table;
+    on.k = given->fingers, on.centres = at.centres, on.stiffness = given->stiffness;
+    question of = {.contents = given->contents, .bands = given->bands, .quiet_count = given->quiet_count,
+                   .is_strict = given->is_strict, .with_onset = given->with_onset, .apart = given->apart,
+                   .level = given->level, .background = given->background, .judging = given->judging,
+                   .promise = given->promise, .few = read->few, .fine = read->fine, .few_points = at.few,
+                   .fine_points = at.fine, .few_weights = at.few_weights, .fine_weights = at.fine_weights};
+    of.starts = given->numbers, of.targets = of.starts + contents + 1, of.quiet = of.targets + of.starts[contents];
+    of.priority = of.quiet + of.quiet_count;
+    of.is_ranked = contents == 1 && of.starts[1] == 1 && of.bands == 1 && of.quiet_count > 0;
+    find_rows(&of, of.priority + contents, memory);
+    answered to = {.rows = found->rows, .weights = found->figures};
+    to.gains = to.weights + 2 * contents * on.n, to.contrast = to.gains + contents, to.level = to.contrast + 3 * k;
+    to.foreign = to.level + 2 * k, to.of_all = to.foreign + k;
+    const int status = answer_from(&to, &on, by, &of, memory);
+    found->is_apart = to.is_apart;
+    return status;
 }
 
 /* FOUND, NOT_REACHED where tones of one frequency do not do, NEEDS_ONSETS, or NO_MEMORY. */
-int answer(answered *to, const plates *on, const rules *by, const question *of) {
+int answer(results *to, const plates *on, const raster *read, const rules *by, const asked *of) {
     arena memory = {NULL, NULL, NULL};
-    const int status = guarded(to, on, by, of, &memory);
+    const int status = guarded(to, on, read, by, of, &memory);
     release(&memory, (arena){NULL, NULL, NULL});
     return status;
 }

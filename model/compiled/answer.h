@@ -4,6 +4,7 @@
 
 #include "choice.h"
 #include "drawn.h"
+#include "fingertips.h"
 #include "forms.h"
 #include "search.h"
 
@@ -23,27 +24,47 @@ typedef struct {
     const float *onsets;           /* (f, n, times, r), or none */
 } rules;
 
+/* Fingers (k) and contents, as given. */
 typedef struct {
-    int contents, bands, rows, quiet_count, few, fine; /* few, fine: points of a finger */
-    int is_ranked, is_strict, with_onset; /* strict: give up where the level is hard to reach */
-    float apart;                          /* of frequencies [Hz] */
-    const int *row, *starts, *targets, *quiet; /* (rows); (contents + 1) of the targets; fingers; fingers */
-    const int *priority, *band;           /* (contents); (contents, bands, 2) first row and one past the last */
-    const float *level;                   /* (contents) amplitude to threshold */
-    const float *few_points, *fine_points, *few_weights, *fine_weights;
-    const float *background;              /* (f, n, n) form of the rest of the plate, for no other finger */
+    int contents, bands, fingers, quiet_count;
+    int is_strict, with_onset;  /* strict: give up where the level is hard to reach */
+    float apart;                /* of frequencies [Hz] */
+    const int *numbers;         /* (contents + 1) starts of targets; these and quiet ones, by finger; (contents)
+                                 * priorities; (contents, bands, 2) first row of a band and one past the last */
+    const float *level;         /* (contents) amplitude to threshold */
+    const double *places;       /* (k, 2) [m] */
+    const float *stiffness;     /* (f, k) of fingers */
+    const float *background;    /* (f, n, n) form of the rest of the plate, for no other finger */
     const draws *judging, *promise;
+} asked;
+
+/* The same with what is found first. */
+typedef struct {
+    int contents, bands, quiet_count, is_strict, with_onset, is_ranked; /* see `ranked_rows` */
+    float apart;
+    const int *starts, *targets, *quiet, *priority;
+    const float *level, *background;
+    const draws *judging, *promise;
+    int rows, few, fine;        /* that any band holds; points of a finger */
+    int *row, *band;            /* (rows) of the table; (contents, bands, 2) of these */
+    const float *few_points, *fine_points, *few_weights, *fine_weights;
 } question;
 
+/* What a caller has room for. */
 typedef struct {
-    int is_apart, is_limited;
+    int is_apart;
     int *rows;          /* (contents) of the table */
+    float *figures;     /* those of `answered` in its order */
+} results;
+
+typedef struct {
+    int is_apart, *rows;
     float *weights;     /* (contents, n) */
     float *gains;       /* (contents) within the stroke */
-    float *contrast;    /* (k, 3) as modelled, half of plates, promised; NaN where there is none */
-    float *level;       /* (k, 2) of its own content, as modelled and promised */
-    float *foreign;     /* (k) of other contents, which few plates exceed */
-    float *of_all;      /* worst contrast promised; least factor on requested levels; loudest at quiet fingers */
+    float *contrast;    /* (k, 3) [dB] as modelled, half of plates, promised; NaN where there is none */
+    float *level;       /* (k, 2) [dB SL] of its own content, as modelled and promised */
+    float *foreign;     /* (k) [dB SL] of other contents, which few plates exceed */
+    float *of_all;      /* worst contrast promised [dB]; loudest at quiet fingers [dB SL]; least factor on levels */
 } answered;
 
 enum { FOUND, NOT_REACHED, NEEDS_ONSETS };

@@ -124,6 +124,10 @@ INLINE float promised(float *values, const felt *of, float percent) {
     return percentile(values + 1, of->plates - 1, percent);
 }
 
+INLINE void to_decibels(float *ratios, size_t count) {
+    for (size_t i = 0; i < count; i++) ratios[i] = 20 * log10f(ratios[i]);
+}
+
 /* Figures of tones at rows, of weights (contents, n). */
 SHARED void promise(answered *to, const plates *on, const rules *by, const question *of, const float *columns,
                     arena *memory) {
@@ -146,7 +150,7 @@ SHARED void promise(answered *to, const plates *on, const rules *by, const quest
         for (size_t group = 0; group < groups; group++) keep(own, weakest_target(&now, j, group, 1), of->promise, group);
         to->gains[j] = of->level[j] / fmaxf(promised(own, &now, by->promised), LEAST);
     }
-    to->of_all[1] = share_stroke(to->gains, of, to->weights, on->n, memory);
+    to->of_all[2] = share_stroke(to->gains, of, to->weights, on->n, memory);
 
     for (size_t i = 0; i < 3 * k; i++) to->contrast[i] = NAN;
     for (size_t i = 0; i < 2 * k; i++) to->level[i] = NAN;
@@ -190,7 +194,7 @@ SHARED void promise(answered *to, const plates *on, const rules *by, const quest
         contrast[0] = some[0], contrast[1] = promised(some, &now, 50), contrast[2] = promised(some, &now, by->promised);
         release(memory, before);
     }
-    to->of_all[0] = NAN, to->of_all[2] = promised(loudest, &now, 100 - by->promised);
+    to->of_all[0] = NAN, to->of_all[1] = promised(loudest, &now, 100 - by->promised);
     if (any) {
         const float modelled = worst[0], half = promised(worst, &now, 50);
         to->of_all[0] = promised(worst, &now, by->promised);
@@ -199,6 +203,7 @@ SHARED void promise(answered *to, const plates *on, const rules *by, const quest
             contrast[0] = modelled, contrast[1] = half, contrast[2] = to->of_all[0];
         }
     }
+    to_decibels(to->contrast, 3 * k), to_decibels(to->level, 2 * k), to_decibels(to->foreign, k), to_decibels(to->of_all, 2);
     release(memory, mark);
 }
 

@@ -1,7 +1,7 @@
 """Structures and arrays as the kernels in C take them, whose headers say what is in them."""
 
 import ctypes
-from ctypes import c_float, c_int, c_void_p
+from ctypes import c_double, c_float, c_int, c_void_p
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,8 @@ _TYPES = {"i": np.int32, "f": np.float32, "c": np.complex64}
 
 
 def _fields(**names: str) -> list[tuple[str, Any]]:
-    """Names of fields by the first letter of their kind: integers, floats, pointers."""
-    kinds = {"i": c_int, "f": c_float, "p": c_void_p}
+    """Names of fields by the first letter of their kind: integers, floats, doubles, pointers."""
+    kinds = {"i": c_int, "f": c_float, "d": c_double, "p": c_void_p}
     return [(name, kinds[kind[0]]) for kind, all_ in names.items() for name in all_.split()]
 
 
@@ -103,21 +103,26 @@ class Rules(Structure):
     ]
 
 
+class GivenRaster(Structure):
+    """`raster`: shapes of the plate, and how they are read under a fingertip."""
+
+    _fields_ = _fields(
+        i="nx ny side_x side_y r few fine",
+        d="length width radius",
+        p="points weights nodes shapes",
+    )
+
+
 class GivenQuestion(Structure):
-    """`question`: fingers, and what each is to feel."""
+    """`question`: fingers, and what each is to feel; what is found first is not named."""
 
     _fields_ = [
-        *_fields(i="contents bands rows quiet_count few fine is_ranked is_strict with_onset"),
-        *_fields(
-            f="apart", p="row starts targets quiet priority band level few_points fine_points"
-        ),
-        *_fields(p="few_weights fine_weights background judging promise"),
+        *_fields(i="contents bands fingers quiet_count is_strict with_onset", f="apart"),
+        *_fields(p="numbers level places stiffness background judging promise"),
     ]
 
 
 class FoundTones(Structure):
     """`answered`: tones, and what is felt of them."""
 
-    _fields_ = _fields(
-        i="is_apart is_limited", p="rows weights gains contrast level foreign of_all"
-    )
+    _fields_ = _fields(i="is_apart", p="rows figures")

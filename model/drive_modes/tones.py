@@ -3,9 +3,7 @@
 import cmath
 from collections.abc import Sequence
 
-import numpy as np
-
-from model.arrays import Complex64Array, FloatArray
+from model.arrays import FloatArray
 from model.choice import NEARLY
 from model.structure.attachments import Era
 from model.vibration.excitation import Excitation, Tone
@@ -14,7 +12,7 @@ ROUNDING = 1e-6  # of single precision
 
 
 def excitation_of(
-    weights: Sequence[tuple[int, Complex64Array]],
+    weights: Sequence[tuple[int, Sequence[complex]]],
     eras: Sequence[Era],
     frequencies: FloatArray,
     *,
@@ -26,11 +24,9 @@ def excitation_of(
     weights (eras,): at each of some frequencies (f,) [Hz], by index.
     """
     tones = {}
-    for index, at_frequency in weights:
-        sizes = np.abs(at_frequency)
-        # Python's own numbers: those of numpy take ten times as long, one by one.
-        values = at_frequency.tolist()
-        strongest = values[int((sizes >= (1 - NEARLY) * sizes.max()).argmax())]
+    for index, values in weights:  # Python's numbers: numpy's take ten times as long, one by one
+        enough = (1 - NEARLY) * max(map(abs, values))
+        strongest = next(value for value in values if abs(value) >= enough)
         factor = strongest.conjugate() / abs(strongest)
         frequency = float(frequencies[index])
         for era, value in zip(eras, values, strict=True):

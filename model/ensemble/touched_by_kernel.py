@@ -39,8 +39,7 @@ class TouchedByKernel(TouchedPlate):
     @cached_property
     def structure(self) -> Plates:
         """The plate as kernels read it."""
-        of_table = _kept.get(self.on) or _of_table(self.on)
-        found = Plates.from_buffer_copy(of_table)
+        found = Plates.from_buffer_copy(plates_structure(self.on))
         found.k = len(self.centres)
         found.point(centres=self.centres, stiffness=self.stiffness)
         return found
@@ -94,8 +93,11 @@ class TouchedByKernel(TouchedPlate):
         return Sensed(means, loudest, powers if with_powers else None)
 
 
-def _of_table(on: PlateOnEras) -> Plates:
+def plates_structure(on: PlateOnEras) -> Plates:
     """A plate without fingers as kernels read it, kept with it."""
+    kept = _kept.get(on)
+    if kept is not None:
+        return kept
     plate = on.plate
     (b, r), t = plate.shapes.shape, on.thickness_count
     found = Plates(plate.era_count, b, 0, r, t, plate.load_std)

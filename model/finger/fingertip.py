@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from model.arrays import FloatArray
 from model.structure.plate import Plate
 
-_NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(8)
+GAUSS_LEGENDRE = np.column_stack(np.polynomial.legendre.leggauss(8))
+"""Points and weights (8, 2) over -1..1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,9 +102,9 @@ def _centroids(low: FloatArray, high: FloatArray) -> FloatArray:
     ends = np.column_stack([first, -corners, corners, last])
     ends = np.sort(np.minimum(np.maximum(ends, first[:, None]), last[:, None]), axis=1)
     half = np.diff(ends, axis=1)[..., None] / 2
-    angles = (ends[:, :-1, None] + half + half * _NODES).reshape(len(low), -1)
+    angles = (ends[:, :-1, None] + half + half * GAUSS_LEGENDRE[:, 0]).reshape(len(low), -1)
     x, rim = np.sin(angles), np.cos(angles)
-    widths = (half * _NODE_WEIGHTS).reshape(len(low), -1) * rim
+    widths = (half * GAUSS_LEGENDRE[:, 1]).reshape(len(low), -1) * rim
     bottom, top = np.maximum(-rim, low[:, 1:]), np.minimum(rim, high[:, 1:])
     area = (widths * (top - bottom)).sum(axis=1)
     along_x = (widths * x * (top - bottom)).sum(axis=1)

@@ -8,22 +8,17 @@ but for bounds that requests state themselves: these hold, if by silence.
 """
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
-
-import numpy as np
 
 from model.arguments import expect_at_least
-from model.arrays import IntArray
 from model.choice import best_by, best_of
 from model.drive_modes.tones import excitation_of
 from model.errors import InputError
-from model.finger.perception import decibels
 from model.table.contents import Contents, Stream
 from model.table.contents_kernel import choose_tones
-from model.table.raster import FingertipShapes
 from model.table.request import (
     APART_HZ,
     MIN_CONTRAST_DB,
@@ -206,13 +201,12 @@ class _Answering:
     @cached_property
     def _bands(self) -> list[tuple[int, int]]:
         """The first of the rows that each request may have, and one past the last."""
-        frequencies, bands = self.table.frequencies, []
+        frequencies, bands = self.table.frequencies.tolist(), []
         for request in self.requests:
             low, high = request.band_hz
-            first = int(frequencies.searchsorted(low))
-            end = int(frequencies.searchsorted(high, side="right"))
+            first, end = bisect_left(frequencies, low), bisect_right(frequencies, high)
             if first == end:
-                nearest = frequencies[np.abs(frequencies - low).argmin()]
+                nearest = min(frequencies, key=lambda each: abs(each - low))
                 raise InputError(
                     f"band of {_at(request)} must be LOW-HIGH in Hz and hold a frequency of the "
                     f"table, {frequencies[0]:g} to {frequencies[-1]:g} Hz, of which {nearest:g} Hz "
@@ -221,23 +215,9 @@ class _Answering:
             bands.append((first, end))
         return bands
 
-    @cached_property
-    def _rows(self) -> IntArray:
-        """Rows of the table's frequencies that any band holds."""
-        is_held = np.zeros(len(self.table.frequencies), dtype=bool)
-        for first, end in self._bands:
-            is_held[first:end] = True
-        return np.flatnonzero(is_held)
-
-    @cached_property
-    def _tips(self) -> FingertipShapes:
-        """Shapes of the plate at all fingers."""
-        return self.table.read_fingertips([each.at for each in self._every])
-
     def _contents(self, plan: _Plan) -> Contents:
         """A plan for a kernel."""
-        bands = list(map(tuple, self._rows.searchsorted(self._bands).tolist()))
-        streams = []
+        bands, streams, background = self._bands, [], None
         for fingers in plan.contents:
             own = tuple(bands) if self.bands_may_swap else (bands[fingers[0]],)
             request = self.requests[fingers[0]]
@@ -247,22 +227,16 @@ class _Answering:
                 level = max(level, request.level_db_sl)
                 priority = max(priority, request.priority)
             streams.append(Stream(fingers, level, own, priority))
-        first, rows, background = streams[0], self._rows, None
-        is_ranked = len(streams) == len(first.targets) == len(first.bands) == 1 <= len(plan.quiet)
-        if is_ranked:
-            rows = np.arange(*self._bands[first.targets[0]])
-        elif len(streams) == 1 and not plan.quiet:
-            places = [self.requests[finger].at for finger in first.targets]
+        if len(streams) == 1 and not plan.quiet:
+            places = [self.requests[finger].at for finger in streams[0].targets]
             background = self.table.background(places)
         return Contents(
-            self._tips,
+            tuple([each.at for each in self._every]),
             tuple([each.load for each in self._every]),
             tuple(streams),
             plan.quiet,
-            rows,
             self.apart_hz,
             background=background,
-            is_ranked=is_ranked,
         )
 
     def _measure(self, plan: _Plan) -> _Measured:
@@ -277,15 +251,17 @@ class _Answering:
         found = choose_tones(table, contents)
         if found is None:
             raise AssertionError("contents must have tones")
-        felt = decibels(np.column_stack([found.contrast, found.level, found.foreign_amplitudes]))
-        figures: list[Any] = np.where(np.isnan(felt), None, felt).tolist()  # type: ignore[call-overload]
         for number, stream in enumerate(contents.streams):
-            weights = [(int(found.rows[number]), found.weights[number])]
+            weights = [(found.rows[number], found.weights[number])]
             excitation = excitation_of(
-                weights, table.eras, table.frequencies, gain=float(found.gains[number])
+                weights, table.eras, table.frequencies, gain=found.gains[number]
             )
             for finger in stream.targets:
-                nominal, median, promised, level, promised_level, foreign_level = figures[finger]
+                (level, promised_level) = found.level_db_sl[finger]
+                figures = *found.contrast_db[finger], found.foreign_db_sl[finger]
+                nominal, median, promised, others_level = [
+                    None if math.isnan(each) else each for each in figures
+                ]
                 is_shared = finger != stream.targets[0]
                 layers[finger] = Layer(
                     self.requests[finger],
@@ -296,12 +272,13 @@ class _Answering:
                     felt_contrast_db=nominal,
                     median_felt_contrast_db=median,
                     promised_contrast_db=promised,
-                    foreign_level_db_sl=foreign_level,
+                    foreign_level_db_sl=others_level,
                 )
         for finger in plan.quiet:
-            nominal, _, promised, _, _, level = figures[finger]
-            quiet[finger] = QuietFinger(self._every[finger].at, nominal, promised, level)
-        worst = None if math.isnan(found.worst) else float(decibels(found.worst))
+            felt, _, promised_felt = found.contrast_db[finger]
+            at = self._every[finger].at
+            quiet[finger] = QuietFinger(at, felt, promised_felt, found.foreign_db_sl[finger])
+        worst = None if math.isnan(found.worst_db) else found.worst_db
         applied = () if found.is_apart else (f"frequencies are nearer than {self.apart_hz:g} Hz",)
         return _Measured(layers, quiet, worst, found.stroke_factor, applied)
 

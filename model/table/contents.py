@@ -17,10 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from model.arrays import Complex64Array, Float32Array, IntArray
 from model.ensemble.draws import Drawing
-from model.table.question import Question
-from model.table.raster import FingertipShapes
+from model.table.question import Point
 
 JUDGING_DRAWS = Drawing(count=64, seed=1, thicknesses=5)
 PROMISED_DRAWS = Drawing(count=200, seed=8, thicknesses=40, bases=5)
@@ -63,8 +62,8 @@ REACHED = 1 - 1e-5
 class Stream:
     """A content for fingers, by index, at a level; higher priorities take the stroke first.
 
-    bands: of the rows that it may have the first and one past the last, for each band (one unless
-    bands may be exchanged).
+    bands: of the table's frequencies that it may have the first and one past the last, by row, for
+    each band (one unless bands may be exchanged).
     """
 
     targets: tuple[int, ...]
@@ -77,40 +76,33 @@ class Stream:
 class Contents:
     """K contents for k fingers on a plate, some of which are quiet; all others are not protected.
 
-    tips: of the fingers; loads: of each relative to the rig's fingertip, empty for 1; quiet: by
-    index; rows (f,): of the table's frequencies that may be played, ascending; apart_hz: distance
-    of the contents' frequencies where bands allow it; background: form of the rest of the plate at
-    all of the table's frequencies, for no other finger; is_ranked: whether an only content, which
-    may have any of the rows, is searched at the KEPT frequencies first; is_strict: whether nothing
-    is to be found where tones of one frequency hardly reach the level; with_onset: whether onsets
-    along a plain ramp count.
+    places: of the fingers [m]; loads: of each relative to the rig's fingertip, empty for 1; quiet:
+    by index; apart_hz: distance of the contents' frequencies where bands allow it; background: form
+    of the rest of the plate at all of the table's frequencies, for no other finger; is_strict:
+    whether nothing is to be found where tones of one frequency hardly reach the level; with_onset:
+    whether onsets along a plain ramp count.
     """
 
-    tips: FingertipShapes
+    places: tuple[Point, ...]
     loads: tuple[float, ...]
     streams: tuple[Stream, ...]
     quiet: tuple[int, ...]
-    rows: IntArray
     apart_hz: float = 0.0
     background: Complex64Array | None = None
-    is_ranked: bool = False
     is_strict: bool = False
     with_onset: bool = True
 
-    @classmethod
-    def of(cls, question: Question, tips: FingertipShapes, rows: IntArray) -> "Contents":
-        """The only content of a question of one target and quiet fingers, at rows (f,)."""
-        stream = Stream((0,), question.level_db_sl, ((0, len(rows)),))
-        return cls(
-            tips,
-            question.loads,
-            (stream,),
-            tuple(range(1, len(question.contacts))),
-            rows,
-            is_ranked=True,
-            is_strict=True,
-            with_onset=not question.envelopes,
-        )
+    @property
+    def is_ranked(self) -> bool:
+        """Whether the KEPT frequencies are searched first: of one content for one finger."""
+        first = self.streams[0]
+        return len(self.streams) == len(first.targets) == len(first.bands) == 1 <= len(self.quiet)
+
+    @property
+    def rows(self) -> IntArray:
+        """Rows of the table's frequencies that any band holds, ascending, (f,)."""
+        bands = [np.arange(*band) for stream in self.streams for band in stream.bands]
+        return np.unique(np.concatenate(bands))
 
     @property
     def levels(self) -> Float32Array:
@@ -121,24 +113,24 @@ class Contents:
 
 @dataclass(frozen=True, eq=False)
 class Tones:
-    """Tones of K contents, and what k fingers feel of them, amplitudes as ratios.
+    """Tones of K contents, and what k fingers feel of them.
 
     rows (K,): of the table's frequencies; weights (K, n): up to full stroke; gains (K,): to the
-    levels, within the stroke; contrast (k, 3): as modelled, of half of the drawn plates and
-    promised, NaN without other contents or fingers; level (k, 2): of a finger's own content, as
-    modelled and promised; foreign_amplitudes (k,): of other contents, which nine of ten plates do
-    not exceed; worst: contrast of all fingers that is promised, NaN for one alone; stroke_factor:
-    least factor on the gains for the stroke; loudest: at quiet fingers; is_apart: whether the
+    levels, within the stroke; contrast_db (k, 3): as modelled, of half of the drawn plates and
+    promised, NaN without other contents or fingers; level_db_sl (k, 2): of a finger's own content,
+    as modelled and promised; foreign_db_sl (k,): of other contents, which nine of ten plates do not
+    exceed; worst_db: contrast of all fingers that is promised, NaN for one alone; loudest_db_sl: at
+    quiet fingers; stroke_factor: least factor on the gains for the stroke; is_apart: whether the
     frequencies are.
     """
 
-    rows: IntArray
-    weights: Complex64Array
-    gains: FloatArray
-    contrast: FloatArray
-    level: FloatArray
-    foreign_amplitudes: FloatArray
-    worst: float
+    rows: list[int]
+    weights: list[list[complex]]
+    gains: list[float]
+    contrast_db: list[list[float]]
+    level_db_sl: list[list[float]]
+    foreign_db_sl: list[float]
+    worst_db: float
+    loudest_db_sl: float
     stroke_factor: float
-    loudest: float
     is_apart: bool

@@ -1,19 +1,35 @@
 """Tones of contents by one call of a kernel in C, or in numpy where there is no compiler."""
 
+from array import array
 from ctypes import addressof
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 from weakref import WeakKeyDictionary
 
-import numpy as np
-
-from model.compiled.kernels import run
-from model.compiled.structures import FOUND, Drawn, FoundTones, GivenQuestion, Method, Rules
+from model.arrays import Complex64Array
+from model.compiled.kernels import kernels, run
+from model.compiled.structures import (
+    FOUND,
+    Drawn,
+    FoundTones,
+    GivenQuestion,
+    GivenRaster,
+    Method,
+    Plates,
+    Rules,
+)
 from model.drive_modes.coherent import ONE_FINGER, SEVERAL, WITHIN_STROKE
 from model.drive_modes.forms import LEVEL_MARGIN
 from model.drive_modes.phased import MAX_TARGETS, PHASED, as_structure
 from model.ensemble.measures import PERCENTILE
-from model.ensemble.touched_by_kernel import TouchedByKernel, draws_structure, touch
+from model.ensemble.touched_by_kernel import draws_structure, plates_structure
 from model.ensemble.touched_plate import RIDGE
+from model.finger.fingertip import (
+    FINE_POINTS,
+    FINGERTIP_RADIUS,
+    FIVE_AND_FINE,
+    FIVE_POINTS,
+    GAUSS_LEGENDRE,
+)
 from model.table.contents import (
     JUDGING_DRAWS,
     KEPT,
@@ -42,100 +58,95 @@ _NEEDS_ONSETS = 2
 
 def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones | None:
     """Choose a tone for each content; None where one frequency hardly reaches a strict level."""
-    touched = touch(table.on_eras, contents.tips.few[:, 0], contents.loads)
-    streams = contents.streams
-    has_many = False
-    for stream in streams:
-        has_many |= len(stream.targets) > MAX_TARGETS
-    if has_many or not isinstance(touched, TouchedByKernel):
-        return choose_by_numpy(table, contents)
-    count, n, k = len(streams), len(table.eras), len(touched.centres)
-    rules, drawn = _rules(table, k)
-    given = _question(contents, drawn)
-    rows = np.empty(count, dtype=np.int32)
-    found = np.empty(count * (2 * n + 1) + 6 * k + 3, dtype=np.float32)
-    ends = np.cumsum([2 * n * count, count, 3 * k, 2 * k, k])
-    weights, *figures = np.split(found, ends)
-    at = found.ctypes.data
-    to = FoundTones(0, 0, rows.ctypes.data, at, *(at + 4 * ends).tolist())
-    kernel, plates = touched.kernels.library.answer, touched.structure
-    status = run(kernel, to, plates, rules, given)
-    if status == _NEEDS_ONSETS:
-        onsets = table.onsets
-        given.with_onset = onsets is not None
-        if onsets is not None:
-            rules.point(onsets=onsets.parts)
-        status = run(kernel, to, plates, rules, given)
-    if status != FOUND:
-        return None
-    gains, contrast, level, foreign_amplitudes, of_all = figures
-    worst, factor, loudest = of_all.tolist()
-    return Tones(
-        rows.astype(int),
-        weights.view(np.complex64).reshape(count, n),
-        gains.astype(float),
-        contrast.astype(float).reshape(k, 3),
-        level.astype(float).reshape(k, 2),
-        foreign_amplitudes.astype(float),
-        worst,
-        factor,
-        loudest,
-        bool(to.is_apart),
-    )
-
-
-def _question(contents: Contents, drawn: tuple[Drawn, Drawn]) -> GivenQuestion:
-    """Contents as kernels read them, with the plates that judge and those of the promise."""
-    tips, streams, rows = contents.tips, contents.streams, contents.rows
-    starts, targets, bands, priorities = [0], list[int](), list[int](), []
+    streams, places, quiet, by = contents.streams, contents.places, contents.quiet, kernels()
+    starts, targets, bands, priorities, levels = [0], list[int](), list[int](), [], array("f")
     for stream in streams:
         targets += stream.targets
         starts.append(len(targets))
         for band in stream.bands:
             bands += band
         priorities.append(stream.priority)
+        levels.append(10 ** (stream.level_db_sl / 20))
+        if len(stream.targets) > MAX_TARGETS:
+            by = None
+    if by is None:
+        return choose_by_numpy(table, contents)
+    count, n, k = len(streams), len(table.eras), len(places)
+    kept = _kept.get(table) or _kept.setdefault(table, _kept_of(table))
+    plates, raster, rules, by_count = kept
+    judging, promise, stiffness = by_count.get(k) or by_count.setdefault(k, _with(table, k))
+    if contents.loads.count(1.0) < len(contents.loads):
+        stiffness = table.attached.finger_stiffness(k, contents.loads)
+    # Not arrays of numpy, of which each takes as long to make and to read as all of these.
+    numbers = array("i", [*starts, *targets, *quiet, *priorities, *bands])
+    at = array("d", [coordinate for place in places for coordinate in place])
+    background = contents.background
     given = GivenQuestion(
-        *(len(streams), len(streams[0].bands), len(rows), len(contents.quiet)),
-        *(tips.few.shape[1], tips.fine.shape[1], contents.is_ranked, contents.is_strict),
-        *(contents.with_onset, contents.apart_hz),
-        judging=addressof(drawn[0]),
-        promise=addressof(drawn[1]),
+        *(count, len(streams[0].bands), k, len(quiet), contents.is_strict, contents.with_onset),
+        *(contents.apart_hz, numbers.buffer_info()[0], levels.buffer_info()[0]),
+        *(at.buffer_info()[0], stiffness.ctypes.data),
+        None if background is None else background.ctypes.data,
+        *(addressof(judging), addressof(promise)),
     )
-    given.point(
-        row=rows,
-        starts=np.array(starts),
-        targets=np.array(targets),
-        quiet=np.array(contents.quiet, dtype=int),
-        priority=np.array(priorities),
-        band=np.array(bands),
-        level=contents.levels,
-        few_points=tips.few,
-        fine_points=tips.fine,
-        few_weights=tips.few_weights,
-        fine_weights=tips.fine_weights,
-        background=contents.background,
+    size = 2 * n * count
+    rows, figures = array("i", bytes(4 * count)), array("f", bytes(4 * (size + count + 6 * k + 3)))
+    to = FoundTones(0, rows.buffer_info()[0], figures.buffer_info()[0])
+    status = run(by.library.answer, to, plates, raster, rules, given)
+    if status == _NEEDS_ONSETS:
+        if table.onsets is not None:
+            rules.point(onsets=table.onsets.parts)
+        given.with_onset = table.onsets is not None
+        status = run(by.library.answer, to, plates, raster, rules, given)
+    if status != FOUND:
+        return None
+    found = figures.tolist()
+    weights = list(map(complex, found[:size:2], found[1:size:2]))
+    contrast = size + count
+    level, of_others = contrast + 3 * k, contrast + 5 * k
+    worst, loudest, factor = found[-3:]
+    return Tones(
+        rows=rows.tolist(),
+        weights=[weights[each : each + n] for each in range(0, n * count, n)],
+        gains=found[size:contrast],
+        contrast_db=[found[each : each + 3] for each in range(contrast, level, 3)],
+        level_db_sl=[found[each : each + 2] for each in range(level, of_others, 2)],
+        foreign_db_sl=found[of_others:-3],
+        worst_db=worst,
+        loudest_db_sl=loudest,
+        stroke_factor=factor,
+        is_apart=bool(to.is_apart),
     )
-    return given
 
 
-def _rules(table: "LocalizationTable", fingers: int) -> tuple[Rules, tuple[Drawn, Drawn]]:
-    """How tones are chosen on a table, and drawn plates with so many fingers, kept with it."""
-    kept = _kept.get(table)
-    if kept is None:
-        kept = _kept.setdefault(table, (_rules_of(table), {}))
-    rules, by_count = kept
-    drawn = by_count.get(fingers)
-    if drawn is None:
-        on = table.on_eras
-        judging = draws_structure(on, fingers, JUDGING_DRAWS)
-        drawn = by_count[fingers] = judging, draws_structure(on, fingers, PROMISED_DRAWS)
-    return rules, drawn
+_Fingers: TypeAlias = tuple[Drawn, Drawn, Complex64Array]
+"""Plates that judge and those of the promise, and the stiffness of fingers that press lightly."""
+
+_Kept: TypeAlias = tuple[Plates, GivenRaster, Rules, dict[int, _Fingers]]
+"""What kernels read of a table; and of so many fingers."""
+
+_kept: WeakKeyDictionary["LocalizationTable", _Kept] = WeakKeyDictionary()
 
 
-def _rules_of(table: "LocalizationTable") -> Rules:
-    """How tones are chosen on a table."""
-    plate = table.attached
-    found = Rules(
+def _with(table: "LocalizationTable", fingers: int) -> _Fingers:
+    judging, promise = (
+        draws_structure(table.on_eras, fingers, by) for by in (JUDGING_DRAWS, PROMISED_DRAWS)
+    )
+    return judging, promise, table.attached.finger_stiffness(fingers)
+
+
+def _kept_of(table: "LocalizationTable") -> _Kept:
+    """The plate, its raster, and how tones are chosen on a table, as kernels read them."""
+    plate, raster = table.attached, table.raster
+    few, fine = len(FIVE_POINTS.points), len(FINE_POINTS.points)
+    read = GivenRaster(raster.nx, raster.ny, *raster.patch, table.shapes.shape[1], few, fine)
+    read.length, read.width, read.radius = raster.length, raster.width, FINGERTIP_RADIUS
+    read.point(
+        points=FIVE_AND_FINE.points,
+        weights=FIVE_AND_FINE.weights,
+        nodes=GAUSS_LEGENDRE,
+        shapes=table.shapes,
+    )
+    rules = Rules(
         *(KEPT, MISSING, MAX_FINGERS_BY_POINT, MIN_CANDIDATES, MAX_COMBINATIONS, PRUNING_STEP),
         *(len(CENTRE_AND_RIM), plate.gain_variance < MAX_VARIANCE_FINE, plate.thickness > 0),
         *(TIME_COUNT, plate.gain_variance, RIDGE, LEVEL_MARGIN, NEARLY_HIGHEST, REACHED),
@@ -143,15 +154,10 @@ def _rules_of(table: "LocalizationTable") -> Rules:
         *(PHASED.phases[1], PHASED.iterations, as_structure(ONE_FINGER), as_structure(SEVERAL)),
         (Method * 3)(*map(as_structure, WITHIN_STROKE)),
     )
-    found.point(
+    rules.point(
         rim=CENTRE_AND_RIM,
         threshold=table.thresholds,
         error=table.error_power,
         frequencies=table.frequencies,
     )
-    return found
-
-
-_kept: WeakKeyDictionary["LocalizationTable", tuple[Rules, dict[int, tuple[Drawn, Drawn]]]] = (
-    WeakKeyDictionary()
-)
+    return plates_structure(table.on_eras), read, rules, {}

@@ -13,8 +13,10 @@ from model.choice import NEARLY, best_few, best_first, best_of
 from model.drive_modes.coherent import Coherent
 from model.drive_modes.forms import Forms
 from model.drive_modes.phased import PHASED
+from model.ensemble.draws import Drawing
 from model.ensemble.measures import percentile
-from model.ensemble.touched_plate import TouchedPlate
+from model.ensemble.touched_plate import Sensed, TouchedPlate
+from model.finger.perception import decibels
 from model.table.contents import (
     JUDGING_DRAWS,
     KEPT,
@@ -53,30 +55,55 @@ class Candidates:
     weights: Complex64Array
 
 
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """Contents on a table, and their fingers on its plate."""
+
+    table: "LocalizationTable"
+    contents: Contents
+    tips: FingertipShapes
+    touched: TouchedPlate
+
+    @classmethod
+    def of(cls, table: "LocalizationTable", contents: Contents) -> "Asked":
+        """Put the fingers of contents on a table's plate."""
+        tips = table.read_fingertips(contents.places)
+        stiffness = table.attached.finger_stiffness(len(tips.few), contents.loads)
+        touched = TouchedPlate(table.on_eras, tips.few[:, 0], stiffness)
+        return cls(table, contents, tips, touched)
+
+    def drawn(
+        self, by: Drawing, rows: IntArray, weights: Complex64Array, *, with_powers: bool = False
+    ) -> Sensed:
+        """What tones at rows (m,) of weights (m, n) do at all fine points on drawn plates."""
+        points, table = self.tips.fine.reshape(-1, self.tips.fine.shape[2]), self.table
+        given = points, self.tips.fine_weights, table.error_power, table.thresholds
+        return self.touched.drawn(by, rows, weights, *given, with_powers=with_powers)
+
+
 def choose_by_numpy(table: "LocalizationTable", contents: Contents) -> Tones | None:
     """Choose a tone for each content; None where one frequency hardly reaches a strict level."""
-    tips, rows = contents.tips, contents.rows
-    stiffness = table.attached.finger_stiffness(len(tips.few), contents.loads)
-    touched = TouchedPlate(table.on_eras, tips.few[:, 0], stiffness)
-    kept = ranked(table, touched, contents) if contents.is_ranked else rows
-    found, is_limited = _candidates(table, touched, contents, kept)
+    asked, rows = Asked.of(table, contents), contents.rows
+    kept = ranked(asked) if contents.is_ranked else rows
+    found, is_limited = _candidates(asked, kept)
     if len(kept) < len(rows) and (not len(found.rows) or (is_limited and not contents.is_strict)):
-        found, is_limited = _candidates(table, touched, contents, rows)
+        found, is_limited = _candidates(asked, rows)
     if not len(found.rows) or (is_limited and contents.is_strict):
         return None
     best, is_apart = np.zeros(1, dtype=int), True
     if len(found.rows) > 1:
-        own, loudest = _judged(table, touched, contents, found)
+        own, loudest = _judged(asked, found)
         if len(contents.streams) == 1:
-            best[0] = _best_tone(table, contents, found, own, loudest)
+            best[0] = _best_tone(asked, found, own, loudest)
         else:
             best, is_apart = best_combination(table, contents, found, own, loudest)
-    return _promised(table, touched, contents, found.rows[best], found.weights[best], is_apart)
+    return _promised(asked, found.rows[best], found.weights[best], is_apart)
 
 
-def ranked(table: "LocalizationTable", touched: TouchedPlate, contents: Contents) -> IntArray:
+def ranked(asked: Asked) -> IntArray:
     """The rows most worth a search for one target, ascending; by one form of all other fingers."""
-    tips, rows, target = contents.tips, contents.rows, contents.streams[0].targets[0]
+    table, contents, tips, touched = asked.table, asked.contents, asked.tips, asked.touched
+    rows, target = contents.rows, contents.streams[0].targets[0]
     others = _others(contents, 0)
     points, weights = tips.few, tips.few_weights
     if len(others) > MAX_FINGERS_BY_POINT:
@@ -105,11 +132,10 @@ def _others(contents: Contents, number: int) -> list[int]:
     return sorted(every - {*contents.streams[number].targets})
 
 
-def _candidates(
-    table: "LocalizationTable", touched: TouchedPlate, contents: Contents, rows: IntArray
-) -> tuple[Candidates, bool]:
+def _candidates(asked: Asked, rows: IntArray) -> tuple[Candidates, bool]:
     """The best tones of each content in each band, and whether a level was hard to reach."""
-    tips, count = contents.tips, len(contents.streams)
+    table, contents, tips, touched = asked.table, asked.contents, asked.tips, asked.touched
+    count = len(contents.streams)
     formed = touched.forms(rows, tips.few, tips.few_weights, table.error_power, tips.fine)
     fingers = FingersOnPlate(
         *(touched, rows, tips, table.thresholds, table.error_power, formed),
@@ -124,7 +150,7 @@ def _candidates(
         view = fingers.for_targets(stream.targets, others, level_db_sl=level)
         rest = None if contents.background is None or others else contents.background[rows]
         for band, (low, end) in enumerate(stream.bands):
-            at = np.arange(len(rows)) if contents.is_ranked else np.arange(low, end)
+            at = np.flatnonzero((rows >= low) & (rows < end))
             forms = view.forms(rest).at(at)
             searched = _SEARCH.search(forms)
             is_limited |= searched.is_level_limited
@@ -158,17 +184,13 @@ def _apart(score: Float32Array, frequencies: FloatArray, count: int, apart_hz: f
     return found
 
 
-def _judged(
-    table: "LocalizationTable", touched: TouchedPlate, contents: Contents, found: Candidates
-) -> tuple[FloatArray, FloatArray]:
+def _judged(asked: Asked, found: Candidates) -> tuple[FloatArray, FloatArray]:
     """Amplitude (m, d) at the targets of each candidate, squared one (m, k, d) at loudest points.
 
     Those of several contents at the contents' levels.
     """
-    tips = contents.tips
-    given = tips.fine.reshape(-1, tips.fine.shape[2]), tips.fine_weights
-    sizes = table.error_power, table.thresholds
-    judged = touched.drawn(JUDGING_DRAWS, found.rows, found.weights, *given, *sizes)
+    contents = asked.contents
+    judged = asked.drawn(JUDGING_DRAWS, found.rows, found.weights)
     loudest = judged.loudest[:, :, 1:].astype(float)
     own = np.empty((len(loudest), loudest.shape[2]))
     for number, stream in enumerate(contents.streams):
@@ -181,18 +203,13 @@ def _judged(
     return own, loudest
 
 
-def _best_tone(
-    table: "LocalizationTable",
-    contents: Contents,
-    found: Candidates,
-    own: FloatArray,
-    loudest: FloatArray,
-) -> int:
+def _best_tone(asked: Asked, found: Candidates, own: FloatArray, loudest: FloatArray) -> int:
     """The tone of an only content: level first, then contrast, of nearly the same the onset.
 
     Without other fingers the score counts, and as much a level that is much the same on all plates.
     """
-    quiet, tips, least = [*contents.quiet], contents.tips, percentile(own)
+    contents = asked.contents
+    quiet, least = [*contents.quiet], percentile(own)
     reaches = least >= contents.levels[0] * REACHED
     if not reaches.any():
         reaches[:] = True
@@ -204,7 +221,8 @@ def _best_tone(
     contrast = None
     if contents.with_onset and len(near) > 1:
         drives, targets = (found.rows[near], found.weights[near]), [*contents.streams[0].targets]
-        contrast = onset_contrast(table, tips, targets, quiet, np.ones(len(targets)), *drives)
+        gains = np.ones(len(targets))
+        contrast = onset_contrast(asked.table, asked.tips, targets, quiet, gains, *drives)
     if contrast is None:
         return best_of(robust)
     return int(near[best_of(robust[near] * contrast**ONSET_WEIGHT)])
@@ -291,19 +309,11 @@ def worst_ratios(
     return percentile(worst)
 
 
-def _promised(
-    table: "LocalizationTable",
-    touched: TouchedPlate,
-    contents: Contents,
-    rows: IntArray,
-    weights: Complex64Array,
-    is_apart: bool,
-) -> Tones:
+def _promised(asked: Asked, rows: IntArray, weights: Complex64Array, is_apart: bool) -> Tones:
     """What fingers feel of tones at rows (K,) of weights (K, n), brought to their levels."""
-    tips, streams, k = contents.tips, contents.streams, len(contents.tips.fine)
-    shares, levels = tips.fine_weights, contents.levels
-    given = tips.fine.reshape(-1, tips.fine.shape[2]), shares, table.error_power, table.thresholds
-    powers = touched.drawn(PROMISED_DRAWS, rows, weights, *given, with_powers=True).powers
+    contents, shares = asked.contents, asked.tips.fine_weights
+    streams, levels, k = contents.streams, contents.levels, len(shares)
+    powers = asked.drawn(PROMISED_DRAWS, rows, weights, with_powers=True).powers
     power = np.asarray(powers).reshape(len(rows), *shares.shape, -1)
     alone = np.arange(len(rows))  # as if each had a frequency of its own
     own = [
@@ -334,17 +344,18 @@ def _promised(
     worst = figures(np.min(ratios, axis=0)) if ratios else (np.nan,) * 3
     if len(streams) == 1:
         contrast[[*streams[0].targets]] = worst  # the one at the loudest quiet finger
-    loud = promise(loudest, 100 - PROMISED_PERCENTILE)
+    of_all = worst[2], promise(loudest, 100 - PROMISED_PERCENTILE)
+    worst_db, loudest_db_sl = decibels(np.array(of_all)).tolist()
     return Tones(
-        rows,
-        weights,
-        gains,
-        contrast,
-        level,
-        foreign_amplitudes,
-        worst[2],
-        factor,
-        loud,
+        rows=rows.tolist(),
+        weights=weights.tolist(),
+        gains=gains.tolist(),
+        contrast_db=decibels(contrast).tolist(),
+        level_db_sl=decibels(level).tolist(),
+        foreign_db_sl=decibels(foreign_amplitudes).tolist(),
+        worst_db=worst_db,
+        loudest_db_sl=loudest_db_sl,
+        stroke_factor=factor,
         is_apart=is_apart,
     )
 

@@ -111,29 +111,25 @@ def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) 
 
 
 def pattern_of(
-    question: Question,
     tones: Tones,
     *,
     eras: Sequence[Era],
     frequencies: FloatArray,
     threshold: str,
 ) -> Pattern:
-    """The pattern of one target's tone, turned down to the wanted level at nine of ten plates."""
-    gain = float(tones.gains[0])
-    amplitudes = [*tones.level[0] / gain, tones.loudest / gain, *tones.contrast[0]]
-    nominal, robust, loudest, contrast, median, promised = decibels(np.array(amplitudes)).tolist()
-    gain_db = min(0.0, question.level_db_sl - robust)
-    drive = [(int(tones.rows[0]), tones.weights[0])]
+    """The pattern of one target's tone."""
+    (nominal, robust), (contrast, median, promised) = tones.level_db_sl[0], tones.contrast_db[0]
+    drive = [(tones.rows[0], tones.weights[0])]
     return Pattern(
-        excitation=excitation_of(drive, eras, frequencies, gain=10 ** (gain_db / 20)),
+        excitation=excitation_of(drive, eras, frequencies, gain=tones.gains[0]),
         ramp=ONSET_RAMP,
-        level_db_sl=gain_db + nominal,
-        robust_level_db_sl=gain_db + robust,
+        level_db_sl=nominal,
+        robust_level_db_sl=robust,
         drive_mode=UNRESTRICTED,
         threshold=threshold,
         contrast_db=contrast,
-        quiet_level_db_sl=gain_db + nominal - contrast,
-        robust_quiet_level_db_sl=gain_db + loudest,
+        quiet_level_db_sl=nominal - contrast,
+        robust_quiet_level_db_sl=tones.loudest_db_sl,
         robust_contrast_db=promised,
         robust_felt_contrast_db=promised,
         median_felt_contrast_db=median,
@@ -329,9 +325,10 @@ def _pattern(
     nominal, robust, median, highest = decibels(np.array([each[:, 0], *levels])).tolist()
     gain_db = min(0.0, question.level_db_sl - robust[0])
     gain = 10 ** (gain_db / 20)
+    tones = [(row, weights.tolist()) for row, weights in drive.tones()]
     pattern = partial(
         Pattern,
-        excitation=excitation_of(drive.tones(), candidates.eras, candidates.frequencies, gain=gain),
+        excitation=excitation_of(tones, candidates.eras, candidates.frequencies, gain=gain),
         ramp=ONSET_RAMP,
         level_db_sl=gain_db + nominal[0],
         robust_level_db_sl=gain_db + robust[0],

@@ -6,7 +6,6 @@ product, whatever the mesh.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -17,14 +16,11 @@ from model.errors import InputError
 from model.finger.fingertip import FINGERTIP_RADIUS, FIVE_AND_FINE, FIVE_POINTS, fingertips_on
 from model.structure.footprint import mean_over
 from model.structure.plate import Plate
-from model.table.question import Point
 
 POINTS_PER_WAVELENGTH = 20
 MAX_SPACING, MIN_SPACING = 0.008, 0.003  # m
 PATCH = 6  # points along a side of an interpolation, at least
 FEW = len(FIVE_POINTS.points)
-MAX_KEPT = 512
-"""Fingertips whose shapes are kept, of some 8 kB each."""
 
 
 @dataclass(frozen=True)
@@ -98,17 +94,23 @@ class Raster:
         return np.asarray((weights @ values[index])[:, 0])
 
     @cached_property
-    def _sides(self) -> tuple[IntArray, FloatArray, IntArray]:
-        """Points along x and y: of the raster; their spacing [m]; of a patch that holds a disc."""
-        count = np.array([self.nx, self.ny])
-        spacing = np.array([self.length, self.width]) / (count - 1)
+    def patch(self) -> tuple[int, int]:
+        """Points along the sides of a patch that holds a fingertip."""
+        count, spacing = self._points
         wide = np.ceil(2 * FINGERTIP_RADIUS / spacing).astype(int) + 2
-        return count, spacing, np.minimum(np.maximum(PATCH, wide), count)
+        side_x, side_y = np.minimum(np.maximum(PATCH, wide), count).tolist()
+        return side_x, side_y
+
+    @property
+    def _points(self) -> tuple[IntArray, FloatArray]:
+        """Number of points along x and y, and their spacing [m]."""
+        count = np.array([self.nx, self.ny])
+        return count, np.array([self.length, self.width]) / (count - 1)
 
     @cached_property
     def _patch_index(self) -> IntArray:
         """Numbers of a patch's points, counted from its lowest, (patch,)."""
-        side_x, side_y = self._sides[2]
+        side_x, side_y = self.patch
         return np.asarray((np.arange(side_y)[:, None] * self.nx + np.arange(side_x)).ravel())
 
     @cached_property
@@ -117,7 +119,7 @@ class Raster:
 
         (2, 1, powers, powers); the shorter side's have zeros beside them.
         """
-        side = self._sides[2]
+        side = self.patch
         found = np.zeros((2, 1, max(side), max(side)))
         for axis, count in enumerate(side):
             powers = np.vander(np.linspace(-1, 1, count), increasing=True)
@@ -129,7 +131,7 @@ class Raster:
 
         (k, patch) and (k, p, patch).
         """
-        count, spacing, side = self._sides
+        (count, spacing), side = self._points, np.array(self.patch)
         start = np.rint(centres / spacing - (side - 1) / 2).astype(int)
         start = np.minimum(np.maximum(start, 0), count - side)
         local = (points / spacing - start[:, None]) * (2 / (side - 1)) - 1
@@ -152,25 +154,3 @@ class FingertipShapes:
     fine: Float32Array
     few_weights: Float32Array
     fine_weights: Float32Array
-
-
-class FingertipReader:
-    """Reads shapes (points, r) on a raster at fingertips, kept for fingers that do not move."""
-
-    def __init__(self, raster: Raster, shapes: Float32Array) -> None:
-        self._raster, self._shapes = raster, shapes
-        self._kept: dict[Point, tuple[Float32Array, ...]] = {}
-
-    def __call__(self, places: Sequence[Point]) -> FingertipShapes:
-        """Read at fingertips centred at places [m] of the plate; from any thread."""
-        kept = self._kept
-        missing = [place for place in places if place not in kept]
-        if missing:
-            if len(kept) > MAX_KEPT:
-                kept = self._kept = {}  # another thread may still read the one before
-                missing = list(places)
-            tips = self._raster.fingertips(np.array(missing), self._shapes)
-            read = zip(tips.few, tips.fine, tips.few_weights, tips.fine_weights, strict=True)
-            kept.update(zip(missing, read, strict=True))
-        found = zip(*map(kept.__getitem__, places), strict=True)
-        return FingertipShapes(*map(np.array, found))

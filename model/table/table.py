@@ -13,7 +13,7 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
+from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
 from model.drive_modes import UNRESTRICTED
 from model.drive_modes.forms import Forms
 from model.drive_modes.switched import amplitude_powers, members_of, sums_of_sources
@@ -30,7 +30,7 @@ from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loads
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
-from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS, Contents
+from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS, Contents, Stream
 from model.table.contents_kernel import choose_tones
 from model.table.contents_numpy import onset_contrast
 from model.table.fingers_on_plate import FingersOnPlate
@@ -38,7 +38,7 @@ from model.table.pattern import ONSET_RAMP, Pattern
 from model.table.pattern_choice import Candidates, choose_pattern, pattern_of
 from model.table.pulse_gains import OverEffect
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
-from model.table.raster import FingertipReader, FingertipShapes, Raster
+from model.table.raster import FingertipShapes, Raster
 from model.transients.onset import RampedOnsets, RampedRinging, ramped_ringing
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation, base_amplitudes
@@ -145,11 +145,11 @@ class LocalizationTable:
                 f"these amplifiers play, got {self.frequencies[0]:g} to {self.frequencies[-1]:g} "
                 "Hz; build a table with others: era table build --frequencies"
             )
-        tips = self.read_fingertips(question.contacts)
         if drive_mode == UNRESTRICTED and over_effect is None:
-            found = self._tone(question, tips, playable)
+            found = self._tone(question, (int(playable[0]), int(playable[-1]) + 1))
             if found is not None:
                 return found
+        tips = self.read_fingertips(question.contacts)
         count = len(question.targets)
         candidates = Candidates(
             eras=self.eras,
@@ -349,10 +349,9 @@ class LocalizationTable:
         counts = {JUDGING_DRAWS.thicknesses, PROMISED_DRAWS.thicknesses, PROMISED_DRAWS.bases}
         return PlateOnEras.of(self.attached, *sorted(counts))
 
-    @cached_property
-    def read_fingertips(self) -> FingertipReader:
-        """Reads the shapes at fingertips, by their positions [m]."""
-        return FingertipReader(self.raster, self.shapes)
+    def read_fingertips(self, places: Sequence[Point]) -> FingertipShapes:
+        """Shapes at fingertips centred at places [m] of the plate."""
+        return self.raster.fingertips(np.array(places), self.shapes)
 
     @cached_property
     def error_power(self) -> Float32Array:
@@ -396,17 +395,22 @@ class LocalizationTable:
             error_power=self.error_power,
         )
 
-    def _tone(
-        self, question: Question, tips: FingertipShapes, playable: IntArray
-    ) -> Pattern | None:
+    def _tone(self, question: Question, band: tuple[int, int]) -> Pattern | None:
         """The best pattern of one tone for one target, None where that hardly reaches the level."""
         if len(question.targets) > 1 or not question.quiet:
             return None
-        found = choose_tones(self, Contents.of(question, tips, playable))
+        contents = Contents(
+            question.contacts,
+            question.loads,
+            (Stream((0,), question.level_db_sl, (band,)),),
+            tuple(range(1, len(question.contacts))),
+            is_strict=True,
+            with_onset=not question.envelopes,
+        )
+        found = choose_tones(self, contents)
         if found is None:
             return None
         return pattern_of(
-            question,
             found,
             eras=self.eras,
             frequencies=self.frequencies,

@@ -58,7 +58,7 @@ def test_ramped_onset_contrast_equals_sampled_contrast(ramp, within):
             quiet=shapes[count:].reshape(-1, shapes.shape[-1]),
         )
         for row, weight, contrast in zip(rows, weights, found, strict=True):
-            excitation = excitation_of([(row, weight)], table.eras, FREQUENCIES, gain=1.0)
+            excitation = excitation_of([(row, weight.tolist())], table.eras, FREQUENCIES, gain=1.0)
             bases = ramped_onset(excitation, table.eras, ramp=ramp)
             exact = transients.contrast_db(bases, targets=targets, quiet=quiet)
             errors.append(20 * np.log10(contrast) - exact)

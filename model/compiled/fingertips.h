@@ -1,0 +1,146 @@
+/* Shapes of the plate under fingertips: `model.table.raster` and `model.finger.fingertip` in C. */
+#ifndef FINGERTIPS_H
+#define FINGERTIPS_H
+
+#include "arena.h"
+
+typedef struct {
+    int nx, ny, side_x, side_y, r; /* points of the raster, and of a patch of it; reduced coordinates */
+    int few, fine;                 /* points of both rules */
+    double length, width, radius;  /* of the plate and of a fingertip [m] */
+    const float *points, *weights; /* (few + fine, 2) of the unit disc, the few first; (2, few + fine) */
+    const float *nodes;            /* (8, 2) Gauss-Legendre points and weights */
+    const float *shapes;           /* (ny nx, r) */
+} raster;
+
+typedef struct {
+    float *few, *fine, *few_weights, *fine_weights, *centres; /* (k, few, r), (k, fine, r), (k, few), (k, fine), (k, r) */
+} tips;
+
+INLINE double within(double a, double low, double high) { return a < low ? low : a > high ? high : a; }
+
+/* Centroid of the unit disc's part between two corners, which hold its centre. */
+SHARED void centroid_of(double *to, const double *low, const double *high, const raster *on) {
+    const double bottom = fmax(low[1], -1), top = fmin(high[1], 1);
+    const double first = asin(fmax(low[0], -1)), last = asin(fmin(high[0], 1));
+    const double corners[2] = {acos(-bottom), acos(top)};
+    double ends[6] = {first, -corners[0], corners[0], -corners[1], corners[1], last}, area = 0;
+    to[0] = to[1] = 0;
+    for (int i = 0; i < 6; i++) {
+        double own = within(ends[i], first, last);
+        int at = i;
+        for (; at > 0 && ends[at - 1] > own; at--) ends[at] = ends[at - 1];
+        ends[at] = own;
+    }
+    for (int i = 0; i < 5; i++)
+        for (int node = 0; node < 8; node++) {
+            const double half = (ends[i + 1] - ends[i]) / 2, angle = ends[i] + half + half * on->nodes[2 * node];
+            const double x = sin(angle), rim = cos(angle), width = half * on->nodes[2 * node + 1] * rim;
+            const double from = fmax(-rim, bottom), till = fmin(rim, top);
+            area += width * (till - from);
+            to[0] += width * x * (till - from), to[1] += width * (till * till - from * from) / 2;
+        }
+    to[0] /= area, to[1] /= area;
+}
+
+/* Weights (points) of those kept, times the linear function that makes linear means exact; none is negative. */
+SHARED void refit(double *weights, const char *is_kept, const double *centroid, const raster *on) {
+    const int count = on->few + on->fine;
+    double sum = 0, A[3][4] = {{1e-9, 0, 0, 1}, {0, 1e-9, 0, centroid[0]}, {0, 0, 1e-9, centroid[1]}};
+    for (int i = 0; i < count; i++) sum += weights[i] *= is_kept[i];
+    for (int i = 0; i < count; i++) {
+        const double each[3] = {1, on->points[2 * i], on->points[2 * i + 1]};
+        weights[i] /= sum;
+        for (int u = 0; u < 3; u++)
+            for (int v = 0; v < 3; v++) A[u][v] += weights[i] * each[u] * each[v];
+    }
+    for (int s = 0; s < 3; s++) /* definite */
+        for (int u = 0; u < 3; u++)
+            for (int v = 3; u != s && v >= s; v--) A[u][v] -= A[u][s] / A[s][s] * A[s][v];
+    sum = 0;
+    for (int i = 0; i < count; i++) {
+        const double x = on->points[2 * i], y = on->points[2 * i + 1];
+        weights[i] = fmax(weights[i] * (A[0][3] / A[0][0] + A[1][3] / A[1][1] * x + A[2][3] / A[2][2] * y), 0);
+        sum += weights[i];
+    }
+    for (int i = 0; i < count; i++) weights[i] /= sum;
+}
+
+/* Lagrange polynomials of the points 0, 1, ... (count) at x. */
+INLINE void lagrange(float *to, double x, int count) {
+    for (int i = 0; i < count; i++) {
+        double found = 1;
+        for (int j = 0; j < count; j++)
+            if (j != i) found *= (x - j) / (i - j);
+        to[i] = (float)found;
+    }
+}
+
+/* Shapes under fingertips centred at places (k, 2) [m], and weights of the points in the mean over each. */
+SHARED tips read_tips(const raster *on, const double *places, size_t k, arena *memory) {
+    const size_t r = on->r, few = on->few, fine = on->fine, count = few + fine, patch = on->side_x * on->side_y;
+    const size_t padded = (r + LANES - 1) / LANES * LANES;
+    tips to = {floats(memory, k * few * r), floats(memory, k * fine * r), floats(memory, k * few),
+               floats(memory, k * fine), floats(memory, k * r)};
+    const arena mark = *memory;
+    float *near = floats(memory, patch * padded), *share = floats(memory, patch), *found = floats(memory, padded);
+    float *along_x = floats(memory, on->side_x), *along_y = floats(memory, on->side_y);
+    double *weights = take(memory, 2 * count * sizeof(double)), *inside = take(memory, 2 * count * sizeof(double));
+    char *is_kept = take(memory, count);
+    memset(near, 0, patch * padded * sizeof(float));
+    for (size_t finger = 0; finger < k; finger++) {
+        const double *centre = places + 2 * finger, size[2] = {on->length, on->width};
+        const int points[2] = {on->nx, on->ny}, side[2] = {on->side_x, on->side_y};
+        double low[2], high[2], spacing[2];
+        int start[2], is_cut = 0;
+        for (int axis = 0; axis < 2; axis++) {
+            low[axis] = -centre[axis] / on->radius, high[axis] = (size[axis] - centre[axis]) / on->radius;
+            spacing[axis] = size[axis] / (points[axis] - 1);
+            start[axis] = (int)within(rint(centre[axis] / spacing[axis] - (side[axis] - 1) / 2.0), 0, points[axis] - side[axis]);
+        }
+        for (size_t i = 0; i < count; i++) {
+            for (int axis = 0; axis < 2; axis++) inside[2 * i + axis] = within(on->points[2 * i + axis], low[axis], high[axis]);
+            is_kept[i] = inside[2 * i] == on->points[2 * i] && inside[2 * i + 1] == on->points[2 * i + 1];
+            is_cut |= !is_kept[i];
+        }
+        for (size_t i = 0; i < 2 * count; i++) weights[i] = on->weights[i];
+        if (is_cut) {
+            double centroid[2];
+            centroid_of(centroid, low, high, on);
+            refit(weights, is_kept, centroid, on), refit(weights + count, is_kept, centroid, on);
+        }
+        for (size_t i = 0; i < few; i++) to.few_weights[finger * few + i] = (float)weights[i];
+        for (size_t i = 0; i < fine; i++) to.fine_weights[finger * fine + i] = (float)weights[count + few + i];
+
+        for (size_t y = 0; y < (size_t)side[1]; y++)
+            for (size_t x = 0; x < (size_t)side[0]; x++)
+                memcpy(near + (y * side[0] + x) * padded, on->shapes + ((start[1] + y) * on->nx + start[0] + x) * r,
+                       r * sizeof(float));
+        for (size_t i = 0; i < count; i++) {
+            lagrange(along_x, (centre[0] + on->radius * inside[2 * i]) / spacing[0] - start[0], side[0]);
+            lagrange(along_y, (centre[1] + on->radius * inside[2 * i + 1]) / spacing[1] - start[1], side[1]);
+            for (int y = 0; y < side[1]; y++)
+                for (int x = 0; x < side[0]; x++) share[y * side[0] + x] = along_y[y] * along_x[x];
+            for (size_t at = 0; at < padded; at += LANES) {
+                lanes even = {0}, odd = {0};
+                for (size_t j = 0; j < patch; j += 2) {
+                    lanes from;
+                    memcpy(&from, near + j * padded + at, sizeof from);
+                    even += share[j] * from;
+                    if (j + 1 == patch) break;
+                    memcpy(&from, near + (j + 1) * padded + at, sizeof from);
+                    odd += share[j + 1] * from;
+                }
+                even += odd;
+                memcpy(found + at, &even, sizeof even);
+            }
+            memcpy(i < few ? to.few + (finger * few + i) * r : to.fine + (finger * fine + i - few) * r, found,
+                   r * sizeof(float));
+        }
+        memcpy(to.centres + finger * r, to.few + finger * few * r, r * sizeof(float));
+    }
+    release(memory, mark);
+    return to;
+}
+
+#endif

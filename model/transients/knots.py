@@ -14,14 +14,16 @@ Responses are demodulated: without the factor exp(s t), as the envelopes are.
 The response to a linear ramp t / step from time 0 on is z(t) = a0 + a1 t - a0 exp((lambda - s) t)
 in the coordinates of `PlateInTime`; that to a hat is its second difference.
 
-Minima have bounded magnitudes of their complex unknowns: no knot exceeds the stroke.
+Of many ERAs an onset takes a few combinations: the pattern's, and those that move the fingers most.
+What the others would add they would hardly do. Minima have bounded magnitudes of their complex
+knots: none exceeds the stroke. Single precision changes contrasts by some hundredths of a decibel.
 """
 
 import math
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +33,9 @@ from model.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
 from model.transients import base_motion
 from model.transients.base_motion import KNOT_STEP
 from model.transients.time_response import PlateInTime
+
+Complex: TypeAlias = NDArray[np.complexfloating[Any, Any]]
+"""Of either precision."""
 
 ONSET_KNOTS = 21
 """Knots of an onset; the last, after 105 ms, is the pattern's amplitude."""
@@ -48,6 +53,9 @@ _TARGET_WEIGHT = 2.0
 # residual vibration, relative to the steady one. Three times as much changes both by about 1 dB;
 # zero makes the ending as loud for the quiet finger as a plain ramp.
 _QUIET_WEIGHT = 0.03
+
+# Combinations of ERAs in an onset. With all of eight and more contrast is the same or lower.
+_COMBINATIONS = 6
 
 _SAMPLES = 5  # for each step; a demodulated response changes little within a millisecond
 _STEPS = ONSET_KNOTS + 9  # of an onset, until the plate has settled
@@ -67,10 +75,42 @@ class Carrier:
     """
 
     frequency: float
-    hats: ComplexArray
+    hats: Complex64Array
     steady: ComplexArray
     residual_form: ComplexArray
     gain_variance: float
+
+
+@dataclass(frozen=True, eq=False)
+class Felt:
+    """Responses of some ERAs, as in `Carrier`, at t targets and at d rows of quiet fingers.
+
+    hats (samples, t + d, knots, eras), steady (t + d, eras).
+    """
+
+    targets: int
+    hats: Complex64Array
+    steady: ComplexArray
+
+    @classmethod
+    def at(cls, carrier: Carrier, target_rows: FloatArray, quiet_rows: FloatArray) -> "Felt":
+        """Read all ERAs at rows (t, r) and (d, r) of shapes.
+
+        target_rows: means under targets; quiet_rows: whose sum of squares is the mean square under
+        quiet fingers.
+        """
+        rows = np.vstack([target_rows, quiet_rows])
+        samples, r, knots, eras = carrier.hats.shape
+        flat = carrier.hats.reshape(samples, r, -1).view(np.float32)
+        hats = (rows.astype(np.float32) @ flat).view(np.complex64)
+        hats = hats.reshape(samples, len(rows), knots, eras)
+        return cls(len(target_rows), hats, rows @ carrier.steady.T)
+
+    def of(self, active: IntArray) -> "Felt":
+        """That of active ERAs only."""
+        if len(active) == self.steady.shape[1]:
+            return self
+        return Felt(self.targets, self.hats[..., active], self.steady[:, active])
 
 
 def solve_carrier(
@@ -84,41 +124,45 @@ def solve_carrier(
     states = ending_states(plate, omega, step=KNOT_STEP, steps=ENDING_KNOTS)
     flat = states.reshape(len(states), -1)
     form = flat.conj().T @ residual_form @ flat
-    return Carrier(frequency, np.ascontiguousarray(hats), steady, form, gain_variance)
+    _add_errors(form, len(plate.eras), gain_variance)
+    return Carrier(frequency, hats.astype(np.complex64, order="C"), steady, form, gain_variance)
 
 
 def onset_knots(
-    carrier: Carrier,
-    amplitudes: ComplexArray,
-    active: IntArray,
-    *,
-    target_rows: FloatArray,
-    quiet_rows: FloatArray,
-    rise: float,
+    amplitudes: ComplexArray, found: Felt, *, gain_variance: float, rise: float
 ) -> ComplexArray:
-    """Find the knots (ONSET_KNOTS, active) in strokes; the last are the amplitudes (eras,).
+    """Find the knots (ONSET_KNOTS, eras) in strokes; the last are the amplitudes (eras,).
 
-    target_rows, quiet_rows (d, r): shapes under targets and quiet fingers, whose sum of squares is
-    the mean square there; rise [s].
+    found: of these ERAs; rise [s].
     """
-    eras, variance = len(active), carrier.gain_variance
-    steady = amplitudes[active, None] * carrier.steady[active]
-    quiet_power, target_power = (
-        _expected_power(rows @ steady.T, variance) for rows in (quiet_rows, target_rows)
-    )
-    weight = _TARGET_WEIGHT**2 * quiet_power / target_power
-    at_targets = math.sqrt(weight) * _at(target_rows, carrier.hats)[..., active]
-    at_quiet = _at(quiet_rows, carrier.hats)[..., active]
-    form = _form(np.concatenate([at_targets, at_quiet], axis=1))
-    _add_errors(form, _own_form(at_quiet), variance)
-    wanted = math.sqrt(weight) * target_rows @ (amplitudes @ carrier.steady)
-    along = np.tensordot(wanted, at_targets.conj(), axes=(0, 1)).reshape(-1, eras)
-    aim = _rises(rise) @ along
+    t, free = found.targets, ONSET_KNOTS - 1
+    steady = amplitudes * found.steady
+    power = _expected_power(steady[t:], gain_variance) / _expected_power(steady[:t], gain_variance)
+    weights = np.ones((len(steady), 1, 1), dtype=np.float32)
+    weights[:t] = _TARGET_WEIGHT * math.sqrt(power)
+    hats = found.hats * weights
+    combinations = _combinations(hats, amplitudes)
+    combined: Complex = hats @ combinations
+    count = combinations.shape[1]
+    form = _summed(combined, gain_variance)
+    wanted = weights[:t, 0, 0] * steady[:t].sum(axis=1)
+    along = np.tensordot(wanted, combined[:, :t].conj(), axes=(0, 1)).reshape(-1, count)
+    settled = np.tile(amplitudes @ combinations.conj(), _STEPS - free)
+    held = form[: free * count, free * count :] @ settled
+    right = _rises(rise)[:free] @ along - held.reshape(free, count)
+    knots = bounded_minimum(form[: free * count, : free * count], right, combinations)
+    return np.vstack([knots, amplitudes])
 
-    free = (ONSET_KNOTS - 1) * eras
-    settled = np.tile(amplitudes[active], _STEPS - ONSET_KNOTS + 1)
-    knots = _minimum(form[:free, :free], aim.ravel()[:free] - form[:free, free:] @ settled)
-    return np.vstack([knots.reshape(-1, eras), amplitudes[active]])
+
+def _combinations(hats: Complex64Array, amplitudes: ComplexArray) -> Complex64Array:
+    """Orthonormal combinations (eras, c) of ERAs, the amplitudes among them."""
+    eras = len(amplitudes)
+    if eras <= _COMBINATIONS:
+        return np.eye(eras, dtype=np.complex64)
+    flat = hats.reshape(-1, eras)
+    _, vectors = np.linalg.eigh(flat.conj().T @ flat)
+    some = np.column_stack([amplitudes, vectors[:, 1 - _COMBINATIONS :]])
+    return np.asarray(np.linalg.qr(some)[0], dtype=np.complex64)
 
 
 @cache
@@ -136,67 +180,47 @@ def _rises(rise: float) -> FloatArray:
 
 
 def ending_knots(
-    carrier: Carrier,
-    amplitudes: ComplexArray,
-    active: IntArray,
-    *,
-    target_rows: FloatArray | None = None,
-    quiet_rows: FloatArray | None = None,
+    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: Felt | None = None
 ) -> ComplexArray:
     """Find start and knots (1 + ENDING_KNOTS, active) in strokes; the last are zero.
 
-    The whole plate comes to rest. With target_rows and quiet_rows (as in `onset_knots`) quiet
-    fingers stay quiet meanwhile.
+    amplitudes (eras,). The whole plate comes to rest. found: of the active ERAs, with quiet fingers
+    that stay quiet meanwhile.
     """
-    eras = len(active)
+    eras, total = len(active), len(amplitudes)
     start = amplitudes[active]
-    total = len(amplitudes)
-    rows = (np.arange(ENDING_KNOTS)[:, None] * total + active).ravel()
-    form = carrier.residual_form[np.ix_(rows, rows)]
-    if target_rows is not None and quiet_rows is not None:
-        vibration = amplitudes @ carrier.steady
-        target = np.linalg.norm(target_rows @ vibration) ** 2
-        meanwhile = while_ending(carrier.hats[..., active], carrier.steady[active], quiet_rows)
-        form = form + _QUIET_WEIGHT * np.linalg.norm(vibration) ** 2 / target * meanwhile
-    blocks = form.reshape(ENDING_KNOTS, eras, ENDING_KNOTS, eras)
-    _add_errors(form, np.einsum("kele->kle", blocks), carrier.gain_variance)
-    knots = _minimum(form[eras:, eras:], -form[eras:, :eras] @ start)
-    return np.vstack([start, knots.reshape(-1, eras), np.zeros(eras)])
+    form = carrier.residual_form
+    if eras < total:
+        rows = (np.arange(ENDING_KNOTS)[:, None] * total + active).ravel()
+        form = form[np.ix_(rows, rows)]
+    right = -(form[eras:, :eras] @ start)
+    form = form[eras:, eras:]
+    if found is not None:
+        vibration = np.linalg.norm(amplitudes @ carrier.steady) ** 2
+        target = np.linalg.norm(found.steady[: found.targets] @ start) ** 2
+        quiet_form, quiet_right = while_ending(found, start, carrier.gain_variance)
+        weight = _QUIET_WEIGHT * float(vibration / target)
+        form = form + weight * quiet_form
+        right += weight * quiet_right
+    knots = bounded_minimum(form, right.reshape(-1, eras), np.eye(eras, dtype=np.complex64))
+    return np.vstack([start, knots, np.zeros(eras)])
 
 
-def while_ending(hats: ComplexArray, steady: ComplexArray, quiet_rows: FloatArray) -> ComplexArray:
-    """Form of the mean square at quiet fingers during an ending: the tone that ends, then knots.
+def while_ending(found: Felt, start: ComplexArray, gain_variance: float) -> tuple[Complex, Complex]:
+    """Form and right side of the mean square at quiet fingers during an ending.
 
-    hats (samples, r, knots, eras) and steady (eras, r) as in `Carrier`, quiet_rows (d, r) as in
-    `onset_knots`. An ending is the steady tone minus hats of the tone's height at every knot plus
-    the knots' hats.
+    An ending from a start (eras,) is the steady tone, and at each knot a hat of what the knot is
+    above the start.
     """
-    steps, eras = ENDING_KNOTS, len(steady)
-    at_quiet = _at(quiet_rows, hats[:, :, -steps:])
-    tone = quiet_rows @ steady.T
-    cross = np.tensordot(tone.conj(), at_quiet.sum(axis=0), axes=(0, 0))
-    cross = cross[:, ::-1].cumsum(axis=1)[:, ::-1]
-    blocks = np.empty((1 + steps, eras, 1 + steps, eras), dtype=complex)
-    blocks[0, :, 0] = steps * _SAMPLES * tone.conj().T @ tone
-    blocks[0, :, 1:] = cross
-    blocks[1:, :, 0] = cross.conj().transpose(1, 2, 0)
-    blocks[1:, :, 1:] = _form(at_quiet).reshape(steps, eras, steps, eras)
-    # The tone takes its height off every hat; the last knot is zero.
-    blocks[0] -= blocks[1:].sum(axis=0)
-    blocks[:, :, 0] -= blocks[:, :, 1:].sum(axis=2)
-    return np.asarray(blocks[:-1, :, :-1].reshape((steps * eras,) * 2) / (steps * _SAMPLES))
-
-
-def _minimum(form: ComplexArray, right: ComplexArray) -> ComplexArray:
-    ridge = _RIDGE * float(np.trace(form).real) / len(form)
-    return bounded_solution(form + ridge * np.eye(len(form)), right, np.ones(len(form)))
-
-
-def _add_errors(form: ComplexArray, own: ComplexArray, gain_variance: float) -> None:
-    """Add to a form what the errors of the ERAs do, by their own forms (knots, knots, eras)."""
-    knots, _, eras = own.shape
-    blocks = form.reshape(knots, eras, knots, eras)
-    np.einsum("kele->kle", blocks)[...] += gain_variance * own
+    count = ENDING_KNOTS * _SAMPLES
+    hats = found.hats[:, found.targets :, -ENDING_KNOTS:]
+    form = _summed(hats, gain_variance) / count
+    tones = start * found.steady[found.targets :]
+    tones = tones.sum(axis=1, keepdims=True) + gain_variance * tones  # as errors have it
+    by_knot = (hats.sum(axis=0).conj() * tones[:, None]).sum(axis=0)
+    along = by_knot[::-1].cumsum(axis=0)[::-1].ravel() / count
+    free = len(form) - len(start)
+    return form[:free, :free], form[:free] @ np.tile(start, ENDING_KNOTS) - along[:free]
 
 
 def _expected_power(responses: ComplexArray, gain_variance: float) -> float:
@@ -205,19 +229,11 @@ def _expected_power(responses: ComplexArray, gain_variance: float) -> float:
     return float(together + gain_variance * np.linalg.norm(responses) ** 2)
 
 
-def _at(rows: FloatArray, hats: ComplexArray) -> ComplexArray:
-    """Hats (samples, r, knots, eras) at rows (d, r): (samples, d, knots, eras)."""
-    samples, _, *knots_and_eras = hats.shape
-    flat = hats.reshape(*hats.shape[:2], -1)
-    responses = (rows @ flat.view(float)).view(complex)
-    return np.asarray(responses.reshape(samples, len(rows), *knots_and_eras))
+def _summed(responses: Complex, gain_variance: float) -> Complex:
+    """Expected form over knots and ERAs, summed over time, of the squares over samples and rows.
 
-
-def _form(responses: ComplexArray) -> ComplexArray:
-    """Form over knots and ERAs, summed over time, of the sum of squares over samples and rows.
-
-    responses (samples, d, knots, eras) as in `Carrier.hats`. In the step before the last, each hat
-    is as that of the next knot in the last step, and so on.
+    responses (samples, d, knots, eras) as in `Felt.hats`. In the step before the last, each hat is
+    as that of the next knot in the last step, and so on.
     """
     knots, eras = responses.shape[2:]
     flat = responses.reshape(-1, knots * eras)
@@ -225,17 +241,15 @@ def _form(responses: ComplexArray) -> ComplexArray:
     by_knot = form.reshape(knots, eras, -1)
     for later, knot in pairwise(by_knot[::-1]):
         knot[:, :-eras] += later[:, eras:]
+    _add_errors(form, eras, gain_variance)
     return form
 
 
-def _own_form(responses: ComplexArray) -> ComplexArray:
-    """The form's parts of one ERA each, (knots, knots, eras)."""
-    knots, eras = responses.shape[2:]
-    of_era = responses.reshape(-1, knots, eras).transpose(2, 1, 0)
-    own = (of_era.conj() @ of_era.transpose(0, 2, 1)).transpose(1, 2, 0).copy()
-    for later, knot in pairwise(own[::-1]):
-        knot[:-1] += later[1:]
-    return own
+def _add_errors(form: Complex, eras: int, gain_variance: float) -> None:
+    """Add to a form what errors of the ERAs do: more of the parts of one ERA each."""
+    knots = len(form) // eras
+    own = np.einsum("kele->kle", form.reshape(knots, eras, knots, eras))
+    own *= np.float32(1 + gain_variance)
 
 
 def steady_states(plate: PlateInTime, omega: float) -> ComplexArray:
@@ -312,29 +326,34 @@ _RELAXATION = 1.6
 _ITERATIONS = 30
 
 
-def bounded_solution(A: ComplexArray, b: ComplexArray, bound: FloatArray) -> ComplexArray:
-    """Minimise x^H A x - 2 Re b^H x with |x_i| <= bound_i, A Hermitian positive definite.
+def bounded_minimum(form: Complex, right: Complex, combinations: Complex64Array) -> ComplexArray:
+    """Minimise x^H form x - 2 Re right^H x where no ERA exceeds its stroke; its knots (k, eras).
 
-    The unbounded solution where it satisfies the bounds; otherwise by alternating directions (ADMM:
-    Boyd and others, 2011, section 5), whose result satisfies them exactly.
+    form: Hermitian, positive semidefinite, over knots and combinations; right (k, c); combinations
+    (eras, c): orthonormal. The unbounded solution where it is within the bounds; otherwise by
+    alternating directions (ADMM: Boyd and others, 2011, section 5), whose result is so exactly.
     """
-    _, free, _ = lapack.zposv(A, b)
-    if (np.abs(free) <= bound).all():
-        return np.asarray(free)
-    penalty = _PENALTY * float(np.trace(A).real) / len(A)
-    single, limit = A.astype(np.complex64), bound.astype(np.float32)
-    single[np.diag_indices(len(A))] += penalty
+    single = form.astype(np.complex64)
+    size = float(single.diagonal().real.mean())
+    diagonal = np.einsum("ii->i", single)
+    diagonal += _RIDGE * size
+    right = right.astype(np.complex64)
+    to_knots, back = combinations.T, combinations.conj()
+    _, found, _ = lapack.cposv(single, right.ravel())
+    knots = found.reshape(right.shape) @ to_knots
+    if np.abs(knots).max() <= 1:
+        return np.asarray(knots, dtype=complex)
+    penalty = _PENALTY * size
+    diagonal += penalty
     inverse = _inverse(single)
-    offset = inverse @ b.astype(np.complex64)
-    inverse *= penalty
-    feasible = _within(free.astype(np.complex64), limit)
-    dual = np.zeros_like(feasible)
+    feasible, dual = _within(knots), np.zeros_like(knots)
     for _ in range(_ITERATIONS):
-        x = offset + inverse @ (feasible - dual)
-        relaxed = _RELAXATION * x + (1 - _RELAXATION) * feasible + dual
-        feasible = _within(relaxed, limit)
+        pulled = right + penalty * ((feasible - dual) @ back)
+        knots = (inverse @ pulled.ravel()).reshape(right.shape) @ to_knots
+        relaxed = _RELAXATION * knots + (1 - _RELAXATION) * feasible + dual
+        feasible = _within(relaxed)
         dual = relaxed - feasible
-    return _within(feasible.astype(complex), bound)
+    return np.asarray(_within(feasible.astype(complex)), dtype=complex)
 
 
 def _inverse(A: Complex64Array) -> Complex64Array:
@@ -344,7 +363,6 @@ def _inverse(A: Complex64Array) -> Complex64Array:
     return np.asarray(np.triu(upper) + np.triu(upper, 1).conj().T)
 
 
-def _within(x: NDArray[Any], bound: NDArray[Any]) -> NDArray[Any]:
-    """Reduced to magnitudes within bounds by 1e-12 more, so that rounding never exceeds them."""
-    size = np.maximum(np.abs(x), 1e-30)
-    return np.asarray(x * np.minimum((1 - 1e-12) * bound / size, 1.0, dtype=size.dtype))
+def _within(knots: Complex) -> Complex:
+    """Reduced to magnitudes within 1 by 1e-12 more, so that rounding never exceeds it."""
+    return np.asarray(knots * np.minimum((1 - 1e-12) / np.maximum(np.abs(knots), 1e-30), 1.0))

@@ -20,11 +20,18 @@ from functools import lru_cache
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.finger.fingertip import FINGERTIP_RADIUS, fingertips_on
+from model.finger.fingertip import FIVE_POINTS, fingertips_on
 from model.finger.grid import Grid
 from model.finger.perception import is_background
 from model.transients.base_motion import BaseEnvelope, Envelopes
-from model.transients.knots import Carrier, ending_knots, mean_square, onset_knots, solve_carrier
+from model.transients.knots import (
+    Carrier,
+    Felt,
+    ending_knots,
+    mean_square,
+    onset_knots,
+    solve_carrier,
+)
 from model.transients.measures import ENDING_WINDOW
 from model.transients.time_response import PlateInTime
 from model.vibration.excitation import Excitation, base_amplitudes
@@ -50,7 +57,8 @@ class Shaper:
         self._gain_variance = gain_variance
         self._residual_form = mean_square(plate, ENDING_WINDOW)
         self._carriers: dict[float, Carrier] = {}
-        self._fingertips = lru_cache(_KEPT)(self._read)
+        self._felt = lru_cache(_KEPT)(self._read)
+        self._resting = lru_cache(_KEPT)(self._quiet_rows)
 
     def prepare(self, frequency: float) -> None:
         """Compute in advance everything for a frequency [Hz] that does not depend on contacts."""
@@ -69,17 +77,11 @@ class Shaper:
         fingers the plate beyond 50 mm of the targets takes their place. An ERA that the excitation
         leaves silent helps where there is one frequency only.
         """
-        target_rows = self._fingertips(tuple(targets))
-        quiet_rows = self._fingertips(tuple(quiet)) if quiet else self._surroundings(targets)
         envelopes: dict[str, BaseEnvelope] = {}
         for frequency, amplitudes, active in self._groups(excitation, helped=True):
+            found = self._felt(frequency, tuple(targets), tuple(quiet)).of(active)
             knots = onset_knots(
-                self._carrier(frequency),
-                amplitudes,
-                active,
-                target_rows=target_rows,
-                quiet_rows=quiet_rows,
-                rise=RISE,
+                amplitudes[active], found, gain_variance=self._gain_variance, rise=RISE
             )
             envelopes.update(self._envelopes(frequency, np.vstack([0 * knots[0], knots]), active))
         return envelopes
@@ -96,18 +98,12 @@ class Shaper:
         With targets and quiet fingers [m] the quiet ones are kept quiet meanwhile. Silent ERAs stay
         silent.
         """
-        both = bool(targets and quiet)
-        target_rows = self._fingertips(tuple(targets)) if both else None
-        quiet_rows = self._fingertips(tuple(quiet)) if both else None
         envelopes: dict[str, BaseEnvelope] = {}
         for frequency, amplitudes, active in self._groups(excitation, helped=False):
-            knots = ending_knots(
-                self._carrier(frequency),
-                amplitudes,
-                active,
-                target_rows=target_rows,
-                quiet_rows=quiet_rows,
-            )
+            found = None
+            if targets and quiet:
+                found = self._felt(frequency, tuple(targets), tuple(quiet)).of(active)
+            knots = ending_knots(self._carrier(frequency), amplitudes, active, found)
             envelopes.update(self._envelopes(frequency, knots, active))
         return envelopes
 
@@ -146,21 +142,27 @@ class Shaper:
             )
         ]
 
-    def _read(self, positions: tuple[Position, ...]) -> FloatArray:
-        """Rows (d, r) whose sum of squares is the mean square under the fingertips, summed.
+    def _read(
+        self, frequency: float, targets: tuple[Position, ...], quiet: tuple[Position, ...]
+    ) -> Felt:
+        weights, shapes = self._fingertips(targets)
+        means = (weights[:, None] @ shapes)[:, 0]
+        quiet_rows = self._resting(quiet) if quiet else self._surroundings(targets)
+        return Felt.at(self._carrier(frequency), means, quiet_rows)
 
-        Coefficients of polynomials of second order, orthonormal over a fingertip's points: enough
-        for bending waves much longer than the fingertip.
-        """
-        plate, centres = self._plate.reduced.plate, np.array(positions)
-        points, weights = fingertips_on(centres, length=plate.length, width=plate.width)
-        root = np.sqrt(weights)[..., None]
-        u, v = np.moveaxis((points - centres[:, None]) / FINGERTIP_RADIUS, -1, 0)
-        powers = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
-        basis, _ = np.linalg.qr(root * powers)
-        shapes = self._plate.shapes_at(points.reshape(-1, 2)).reshape(*u.shape, -1)
-        rows = (root * basis).transpose(0, 2, 1) @ shapes
-        return np.asarray(rows.reshape(-1, rows.shape[-1]))
+    def _quiet_rows(self, positions: tuple[Position, ...]) -> FloatArray:
+        """Rows (d, r) whose sum of squares is the mean square under the fingertips, summed."""
+        weights, shapes = self._fingertips(positions)
+        return np.asarray((np.sqrt(weights)[..., None] * shapes).reshape(-1, shapes.shape[-1]))
+
+    def _fingertips(self, positions: tuple[Position, ...]) -> tuple[FloatArray, FloatArray]:
+        """Weights (k, p) of points under fingertips, and their shapes (k, p, r)."""
+        plate = self._plate.reduced.plate
+        points, weights = fingertips_on(
+            np.array(positions), length=plate.length, width=plate.width, rule=FIVE_POINTS
+        )
+        shapes = self._plate.shapes_at(points.reshape(-1, 2))
+        return weights, shapes.reshape(*weights.shape, -1)
 
     def _surroundings(self, targets: Sequence[Position]) -> FloatArray:
         """The same for the plate beyond 50 mm of all targets; all of a plate too small for it."""

@@ -17,7 +17,8 @@ from model.table.question import Question
 from model.transients.base_motion import BaseEnvelope, Term, ramped_ending, ramped_onset, shaped
 from model.transients.knots import (
     ENDING_KNOTS,
-    bounded_solution,
+    Felt,
+    bounded_minimum,
     mean_square,
     solve_carrier,
     while_ending,
@@ -108,22 +109,21 @@ def test_ramped_onsets_of_heavily_damped_eras_do_not_overflow():
 
 
 def test_while_ending_is_the_mean_square_of_the_response():
-    """For knots at random, the form's value is that of the sampled vibration, mean over phases."""
+    """For knots at random, what the form adds to a tone that stops is that of sampled vibrations.
+
+    Mean over phases.
+    """
     rig, plate = make_plate_in_time()
     frequency = 217.0
     carrier = solve_carrier(
         plate, frequency, residual_form=mean_square(plate, 0.1), gain_variance=0.0
     )
     point = np.array([[0.21, 0.06]])
-    form = while_ending(carrier.hats, carrier.steady, plate.reduced.at(point))
+    rows = plate.reduced.at(point)
     transients = Transients(plate)
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        shape = (ENDING_KNOTS, 4)  # the tone, then seven knots, in strokes; the eighth is silence
-        knots = 0.1 * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
-        knots += (rng.standard_normal(4) + 1j) * np.linspace(1, 0, ENDING_KNOTS)[:, None]
-        predicted = (knots.ravel().conj() @ form @ knots.ravel()).real
-        sampled = 0.0
+
+    def sampled(knots) -> float:
+        found = 0.0
         for phase in (0.0, math.pi / 2):  # their squares add up to that of the complex amplitude
             turned = knots * np.exp(1j * phase)
             envelopes, tones = {}, {}
@@ -134,8 +134,19 @@ def test_while_ending_is_the_mean_square_of_the_response():
             felt = transients.acceleration(
                 shaped(envelopes, rig.eras), point, duration=0.005 * ENDING_KNOTS, after=tones
             )
-            sampled += (felt**2).mean()
-        np.testing.assert_allclose(predicted, sampled, rtol=0.03)
+            found += (felt**2).mean()
+        return found
+
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        shape = (ENDING_KNOTS, 4)  # the tone, then seven knots, in strokes; the eighth is silence
+        knots = 0.1 * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
+        knots += (rng.standard_normal(4) + 1j) * np.linspace(1, 0, ENDING_KNOTS)[:, None]
+        felt = Felt.at(carrier, rows, rows)
+        form, right = while_ending(felt, knots[0], gain_variance=0.0)
+        added = value(form, right, knots[1:].ravel())
+        stopped = np.vstack([knots[:1], 0 * knots[1:]])
+        assert added == pytest.approx(sampled(knots) - sampled(stopped), abs=0.03 * sampled(knots))
 
 
 def motion(terms: tuple[Term, ...], time: float) -> float:
@@ -208,10 +219,10 @@ def value(A, b, x):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_bounded_solution_equals_a_general_optimiser(seed):
+def test_bounded_minimum_equals_a_general_optimiser(seed):
     """No bound is exceeded, and the value is that of SLSQP within 1 % of what is to be gained."""
     A, b = random_form(seed, 6)
-    found = bounded_solution(A, b, np.ones(6))
+    found = bounded_minimum(A, b.reshape(3, 2), np.eye(2)).ravel()
     general = minimize(
         lambda z: value(A, b, z[:6] + 1j * z[6:]),
         np.zeros(12),
@@ -224,8 +235,24 @@ def test_bounded_solution_equals_a_general_optimiser(seed):
     assert value(A, b, found) <= 0.99 * general.fun
 
 
-def test_bounded_solution_is_unbounded_when_bounds_are_inactive():
-    """Where the free solution keeps the bounds, it is the answer."""
-    A, b = random_form(9, 7)
+def test_bounds_are_those_of_eras_not_of_their_combinations():
+    """Two combinations of five ERAs: none exceeds its stroke, and all stay combinations."""
+    A, b = random_form(3, 6)
+    rng = np.random.default_rng(4)
+    rows = rng.standard_normal((5, 2)) + 1j * rng.standard_normal((5, 2))
+    combinations = np.linalg.qr(rows)[0]
+    free = np.linalg.solve(A, b).reshape(3, 2) @ combinations.T
+    knots = bounded_minimum(A, 1.3 / np.abs(free).max() * b.reshape(3, 2), combinations)
+    assert knots.shape == (3, 5)
+    assert 0.99 < np.abs(knots).max() <= 1
+    within = knots @ combinations.conj() @ combinations.T
+    np.testing.assert_allclose(within, knots, atol=0.02)
+
+
+def test_bounded_minimum_is_unbounded_when_bounds_are_inactive():
+    """Where the free solution keeps the bounds, it is the answer, in single precision."""
+    A, b = random_form(9, 8)
     free = np.linalg.solve(A, b)
-    np.testing.assert_allclose(bounded_solution(A, b, 1.01 * np.abs(free)), free, rtol=1e-9)
+    b /= 1.01 * np.abs(free).max()
+    found = bounded_minimum(A, b.reshape(2, 4), np.eye(4)).ravel()
+    np.testing.assert_allclose(found, free / (1.01 * np.abs(free).max()), atol=1e-4)

@@ -126,7 +126,7 @@ def driven_by(rig: Rig, pattern: Pattern, times: FloatArray) -> FloatArray:
 def test_contrast_of_an_onset_behind_actuators_that_lag(
     coarse_rig: Rig, is_shaped: bool, actuators: tuple[tuple[float, float], ...]
 ) -> None:
-    """That of their equation of motion within 1 dB of the one that gains predict.
+    """That of their equation of motion within 1.2 dB of the one that gains predict.
 
     But for a shaped onset through resonances that are played, which loses up to 6 dB.
     """
@@ -165,4 +165,4 @@ def test_contrast_of_an_onset_behind_actuators_that_lag(
         peaks = np.split(np.abs(felt_part(felt, RATE)).max(axis=0), [len(discs[0])])
         weights = [fingertip_weights(*target, rig.plate)]
         lost = predicted - contrast_db(peaks[:1], peaks[1], weights)
-        assert -1 < lost < (6 if is_shaped and actuators is WITHIN else 1)
+        assert -1 < lost < (6 if is_shaped and actuators is WITHIN else 1.2)

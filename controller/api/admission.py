@@ -21,7 +21,7 @@ from functools import partial
 
 from controller.api.connection import Connection
 from controller.api.place import credentials_of
-from controller.api.rate_limit import RateLimiter
+from controller.api.rate_limit import Rates
 
 MAX_CONNECTIONS = 32  # for all methods
 RESERVE = 8  # further ones, for the methods in reserve alone
@@ -29,25 +29,19 @@ IDLE_TIMEOUT = 1.0  # s; without a request, after which a client may be evicted
 SILENT_TIMEOUT = 0.1  # s; the same for one that has sent nothing yet
 MAX_CONNECTION_RATE = 20.0  # 1/s; connections of one process
 CONNECTION_BURST = 64  # connections
-_MAX_RATES = 256  # processes, above which those that have not connected lately are dropped
 _QUEUE = 512  # connections
 _REFUSALS_PER_TURN = 8
 _PAUSE = 0.1  # s; while there is no descriptor at all
 
 
 class Admission:
-    """The connected clients; holds_lease, is_subscribed: whether a client does or is."""
+    """The connected clients; holds_lease: whether a client does."""
 
     def __init__(
-        self,
-        *,
-        holds_lease: Callable[[Connection], bool],
-        is_subscribed: Callable[[Connection], bool],
-        clock: Callable[[], float],
+        self, *, holds_lease: Callable[[Connection], bool], clock: Callable[[], float]
     ) -> None:
         self.admitted: set[Connection] = set()
         self._holds_lease = holds_lease
-        self._is_subscribed = is_subscribed
         self._clock = clock
 
     def admit(self, new: Connection) -> None:
@@ -79,7 +73,7 @@ class Admission:
         if not idle:
             timeout = IDLE_TIMEOUT
             expired = [each for each in candidates if now - each.received_at >= timeout]
-            idle = [each for each in expired if self._is_subscribed(each)] or expired
+            idle = [each for each in expired if each.topics] or expired
         evictable = min(idle, key=lambda each: each.received_at, default=None)
         if evictable is None or now - evictable.received_at < timeout:
             return False
@@ -126,10 +120,9 @@ class Acceptor:
     ) -> None:
         self._bound = bound
         self._make_connection = make_connection
-        self._clock = clock
         self._loop = asyncio.get_running_loop()
         self._beginning: set[asyncio.Task[object]] = set()
-        self._rates: dict[int, RateLimiter] = {}  # by process
+        self._rates = Rates(MAX_CONNECTION_RATE, burst=CONNECTION_BURST, clock=clock)
         self._spare = _spare_descriptor()
         bound.setblocking(False)
         bound.listen(_QUEUE)
@@ -157,22 +150,13 @@ class Acceptor:
                 self._refuse_without_descriptors()
                 return
             process, _ = credentials_of(accepted) or (0, 0)
-            if self._is_within_rate(process):
+            if self._rates.of(process).take():
                 make = partial(self._make_connection, process)
                 task = self._loop.create_task(self._loop.connect_accepted_socket(make, accepted))
                 self._beginning.add(task)
                 task.add_done_callback(self._beginning.discard)
                 return
             accepted.close()
-
-    def _is_within_rate(self, process: int) -> bool:
-        if len(self._rates) >= _MAX_RATES:
-            self._rates = {id: each for id, each in self._rates.items() if not each.is_unused}
-        rate = self._rates.get(process)
-        if rate is None:
-            rate = RateLimiter(MAX_CONNECTION_RATE, burst=CONNECTION_BURST, clock=self._clock)
-            self._rates[process] = rate
-        return rate.take()
 
     def _refuse_without_descriptors(self) -> None:
         """Refuse a connection by means of the spare descriptor; pause if it was taken meanwhile."""

@@ -13,6 +13,7 @@ from typing import Any, cast
 
 from controller.api.jsonrpc import MAX_LINE_LENGTH, ErrorCode, InvalidRequest, RpcError, error_line
 from controller.api.rate_limit import RateLimiter
+from controller.api.schema import Topic
 
 MAX_UNREAD_BYTES = 1 << 18  # written but not read by the client
 _MAX_UNREAD_NOTIFICATIONS = MAX_UNREAD_BYTES // 2  # bytes; the rest is reserved for responses
@@ -54,6 +55,9 @@ class Connection(asyncio.BufferedProtocol):
         self.silenced = 0  # its stops and disarms
         self.touched_at = -math.inf  # s; when it sent fingers, unless it has lifted them since
         self.ahead: Any = None
+        self.topics: dict[Topic, asyncio.TimerHandle | None] = {}  # subscriptions; None: unperiodic
+        self.lease = ""  # token of the last lease that it armed or renewed
+        self.number: int | None = None  # of those that have touched
         self._on_connect = on_connect
         self._on_lines = on_lines
         self._on_disconnect = on_disconnect

@@ -25,7 +25,7 @@ class Hub:
     ) -> None:
         self._current = current
         self._clock = clock
-        self._topics: dict[Connection, dict[Topic, asyncio.TimerHandle | None]] = {}
+        self._subscribers: dict[Connection, None] = {}  # in the order of their first subscription
         self._newest: dict[Topic, Callable[[], Message | None]] = {}
         self._flush: asyncio.TimerHandle | None = None
         self._flushed_at = -1.0
@@ -37,7 +37,8 @@ class Hub:
         """Add topics, and send their current data; rate [Hz]: of those that are periodic."""
         new = sorted(set(topics))
         self.unsubscribe(connection, new)
-        self._topics.setdefault(connection, {}).update(dict.fromkeys(new))
+        self._subscribers[connection] = None
+        connection.topics.update(dict.fromkeys(new))
         for topic in new:
             if topic in self._current:
                 self._send([connection], topic, self._current[topic])
@@ -46,21 +47,15 @@ class Hub:
 
     def unsubscribe(self, connection: Connection, topics: Iterable[Topic]) -> None:
         """Remove topics."""
-        subscribed = self._topics.get(connection, {})
         for topic in topics:
-            timer = subscribed.pop(topic, None)
+            timer = connection.topics.pop(topic, None)
             if timer is not None:
                 timer.cancel()
-        if not subscribed:
-            self._topics.pop(connection, None)
 
     def forget(self, connection: Connection) -> None:
         """Remove a client that has disconnected."""
-        self.unsubscribe(connection, [*self._topics.get(connection, ())])
-
-    def is_subscribed(self, connection: Connection) -> bool:
-        """Whether a client has subscribed to any topic."""
-        return connection in self._topics
+        self.unsubscribe(connection, [*connection.topics])
+        self._subscribers.pop(connection, None)
 
     def publish(self, topic: Topic, make_data: Callable[[], Message | None]) -> None:
         """Send to all subscribers; make_data is called only if there are any.
@@ -68,9 +63,9 @@ class Hub:
         Nothing is sent if it returns None, for outdated data.
         """
         if TOPICS[topic].sent != "newest":
-            self._send(self._subscribers(topic), topic, make_data)
+            self._send(self._of(topic), topic, make_data)
             return
-        if not self._topics:
+        if not self._subscribers:
             return
         self._newest.pop(topic, None)  # sent in the order of the newest
         self._newest[topic] = make_data
@@ -80,7 +75,7 @@ class Hub:
 
     def close(self) -> None:
         """Remove all clients."""
-        for connection in list(self._topics):
+        for connection in list(self._subscribers):
             self.forget(connection)
         if self._flush is not None:
             self._flush.cancel()
@@ -90,10 +85,10 @@ class Hub:
         self._flushed_at = self._clock()
         newest, self._newest = self._newest, {}
         for topic, make_data in newest.items():
-            self._send(self._subscribers(topic), topic, make_data)
+            self._send(self._of(topic), topic, make_data)
 
-    def _subscribers(self, topic: Topic) -> list[Connection]:
-        return [connection for connection, topics in self._topics.items() if topic in topics]
+    def _of(self, topic: Topic) -> list[Connection]:
+        return [each for each in self._subscribers if topic in each.topics]
 
     def _send(
         self,
@@ -126,4 +121,4 @@ class Hub:
             self._start_timer(connection, topic, period)
 
         loop = asyncio.get_running_loop()
-        self._topics[connection][topic] = loop.call_later(period, send)
+        connection.topics[topic] = loop.call_later(period, send)

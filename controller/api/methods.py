@@ -12,21 +12,20 @@ from controller.api.schema import (
     MAX_LEASE,
     MAX_RATE,
     MIN_LEASE,
-    PROMISED,
     STATE_WORDS,
     AmplifierSilence,
     AmplifierStatus,
-    ContactStatus,
     Count,
     DaemonStateName,
     EffectDescription,
     Empty,
     Epoch,
+    Explained,
     LatencySummary,
     LearningSummary,
     Message,
     Name,
-    PlayedTone,
+    Playing,
     RigSummary,
     TableSummary,
     Topic,
@@ -54,7 +53,7 @@ class HelloResult(Message):
     layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
 
 
-class StatusResult(Message):
+class StatusResult(Playing, Explained):
     """State of the daemon, the amplifiers and the plate."""
 
     time_s: float = Field(description="time of this response on CLOCK_MONOTONIC")
@@ -64,8 +63,6 @@ class StatusResult(Message):
         default_factory=lambda known: STATE_WORDS[known["state"]],
         description="the state in a word for people",
     )
-    cause: str = Field(description="why the daemon is in this state")
-    remedy: str | None = Field(description="what to do about it; null if nothing")
     epoch: Epoch
     assume_energised: bool = Field(description="whether lost amplifiers may still be playing")
     lost_for_s: float | None = Field(
@@ -77,18 +74,7 @@ class StatusResult(Message):
     )
     armed_by: str | None
     lease_left_s: float | None
-    contacts: list[ContactStatus] = Field(description="in order of arrival, newest last")
-    drive: dict[str, PlayedTone] = Field(description="by ERA, without silent ones")
     silence_reason: str | None = Field(None, description="why nothing plays although armed")
-    robust_felt_contrast_db: float | None = Field(None, description=PROMISED)
-    predicted_felt_contrast_db: float | None = Field(
-        None, description="the same on the plate as modelled"
-    )
-    robust_contrast_db: float | None = Field(
-        None, description="promised contrast in peak acceleration"
-    )
-    predicted_contrast_db: float | None
-    predicted_level_db_sl: float | None
     amplifiers: list[AmplifierStatus]
     latency_ms: LatencySummary
     rejected_touches: dict[str, Count] = Field(description="number by reason")
@@ -105,13 +91,6 @@ class ArmParams(Message):
     lease_s: Annotated[float, Field(ge=MIN_LEASE, le=MAX_LEASE)] = DEFAULT_LEASE
 
 
-class ArmResult(Message):
-    """The lease, to be renewed within lease_s."""
-
-    lease: str
-    lease_s: float
-
-
 class RenewParams(Message):
     """The lease that `arm` returned."""
 
@@ -122,6 +101,12 @@ class RenewResult(Message):
     """Time until the lease expires."""
 
     lease_s: float
+
+
+class ArmResult(RenewResult):
+    """The lease, to be renewed within lease_s."""
+
+    lease: str
 
 
 class RequestedBy(Message):
@@ -175,19 +160,18 @@ class PlayParams(Message):
     level_db_sl: float | None = Field(None, description="at most, and by default, the effect's own")
 
 
-class SubscribeParams(Message):
-    """Topics to receive, and the rate of the periodic ones."""
-
-    topics: Annotated[list[Topic], Field(min_length=1, max_length=16)]
-    rate_hz: Annotated[float, Field(ge=1, le=MAX_RATE)] | None = Field(
-        None, description="of amplifiers and latency; default 10"
-    )
-
-
 class UnsubscribeParams(Message):
     """Topics to receive no longer."""
 
     topics: Annotated[list[Topic], Field(min_length=1, max_length=16)]
+
+
+class SubscribeParams(UnsubscribeParams):
+    """Topics to receive, and the rate of the periodic ones."""
+
+    rate_hz: Annotated[float, Field(ge=1, le=MAX_RATE)] | None = Field(
+        None, description="of amplifiers and latency; default 10"
+    )
 
 
 class Method(NamedTuple):

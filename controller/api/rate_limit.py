@@ -1,6 +1,9 @@
 """A token bucket: of actions at a rate, or of processor time at a share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
+from functools import partial
+
+_MAX_RATES = 256  # above which those that were not used lately are forgotten
 
 
 class RateLimiter:
@@ -44,3 +47,19 @@ class RateLimiter:
         saved = self._left + self._per_second * (now - self._counted_at)
         self._left, self._counted_at = min(self._burst, saved), now
         return self._left
+
+
+class Rates:
+    """A token bucket for each process, host or whoever else."""
+
+    def __init__(
+        self, per_second: float, *, burst: float | None = None, clock: Callable[[], float]
+    ) -> None:
+        self._make = partial(RateLimiter, per_second, burst=burst, clock=clock)
+        self._rates: dict[Hashable, RateLimiter] = {}
+
+    def of(self, key: Hashable) -> RateLimiter:
+        """The one of a key."""
+        if len(self._rates) >= _MAX_RATES:
+            self._rates = {key: each for key, each in self._rates.items() if not each.is_unused}
+        return self._rates.setdefault(key, self._make())

@@ -112,6 +112,13 @@ class Empty(Message):
     """An empty object: no parameters, or no result."""
 
 
+class Explained(Message):
+    """A state, and why."""
+
+    cause: str = Field(description="why it is so")
+    remedy: str | None = Field(description="what to do about it; null if nothing")
+
+
 class EraPosition(Message):
     """Position of an ERA under the plate, from the south-west corner, and its wiring."""
 
@@ -206,6 +213,24 @@ class PlayedTone(Message):
     phase_deg: float
 
 
+class Playing(Message):
+    """The contacts, and what plays for them."""
+
+    contacts: list[ContactStatus] = Field(description="in order of arrival, newest last")
+    drive: dict[str, PlayedTone] = Field(
+        description="of the newest content, by ERA, without silent ones"
+    )
+    robust_felt_contrast_db: float | None = Field(None, description=PROMISED)
+    predicted_felt_contrast_db: float | None = Field(
+        None, description="the same on the plate as modelled"
+    )
+    robust_contrast_db: float | None = Field(
+        None, description="promised contrast in peak acceleration"
+    )
+    predicted_contrast_db: float | None
+    predicted_level_db_sl: float | None
+
+
 class LinkCounters(Message):
     """Counters of the link to an amplifier since it was opened; see the wire protocol."""
 
@@ -280,16 +305,20 @@ class LatencySummary(Message):
     )
 
 
-class LearningSummary(Message):
-    """What is learned of the plate while it plays, and how often."""
+class PlateEvent(Explained):
+    """What is known of the plate has changed, or whether it is followed."""
 
     state: LearningStateName
-    cause: str
-    remedy: str | None = Field(description="what to do about it; null if nothing")
     robust: bool = Field(
         description="whether answers are those of a plate that is not known: it has changed in an "
         "unknown way, or there was no estimator for a minute"
     )
+    alarms: Count = Field(description="patterns so far that show another plate than the known one")
+
+
+class LearningSummary(PlateEvent):
+    """What is learned of the plate while it plays, and how often."""
+
     readings: Count = Field(description="settled patterns that were measured")
     estimates: Count = Field(description="of these, by the estimator")
     discarded: Count = Field(
@@ -299,7 +328,6 @@ class LearningSummary(Message):
         description="settled patterns whose measurement a change, an overload or the link spoilt"
     )
     corrections: Count = Field(description="of the answers to touches")
-    alarms: Count = Field(description="patterns that show another plate than the known one")
     restarts: Count = Field(description="of the estimator")
     last_estimate_s: float | None = Field(description="time since the last estimate")
     latency_ms: LatencySummary = Field(

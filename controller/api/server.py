@@ -88,7 +88,7 @@ class ApiServer:
 
     handlers: of all METHODS, called with the client and the parameters; on_disconnect: called with
     every client that disconnects; holds_lease: whether a client does, and must not be evicted;
-    is_subscribed: whether it has subscriptions; is_busy: whether a touch is on its way to the wire,
+    is_busy: whether a touch is on its way to the wire,
     for which clients wait; stop_all: requests a stop of all amplifiers, whatever has failed on the
     way of a client's; clock [s]; processor_time: of this thread [s].
     """
@@ -99,7 +99,6 @@ class ApiServer:
         *,
         on_disconnect: Callable[[Connection], None],
         holds_lease: Callable[[Connection], bool],
-        is_subscribed: Callable[[Connection], bool],
         is_busy: Callable[[], bool] = lambda: False,
         stop_all: Callable[[], object] = lambda: None,
         clock: Callable[[], float] = clock.now,
@@ -109,9 +108,7 @@ class ApiServer:
         self._on_disconnect = on_disconnect
         self._stop_all = stop_all
         self._clock = clock
-        self._admission = Admission(
-            holds_lease=holds_lease, is_subscribed=is_subscribed, clock=clock
-        )
+        self._admission = Admission(holds_lease=holds_lease, clock=clock)
         self._turns = Turns(
             self._serve_line,
             is_first=lambda client: self._is_touching(client) or holds_lease(client),

@@ -5,22 +5,23 @@ from typing import Any, Literal, NamedTuple
 from pydantic import Field
 
 from controller.api.schema import (
-    PROMISED,
     STATE_WORDS,
     AmplifierStatus,
     ContactStatus,
     Count,
     DaemonStateName,
     Epoch,
+    Explained,
     LatencySummary,
-    LearningStateName,
     Message,
+    PlateEvent,
     PlayedTone,
+    Playing,
     Topic,
 )
 
 
-class StateEvent(Message):
+class StateEvent(Explained):
     """The daemon changed its state."""
 
     old: DaemonStateName
@@ -29,8 +30,6 @@ class StateEvent(Message):
         default_factory=lambda known: STATE_WORDS[known["new"]],
         description="the new state in a word for people",
     )
-    cause: str
-    remedy: str | None = Field(description="what to do about it; null if nothing")
     epoch: Epoch
 
 
@@ -40,26 +39,13 @@ class ContactsEvent(Message):
     contacts: list[ContactStatus]
 
 
-class PatternEvent(Message):
+class PatternEvent(Playing):
     """A pattern that the amplifiers confirmed."""
 
-    contacts: list[ContactStatus]
-    drive: dict[str, PlayedTone] = Field(
-        description="of the newest content, by ERA, without silent ones"
-    )
     layers: dict[str, dict[str, PlayedTone]] = Field(
         default_factory=dict,
         description="what plays of each content, by layer, then as `drive`; they add up",
     )
-    robust_felt_contrast_db: float | None = Field(None, description=PROMISED)
-    predicted_felt_contrast_db: float | None = Field(
-        None, description="the same on the plate as modelled"
-    )
-    robust_contrast_db: float | None = Field(
-        None, description="promised contrast in peak acceleration"
-    )
-    predicted_contrast_db: float | None
-    predicted_level_db_sl: float | None
     latency_ms: float | None = Field(
         description="from the touch to the last byte of the command; null if none was needed"
     )
@@ -105,16 +91,6 @@ class LinkEvent(Message):
     amplifier: str | None = Field(description="its name, if known")
     message: str
     remedy: str | None
-
-
-class PlateEvent(Message):
-    """What is known of the plate has changed, or whether it is followed."""
-
-    state: LearningStateName
-    cause: str
-    remedy: str | None = Field(description="what to do about it; null if nothing")
-    robust: bool = Field(description="whether answers are those of a plate that is not known")
-    alarms: Count = Field(description="patterns so far that show another plate than the known one")
 
 
 class LayoutEvent(Message):

@@ -42,22 +42,34 @@ class Turns:
         self._serve = serve
         self._is_first = is_first
         self._processor_time = processor_time
-        first, others = (RateLimiter(SHARE, burst=BURST, clock=clock) for _ in range(2))
+        share = partial(RateLimiter, SHARE, burst=BURST, clock=clock)
         lane = partial(_Lane, self._take, is_busy=is_busy, clock=clock)
-        self._first, self._others = lane(first), lane(others)
-        self._urgent = lane(others, is_urgent=True)  # within no limit, but counted
+        self._first, self._others = lane(share()), lane(share())
+        self._urgent: deque[Connection] = deque()
+        self._is_urgent_due = False
 
     def add(self, connection: Connection) -> None:
         """Serve a client that has lines."""
-        lanes = (self._first, self._others, self._urgent)
-        is_waiting = any(connection in lane.waiting for lane in lanes)
+        waiting = (self._urgent, self._first.waiting, self._others.waiting)
         if connection.is_urgent:
-            for lane in (self._first, self._others):
+            for each in waiting:
                 with contextlib.suppress(ValueError):
-                    lane.waiting.remove(connection)
-            self._urgent.add(connection)
-        elif not is_waiting:
+                    each.remove(connection)
+            self._urgent.append(connection)
+            if not self._is_urgent_due:
+                self._is_urgent_due = True
+                asyncio.get_running_loop().call_soon(self._take_urgent)
+        elif not any(connection in each for each in waiting):
             (self._first if self._is_first(connection) else self._others).add(connection)
+
+    def _take_urgent(self) -> None:
+        """Serve clients whose input may hold a stop, within no limit, but counted."""
+        try:
+            self._take(self._urgent, self._others.budget)
+        finally:  # whatever fails: another stop may wait
+            self._is_urgent_due = bool(self._urgent)
+            if self._is_urgent_due:
+                asyncio.get_running_loop().call_soon(self._take_urgent)
 
     def _take(self, waiting: deque[Connection], budget: RateLimiter) -> None:
         """Serve a line of each connection, round and round, until the turn's time is up."""
@@ -79,8 +91,7 @@ class Turns:
 class _Lane:
     """Clients that wait, and when their next turn is.
 
-    take: takes a turn; budget: of processor time; is_busy: whether turns wait; is_urgent: whether
-    they wait for nothing.
+    take: takes a turn; budget: of processor time; is_busy: whether turns wait.
     """
 
     def __init__(
@@ -90,14 +101,12 @@ class _Lane:
         *,
         is_busy: Callable[[], bool],
         clock: Callable[[], float],
-        is_urgent: bool = False,
     ) -> None:
         self.waiting: deque[Connection] = deque()
-        self._budget = budget
+        self.budget = budget
         self._take = take
         self._is_busy = is_busy
         self._clock = clock
-        self._is_urgent = is_urgent
         self._is_turn_scheduled = False
         self._deferred_since: float | None = None
 
@@ -111,28 +120,24 @@ class _Lane:
         """Schedule a turn unless one is: after a delay [s], or in the next iteration but one.
 
         Data that arrived meanwhile and what it wakes, such as the control loop for a touch, run
-        first, unless the turn is urgent.
+        first.
         """
         if not self.waiting or self._is_turn_scheduled:
             return
         self._is_turn_scheduled = True
         loop = asyncio.get_running_loop()
-        if self._is_urgent:
-            loop.call_soon(self._take_turn)
-        elif delay > 0:
+        if delay > 0:
             loop.call_later(delay, self._take_turn)
         else:
             loop.call_soon(loop.call_soon, self._take_turn)
 
     def _take_turn(self) -> None:
         self._is_turn_scheduled = False
-        delay = 0.0 if self._is_urgent else self._delay()
-        try:
-            if delay <= 0:
-                self._deferred_since = None
-                self._take(self.waiting, self._budget)
-        finally:  # whatever fails: a stop may wait
-            self._schedule(delay)
+        delay = self._delay()
+        if delay <= 0:
+            self._deferred_since = None
+            self._take(self.waiting, self.budget)
+        self._schedule(delay)
 
     def _delay(self) -> float:
         """Return the time [s] by which the turn that is due has to wait, 0 for none."""
@@ -142,4 +147,4 @@ class _Lane:
                 self._deferred_since = now
             if now - self._deferred_since < MAX_DEFERRAL:
                 return _RECHECK
-        return self._budget.pause()
+        return self.budget.pause()

@@ -30,7 +30,7 @@ from controller.api.methods import (
 from controller.api.schema import Empty, headline
 from controller.api.server import Handler
 from controller.daemon.active_layout import ActiveLayout
-from controller.daemon.api_views import amplifier_silence, hello_result
+from controller.daemon.api_views import amplifier_silence, hello_result, predicted_of
 from controller.daemon.config import DaemonConfig
 from controller.daemon.operation import LEASE_OVER
 from controller.daemon.publisher import EventPublisher
@@ -84,8 +84,6 @@ class ApiService:
         self._touches = touches
         self._layout = layout
         self._learning = learning
-        self._tokens: dict[Connection, str] = {}  # of clients that armed or renewed a lease
-        self._client_numbers: dict[Connection, int] = {}
         self._next_number = itertools.count(1)
         self._started = clock.now()
 
@@ -96,14 +94,12 @@ class ApiService:
     def client_left(self, client: Connection) -> None:
         """Release what a disconnected client holds; lift its fingers."""
         self._publisher.hub.forget(client)
-        self._client_numbers.pop(client, None)
-        self._tokens.pop(client, None)
         self._touches.lift_all(client, now=clock.now())
 
     def holds_lease(self, client: Connection) -> bool:
         """Whether a client armed or renewed the current lease: it is never evicted."""
         lease = self._supervisor.operation.lease_at(clock.now())
-        return lease is not None and self._tokens.get(client) == lease.token
+        return lease is not None and client.lease == lease.token
 
     def _status(self, client: Connection, params: Empty) -> StatusResult:
         operation, view, now = self._supervisor.operation, self._publisher.view, clock.now()
@@ -124,11 +120,7 @@ class ApiService:
             contacts=view.statuses_now(self._controller.table),
             drive=view.drive() if pattern else {},
             silence_reason=view.silenced.reason if view.silenced and lease else None,
-            robust_felt_contrast_db=pattern.robust_felt_contrast_db if pattern else None,
-            predicted_felt_contrast_db=pattern.predicted_felt_contrast_db if pattern else None,
-            robust_contrast_db=pattern.robust_contrast_db if pattern else None,
-            predicted_contrast_db=pattern.predicted_contrast_db if pattern else None,
-            predicted_level_db_sl=pattern.predicted_level_db_sl if pattern else None,
+            **predicted_of(view.applied if pattern else None),
             amplifiers=self._publisher.amplifiers(),
             latency_ms=self._publisher.latencies.summary(),
             rejected_touches=dict(self._controller.rejected_touches),
@@ -168,14 +160,14 @@ class ApiService:
         except BaseException:
             self._supervisor.withdraw(lease.token, "arming failed")
             raise
-        self._tokens[client] = lease.token
+        client.lease = lease.token
         # After the reply was sent, or failed to be sent.
         asyncio.get_running_loop().call_soon(self._check_holder, client, lease.token)
         return ArmResult(lease=lease.token, lease_s=lease.duration)
 
     def _renew(self, client: Connection, params: RenewParams) -> RenewResult:
         lease = self._supervisor.renew(params.lease)
-        self._tokens[client] = lease.token
+        client.lease = lease.token
         return RenewResult(lease_s=lease.duration)
 
     async def _disarm(self, client: Connection, params: DisarmParams) -> Empty:
@@ -229,11 +221,9 @@ class ApiService:
         return Empty()
 
     def _touch(self, client: Connection, params: TouchParams) -> Empty:
-        if client not in self._client_numbers:
-            self._client_numbers[client] = next(self._next_number)
-        self._touches.add(
-            client, params, client_name=str(self._client_numbers[client]), now=client.received_at
-        )
+        if client.number is None:
+            client.number = next(self._next_number)
+        self._touches.add(client, params, client_name=str(client.number), now=client.received_at)
         return Empty()
 
     def _effects(self, client: Connection, params: Empty) -> EffectsResult:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
+from typing import Any
 
 from controller.api.methods import HelloResult
 from controller.api.schema import (
@@ -15,11 +16,12 @@ from controller.api.schema import (
     LatencySummary,
     LearningSummary,
     LinkCounters,
+    PlateEvent,
     PlayedTone,
     RigSummary,
     TableSummary,
 )
-from controller.api.topics import ContactsEvent, PatternEvent, PlateEvent, SilenceEvent
+from controller.api.topics import ContactsEvent, PatternEvent, SilenceEvent
 from controller.daemon.config import DaemonConfig
 from controller.learning.learning_status import LearningStatus
 from controller.loop.leak import leaks_db_sl
@@ -88,11 +90,7 @@ class PlateView:
             layers={
                 str(number): played_tones(one.drive) for number, one in applied.contents.items()
             },
-            robust_felt_contrast_db=_finite(applied.pattern.robust_felt_contrast_db),
-            predicted_felt_contrast_db=_finite(applied.pattern.felt_contrast_db),
-            robust_contrast_db=_finite(applied.pattern.robust_contrast_db),
-            predicted_contrast_db=_finite(applied.pattern.contrast_db),
-            predicted_level_db_sl=_finite(applied.pattern.level_db_sl),
+            **predicted_of(applied),
             latency_ms=None if applied.latency is None else 1e3 * applied.latency,
         )
 
@@ -113,6 +111,18 @@ class PlateView:
     def drive(self) -> dict[str, PlayedTone]:
         """The tones of the newest content, by ERA."""
         return {} if self.applied is None else played_tones(self.applied.drive)
+
+
+def predicted_of(applied: Applied | None) -> dict[str, Any]:
+    """What is promised and predicted of a pattern; None throughout while nothing plays."""
+    pattern = None if applied is None else applied.pattern
+    return {
+        "robust_felt_contrast_db": pattern and _finite(pattern.robust_felt_contrast_db),
+        "predicted_felt_contrast_db": pattern and _finite(pattern.felt_contrast_db),
+        "robust_contrast_db": pattern and _finite(pattern.robust_contrast_db),
+        "predicted_contrast_db": pattern and _finite(pattern.contrast_db),
+        "predicted_level_db_sl": pattern and _finite(pattern.level_db_sl),
+    }
 
 
 def played_tones(drive: Drive) -> dict[str, PlayedTone]:
@@ -290,16 +300,12 @@ def learning_summary(
 ) -> LearningSummary:
     """Describe what is learned of the plate at a time [s]."""
     return LearningSummary(
-        state=status.state.value,
-        cause=status.cause,
-        remedy=status.remedy,
-        robust=status.are_robust,
+        **plate_event(status).model_dump(),
         readings=status.readings,
         estimates=status.estimates,
         discarded=status.discarded,
         disturbed=status.disturbed,
         corrections=status.corrections,
-        alarms=status.alarms,
         restarts=status.restarts,
         last_estimate_s=None if status.last_at is None else max(0.0, now - status.last_at),
         latency_ms=latencies,

@@ -141,7 +141,6 @@ class Daemon:
             self._api.handlers(),
             on_disconnect=self._api.client_left,
             holds_lease=self._api.holds_lease,
-            is_subscribed=self._publisher.hub.is_subscribed,
             is_busy=lambda: self._controller.is_preparing,
             stop_all=self._stop_all,
             clock=clock.now,

@@ -6,14 +6,13 @@ import logging
 from collections.abc import Callable, Sequence
 
 from controller.api.hub import Hub
-from controller.api.schema import AmplifierStatus, LearningSummary
+from controller.api.schema import AmplifierStatus, LearningSummary, PlateEvent
 from controller.api.topics import (
     AmplifiersEvent,
     LatencyEvent,
     LayoutEvent,
     LinkEvent,
     LogEvent,
-    PlateEvent,
     SilenceEvent,
     StateEvent,
 )

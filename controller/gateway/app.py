@@ -31,7 +31,7 @@ from controller.api.jsonrpc import (
     unknown_method,
 )
 from controller.api.methods import METHODS, DisarmParams, RequestedBy, StatusResult
-from controller.api.rate_limit import RateLimiter
+from controller.api.rate_limit import RateLimiter, Rates
 from controller.gateway.access import SUBPROTOCOL, Access
 from controller.gateway.bridge import bridge, client_name
 from controller.gateway.field import DrawnField
@@ -46,7 +46,6 @@ MAX_OPENING_RATE, OPENING_BURST = 10.0, 32.0  # 1/s; of a host's connections to 
 # a burst
 MAX_TOTAL_RATE, TOTAL_BURST = 16.0, 48.0  # the same of all hosts together: fewer than the daemon
 # accepts of one process, so that there are always some for the gateway's own
-_MAX_HOSTS = 256  # above which those that have not connected lately are forgotten
 # Over the own connection, whoever sends them; with their parameters.
 _SILENCING: dict[str, type[RequestedBy]] = {"stop": RequestedBy, "disarm": DisarmParams}
 _METRICS_TIME = 0.5  # s; for which the same metrics are given
@@ -63,7 +62,8 @@ class Gateway:
         self.field = DrawnField(settings.socket)
         self._daemon = settings.socket
         self._session_count = 0
-        self._rates: dict[str, RateLimiter] = {}  # of connections to the daemon, by host
+        # Of connections to the daemon, by host.
+        self._rates = Rates(MAX_OPENING_RATE, burst=OPENING_BURST, clock=time.monotonic)
         self._rate = RateLimiter(MAX_TOTAL_RATE, burst=TOTAL_BURST, clock=time.monotonic)
         # For what must not wait for a new connection, which the daemon may refuse.
         self._own = AsyncClient(settings.socket, name="gateway", timeout=RESPONSE_TIMEOUT)
@@ -183,12 +183,7 @@ class Gateway:
     def _may_connect(self, client: HTTPConnection) -> bool:
         """Whether a client's host may open a connection to the daemon; counts it."""
         host = "" if client.client is None else client.client.host
-        if len(self._rates) >= _MAX_HOSTS:
-            self._rates = {name: each for name, each in self._rates.items() if not each.is_unused}
-        rate = self._rates.setdefault(
-            host, RateLimiter(MAX_OPENING_RATE, burst=OPENING_BURST, clock=time.monotonic)
-        )
-        return rate.take() and self._rate.take()
+        return self._rates.of(host).take() and self._rate.take()
 
 
 async def _body(request: Request) -> bytes:

@@ -110,7 +110,6 @@ class ScriptedDaemon:
             {name: self._handler(name) for name in METHODS},
             on_disconnect=self._hub.forget,
             holds_lease=lambda client: False,
-            is_subscribed=self._hub.is_subscribed,
         )
         bound = socket.socket(socket.AF_UNIX)
         bound.bind(str(self.socket))

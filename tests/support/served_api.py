@@ -84,7 +84,6 @@ class ServedApi:
             {name: partial(self._handle, name) for name in METHODS},
             on_disconnect=lambda client: None,
             holds_lease=lambda client: False,
-            is_subscribed=lambda client: False,
             is_busy=lambda: self.is_busy,
             stop_all=self._stop_all,
             clock=clock,

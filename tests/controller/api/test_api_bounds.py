@@ -221,12 +221,12 @@ def test_place_is_taken_from_the_silent_then_idle_subscribers_then_the_idle(
     made: list[tuple[Connection, str]] = []
     admission = Admission(
         holds_lease=lambda one: (one, "kept") in made,
-        is_subscribed=lambda one: (one, "subscribed") in made,
         clock=lambda: 100.0,
     )
     for kind, silence in [*clients, *[("kept", 0.0)] * (MAX_CONNECTIONS - len(clients))]:
         connection, _ = connect(lambda silence=silence: 100.0 - silence)
         connection.has_spoken = kind != "silent"
+        connection.topics = {"state": None} if kind == "subscribed" else {}
         connection.pending = {cast("asyncio.Task[None]", None)} if kind == "pending" else set()
         made.append((connection, kind))
         admission.admitted.add(connection)
@@ -248,7 +248,6 @@ def test_client_in_reserve_survives_processes_that_connect_again_and_again(
     now = 0.0
     admission = Admission(
         holds_lease=lambda one: not one.is_reserve,
-        is_subscribed=lambda one: True,
         clock=lambda: now,
     )
 
@@ -392,11 +391,9 @@ async def test_hub_sends_each_periodic_topic_at_its_own_rate() -> None:
     loop = asyncio.get_running_loop()
     hub.subscribe(connection, ["amplifiers"], rate=2.0)
     hub.subscribe(connection, ["latency"], rate=50.0)
-    timers = {
-        topic: cast(asyncio.TimerHandle, timer) for topic, timer in hub._topics[connection].items()
-    }
+    timers = {topic: cast(asyncio.TimerHandle, timer) for topic, timer in connection.topics.items()}
     due = {topic: timer.when() - loop.time() for topic, timer in timers.items()}
     assert due == pytest.approx({"amplifiers": 0.5, "latency": 0.02}, abs=0.015)
     hub.forget(connection)
     assert all(timer.cancelled() for timer in timers.values())
-    assert not hub.is_subscribed(connection)
+    assert not connection.topics

@@ -14,8 +14,7 @@ from model.arguments import (
 )
 from model.design.area import EDGE, area_of
 from model.design.contacts import contact_rule
-from model.design.layouts import supported_layouts
-from model.design.problem import DEFAULT_APART, DEFAULT_LOWEST, DesignProblem
+from model.design.problem import DEFAULT_APART, DEFAULT_LOWEST, DesignProblem, supported_layouts
 from model.design.run import DEFAULT_FINALISTS, Layout, Runner, rank_layouts, search_layouts
 from model.errors import InputError
 from model.processes import on_processes

@@ -6,12 +6,10 @@ from model.commands.calibrate_cli import calibrate
 from model.commands.config_cli import config_app
 from model.commands.design_cli import design_app
 from model.commands.figure_cli import figure_app
-from model.commands.plate_cli import plate_app
-from model.commands.plate_show_cli import materials, show
+from model.commands.plate_cli import materials, plate_app, show
 from model.commands.table_build_cli import build
 from model.commands.table_cli import query, table_app
-from model.commands.table_export_cli import export, plot
-from model.commands.table_map_cli import contrast_map
+from model.commands.table_export_cli import contrast_map, export, plot
 from model.commands.table_show_cli import show as show_table
 from model.commands.table_show_cli import verify
 from model.errors import InputError

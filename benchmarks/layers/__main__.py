@@ -12,8 +12,7 @@ from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.spectral.functions import CLASSES
 from model.spectral.modes import Band, SpectralPlate
-from model.structure.equivalent import bending, equivalent_plate
-from model.structure.laminate_section import wavenumber_of
+from model.structure.laminate_section import bending, equivalent_plate, wavenumber_of
 from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
 from model.vibration.natural_modes import direct_responder, natural_modes
 

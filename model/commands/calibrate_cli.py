@@ -82,7 +82,7 @@ def calibrate(
         files.append(str(output))
     if picture is not None:
         from model.figures import save_figure
-        from model.figures.calibration_figure import calibration_figure
+        from model.figures.measured import calibration_figure
 
         save_figure(calibration_figure(calibration), picture)
         files.append(str(picture))

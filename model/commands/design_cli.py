@@ -92,9 +92,8 @@ def design(
     from model.config.document import read_document
     from model.design.area import area_of
     from model.design.contacts import contact_rule
-    from model.design.layouts import supported_layouts
     from model.design.outcome import summary, write_design
-    from model.design.problem import DesignProblem
+    from model.design.problem import DesignProblem, supported_layouts
     from model.design.run import Runner, rank_layouts, search_layouts
     from model.rig.file import rig_of
 

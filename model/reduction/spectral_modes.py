@@ -21,8 +21,8 @@ from model.spectral.local_compliance import (
 )
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import Band, SpectralClass, SpectralPlate
-from model.structure.equivalent import short_wave_plate
 from model.structure.footprint import check_on_plate
+from model.structure.laminate_section import short_wave_plate
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 

@@ -14,7 +14,7 @@ from model.rig.sections import (
 )
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import Era, Fingertip, PointLoad, damping_from_ratio
-from model.structure.equivalent import equivalent_plate
+from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
 from registry.limits import GuardLimits
 

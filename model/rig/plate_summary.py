@@ -4,8 +4,12 @@ import math
 from typing import Any
 
 from model.rig.rig import Rig
-from model.structure.equivalent import bending
-from model.structure.laminate_section import freely_sliding, perfectly_bonded, wavenumber_of
+from model.structure.laminate_section import (
+    bending,
+    freely_sliding,
+    perfectly_bonded,
+    wavenumber_of,
+)
 from model.structure.plate import AirGap, Bond, Laminate, Plate
 from registry.limits import GuardLimits
 

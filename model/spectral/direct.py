@@ -24,8 +24,8 @@ from model.structure.attachments import (
     footprints_of,
     on_diagonal,
 )
-from model.structure.equivalent import short_wave_plate
 from model.structure.footprint import as_footprints
+from model.structure.laminate_section import short_wave_plate
 from model.structure.modal_elasticity import check_of_theory, loss_factors
 from model.structure.plate import Plate
 

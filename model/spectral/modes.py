@@ -17,10 +17,11 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray
-from model.spectral.air_motion import AirMotion, air_motion
 from model.spectral.functions import EdgedFunctions, edge_decays
 from model.spectral.stiffness import (
+    AirMotion,
     ClassFunctions,
+    air_motion,
     along_mass,
     class_stiffness,
     follow,

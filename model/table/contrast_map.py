@@ -9,8 +9,7 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.files.csv_file import Columns
-from model.files.frame import as_frame
+from model.files.csv_file import Columns, as_frame
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL

@@ -10,7 +10,7 @@ import numpy as np
 
 from model.arguments import expect_number, shown
 from model.errors import InputError
-from model.files.frame import as_frame
+from model.files.csv_file import as_frame
 from model.finger import MAX_CONTACTS
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import STRONG_DB_SL

@@ -8,7 +8,7 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray, lattice
 from model.counting import counted
 from model.errors import InputError
-from model.files.frame import as_frame
+from model.files.csv_file import as_frame
 from model.reduction.free_plate import FreePlate
 from model.rig.rig import Rig
 from model.vibration.excitation import Excitation, find_nulls, peak_acceleration, tone_fields

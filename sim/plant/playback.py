@@ -12,7 +12,7 @@ import numpy as np
 from model.arrays import FloatArray
 from model.counting import counted
 from model.errors import InputError
-from model.files.frame import as_frame
+from model.files.csv_file import as_frame
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import (
     DEFAULT_THRESHOLD,

@@ -12,8 +12,7 @@ import numpy as np
 
 from model.design.area import area_of
 from model.design.contacts import anywhere
-from model.design.layouts import layouts_of
-from model.design.problem import DesignProblem
+from model.design.problem import DesignProblem, layouts_of
 from model.design.search import LayoutSearch
 from model.drive_modes import DRIVE_MODES
 from model.table.build import solve_table

@@ -9,10 +9,8 @@ import pytest
 from model.cluster import on_cluster
 from model.design.area import area_of
 from model.design.contacts import anywhere
-from model.design.judge import judge
-from model.design.layouts import layouts_of
-from model.design.problem import DesignProblem
-from model.design.run import Design, Runner, rank_layouts
+from model.design.problem import DesignProblem, layouts_of
+from model.design.run import Design, Runner, judge, rank_layouts
 from model.processes import on_processes
 from paper_plate import make_paper_rig
 

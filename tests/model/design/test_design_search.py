@@ -12,9 +12,8 @@ from model.arrays import ComplexArray, FloatArray
 from model.design import problem as problem_module
 from model.design.area import Area, area_of, candidates_of, everywhere
 from model.design.contacts import ContactRule, anywhere
-from model.design.judge import judge
-from model.design.layouts import layouts_of
-from model.design.problem import DesignProblem, shortfall
+from model.design.problem import DesignProblem, layouts_of, shortfall
+from model.design.run import judge
 from model.design.score import Scorer
 from model.design.search import LayoutSearch
 from model.errors import InputError

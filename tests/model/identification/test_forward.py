@@ -16,7 +16,7 @@ from model.rig.rig import Rig
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import Fingertip, FingertipLoad, Load, PointLoad
-from model.structure.equivalent import equivalent_plate
+from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import Bond, Laminate, Layer, Material
 
 FREQUENCIES = np.array([60.0, 140.0, 222.0, 350.0, 480.0])

@@ -10,9 +10,9 @@ from long_form import in_turn
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import parse_rig
-from model.spectral.air_motion import air_motion
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralPlate
+from model.spectral.stiffness import air_motion
 from model.structure.attachments import Era
 from model.structure.plate import HEAT_RATIO, PRESSURE, VISCOSITY, AirGap, Material, Plate
 from model.vibration.natural_modes import direct_responder, natural_modes

@@ -17,7 +17,7 @@ from model.rig.file import load_rig
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import Band, SpectralPlate
 from model.structure.attachments import Era, footprints_of
-from model.structure.equivalent import equivalent_plate
+from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import Bond, Laminate, Layer, Material, Plate
 from model.vibration.natural_modes import direct_responder, natural_modes
 

@@ -10,7 +10,7 @@ from model.fem.plate import element_slopes
 from model.reduction.free_plate import solve_free_plate
 from model.spectral.mesh import SpectralMesh
 from model.spectral.shape_stiffness import stiffness_slopes
-from model.structure.equivalent import equivalent_plate
+from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import Laminate, Layer, Material, Plate
 
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.22)

@@ -9,8 +9,9 @@ import pytest
 from benchmarks.layers.elasticity import wave_number
 from long_form import in_turn
 from model.errors import InputError
-from model.structure.equivalent import bending, equivalent_plate
 from model.structure.laminate_section import (
+    bending,
+    equivalent_plate,
     freely_sliding,
     perfectly_bonded,
     shear_corrections,

@@ -18,8 +18,8 @@ from controller.demo.touch_row import (
     steady_contrast_db,
 )
 from controller.loop.content import HELD_BACK, Prediction
-from controller.loop.decision import PlayedContent
 from controller.loop.observer import Applied, Observer, Silenced
+from controller.loop.playing import PlayedContent
 from controller.sources.contacts import Change, Contact, ContactKey
 from drivers import clock
 from drivers.errors import LinkError

@@ -6,26 +6,19 @@ decide(now)  ->  contacts -> intent -> contents -> the layers that change, on ev
 
 import logging
 import math
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.content import Content, Selection, no_layer_free, not_served
 from controller.loop.intent import IntentSource
 from controller.loop.plate_set import FADE_RAMP, PlateSet, SetBuilder
-from controller.loop.routing import Drive, continues_all_tones, tones_by_era
+from controller.loop.playing import PlayedContent, Playing, all_left
 from controller.loop.selection import Selector
-from controller.loop.validity import Validity, first_lasts, valid_for
-from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
-from controller.sources.touch import TouchFrame
+from controller.sources.contacts import Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
-from drivers.host.ledger import is_vibrating
 from drivers.host.members import Played
-from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import QUANTITIES
 from model.rig.rig import Rig
-from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
@@ -38,7 +31,6 @@ ENDED = "the vibration has ended by itself: it was not renewed, or a limit of ti
 
 # s; after a vibration a plate first rings louder than the next onset is at a quiet finger.
 _RING_DOWN = 0.4
-_VALID_FOR = QUANTITIES["valid_for"]
 
 _logger = logging.getLogger(__name__)
 
@@ -64,22 +56,6 @@ class Decision:
     refusal: str | None = None
 
 
-@dataclass(frozen=True)
-class PlayedContent:
-    """A content in its layer.
-
-    pattern: with the ramp, onset and ending of its set; drive: by ERA, as confirmed; settled_at
-    [s]: when its onset has ended.
-    """
-
-    content: Content
-    set: PlateSet
-    pattern: Pattern
-    drive: Drive = field(default_factory=dict)
-    settled_at: float = math.inf
-    validity: Validity = field(default_factory=Validity)
-
-
 class Decider:
     """Intent, selection and sets for the contacts on one plate; synchronous, times are arguments.
 
@@ -98,14 +74,13 @@ class Decider:
         timing: Timing | None = None,
         arrived: Callable[[], None] = lambda: None,
     ) -> None:
-        self._rig = rig
         self._table = table
         self._timing = timing
         self.capabilities = capabilities
         """Of the amplifiers together."""
         self._tracker = tracker
         self._intent_source = intent_source
-        self._intent_due: float | None = None  # when the intent may change without a touch
+        self._intent_due = math.inf  # s; when the intent may change without a touch
         self._builder = SetBuilder(
             rig,
             support=capabilities.envelope_support,
@@ -120,17 +95,13 @@ class Decider:
         )
         self._selected: Selection | None = None
         self._decided: Decision | None = None  # the last one with something to send
-        self.playing: Mapping[int, PlayedContent] = {}
-        """The contents that play, by layer."""
-        # By finger and voice, also where what plays is unknown.
-        self._layer_of: Mapping[tuple[ContactKey, int], int] = {}
-        self._may_play: frozenset[int] = frozenset()  # layers, since all were silent
-        self._is_silent = False  # for certain
+        self.playing = Playing(rig, capabilities.layers, tracker.expiry_of)
+        """The layers."""
         self._over: tuple[Content, ...] = ()  # ended by themselves
-        self._retry_at: float | None = None
+        self._retry_at = math.inf  # s; when a ledger would admit what it refused
         self._is_new = True  # something has come that is not decided yet
         self._arrived = arrived
-        self._triggered_at: float | None = None
+        self._triggered_at = math.inf  # s; when the first change since the last decision arrived
         self._played_until = -math.inf  # s; as far as known
 
     def replace_answers(self, table: LocalizationTable, timing: Timing | None) -> None:
@@ -168,19 +139,12 @@ class Decider:
         self._timing.with_transient_measures(question, pattern)
 
     @property
-    def due(self) -> float | None:
+    def due(self) -> float:
         """When [s] to decide next even if nothing arrives.
 
-        A source times out then, an intent expires, a ledger would admit what it refused, or a
-        finger that moved rests.
+        An intent expires then, a ledger would admit what it refused, or a finger that moved rests.
         """
-        moments = [
-            self._tracker.next_expiry,
-            self._intent_due,
-            self._retry_at,
-            self._selector.due,
-        ]
-        return min([moment for moment in moments if moment is not None], default=None)
+        return min(self._intent_due, self._retry_at, self._selector.due)
 
     @property
     def is_choosing(self) -> bool:
@@ -190,21 +154,12 @@ class Decider:
     @property
     def is_silence_pending(self) -> bool:
         """Whether the last contact has lifted and silence has not been commanded yet."""
-        return not self._tracker.contacts and not self._is_silent
+        return not self._tracker.contacts and not self.playing.is_silent
 
-    def update(self, frame: TouchFrame, *, keeps_taps: bool = False) -> Change:
-        """Apply a touch frame to the contacts; keeps_taps: as of `ContactTracker.update`."""
-        change = self._tracker.update(frame, keeps_taps=keeps_taps)
-        if change:
-            self._note(frame.time)
-        return change
-
-    def expire(self, now: float) -> Change:
-        """Lift the contacts of sources that have timed out at now [s]."""
-        change = self._tracker.expire(now)
-        if change:
-            self._note(now)
-        return change
+    def note(self, time: float) -> None:
+        """Note that contacts have changed, by what arrived at a time [s]."""
+        self._is_new = True
+        self._triggered_at = min(self._triggered_at, time)
 
     def look_again(self) -> None:
         """Note that the next decision may differ though no contact has changed."""
@@ -212,8 +167,9 @@ class Decider:
 
     def forget(self) -> None:
         """Discard the known playback: the next decision has a set; fingers keep their layers."""
-        self._selected, self._decided, self._retry_at, self._is_new = None, None, None, True
-        self.playing, self._over, self._is_silent = {}, (), False
+        self._selected, self._decided, self._retry_at, self._is_new = None, None, math.inf, True
+        self._over = ()
+        self.playing.forget()
 
     def only_ends(self, decision: Decision) -> Decision:
         """Return the last decision without what it starts, which is decided again later."""
@@ -221,40 +177,27 @@ class Decider:
         sets = {n: each for n, each in decision.sets.items() if n not in decision.started}
         return replace(decision, sets=sets, started=frozenset())
 
-    def confirm_silence(self) -> None:
-        """Note that all layers have fallen silent."""
-        self._may_play = frozenset()
-
     def confirm(self, decision: Decision, played: Played, *, now: float) -> None:
         """Note what the amplifiers play for the last decision.
 
         Pulses start when the last commit was sent.
         """
-        self._may_play = self._may_play.difference(decision.sets).union(decision.started)
+        playing = self.playing
+        playing.may_play = playing.may_play.difference(decision.sets).union(decision.started)
         for number in decision.started:
-            one = self.playing[number]
-            for _, target in one.content.targets:
+            for _, target in playing.contents[number].content.targets:
                 if target.pulse is not None and target.pulse.started_at is None:
                     target.pulse.started_at = played.sent_at
-                    self._intent_due = min(self._intent_due or math.inf, target.pulse.end)
-            self._change(
-                number,
-                drive=tones_by_era(played.layers, self._rig, number),
-                settled_at=now + one.set.settled_after,
-                validity=self._validity(played, number, one.content, now),
-            )
-
-    def _change(self, number: int, **values: Any) -> None:
-        """Give what plays in a layer other values of its fields."""
-        self.playing = {**self.playing, number: replace(self.playing[number], **values)}
+                    self._intent_due = min(self._intent_due, target.pulse.end)
+            playing.confirm_start(number, played, now)
 
     def _without_shapes(self, decision: Decision) -> Decision:
         """Return the last decision along its plain ramps."""
         sets = {number: each.plain or each for number, each in decision.sets.items()}
         decision = self._decided = replace(decision, sets=sets)
         for number in decision.started:
-            pattern = replace(self.playing[number].pattern, onset=None, ending=None)
-            self._change(number, set=sets[number], pattern=pattern)
+            pattern = replace(self.playing.contents[number].pattern, onset=None, ending=None)
+            self.playing.change(number, set=sets[number], pattern=pattern)
         return decision
 
     def refused(self, decision: Decision, error: CommandRefused) -> Decision:
@@ -265,13 +208,13 @@ class Decider:
         if any(each.plain for each in decision.sets.values()):
             _logger.info("loop: plain ramps instead of envelopes: %s", error)
             return self._without_shapes(decision)
-        self._retry_at = error.until
+        self._retry_at = math.inf if error.until is None else error.until
         newest = max(decision.started, key=self._requested_at, default=None)
         if newest is not None:
-            ends = self._voices_beside(newest)
-            if len(ends) < len(self.playing):
+            ends = self.playing.beside(newest)
+            if len(ends) < len(self.playing.contents):
                 return self._without(ends, decision, str(error))
-        self.playing, self._is_silent = {}, True
+        self.playing.end(is_silent=True)
         self._decided = replace(
             decision,
             sets={},
@@ -283,18 +226,13 @@ class Decider:
 
     def _requested_at(self, number: int) -> float:
         """Return when [s] what plays in a layer was requested, by its pulse or its contact."""
-        contact, target = self.playing[number].content.targets[0]
+        contact, target = self.playing.contents[number].content.targets[0]
         return contact.since if target.pulse is None else target.pulse.requested_at
-
-    def _voices_beside(self, number: int) -> frozenset[int]:
-        """Return the layers that play for the same finger as one, itself included."""
-        key, _ = self.playing[number].content.key
-        return frozenset(n for n, one in self.playing.items() if one.content.key[0] == key)
 
     def _without(self, numbers: frozenset[int], decision: Decision, reason: str) -> Decision:
         """Return the last decision with layers that end instead of what it starts there."""
-        contents = [self.playing[number].content for number in numbers]
-        self.playing = {n: one for n, one in self.playing.items() if n not in numbers}
+        contents = [self.playing.contents[number].content for number in numbers]
+        self.playing.leave_out(numbers)
         ends = {number: self._builder.build_end(number, has_endings=False) for number in numbers}
         self._decided = replace(
             decision,
@@ -307,43 +245,21 @@ class Decider:
 
     def renewal(self, now: float) -> dict[int, PlateSet]:
         """Return the sets that prolong what plays, by layer, where that is due at a time [s]."""
-        due = {}
-        for number, one in self.playing.items():
-            if now < one.validity.renewal_due:
-                continue
-            targets = one.content.targets
-            until = self._confirmed_until(one.content)
-            if one.validity.is_renewal_due(now, confirmed_until=until):
-                lasts = valid_for(targets, confirmed_until=until, now=now)
-                due[number] = self._builder.build_renewal(one.set, valid_for=lasts)
-        return due
-
-    def renewed(
-        self, numbers: Iterable[int], played: Played | CommandRefused, *, now: float
-    ) -> None:
-        """Note what became of a renewal of layers; one refused for good lets them end."""
-        for number in numbers:
-            one = self.playing[number]
-            if isinstance(played, CommandRefused):
-                due = math.inf if played.until is None else played.until
-                self._change(number, validity=replace(one.validity, renewal_due=due))
-            else:
-                self._change(number, validity=self._validity(played, number, one.content, now))
+        return {
+            number: self._builder.build_renewal(
+                one.set, valid_for=self.playing.lasts(one.content, now)
+            )
+            for number, one in self.playing.to_renew(now).items()
+        }
 
     def ended(self, now: float) -> Decision | None:
         """Return the ends of contents that have come by themselves at a time [s], once; else None.
 
         With the selection of those that play on; silence if there are none.
         """
-        over = {
-            number: replace(one, drive={})
-            for number, one in self.playing.items()
-            if one.drive and now >= one.validity.ends_at
-        }
-        if not over or self._decided is None:
+        contents = self.playing.ended(now)
+        if not contents or self._decided is None:
             return None
-        self.playing = {**self.playing, **over}
-        contents = tuple(one.content for one in over.values())
         self._over = (*self._over, *contents)
         if self._selected is not None:
             self._selected = _held_back(self._selected, contents, ENDED)
@@ -359,20 +275,18 @@ class Decider:
 
     def decide(self, now: float) -> Decision | None:
         """Decide at a time [s], for the contacts as of `expire`; None if nothing changes."""
-        for each in self.playing.values():
+        for each in self.playing.contents.values():
             if each.drive:
                 self._played_until = now
-        dues = (self._intent_due, self._retry_at, self._selector.due)
-        if not (self._is_new or any(_is_due(each, now) for each in dues)):
+        if not self._is_new and now < self.due:
             return None
-        contacts = self._tracker.contacts
-        triggered_at = now if self._triggered_at is None else min(self._triggered_at, now)
-        self._is_new = False
+        contacts, triggered_at = self._tracker.contacts, min(self._triggered_at, now)
+        self._is_new, is_retry = False, now >= self._retry_at
         from_rest = now - self._played_until >= _RING_DOWN
         decision, has_failed = None, False
         try:
             selection = self._select(contacts, now, triggered_at)
-            is_new = selection != self._selected or _is_due(self._retry_at, now)
+            is_new = selection != self._selected or is_retry
             triggered_at = min(triggered_at, self._selector.triggered_at)
             draft = Decision(contacts, selection, from_rest, triggered_at)
             if is_new and selection.contents:
@@ -381,18 +295,18 @@ class Decider:
                     decision = draft  # said without sending
         except Exception as error:
             has_failed = self._is_new = True  # and tried again
-            self._selector.due = None
+            self._selector.due = math.inf
             selection = Selection((), contacts, (), failure_text(error))
             is_new = selection != self._selected
             draft = Decision(contacts, selection, from_rest, triggered_at)
             if is_new:
                 _logger.exception("loop: decision failed, silencing all channels")
-        self._triggered_at = None
+        self._triggered_at = math.inf
         if is_new and not selection.contents:
-            is_awaited = selection.is_pending and not self._may_play
+            is_awaited = selection.is_pending and not self.playing.may_play
             decision = None if is_awaited else self._ended(draft, now, has_failed=has_failed)
         if is_new:
-            self._selected, self._retry_at = selection, None
+            self._selected, self._retry_at = selection, math.inf
         if decision is not None and (decision.sets or selection.contents or decision.silence):
             self._decided = decision
         return decision
@@ -403,7 +317,7 @@ class Decider:
 
     def _select(self, contacts: tuple[Contact, ...], now: float, triggered_at: float) -> Selection:
         """Query the intent, and the table for it."""
-        self._intent_due = None
+        self._intent_due = math.inf
         intent = self._intent_source.intent(contacts, now)
         self._intent_due = intent.due(now)
         selection = self._selector.select(
@@ -418,133 +332,57 @@ class Decider:
 
     def _within_layers(self, selection: Selection) -> Selection:
         """Return a selection without the fingers of which a voice has no layer, which says so."""
-        served = [*self._numbered(selection.contents).values()]
+        served = [*self.playing.numbered(selection.contents).values()]
         keys = {each.key[0] for each in selection.contents if each not in served}
         left = [each for each in selection.contents if each.key[0] in keys]
         return _held_back(selection, left, no_layer_free(self.capabilities.layers))
 
     def _with_sets(self, draft: Decision, now: float) -> Decision | None:
         """Return a draft with the sets of all layers that change; None if none does."""
-        numbers = self._numbered(draft.selection.contents)
-        playing = {
-            number: before
-            for number, before in self.playing.items()
-            if before.content == numbers.get(number)
-        }
-        restarting = self._restarting(numbers, playing)
-        playing = {
-            n: before for n, before in playing.items() if before.content.key[0] not in restarting
-        }
-        changed = {n: content for n, content in numbers.items() if n not in playing}
+        playing, before = self.playing, self.playing.contents
+        numbers = playing.numbered(draft.selection.contents)
+        contents = {n: one for n, one in before.items() if one.content == numbers.get(n)}
+        restarting = playing.restarting(numbers, contents)
+        contents = {n: one for n, one in contents.items() if one.content.key[0] not in restarting}
+        changed = {n: content for n, content in numbers.items() if n not in contents}
         sets: dict[int, PlateSet] = {}
         for number, content in changed.items():
-            before = self.playing.get(number)
-            targets, until = content.targets, self._confirmed_until(content)
             sets[number], pattern = self._builder.build_pattern(
                 number,
                 content.pattern,
                 content.question,
-                playing={} if before is None else before.drive,
-                valid_for=valid_for(targets, confirmed_until=until, now=now),
+                playing=before[number].drive if number in before else {},
+                valid_for=playing.lasts(content, now),
                 restarts=content.key[0] in restarting,
-                is_shaped=not targets[0][1].is_short,
-                lasts=first_lasts(targets, now),
+                is_shaped=not content.targets[0][1].is_short,
+                lasts=min(all_left(content.targets, now), default=math.inf),
                 among=len(changed),
             )
-            playing[number] = PlayedContent(content, sets[number], pattern)
+            contents[number] = PlayedContent(content, sets[number], pattern)
         started = frozenset(sets)
-        for number in self._may_play - numbers.keys():
-            has_endings = self._may_end_shaped(number, now)
+        for number in playing.may_play - numbers.keys():
+            has_endings = playing.may_end_shaped(number, now)
             sets[number] = self._builder.build_end(number, has_endings=has_endings)
         if not sets:
             return None
-        self.playing, self._is_silent = playing, False
-        self._layer_of = {each.key: number for number, each in numbers.items()}
-        self._may_play |= started
+        playing.start(contents, started)
         return replace(draft, sets=sets, started=started)
-
-    def _restarting(
-        self, numbers: Mapping[int, Content], unchanged: Container[int]
-    ) -> set[ContactKey]:
-        """Return the fingers of several voices of which one starts, by the contents of layers.
-
-        A carrier and its side bands must count their phases from one moment.
-        """
-        voiced = {content.key[0] for content in numbers.values() if content.voice}
-        found = set()
-        for number, content in numbers.items():
-            before = self.playing.get(number)
-            drive = {} if before is None else before.drive
-            is_continued = continues_all_tones(content.pattern.excitation, drive)
-            if content.key[0] in voiced and number not in unchanged and not is_continued:
-                found.add(content.key[0])
-        return found
-
-    def _numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
-        """Contents by layer: a finger's in the layer that it has, new ones in those that end."""
-        numbers = {}
-        new = []
-        for content in contents:
-            number = self._layer_of.get(content.key)
-            if number is None:
-                new.append(content)
-            else:
-                numbers[number] = content
-        every = range(self.capabilities.layers)
-        free = [number for number in every if number not in numbers]
-        free.sort(key=lambda number: number not in self._may_play)
-        return {**numbers, **dict(zip(free, new, strict=False))}
-
-    def _may_end_shaped(self, number: int, now: float) -> bool:
-        """Whether a layer has settled, so that its endings lead from what plays."""
-        one = self.playing.get(number)
-        return one is not None and one.set.has_endings and now >= one.settled_at
 
     def _ended(self, draft: Decision, now: float, *, has_failed: bool) -> Decision:
         """Return a draft that ends all playback: along endings only under fingers that stay."""
-        if self._is_silent:
+        playing = self.playing
+        if playing.is_silent:
             return draft
-        numbers, self._layer_of = self._may_play, {}
+        numbers = sorted(playing.may_play)
         is_shaped = bool(numbers) and not has_failed and bool(draft.contacts)
-        if is_shaped and all(self._may_end_shaped(number, now) for number in numbers):
-            ends = {n: self._builder.build_end(n, has_endings=True) for n in sorted(numbers)}
-            self.playing = {}
+        if is_shaped and all(playing.may_end_shaped(number, now) for number in numbers):
+            playing.end(is_silent=False)
+            ends = {n: self._builder.build_end(n, has_endings=True) for n in numbers}
             return replace(draft, sets=ends)
-        self.playing, self._is_silent = {}, True
+        playing.end(is_silent=True)
         if not draft.contacts:
             return replace(draft, silence=RELEASE_RAMP)
         return replace(draft, silence=FADE_RAMP)
-
-    def _confirmed_until(self, content: Content) -> float:
-        """Return when [s] the first target of a content is lifted unless a frame arrives."""
-        expiries = [self._tracker.expiry_of(contact.key) for contact, _ in content.targets]
-        return min(expiries, default=-math.inf)
-
-    def _validity(self, played: Played, number: int, content: Content, now: float) -> Validity:
-        """Return how long a layer lasts whose set has been played by now [s]."""
-        until = self._confirmed_until(content)
-        lasts = _shortest(played.layers, number)
-        return Validity.started(lasts, confirmed_until=until, now=now)
-
-    def _note(self, time: float) -> None:
-        """Note a change; when the first one since the last decision arrived."""
-        self._is_new = True
-        if self._triggered_at is None:
-            self._triggered_at = time
-
-
-def _shortest(played: Mapping[str, Sequence[LayerSet]], number: int) -> float:
-    """Return the time [s] after the commit when the first amplifier ends a layer by itself.
-
-    Infinite where none does.
-    """
-    times = [
-        _VALID_FOR.from_wire(one.valid_for)
-        for layers in played.values()
-        for one in layers
-        if one.layer == number and one.valid_for and is_vibrating(one)
-    ]
-    return min(times, default=math.inf)
 
 
 def _held_back(selection: Selection, contents: Sequence[Content], reason: str) -> Selection:
@@ -564,7 +402,3 @@ def _why_not(selection: Selection | None) -> dict[ContactKey, str | None]:
     """Return why targets feel nothing of their own, by contact."""
     held_back = () if selection is None else selection.not_served
     return {each.contact.key: each.held_back for each in held_back}
-
-
-def _is_due(moment: float | None, now: float) -> bool:
-    return moment is not None and now >= moment

@@ -100,10 +100,10 @@ class HapticIntent:
     until: float | None = None
     protected: frozenset[ContactKey] = frozenset()
 
-    def due(self, now: float) -> float | None:
-        """Return when [s] to query again, at least a millisecond from now."""
+    def due(self, now: float) -> float:
+        """Return when [s] to query again, at least a millisecond from now; infinite for never."""
         if self.until is None:
-            return None
+            return math.inf
         return self.until if self.until > now else now + _MIN_WAIT
 
 

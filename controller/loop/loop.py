@@ -99,7 +99,7 @@ class Controller:
         self._rejects = RejectCounter(_logger)
         self._decider_if_open: Decider | None = None
         self._wake = asyncio.Event()
-        self._changed_at: float | None = None  # s; until all changes are decided
+        self._changed_at = -math.inf  # s; of the last change, until all are decided
         self._heartbeat_due = 0.0
         self._sending = asyncio.Lock()  # held while a turn sends
         self._is_closed = False
@@ -136,7 +136,7 @@ class Controller:
         """Whether a change of contacts is on its way to the amplifiers."""
         if self._decider_if_open is not None and self._decider_if_open.is_choosing:
             return True
-        return self._changed_at is not None and self._group.last_sent_at < self._changed_at
+        return self._group.last_sent_at < self._changed_at
 
     @property
     def capabilities(self) -> PlaybackCapabilities:
@@ -223,7 +223,7 @@ class Controller:
         await self._group.arm()
         self._is_armed_anew = True
         if not was_armed:  # else what plays goes on
-            self._decider.confirm_silence()
+            self._decider.playing.may_play = frozenset()
         self._heartbeat_due = clock.now()
         self._schedule_expiry()  # fingers may have rested since before
         self._wake.set()
@@ -289,12 +289,13 @@ class Controller:
         if self._is_armed_anew:  # not amid a turn, whose set may be on the wire
             self._is_armed_anew = False
             decider.forget()
-        expired = decider.expire(now)
+        if (expired := self._tracker.expire(now)).up:
+            decider.note(now)
         decision = decider.decide(now)
         try:
             async with self._sending:
                 if self._group.is_armed:
-                    await self._send(decision, now)
+                    await self._send(decider, decision, now)
                 # Not after a set that was given up: the next cycle silences it first.
                 if self._is_heartbeat_due:
                     await self._group.beat()
@@ -308,16 +309,19 @@ class Controller:
             reason = str(error)
             self._report(lambda each: each.refused(reason))
         finally:
-            self._report_change(expired)
+            if expired.up:
+                self._report_change(expired)
             if not self._wake.is_set():
-                self._changed_at = None
+                self._changed_at = -math.inf
 
     def deliver(self, frame: TouchFrame) -> None:
         """Process a touch frame; to be called in the loop's thread."""
         # Contacts that came since the last cycle have not been decided yet.
         is_undecided = self._group.is_armed and self._wake.is_set()
-        change = self._decider.update(frame, keeps_taps=is_undecided)
-        self._follow(change)
+        change = self._tracker.update(frame, keeps_taps=is_undecided)
+        if change:
+            self._follow(change, frame.time)
+        self._schedule_expiry()
         for reason in change.rejected:
             self._rejects.count(reason, f"touch of {frame.source}")
 
@@ -340,16 +344,15 @@ class Controller:
             raise CommandError("controller must be open; call open() first")
         return self._decider_if_open
 
-    def _follow(self, change: Change) -> None:
-        """Act on a change of contacts, also while amplifiers are being awaited."""
-        if change:
-            self._wake.set()
-            if self._group.is_armed:
-                self._changed_at = clock.now()
-            if self._decider.is_silence_pending:
-                self._group.abort_exchange()
-            self._report_change(change)
-        self._schedule_expiry()
+    def _follow(self, change: Change, time: float) -> None:
+        """Act on a change of contacts at a time [s], also while amplifiers are being awaited."""
+        self._decider.note(time)
+        self._wake.set()
+        if self._group.is_armed:
+            self._changed_at = clock.now()
+        if self._decider.is_silence_pending:
+            self._group.abort_exchange()
+        self._report_change(change)
 
     def _schedule_expiry(self) -> None:
         """Check for expired sources when the next one times out.
@@ -357,7 +360,6 @@ class Controller:
         A timer that is due before stays: nothing is set anew for every frame of a source.
         """
         due = self._tracker.next_expiry
-        due = math.inf if due is None else due
         if self._expiry is not None:
             if self._expiry.when() <= due < math.inf:
                 return
@@ -368,53 +370,59 @@ class Controller:
             self._expiry = asyncio.get_running_loop().call_later(pause, self._expire)
 
     def _expire(self) -> None:
-        self._expiry = None
-        self._follow(self._decider.expire(clock.now()))
+        self._expiry, now = None, clock.now()
+        if (change := self._tracker.expire(now)).up:
+            self._follow(change, now)
+        self._schedule_expiry()
 
-    async def _send(self, decision: Decision | None, now: float) -> None:
+    async def _send(self, decider: Decider, decision: Decision | None, now: float) -> None:
         """Send what was decided, or prolong what plays; raises DriverError."""
         if decision is None:
-            if not self._group.degraded:
-                await self._renew(now)
-            ended = self._decider.ended(now)
-            if ended is not None:
-                self._report_playing(ended, sent_at=None)
+            if now >= decider.playing.due:
+                await self._go_on(decider, now)
         elif decision.started and self._group.degraded:
-            await self._end(self._decider.only_ends(decision))
+            ends = decider.only_ends(decision)
+            if ends.sets:  # unreported
+                played = await self._play(decider, ends.sets)
+                if isinstance(played, CommandRefused):
+                    raise played
+                decider.confirm(ends, played, now=clock.now())
         else:
-            await self._execute(decision)
+            await self._execute(decider, decision)
 
-    async def _end(self, decision: Decision) -> None:
-        """Send a decision that only ends layers, unreported; raises DriverError."""
-        if decision.sets:
-            played = await self._play(decision.sets)
-            if isinstance(played, CommandRefused):
-                raise played
-            self._decider.confirm(decision, played, now=clock.now())
+    async def _go_on(self, decider: Decider, now: float) -> None:
+        """Prolong the layers that are due, and report those that have ended by themselves."""
+        due = {} if self._group.degraded else decider.renewal(now)
+        if due:
+            decider.playing.renewed(due, await self._play(decider, due), now=clock.now())
+        if (ended := decider.ended(now)) is not None:
+            self._report_playing(decider, ended, sent_at=None)
 
-    async def _execute(self, decision: Decision) -> None:
+    async def _execute(self, decider: Decider, decision: Decision) -> None:
         """Send the sets of a decision and report the outcome; raises DriverError."""
         sent_at = None
         if decision.silence is not None:
-            sent_at = await self._silence(decision.silence)
+            sent_at = await self._silence(decider, decision.silence)
         elif decision.sets:
-            played = await self._play(decision.sets)
+            played = await self._play(decider, decision.sets)
             if isinstance(played, CommandRefused):
-                await self._execute(self._decider.refused(decision, played))
+                await self._execute(decider, decider.refused(decision, played))
                 return
             sent_at = played.sent_at
-            self._decider.confirm(decision, played, now=clock.now())
+            decider.confirm(decision, played, now=clock.now())
         refusal = decision.refusal
         if refusal is not None:
             self._report(lambda each: each.refused(refusal))
-        self._report_playing(decision, sent_at=sent_at)
+        self._report_playing(decider, decision, sent_at=sent_at)
 
-    def _report_playing(self, decision: Decision, *, sent_at: float | None) -> None:
+    def _report_playing(
+        self, decider: Decider, decision: Decision, *, sent_at: float | None
+    ) -> None:
         """Report what plays after a decision, or silence; sent_at [s]: None if nothing was sent."""
         if decision.selection.contents and decision.silence is None:
             applied = applied_by(
                 decision,
-                self._decider.playing,
+                decider.playing.contents,
                 sent_at=sent_at,
                 now=clock.now(),
                 timing=self._timing,
@@ -424,23 +432,19 @@ class Controller:
         silenced = silenced_by(decision, sent_at=sent_at, now=clock.now())
         self._report(lambda each: each.silenced(silenced))
 
-    async def _renew(self, now: float) -> None:
-        """Prolong the layers that are due; raises DriverError."""
-        due = self._decider.renewal(now)
-        if due:
-            self._decider.renewed(due, await self._play(due), now=clock.now())
-
-    async def _silence(self, ramp: float) -> float:
+    async def _silence(self, decider: Decider, ramp: float) -> float:
         """Silence all layers of all amplifiers; returns when [s] that was sent."""
         try:
             sent_at = await self._group.silence(ramp)
         except BaseException:
-            self._decider.forget()
+            decider.forget()
             raise
-        self._decider.confirm_silence()
+        decider.playing.may_play = frozenset()
         return sent_at
 
-    async def _play(self, sets: Mapping[int, PlateSet]) -> Played | CommandRefused:
+    async def _play(
+        self, decider: Decider, sets: Mapping[int, PlateSet]
+    ) -> Played | CommandRefused:
         """Play the sets of layers on all amplifiers, from one moment on, or say why not.
 
         Whatever is raised instead leaves it unknown what plays.
@@ -456,7 +460,7 @@ class Controller:
             is_overtaken = isinstance(error, Preempted) or not self._group.is_armed
             if isinstance(error, CommandRefused) and not is_overtaken:
                 return error
-            self._decider.forget()
+            decider.forget()
             raise
 
     async def _wait_for_event(self) -> None:
@@ -464,10 +468,9 @@ class Controller:
         if self._wake.is_set():
             return
         now = clock.now()
-        until = now + IDLE_INTERVAL
-        due = None if self._decider_if_open is None else self._decider.due
-        if due is not None:
-            until = min(until, due)
+        until = min(now + IDLE_INTERVAL, self._tracker.next_expiry)
+        if self._decider_if_open is not None:
+            until = min(until, self._decider_if_open.due)
         if self._group.is_armed:
             until = min(until, self._heartbeat_due, self._group.lost_from)
         pause = max(0.0, until - now)
@@ -478,8 +481,7 @@ class Controller:
             timer.cancel()
 
     def _report_change(self, change: Change) -> None:
-        if change:
-            self._report(lambda each: each.contacts_changed(self._tracker.contacts, change))
+        self._report(lambda each: each.contacts_changed(self._tracker.contacts, change))
 
     def _report(self, event: Callable[[Observer], None]) -> None:
         """Report an event to all observers; their exceptions are only logged."""

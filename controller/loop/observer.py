@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from controller.loop.content import Prediction, not_served
-from controller.loop.decision import Decision, PlayedContent
+from controller.loop.decision import Decision
+from controller.loop.playing import PlayedContent
 from controller.loop.routing import Drive
 from controller.sources.contacts import Change, Contact, ContactKey
 from model.table.pattern import Pattern

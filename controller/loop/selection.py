@@ -94,7 +94,7 @@ class Selector:
         self._current = _NOTHING
         self.triggered_at = math.inf
         """When [s] the change arrived whose answer of the thread the last selection has."""
-        self.due: float | None = None
+        self.due = math.inf
         """When [s] to select anew though no contact changes, since a finger that moved rests."""
         self._requested: tuple[Selection, Targets] = (_NOTHING, ())
         self._protected: frozenset[ContactKey] = frozenset()
@@ -142,10 +142,10 @@ class Selector:
         }
         new = tuple(each for each in short if each[0].key not in self._short)
         is_kept = not lasting or self._fits(self._lasting, lasting, contacts)
-        is_due = self.due is not None and triggered_at >= self.due
+        is_due = self.due < math.inf and self.due <= triggered_at
         is_rested = bool(lasting) and is_due and is_kept and not self._thread.is_busy
         if is_due:
-            self.due = triggered_at + _RESTS_AFTER if lasting and not is_rested else None
+            self.due = triggered_at + _RESTS_AFTER if lasting and not is_rested else math.inf
         if new or is_rested or not is_kept:
             self._choose(
                 lasting if is_rested or not is_kept else None,
@@ -225,7 +225,7 @@ class Selector:
         before, protected = self._lasting, self._protected
         is_moving = lasting is not None and not is_rested and self._has_moved(lasting, contacts)
         if lasting is not None:
-            self.due = triggered_at + _RESTS_AFTER if is_moving else None
+            self.due = triggered_at + _RESTS_AFTER if is_moving else math.inf
 
         def chosen() -> _Chosen:
             found = None

@@ -99,7 +99,7 @@ class ContactTracker:
         self._newest = -math.inf  # s; time of the newest frame
         self.contacts: tuple[Contact, ...] = ()
         """All contacts in order of arrival; the newest is the last."""
-        self.next_expiry: float | None = None
+        self.next_expiry = math.inf
         """When [s] the first contacts are lifted unless a frame of their source arrives."""
 
     def expiry_of(self, key: ContactKey) -> float:
@@ -150,7 +150,7 @@ class ContactTracker:
 
     def expire(self, now: float) -> Change:
         """Lift the contacts of all sources that have timed out at now [s]."""
-        if self._newest <= now and (self.next_expiry is None or now < self.next_expiry):
+        if self._newest <= now < self.next_expiry:
             return _UNCHANGED
         # Frames dated in the future are treated as received now.
         expired = [name for name, source in self._sources.items() if source.expiry <= now]
@@ -224,7 +224,7 @@ class ContactTracker:
             ends.append(source.expiry)
             self._newest = max(self._newest, source.received)
         self._sources, self.contacts = sources, tuple(self._contacts.values())
-        self.next_expiry = min(ends, default=None)
+        self.next_expiry = min(ends, default=math.inf)
 
 
 def _load(known: Contact, touch: Touch, time: float) -> float:

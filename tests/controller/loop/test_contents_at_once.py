@@ -16,12 +16,13 @@ from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.effects.shapes import Rectangle
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.decision import ENDED, Decider, PlayedContent
+from controller.loop.decision import ENDED, Decider
 from controller.loop.envelopes import RAMPS_ONLY
 from controller.loop.intent import Target
 from controller.loop.joint_answer import query_jointly
 from controller.loop.observer import Applied
 from controller.loop.plate_set import PlateSet
+from controller.loop.playing import PlayedContent
 from controller.loop.selection import unshaped
 from controller.sources.contacts import Contact, ContactKey
 from drivers.contents import Layer

@@ -312,8 +312,8 @@ def test_a_click_leaves_what_another_drives_until_that_has_ended(
 
 
 @pytest.mark.parametrize(
-    ("until", "due"), [(None, None), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
+    ("until", "due"), [(None, math.inf), (7.0, 7.0), (3.0, 5.001), (math.nan, 5.001)]
 )
-def test_due_of_an_expired_intent_is_later(until: float | None, due: float | None) -> None:
+def test_due_of_an_expired_intent_is_later(until: float | None, due: float) -> None:
     """So that it does not keep the loop busy."""
     assert HapticIntent((), until=until).due(5.0) == due

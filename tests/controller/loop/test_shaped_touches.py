@@ -309,7 +309,7 @@ async def test_vibration_ends_by_itself_if_a_contact_of_a_dead_panel_stays(
 ) -> None:
     """Were it never lifted, heartbeats alone would keep nothing playing."""
     async with running() as bench:
-        never = property(lambda tracker: None, lambda tracker, at: None)
+        never = property(lambda tracker: math.inf, lambda tracker, at: None)
         monkeypatch.setattr(ContactTracker, "next_expiry", never, raising=False)
         monkeypatch.setattr(ContactTracker, "expire", lambda tracker, now: Change())
         begin = asyncio.get_running_loop().time()

@@ -228,7 +228,7 @@ def test_tracker_lifts_contacts_after_the_timeout() -> None:
     tracker.update(frame(10.2, (1, 0.5, 0.5), source="b"))
     assert not tracker.expire(10.3)
     assert tracker.expire(10.36)
-    assert tracker.next_expiry is None
+    assert tracker.next_expiry == math.inf
 
 
 @pytest.mark.parametrize("time", [math.nan, math.inf])
@@ -284,7 +284,7 @@ def test_tracker_invariants_for_any_sequence(events: list[TouchFrame | float]) -
         assert len(told) == len(contacts) <= MAX_CONTACTS
         assert all(PLATE.contains(contact.x, contact.y) for contact in contacts)
         assert all(math.isfinite(contact.since) for contact in contacts)
-        assert (tracker.next_expiry is None) == (not contacts)
+        assert (tracker.next_expiry == math.inf) == (not contacts)
     tracker.expire(latest)
     tracker.expire(latest + 1.0)
     assert tracker.contacts == ()
@@ -302,7 +302,7 @@ def test_tracker_keeps_a_tap_whose_frames_come_together() -> None:
     assert not tracker.update(frame(1.030), keeps_taps=True)
     assert not tracker.expire(1.059)
     assert [each.key for each in tracker.expire(1.0601).up] == [key]
-    assert tracker.next_expiry is None
+    assert tracker.next_expiry == math.inf
 
     tracker.update(frame(2.0, (1, 0.5, 0.5)))
     tracker.update(frame(2.0), keeps_taps=True)

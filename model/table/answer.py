@@ -73,17 +73,6 @@ class _Plan:
     applied: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class _Measured:
-    """What a plan gives: by finger, and at the worst one on nine of ten plates."""
-
-    layers: dict[int, Layer]
-    quiet: dict[int, QuietFinger]
-    worst_db: float | None
-    stroke_factor: float
-    applied: tuple[str, ...] = ()
-
-
 @dataclass(frozen=True)
 class _Answering:
     """Requests and quiet fingers on a table's plate, numbered in this order."""
@@ -99,58 +88,39 @@ class _Answering:
         count = len(self.requests)
         quiet = range(count, count + len(self.fingers))
         plan = _Plan(tuple(zip(range(count), strict=True)), tuple(quiet))
-        tried = [(plan, self._measure(plan))]
-        while self._is_out_of_bounds(*tried[-1]) or (
-            _worst_of(tried[-1]) < min_contrast_db and len(tried[-1][0].contents) > 1
+        tried = [self._measure(plan)]
+        while self._is_out_of_bounds(tried[-1]) or (
+            _worst_of(tried[-1]) < min_contrast_db and len(plan.contents) > 1
         ):
-            plan = self._with_less(*tried[-1])
-            tried.append((plan, self._measure(plan)))
-        below: tuple[str, ...] = ()
-        if _worst_of(tried[-1]) < min_contrast_db:
-            within = [each for each in tried if not self._is_out_of_bounds(*each)]
-            tried.append(best_by(within, _worst_of))
-            below = (f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served",)
-        plan, found = tried[-1]
-        for number, contrast, is_disturbing in plan.held:
-            heard_there = found.quiet.get(number)
-            found.layers[number] = Layer(
-                self.requests[number],
-                {},
-                "held back",
-                promised_contrast_db=contrast,
-                foreign_level_db_sl=None if heard_there is None else heard_there.level_db_sl,
-                is_disturbing=is_disturbing,
-            )
-        return Answer(
-            tuple(map(found.layers.__getitem__, range(count))),
-            tuple(map(found.quiet.__getitem__, quiet)),
-            found.worst_db,
-            found.stroke_factor,
-            plan.applied + below + found.applied,
-        )
+            plan = self._with_less(plan, tried[-1])
+            tried.append(self._measure(plan))
+        if _worst_of(tried[-1]) >= min_contrast_db:
+            return tried[-1]
+        best = best_by([each for each in tried if not self._is_out_of_bounds(each)], _worst_of)
+        below = f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served"
+        return replace(best, applied=(*best.applied, below))
 
-    def _is_out_of_bounds(self, plan: _Plan, found: _Measured) -> bool:
+    def _is_out_of_bounds(self, found: Answer) -> bool:
         """Whether a finger has less contrast, or more of others' contents, than it allows."""
-        if len(plan.contents) > 1:
-            for finger, layer in found.layers.items():
+        served = [layer for layer in found.layers if layer.verdict != "held back"]
+        if [layer.verdict != "shared" for layer in served].count(True) > 1:
+            for layer in served:
                 contrast = layer.promised_contrast_db
-                if contrast is not None and contrast < self.requests[finger].min_contrast_db:
+                if contrast is not None and contrast < layer.request.min_contrast_db:
                     return True
         return bool(self._disturbed(found))
 
-    def _disturbed(self, found: _Measured) -> list[int]:
+    def _disturbed(self, found: Answer) -> list[int]:
         """Fingers that would feel more of others' contents than they allow."""
-        disturbed = []
-        for finger, layer in found.layers.items():
-            level, allowed = layer.foreign_level_db_sl, self.requests[finger].max_foreign_db_sl
-            if level is not None and not level <= allowed:
-                disturbed.append(finger)
-        for finger, each in found.quiet.items():
-            if not each.level_db_sl <= self._every[finger].max_foreign_db_sl:
-                disturbed.append(finger)
-        return disturbed
+        levels = [layer.foreign_level_db_sl for layer in found.layers]
+        levels += [finger.level_db_sl for finger in found.quiet]
+        return [
+            finger
+            for finger, level in enumerate(levels)
+            if level is not None and not level <= self._every[finger].max_foreign_db_sl
+        ]
 
-    def _with_less(self, plan: _Plan, found: _Measured) -> _Plan:
+    def _with_less(self, plan: _Plan, found: Answer) -> _Plan:
         """The plan after the next step of the rule."""
         requests, contents = self.requests, plan.contents
         pairs = [
@@ -239,25 +209,20 @@ class _Answering:
             background=background,
         )
 
-    def _measure(self, plan: _Plan) -> _Measured:
+    def _measure(self, plan: _Plan) -> Answer:
         """What fingers feel of a plan's contents."""
-        layers: dict[int, Layer] = {}
-        quiet: dict[int, QuietFinger] = {}
-        if not plan.contents:
-            for finger in plan.quiet:
-                quiet[finger] = QuietFinger(self._every[finger].at, *_NOTHING)
-            return _Measured({}, quiet, None, 1.0)
-        table, contents = self.table, self._contents(plan)
-        found = choose_tones(table, contents)
-        if found is None:
-            raise AssertionError("contents must have tones")
+        contents = self._contents(plan)
+        found = choose_tones(self.table, contents) if contents.streams else None
+        layers: list[Layer | None] = [None] * len(self.requests)
         for number, stream in enumerate(contents.streams):
+            if found is None:
+                raise AssertionError("contents must have tones")
             weights = [(found.rows[number], found.weights[number])]
             excitation = excitation_of(
-                weights, table.eras, table.frequencies, gain=found.gains[number]
+                weights, self.table.eras, self.table.frequencies, gain=found.gains[number]
             )
             for finger in stream.targets:
-                (level, promised_level) = found.level_db_sl[finger]
+                level, promised_level = found.level_db_sl[finger]
                 figures = *found.contrast_db[finger], found.foreign_db_sl[finger]
                 nominal, median, promised, others_level = [
                     None if math.isnan(each) else each for each in figures
@@ -274,22 +239,36 @@ class _Answering:
                     promised_contrast_db=promised,
                     foreign_level_db_sl=others_level,
                 )
-        for finger in plan.quiet:
-            felt, _, promised_felt = found.contrast_db[finger]
-            at = self._every[finger].at
-            quiet[finger] = QuietFinger(at, felt, promised_felt, found.foreign_db_sl[finger])
-        worst = None if math.isnan(found.worst_db) else found.worst_db
-        applied = () if found.is_apart else (f"frequencies are nearer than {self.apart_hz:g} Hz",)
-        return _Measured(layers, quiet, worst, found.stroke_factor, applied)
+        heard = [-math.inf] * len(self._every) if found is None else found.foreign_db_sl
+        for finger, contrast, is_disturbing in plan.held:
+            layers[finger] = Layer(
+                self.requests[finger],
+                {},
+                "held back",
+                promised_contrast_db=contrast,
+                foreign_level_db_sl=heard[finger] if finger in plan.quiet else None,
+                is_disturbing=is_disturbing,
+            )
+        quiet = []
+        for number, each in enumerate(self.fingers, start=len(layers)):
+            felt = promised_felt = math.inf
+            if found is not None:
+                felt, _, promised_felt = found.contrast_db[number]
+            quiet.append(QuietFinger(each.at, felt, promised_felt, heard[number]))
+        applied = plan.applied
+        if found is not None and not found.is_apart:
+            applied += (f"frequencies are nearer than {self.apart_hz:g} Hz",)
+        return Answer(
+            tuple(layer for layer in layers if layer),
+            tuple(quiet),
+            None if found is None or math.isnan(found.worst_db) else found.worst_db,
+            1.0 if found is None else found.stroke_factor,
+            applied,
+        )
 
 
-_NOTHING = math.inf, math.inf, -math.inf
-"""Contrasts and level at a quiet finger of no content."""
-
-
-def _worst_of(tried: tuple[_Plan, _Measured]) -> float:
-    worst = tried[1].worst_db
-    return math.inf if worst is None else worst
+def _worst_of(found: Answer) -> float:
+    return math.inf if found.promised_worst_db is None else found.promised_worst_db
 
 
 def _at(request: Request) -> str:

@@ -13,6 +13,7 @@ of the highest contrast at its level; of tones that are nearly the same the onse
 `model.table.contents_kernel` finds them in C, `model.table.contents_numpy` in numpy.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,10 +126,10 @@ class Tones:
     """
 
     rows: list[int]
-    weights: list[list[complex]]
+    weights: Sequence[Sequence[complex]]
     gains: list[float]
-    contrast_db: list[list[float]]
-    level_db_sl: list[list[float]]
+    contrast_db: Sequence[Sequence[float]]
+    level_db_sl: Sequence[Sequence[float]]
     foreign_db_sl: list[float]
     worst_db: float
     loudest_db_sl: float

@@ -100,16 +100,16 @@ def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones | None
     if status != FOUND:
         return None
     found = figures.tolist()
-    weights = list(map(complex, found[:size:2], found[1:size:2]))
+    weights = map(complex, found[:size:2], found[1:size:2])
     contrast = size + count
     level, of_others = contrast + 3 * k, contrast + 5 * k
     worst, loudest, factor = found[-3:]
     return Tones(
         rows=rows.tolist(),
-        weights=[weights[each : each + n] for each in range(0, n * count, n)],
+        weights=list(zip(*[weights] * n, strict=True)),
         gains=found[size:contrast],
-        contrast_db=[found[each : each + 3] for each in range(contrast, level, 3)],
-        level_db_sl=[found[each : each + 2] for each in range(level, of_others, 2)],
+        contrast_db=list(zip(*[iter(found[contrast:level])] * 3, strict=True)),
+        level_db_sl=list(zip(*[iter(found[level:of_others])] * 2, strict=True)),
         foreign_db_sl=found[of_others:-3],
         worst_db=worst,
         loudest_db_sl=loudest,

@@ -55,7 +55,8 @@ def demo(
     import asyncio
     import time
 
-    from controller.demo.run import WIRES, run_demo, run_live, write_pictures
+    from controller.demo.pictures import write_pictures
+    from controller.demo.run import WIRES, run_demo, run_live
     from controller.demo.scene import Scene, example_scenes
     from controller.sources.capture import read_capture
     from model.rig.file import example_rig_path, load_rig

@@ -19,9 +19,7 @@ from controller.daemon.log import LogThread, start_log
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from controller.daemon.states import DaemonState
-from controller.demo.contents_picture import contents_figure
 from controller.demo.far_end import SIM_OPTIONS, WATCHDOG, SimulatedPlate, simulated_plate
-from controller.demo.picture import choose_rows, touches_figure
 from controller.demo.recorder import TouchRecorder
 from controller.demo.scene import Scene, example_layout
 from controller.demo.touch_row import TouchRow
@@ -29,7 +27,6 @@ from controller.gateway.installed import require_gateway
 from controller.sources.capture import replay_capture
 from drivers import clock
 from drivers.errors import LinkError
-from model.figures import save_figure
 from model.rig.file import load_rig
 from model.table.table import LocalizationTable
 
@@ -231,20 +228,3 @@ async def _play(
 
 def _write_layout(folder: Path, layout: Mapping[str, Any]) -> None:
     (folder / _LAYOUT_FILE).write_text(json.dumps(layout), encoding="utf-8")
-
-
-def write_pictures(table: LocalizationTable, rows: list[TouchRow], folder: Path) -> list[Path]:
-    """Draw some of the touches into a folder, and several contents; return what was written."""
-    figures = {}
-    if chosen := choose_rows([row for row in rows if not row.fingers]):
-        figures["touches"] = touches_figure(table, chosen)
-    several = [row for row in rows if row.measured_level_db_sl is not None and row.fingers]
-    if several:
-        figures["contents"] = contents_figure(
-            table, max(several, key=lambda row: len(row.contents))
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{name}.png" for name in figures]
-    for path, figure in zip(paths, figures.values(), strict=True):
-        save_figure(figure, path)
-    return paths

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller.demo.picture import choose_rows
+from controller.demo.pictures import choose_rows
 from controller.demo.touch_row import (
     FingerRow,
     FingerVibration,

@@ -1,6 +1,11 @@
-"""The picture of several contents: where each is felt, in a colour of its own, and all together."""
+"""Pictures of a demonstration: some of the touches, and where each of several contents is felt.
 
-from collections.abc import Mapping
+Of several contents each has a colour of its own.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,12 +15,17 @@ from matplotlib.patches import Circle
 
 from controller.demo.touch_row import FingerRow, TouchRow
 from model.arrays import FloatArray, lattice
+from model.choice import ranked_by
+from model.figures import save_figure
 from model.figures.drawing import label_plate, raster
+from model.figures.table_pictures import draw_fingertip, draw_level_scale, draw_levels
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import sensation_level
 from model.table.pattern import Pattern
 from model.table.request import OWN_CONTRAST_DB
 from model.table.table import LocalizationTable
+
+MAX_PANELS = 6
 
 COLORS = ("#35e07a", "#4f9dff", "#ffa62b", "#ff5fa2")
 """Of contents, in order."""
@@ -24,6 +34,74 @@ BRIGHTEST_DB_SL = 30.0
 """Level from which a colour is at its brightest; the threshold of feeling is black."""
 
 _GREY = 0.62
+
+
+def write_pictures(table: LocalizationTable, rows: list[TouchRow], folder: Path) -> list[Path]:
+    """Draw some of the touches into a folder, and several contents; return what was written."""
+    figures = {}
+    if chosen := choose_rows([row for row in rows if not row.fingers]):
+        figures["touches"] = touches_figure(table, chosen)
+    several = [row for row in rows if row.measured_level_db_sl is not None and row.fingers]
+    if several:
+        figures["contents"] = contents_figure(
+            table, max(several, key=lambda row: len(row.contents))
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.png" for name in figures]
+    for path, figure in zip(paths, figures.values(), strict=True):
+        save_figure(figure, path)
+    return paths
+
+
+def choose_rows(rows: Sequence[TouchRow]) -> list[TouchRow]:
+    """Choose the measured touches of highest contrast, evenly over the number of other fingers.
+
+    One finger alone is shown at most once.
+    """
+    by_count: dict[int, list[TouchRow]] = {}
+    for row in ranked_by(rows, _contrast):
+        if row.measured_level_db_sl is not None:
+            by_count.setdefault(len(row.quiet), []).append(row)
+    chosen = by_count.pop(0, [])[:1]
+    while by_count and len(chosen) < MAX_PANELS:
+        for count in sorted(by_count):
+            chosen.append(by_count[count].pop(0))
+            if not by_count[count]:
+                del by_count[count]
+    return sorted(chosen[:MAX_PANELS], key=lambda row: len(row.quiet))
+
+
+def touches_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure:
+    """Draw a panel per touch: level over the plate, fingers and driven ERAs."""
+    columns = min(3, len(rows))
+    lines = -(-len(rows) // columns)
+    figure = Figure(figsize=(4.4 * columns + 0.8, 4.1 * lines), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
+    for axes in panels:
+        axes.set_axis_off()
+    for axes, row in zip(panels, rows, strict=False):
+        _draw_touch(axes, table, row)
+    draw_level_scale(figure, panels, shrink=0.7)
+    return figure
+
+
+def _contrast(row: TouchRow) -> float:
+    contrast = row.measured_felt_contrast_db
+    return -math.inf if contrast is None else contrast
+
+
+def _draw_touch(axes: Axes, table: LocalizationTable, row: TouchRow) -> None:
+    if row.pattern is not None:
+        draw_levels(axes, table, row.pattern.excitation)
+    level = row.levels_db_sl.get(row.target_id)
+    draw_fingertip(axes, row.targets_m[0], felt=True, level_db_sl=level)
+    for id, position in row.quiet.items():
+        draw_fingertip(axes, position, felt=False, level_db_sl=row.levels_db_sl.get(id))
+    contrast, promised = row.measured_felt_contrast_db, row.robust_felt_contrast_db
+    title = "one finger alone" if contrast is None else f"felt contrast {contrast:.1f} dB"
+    if promised is not None:
+        title += f", promised {promised:.1f}"
+    axes.set_title(title, fontsize=11, pad=20)
 
 
 def contents_figure(table: LocalizationTable, row: TouchRow) -> Figure:

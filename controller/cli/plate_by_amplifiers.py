@@ -68,10 +68,9 @@ def measured_by_amplifiers(
 
     async def measure() -> "MeasuredPlate":
         with shown_progress("steps", is_shown=is_shown) as on_step:
-            found = await PlateSelfMeasurement(
+            return await PlateSelfMeasurement(
                 rig, Lines, at, level=level, is_quick=is_quick, on_step=on_step
             ).run()
-            return found.as_measured
 
     return asyncio.run(measure())
 

@@ -124,7 +124,7 @@ def _measured(
     rig_file: Path, urls: list[str], *, level: float | None, is_untouched: bool, is_shown: bool
 ) -> "tuple[Rig, MeasuredPlate, Responses]":
     """Measure the plate by the sensors of its amplifiers."""
-    from controller.diagnosis.plate_observation import observation_of
+    from controller.diagnosis.plate_measurement import observation_of
 
     with rig_of_file(rig_file) as (_, rig):
         require_untouched(is_known=is_untouched, has_terminal=is_shown)

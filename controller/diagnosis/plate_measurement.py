@@ -10,7 +10,6 @@ import numpy as np
 from controller.diagnosis.interleaved_tones import Interleaved, Step, interleaved
 from controller.diagnosis.plate_sensors import (
     PlateSensor,
-    PlateSensors,
     plate_sensors,
     start_together,
 )
@@ -22,6 +21,7 @@ from drivers.host.sensors import Reading, measure_tones
 from drivers.host.timing import HEARTBEAT
 from drivers.opening import Lines
 from model.arrays import ComplexArray, FloatArray
+from model.calibration.responses import Responses
 from model.choice import best_first, best_of
 from model.errors import InputError
 from model.identification.measured_plate import MeasuredPlate
@@ -37,39 +37,6 @@ HIGHEST = 10**-0.5
 
 _COMPARED = 2  # tones of a repeated step
 _READINGS = 2  # of a step, where the first is disturbed or overloaded
-
-
-@dataclass(frozen=True, eq=False)
-class PlateMeasurement:
-    """What was measured: responses, the sensors, the level and how long it took [s]."""
-
-    measurement: Measurement
-    sensors: PlateSensors
-    level: float
-    tones: Interleaved
-    duration: float
-
-    @property
-    def as_measured(self) -> MeasuredPlate:
-        """For its identification."""
-        sensors = tuple(
-            {
-                "amplifier": sensor.amplifier,
-                "sensor": sensor.number,
-                "era": sensor.place.era or None,
-                "x_m": None if sensor.place.era else sensor.place.x,
-                "y_m": None if sensor.place.era else sensor.place.y,
-            }
-            for sensor in self.sensors.used
-        )
-        return MeasuredPlate(
-            self.measurement,
-            self.level,
-            self.duration,
-            sensors,
-            notes=tuple(self.sensors.unused),
-            details={"settling_s": self.tones.settling, "window_s": self.tones.window},
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +70,7 @@ class PlateSelfMeasurement:
         self._is_quick = is_quick
         self._on_step = on_step
 
-    async def run(self) -> PlateMeasurement:
+    async def run(self) -> MeasuredPlate:
         """Measure; always ends silent and disarmed.
 
         Raises DriverError, among them CommandRefused for a reading that is disturbed or overloaded
@@ -118,15 +85,21 @@ class PlateSelfMeasurement:
                 is_quick=self._is_quick,
             )
             started = clock.now()
-            await self._player.arm()
+            await self._player.group.arm()
             heard, half, last = await self._all(tones, sensors.used)
             await self._player.silence()
             await self._wait(self._player.ramp)
             duration = clock.now() - started
         finally:
             await self._player.close()
-        measurement = self._measurement(sensors.used, heard, half, last)
-        return PlateMeasurement(measurement, sensors, self._level, tones, duration)
+        return MeasuredPlate(
+            self._measurement(sensors.used, heard, half, last),
+            self._level,
+            duration,
+            sensors=tuple(map(_described, sensors.used)),
+            notes=sensors.unused,
+            details={"settling_s": tones.settling, "window_s": tones.window},
+        )
 
     async def _all(
         self, tones: Interleaved, sensors: Sequence[PlateSensor]
@@ -204,7 +177,7 @@ class PlateSelfMeasurement:
         try:
             while not reading.done():
                 await asyncio.wait({reading}, timeout=HEARTBEAT)
-                await self._player.heartbeat()
+                await self._player.group.beat()
             return reading.result()
         finally:
             reading.cancel()
@@ -240,7 +213,7 @@ class PlateSelfMeasurement:
         end = clock.now() + seconds
         while (left := end - clock.now()) > 0:
             await asyncio.sleep(min(HEARTBEAT, left))
-            await self._player.heartbeat()
+            await self._player.group.beat()
 
     def _measurement(
         self,
@@ -276,6 +249,18 @@ class PlateSelfMeasurement:
         return tuple(found)
 
 
+def _described(sensor: PlateSensor) -> Mapping[str, object]:
+    """A sensor for programs."""
+    place = sensor.place
+    return {
+        "amplifier": sensor.amplifier,
+        "sensor": sensor.number,
+        "era": place.era or None,
+        "x_m": None if place.era else place.x,
+        "y_m": None if place.era else place.y,
+    }
+
+
 def _frequency_range(
     playable: tuple[float, float], sensors: Sequence[PlateSensor]
 ) -> tuple[float, float]:
@@ -306,3 +291,23 @@ def checked_level(rig: Rig, level: float | None) -> float:
             f"got {level:g}"
         )
     return level
+
+
+def observation_of(measurement: Measurement, rig: Rig) -> Responses:
+    """Responses to the channels of a rig one by one, from those to interleaved tones.
+
+    Raises InputError for a plate that was not linear or has changed meanwhile.
+    """
+    measurement.check()
+    sensors = measurement.sensors
+    shape = len(measurement.tones), len(rig.eras), len(sensors)
+    values = np.full(shape, np.nan, dtype=complex)
+    values[measurement.rows, measurement.eras, measurement.at] = measurement.values
+    places = [rig.era(each.era) if each.era else each for each in sensors]
+    return Responses(
+        tuple(each.name for each in sensors),
+        np.array([(each.x, each.y) for each in places]),
+        measurement.tones,
+        values,
+        has_phases=not measurement.drives_lag,
+    )

@@ -25,7 +25,7 @@ _LEVEL_STEP = QUANTITIES["level"].from_wire(1)
 class TonePlayer:
     """Plays tones on the amplifiers of a rig; lines: to them, urls: by their names.
 
-    ramp [s]: of what was played last; token: of its set.
+    group: of all amplifiers; ramp [s]: of what was played last; token: of its set.
     """
 
     def __init__(self, rig: Rig, lines: Callable[[], Lines], urls: Mapping[str, str]) -> None:
@@ -35,7 +35,7 @@ class TonePlayer:
         self._rig = rig
         self._lines = lines()
         self._urls = urls
-        self._group = Group({})
+        self.group = Group({})
         self._ramp_max = RAMP
 
     async def open(self) -> PlaybackCapabilities:
@@ -46,20 +46,16 @@ class TonePlayer:
             )
             for name, url in self._urls.items()
         }
-        self._group = Group(self.amplifiers)
-        await self._group.open()
+        self.group = Group(self.amplifiers)
+        await self.group.open()
         found = playback_capabilities(self._rig, self.amplifiers)
         self._ramp_max = min(RAMP, found.ramp_max)
         return found
 
-    async def arm(self) -> None:
-        """Switch the high voltage on at level zero."""
-        await self._group.arm()
-
     async def silence(self) -> None:
         """Let what plays fall silent."""
         self.ramp = RAMP
-        await self._group.silence(RAMP)
+        await self.group.silence(RAMP)
 
     async def play(self, excitation: Excitation) -> Drive:
         """Play on all amplifiers; what each driven ERA plays, by name, as its amplifier confirms.
@@ -68,7 +64,7 @@ class TonePlayer:
         """
         layers = route(excitation, self._rig, ramp=self._ramp_max)
         self.ramp = max(layer.ramp for layer in layers.values())
-        played = await self._group.apply({name: [layer] for name, layer in layers.items()})
+        played = await self.group.apply({name: [layer] for name, layer in layers.items()})
         self.token = played.token
         plays = tones_by_era(played.layers, self._rig)
         for era, wired in self._rig.wiring.items():
@@ -82,13 +78,9 @@ class TonePlayer:
                 )
         return plays
 
-    async def heartbeat(self) -> None:
-        """Feed the watchdogs."""
-        await self._group.beat()
-
     async def close(self) -> None:
         """Play silence, confirm it, disarm and close, whatever came before."""
         try:
-            await self._group.close(RAMP)
+            await self.group.close(RAMP)
         finally:
             await self._lines.close()

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from controller.diagnosis.plate_measurement import (
-    PlateMeasurement,
     PlateSelfMeasurement,
     checked_level,
 )
@@ -22,6 +21,7 @@ from memory_machine import live_in_memory
 from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.identify import identify
+from model.identification.measured_plate import MeasuredPlate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
@@ -91,7 +91,7 @@ async def measured(
     *,
     is_quick: bool = True,
     on_step: Callable[[int, int], None] = lambda done, of: None,
-) -> PlateMeasurement:
+) -> MeasuredPlate:
     """Measure a rig at a far side; then all its amplifiers are silent and disarmed."""
     try:
         return await PlateSelfMeasurement(
@@ -113,17 +113,17 @@ async def contrasts(rig: Rig, far: FarSide, known: Rig) -> list[float]:
     try:
         await player.open()
         (amplifier,) = player.amplifiers.values()
-        await player.arm()
+        await player.group.arm()
         for target, quiet in FINGERS:
             sensors.place([Accelerometer("T", *target), Accelerometer("Q", *quiet)])
             pattern = table.query(Question((target,), (quiet,), level_db_sl=35.0))
             plays = await player.play(pattern.excitation)
             for _ in range(30):
                 await asyncio.sleep(0.05)
-                await player.heartbeat()
+                await player.group.beat()
             (frequency,) = {command.frequency for command in plays.values()}
             reading = await measure_tones(amplifier, [frequency], 0.1)
-            await player.heartbeat()
+            await player.group.beat()
             one, other = (each.tones[0][0] for each in reading.sensors[-2:])
             found.append(20 * math.log10(one / other))
     finally:
@@ -136,7 +136,7 @@ def test_identified_rig_is_the_truth_and_its_patterns_have_more_contrast(
 ) -> None:
     """Parameters agree within three standard errors; contrast in time rises by 6 dB and more."""
 
-    async def run() -> tuple[PlateMeasurement, list[float], Rig, list[float]]:
+    async def run() -> tuple[MeasuredPlate, list[float], Rig, list[float]]:
         live_in_memory()
         async with far_side(WIRES["serial"], truth) as far:
             taken = await measured(rig, far)
@@ -182,7 +182,7 @@ def test_two_amplifiers_hear_each_other_where_they_start_together(
 ) -> None:
     """On one bus all responses, on two wires those to an amplifier's own: as a direct solution."""
 
-    async def run() -> PlateMeasurement:
+    async def run() -> MeasuredPlate:
         live_in_memory()
         wires = SHARED_WIRES if is_shared else WIRES
         async with far_side(wires[wire], on_two_amplifiers(truth)) as far:

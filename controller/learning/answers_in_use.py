@@ -18,42 +18,33 @@ _PAUSE = 0.02  # s; between frequencies, which take a millisecond or two each
 class AnswersInUse:
     """The answers of a controller; table, timing: of the rig as built, with which it starts."""
 
-    def __init__(
-        self, controller: Controller, table: LocalizationTable, timing: Timing | None
-    ) -> None:
+    def __init__(self, controller: Controller, table: LocalizationTable, timing: Timing) -> None:
         self._controller = controller
-        self._base, self._base_timing = table, timing
-        self._fingerprint = table.fingerprint
+        self._base = table, timing
         self.table, self._timing = table, timing
 
     def replace(self, answers: Answers) -> None:
         """Answer by a corrected table from now on; raises InputError for one of another table."""
-        if answers.base != self._fingerprint:
-            raise InputError(
-                f"answers must be those of table {self._fingerprint}, got {answers.base}"
-            )
+        fingerprint = self._base[0].fingerprint
+        if answers.base != fingerprint:
+            raise InputError(f"answers must be those of table {fingerprint}, got {answers.base}")
         if not answers.is_complete:
             answers.table.inherit_ringing(self.table)
-        timing = None if self._timing is None else self._timing.following(answers.table)
-        self._use(answers.table, timing)
+        self._use(answers.table, self._timing.following(answers.table))
 
     def reset(self) -> None:
         """Answer by the table as built from now on."""
-        self._use(self._base, self._base_timing)
+        self._use(*self._base)
 
     async def shape_anew(self) -> None:
         """Shape onsets and endings for the present table, while nothing is on its way."""
-        table = self.table
-        timing = None if self._timing is None else Timing(table)
-        if timing is None:
-            return
-        frequencies = table.frequencies.tolist()
+        timing, frequencies = Timing(self.table), self.table.frequencies.tolist()
         while frequencies:
             if not self._controller.is_preparing:
                 timing.prepare([frequencies.pop()])
             await asyncio.sleep(_PAUSE)
         self._use(self.table, timing.following(self.table))
 
-    def _use(self, table: LocalizationTable, timing: Timing | None) -> None:
+    def _use(self, table: LocalizationTable, timing: Timing) -> None:
         self.table, self._timing = table, timing
         self._controller.replace_answers(table, timing)

@@ -34,13 +34,11 @@ class EstimatorTimeouts:
     """How long an estimator may take [s], and how often it is replaced.
 
     start: until it takes patterns; estimate: for one pattern, of which the search for an
-    explanation takes longest; pause, max_pause: before it is replaced; max_failures: in a row.
+    explanation takes longest; max_failures: in a row.
     """
 
     start: float = 60.0
     estimate: float = 30.0
-    pause: float = 1.0
-    max_pause: float = 60.0
     max_failures: int = 8
 
 
@@ -85,7 +83,7 @@ class EstimatorProcess:
     async def run(self) -> None:
         """Keep an estimator running until cancelled, refused, or given up; lets it end then."""
         timeouts, failures = self._timeouts, 0
-        backoff = Backoff(first=timeouts.pause, maximum=timeouts.max_pause)
+        backoff = Backoff(first=1.0, maximum=60.0)
         while True:
             started_at, self._has_estimated = clock.now(), False
             try:

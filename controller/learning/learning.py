@@ -62,7 +62,7 @@ class Learning:
         self,
         rig: Rig,
         table: LocalizationTable,
-        timing: Timing | None,
+        timing: Timing,
         file: Path,
         *,
         controller: Controller,
@@ -77,8 +77,7 @@ class Learning:
         self._answers = AnswersInUse(controller, table, timing)
         self._robust: Answers | None = None
         self._only_alarms, self._is_held = "", False
-        self._sensors: Sequence[PlateSensor] = ()
-        self._are_sensors_known = False
+        self._sensors: Sequence[PlateSensor] | None = None  # until they were read
         self._readings: SettledReadings | None = None
         self._estimator: EstimatorProcess | None = None
         self._tasks: dict[str, asyncio.Task[None]] = {}
@@ -136,10 +135,10 @@ class Learning:
                 "writable for the daemon, then repeat era forget"
             ) from error
         finally:
-            if self._are_sensors_known:
-                self._start()
-            else:
+            if self._sensors is None:
                 self.open()
+            else:
+                self._start(self._sensors)
 
     async def close(self) -> None:
         """End the estimator, which keeps what it has learned."""
@@ -152,7 +151,7 @@ class Learning:
         while True:
             try:
                 check_common_start(self._controller.amplifiers)
-                self._sensors = (await plate_sensors(self._rig, self._controller.amplifiers)).used
+                found = await plate_sensors(self._rig, self._controller.amplifiers)
             except CommandError as error:
                 self._say(LearningState.OFF, str(error))
                 return
@@ -164,16 +163,16 @@ class Learning:
                 )
                 await asyncio.sleep(_PAUSE)
             else:
-                self._are_sensors_known = True
-                self._start()
+                self._sensors = found.used
+                self._start(found.used)
                 return
 
-    def _start(self) -> None:
+    def _start(self, sensors: Sequence[PlateSensor]) -> None:
         self._say(LearningState.STARTING, "the estimator is starting")
         start = Start(
             self._rig,
             replace(self._base),  # without what is prepared in it
-            tuple(sensor.place for sensor in self._sensors),
+            tuple(sensor.place for sensor in sensors),
             self._controller.drive_mode,
             self._file.absolute(),
         )
@@ -342,7 +341,7 @@ class Learning:
             self._readings = SettledReadings(
                 self._rig,
                 self._controller.amplifiers,
-                self._sensors,
+                self._sensors or (),
                 settling=settling,
                 take=self._hand,
                 disturbed=lambda: self._count(disturbed=1),

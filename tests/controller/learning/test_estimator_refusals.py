@@ -103,7 +103,7 @@ class Taking:
 def test_answers_of_another_table_are_refused() -> None:
     """By its fingerprint, and nothing is replaced; those of the own one are, and can be reset."""
     base, controller = small_table(), Taking()
-    in_use = AnswersInUse(cast(Controller, controller), base, None)
+    in_use = AnswersInUse(cast(Controller, controller), base, Timing(base))
     other = replace(base, masses=(), eras=base.eras[::-1])
     with pytest.raises(InputError, match="table"):
         in_use.replace(Answers(other.fingerprint, other, is_complete=True))

@@ -112,7 +112,7 @@ async def opened(folder: Path) -> tuple[Learning, Taking]:
     learning = Learning(
         make_paper_rig(12, 9),
         small_table(),
-        None,
+        Timing(small_table()),
         folder / "learned.npz",
         controller=cast(Controller, taking),
     )

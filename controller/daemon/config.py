@@ -252,17 +252,14 @@ def _touch(
                 (*location, "name"),
                 f"name must not be {API_SOURCES}, which is reserved for API clients",
             )
+        key = "calibration"
         try:
             calibration = _calibration(section.calibration, rig)
-            touch_input = TouchInput(section.name, section.url, calibration)
+            inputs.append(TouchInput(section.name, section.url, calibration))
+            key = "url"
+            inputs[-1].make()
         except InputError as error:
-            validation.add((*location, "calibration"), str(error))
-            continue
-        try:
-            touch_input.make()
-        except InputError as error:
-            validation.add((*location, "url"), str(error))
-        inputs.append(touch_input)
+            validation.add((*location, key), str(error))
     return tuple(inputs)
 
 

@@ -36,7 +36,6 @@ from drivers.threads import in_thread
 from model.errors import InputError
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
-from registry.plugins import failure_text
 
 _CLOSE_TIMEOUT = 0.2  # s; for the control loop to end after all reachable amplifiers are silent
 
@@ -67,22 +66,22 @@ class Daemon:
         self._log = log
         self._manager = manager
         self._dashboard = dashboard
-        self._reloads: set[asyncio.Task[None]] = set()
-        self._reload_lock = asyncio.Lock()
-        self._is_reload_pending = False
+        self._reload_requested = asyncio.Event()
         self._shutdown = asyncio.Event()
         self._shutdown_cause = "the daemon is shutting down"
-        self._dumps = FaultDumps()
+        self._dumps = FaultDumps(config.dump_folder)
         self._supervisor = Supervisor(
             state_changed=(
                 lambda old, new: self._publisher.state_changed(old, new),
                 lambda old, new: manager.status(headline(new.state.value, new.cause)),
-                self._dump_fault,
+                self._dumps.state_changed,
                 self._follow_state,
             ),
             link_changed=lambda *change: self._publisher.link_changed(*change),
             alive=lambda: manager.alive(clock.now()),
         )
+        self.started = self._supervisor.started
+        """Set once it serves, and its amplifiers are open or searched for."""
         self._layout = ActiveLayout(config.effective_layout)
         self._frequencies = table.frequencies
         self._warn_of_bands(config)
@@ -96,9 +95,10 @@ class Daemon:
             ),
             effect_of=self._layout.effect_of,
             layout=config.layout,
-            learning=lambda: None if self._learning is None else self._learning.status,
+            learning=lambda: None if self.learning is None else self.learning.status,
         )
-        self._learning: Learning | None = None
+        self.learning: Learning | None = None
+        """What learns the plate, if anything is to be learned."""
         timing = Timing(table)
         self._controller = Controller(
             config.rig,
@@ -114,7 +114,7 @@ class Daemon:
             watchdog=watchdog,
         )
         if config.learn is not None:
-            self._learning = Learning(
+            self.learning = Learning(
                 config.rig,
                 table,
                 timing,
@@ -123,10 +123,10 @@ class Daemon:
                 changed=self._publisher.plate_changed,
                 estimated=self._publisher.learning_latencies.add,
             )
-            self._controller.observers.append(self._learning.observer)
+            self._controller.observers.append(self.learning.observer)
         self._controller.observers.append(observer)
         self._touches = ApiTouches(config.rig.plate, self._deliver)
-        self._inputs = TouchInputs(self._deliver, failed=self._input_failed)
+        self._inputs = TouchInputs(self._deliver)
         self._api = ApiService(
             config,
             table,
@@ -135,7 +135,7 @@ class Daemon:
             publisher=self._publisher,
             touches=self._touches,
             layout=self._layout,
-            learning=self._learning,
+            learning=self.learning,
         )
         self._server = ApiServer(
             self._api.handlers(),
@@ -156,7 +156,8 @@ class Daemon:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.shut_down, f"{signal.strsignal(number)} received")
-        loop.add_signal_handler(signal.SIGHUP, self._request_reload)
+        loop.add_signal_handler(signal.SIGHUP, self._reload_requested.set)
+        self._reloading = asyncio.create_task(self._reload_when_requested(), name="reloads")
         running: asyncio.Task[None] | None = None
         try:
             await self._server.open(lock.bind())
@@ -169,7 +170,7 @@ class Daemon:
                 options = gateway_options(self._dashboard, self._config.socket)
                 self._gateway = asyncio.create_task(keep_gateway(options), name="gateway")
             shutdown = asyncio.create_task(self._shutdown.wait())
-            started = asyncio.create_task(self._supervisor.started.wait())
+            started = asyncio.create_task(self.started.wait())
             await asyncio.wait({running, shutdown, started}, return_when=asyncio.FIRST_COMPLETED)
             with no_long_collections():
                 if started.done():
@@ -183,16 +184,6 @@ class Daemon:
         if not running.cancelled():
             running.result()
 
-    @property
-    def started(self) -> asyncio.Event:
-        """Set once it serves, and its amplifiers are open or searched for."""
-        return self._supervisor.started
-
-    @property
-    def learning(self) -> Learning | None:
-        """What learns the plate, if anything is to be learned."""
-        return self._learning
-
     def shut_down(self, cause: str) -> None:
         """Request an orderly shutdown."""
         self._shutdown_cause = cause
@@ -200,17 +191,22 @@ class Daemon:
 
     async def reload(self) -> None:
         """Read the configuration again and apply its layout, if nothing else has changed."""
-        async with self._reload_lock:
-            self._is_reload_pending = False  # a later request needs another read
-            self._manager.reloading()
-            try:
-                new, changed, differs = await in_thread(partial(_read, self._config), name="reload")
-                self._apply(new, changed, differs=differs)
-            except InputError as error:
-                _logger.error("config: reload rejected, keeping previous: %s", error)
-            except Exception:  # systemd waits for the end of the reload
-                _logger.exception("config: reload failed")
-            self._manager.ready(self._status_line())
+        self._manager.reloading()
+        try:
+            new, changed, differs = await in_thread(partial(_read, self._config), name="reload")
+            self._apply(new, changed, differs=differs)
+        except InputError as error:
+            _logger.error("config: reload rejected, keeping previous: %s", error)
+        except Exception:  # systemd waits for the end of the reload
+            _logger.exception("config: reload failed")
+        self._manager.ready(self._status_line())
+
+    async def _reload_when_requested(self) -> None:
+        """Reload at requests; those during one are combined into one after it."""
+        while True:
+            await self._reload_requested.wait()
+            self._reload_requested.clear()
+            await self.reload()
 
     def _warn_of_bands(self, config: DaemonConfig) -> None:
         for problem in config.effective_layout.band_problems(self._frequencies):
@@ -233,8 +229,7 @@ class Daemon:
     async def _close(self, running: "asyncio.Task[None] | None") -> None:
         """Silence the amplifiers first, then close everything else."""
         self._manager.stopping()
-        for reload in self._reloads:
-            reload.cancel()
+        self._reloading.cancel()
         try:
             await self._supervisor.close(self._shutdown_cause)
         finally:
@@ -244,7 +239,7 @@ class Daemon:
                     task.cancel()
                     await asyncio.wait({task})
             self._log.listener = None
-            learning = () if self._learning is None else (self._learning.close(),)
+            learning = () if self.learning is None else (self.learning.close(),)
             gateway = () if self._gateway is None else (self._gateway,)
             for task in gateway:
                 task.cancel()
@@ -273,38 +268,14 @@ class Daemon:
         with contextlib.suppress(DriverError):
             self._controller.deliver(frame)
 
-    def _input_failed(self, name: str, error: Exception) -> None:
-        is_expected = isinstance(error, InputError | OSError)
-        text = str(error) if is_expected else failure_text(error)
-        _logger.error("touch source %s: failed, restarting: %s", name, text)
-
-    def _dump_fault(self, old: Operation, new: Operation) -> None:
-        is_fault = new.state in (
-            DaemonState.FAULT_REACTION_ACTIVE,
-            DaemonState.FAULT,
-            DaemonState.COMM_LOST,
-        )
-        folder = self._config.dump_folder
-        if is_fault and folder is not None:
-            self._dumps.write(folder, cause=new.cause)
-
     def _follow_state(self, old: Operation, new: Operation) -> None:
         """Learn of the plate from when all amplifiers are open."""
-        if self._learning is None:
+        if self.learning is None:
             return
         if new.state is DaemonState.READY_TO_SWITCH_ON:
-            self._learning.open()
+            self.learning.open()
         if new.state is not DaemonState.OPERATION_ENABLED:
-            self._learning.ended()
-
-    def _request_reload(self) -> None:
-        """Start a reload; requests during one are combined into one after it."""
-        if self._is_reload_pending:
-            return
-        self._is_reload_pending = True
-        task = asyncio.ensure_future(self.reload())
-        self._reloads.add(task)
-        task.add_done_callback(self._reloads.discard)
+            self.learning.ended()
 
     def _status_line(self) -> str:
         operation = self._supervisor.operation

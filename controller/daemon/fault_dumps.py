@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from controller.daemon.states import DaemonState, Operation
 from drivers import clock
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
@@ -22,6 +23,7 @@ DUMP_PATTERN = "era-fault-*.jsonl"
 MAX_DUMPS = 20  # files in a folder; the oldest are deleted
 MAX_RECORDS = 400  # over all lines: the last seconds under load, ten seconds at rest
 _MIN_INTERVAL = 1.0  # s; one dump for faults that come together
+_DUMPED = (DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT, DaemonState.COMM_LOST)
 
 _logger = logging.getLogger(__name__)
 
@@ -39,10 +41,11 @@ class MessageRecord(NamedTuple):
 class FaultDumps:
     """Keeps the last messages unformatted, and writes them in a thread: a disk may be slow or gone.
 
-    One dump at a time, so that a hanging disk costs one thread.
+    One dump at a time, so that a hanging disk costs one thread. folder: None for no dumps.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
         self.records: deque[MessageRecord] = deque(maxlen=MAX_RECORDS)
         self._written_at = float("-inf")
         self._writer: threading.Thread | None = None
@@ -71,9 +74,10 @@ class FaultDumps:
         except Exception:
             _logger.exception("recorder failed")
 
-    def write(self, folder: Path, *, cause: str) -> None:
-        """Write a dump unless one was written within the last second."""
-        if clock.now() - self._written_at < _MIN_INTERVAL:
+    def state_changed(self, old: Operation, new: Operation) -> None:
+        """Write a dump at a fault or loss, unless one was written within the last second."""
+        folder, is_soon = self._folder, clock.now() - self._written_at < _MIN_INTERVAL
+        if folder is None or new.state not in _DUMPED or is_soon:
             return
         self._written_at = clock.now()
         if self._writer is not None and self._writer.is_alive():
@@ -83,7 +87,7 @@ class FaultDumps:
 
         def write() -> None:
             try:
-                path = write_dump(folder, records, cause=cause)
+                path = write_dump(folder, records, cause=new.cause)
                 _logger.info("dump: wrote %s", path)
             except OSError as error:
                 _logger.warning("dump in %s failed: %s", folder, error)

@@ -264,26 +264,21 @@ class Supervisor(Operator):
         return is_stopped
 
     def _check_degraded(self) -> None:
-        """Note that armed amplifiers have ceased to reply, or that all reply again."""
+        """Say that armed amplifiers have ceased to reply, or that all reply again."""
         degraded = self._controller.degraded
         if self.operation.state is not DaemonState.OPERATION_ENABLED:
             self._is_degraded = False
-        elif bool(degraded) is self._is_degraded or self._controller.group.lost_by:
-            pass  # of one that is lost the next heartbeat says so
-        elif degraded:
-            cause = f"amplifier {', '.join(degraded)} does not reply; nothing new is played"
-            self._link_event("degraded", degraded, cause, "check cables and supply")
-        else:
-            cause = "all amplifiers reply again and play what they should"
-            self._link_event("restored", (), cause, "era disarm, or era stop")
-
-    def _link_event(
-        self, change: LinkChange, degraded: Sequence[str], cause: str, remedy: str
-    ) -> None:
-        """Say that the link of armed amplifiers is degraded, or restored."""
+            return
+        if bool(degraded) is self._is_degraded or self._controller.group.lost_by:
+            return  # of one that is lost the next heartbeat says so
         self._is_degraded = bool(degraded)
+        change: LinkChange = "restored"
+        level, remedy = logging.INFO, "era disarm, or era stop"
+        cause = "all amplifiers reply again and play what they should"
+        if degraded:
+            change, level, remedy = "degraded", logging.WARNING, "check cables and supply"
+            cause = f"amplifier {', '.join(degraded)} does not reply; nothing new is played"
         self.post(DaemonEvent(Trigger.LINK_CHANGED, cause, remedy))
-        level = logging.WARNING if degraded else logging.INFO
         _rate_limited_logger.log(level, "link: %s: %s", change, cause, extra={"topic": "link"})
         self._link_changed(change, degraded, cause)
 

@@ -15,11 +15,11 @@ from drivers.pauses import Backoff
 from drivers.threads import in_thread
 from model.errors import InputError
 from model.structure.plate import Plate
+from registry.plugins import failure_text
 
 _MIN_PAUSE, _MAX_PAUSE = 1.0, 30.0  # s; before a failed source is restarted
 _CLOSE_TIMEOUT = 0.2  # s
-MAX_SOURCES_PER_CLIENT = 64  # with fingers down; a gateway forwards those of many browsers
-_SOURCE_TIMEOUT = 1.0  # s; without a frame, after which a source no longer counts
+MAX_SOURCES_PER_CLIENT = 64  # with fingers down, until it lifts them
 
 _logger = logging.getLogger(__name__)
 
@@ -27,18 +27,12 @@ _logger = logging.getLogger(__name__)
 class TouchInputs:
     """Runs touch sources concurrently.
 
-    deliver receives their frames, each source name prefixed with the configured name; failed
-    receives the error of a source, which is then restarted after a growing pause.
+    deliver receives their frames, each source name prefixed with the configured name. A source that
+    fails is restarted after a growing pause.
     """
 
-    def __init__(
-        self,
-        deliver: Callable[[TouchFrame], None],
-        *,
-        failed: Callable[[str, Exception], None],
-    ) -> None:
+    def __init__(self, deliver: Callable[[TouchFrame], None]) -> None:
         self._deliver = deliver
-        self._failed = failed
         self._running: list[asyncio.Task[None]] = []
 
     def start(self, inputs: Iterable[TouchInput]) -> None:
@@ -71,7 +65,9 @@ class TouchInputs:
                 source = await in_thread(touch_input.make, name="touch source")  # reads recordings
                 await source.run(deliver)
             except Exception as error:
-                self._failed(touch_input.name, error)
+                is_expected = isinstance(error, InputError | OSError)
+                text = str(error) if is_expected else failure_text(error)
+                _logger.error("touch source %s: failed, restarting: %s", touch_input.name, text)
             else:
                 _logger.info("touch source %s: finished", touch_input.name)
                 return
@@ -89,7 +85,7 @@ class ApiTouches:
         self._plate = plate
         self._deliver = deliver
         self._waiting: dict[str, list[TouchFrame]] = {}
-        self._sources: dict[object, dict[str, float]] = {}  # time [s] of the last frame
+        self._sources: dict[object, set[str]] = {}  # with fingers down
         self._is_scheduled = False
 
     def add(self, client: object, params: TouchParams, *, client_name: str, now: float) -> None:
@@ -98,17 +94,15 @@ class ApiTouches:
         The same source name of two clients denotes two sources.
         """
         source = f"{API_SOURCES}:{client_name}:{params.source}"
-        sources = self._sources.setdefault(client, {})
-        sources.pop(source, None)
+        sources = self._sources.setdefault(client, set())
+        sources.discard(source)
         if params.touches:
-            for old in [each for each in sources if now - sources[each] > _SOURCE_TIMEOUT]:
-                del sources[old]
             if len(sources) >= MAX_SOURCES_PER_CLIENT:
                 raise InputError(
                     f"a client must have at most {MAX_SOURCES_PER_CLIENT} touch sources with "
                     "fingers down; lift some first"
                 )
-            sources[source] = now
+            sources.add(source)
         touches = tuple(
             Touch(point.id, point.x_m / self._plate.length, 1 - point.y_m / self._plate.width)
             for point in params.touches

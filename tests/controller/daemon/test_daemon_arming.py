@@ -1,7 +1,6 @@
 """The arming lease, and interruptions while a daemon arms, reloads or waits for amplifiers."""
 
 import asyncio
-import contextlib
 import logging
 import threading
 from collections.abc import Callable
@@ -221,14 +220,10 @@ async def test_shutdown_cancels_reload(tmp_path: Path, monkeypatch: pytest.Monke
             raise AssertionError("unreachable")
 
         monkeypatch.setattr("controller.daemon.daemon.in_thread", read_for_ever)
-        daemon._request_reload()
+        daemon._reload_requested.set()
         await is_reading.wait()
-        (reload,) = daemon._reloads
         daemon.shut_down("end of the test")
-        await until(reload.done)
-        with contextlib.suppress(asyncio.CancelledError):
-            await reload
-        assert reload.cancelled()
+        await until(daemon._reloading.cancelled)
 
 
 async def test_shutdown_while_a_port_is_opened_leaves_none_open(

@@ -94,7 +94,7 @@ class Panel(TouchSource):
 
 
 async def test_inputs_run_beside_each_other(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Frames carry the configured name, a failure is reported, and the others run on."""
     panels = {
@@ -104,19 +104,15 @@ async def test_inputs_run_beside_each_other(
     }
     monkeypatch.setattr("controller.daemon.config.open_source", panels.__getitem__)
     frames: list[str] = []
-    failed: list[tuple[str, str]] = []
-    inputs = TouchInputs(
-        lambda frame: frames.append(frame.source),
-        failed=lambda name, error: failed.append((name, str(error))),
-    )
+    inputs = TouchInputs(lambda frame: frames.append(frame.source))
     one, two, three = (
         TouchInput(name, url, TouchCalibration())
         for name, url in (("left", "a:"), ("right", "b:"), ("table", "c:"))
     )
     inputs.start([one, two, three])
-    await until(lambda: len(frames) == 3 and failed)
+    await until(lambda: len(frames) == 3 and caplog.messages)
     assert sorted(frames) == ["left:'x\\x1b[2J'", "right:y", "table:z"]
-    assert failed == [("right", "unplugged")]
+    assert caplog.messages == ["touch source right: failed, restarting: unplugged"]
     await inputs.close()
     assert (panels["a:"].ended, panels["c:"].ended) == (["x\x1b[2J"], ["z"])
 
@@ -137,7 +133,7 @@ def test_closing_waits_for_no_source_that_goes_on(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("controller.daemon.touch_inputs._CLOSE_TIMEOUT", 0.0)
 
     async def serve() -> None:
-        inputs = TouchInputs(lambda frame: None, failed=lambda name, error: None)
+        inputs = TouchInputs(lambda frame: None)
         inputs.start([TouchInput("left", "a:", TouchCalibration())])
         await started.wait()
         await inputs.close()
@@ -149,7 +145,7 @@ def test_closing_waits_for_no_source_that_goes_on(monkeypatch: pytest.MonkeyPatc
 
 
 async def test_failed_input_is_restarted_after_growing_pauses(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Until it finishes without an error."""
     errors: list[Exception | None] = [InputError("not plugged in"), OSError("gone"), None]
@@ -171,14 +167,12 @@ async def test_failed_input_is_restarted_after_growing_pauses(
 
     monkeypatch.setattr("controller.daemon.config.open_source", lambda url: Late())
     monkeypatch.setattr("controller.daemon.touch_inputs.asyncio.sleep", pause)
-    failed: list[str] = []
-    inputs = TouchInputs(
-        lambda frame: None, failed=lambda name, error: failed.append(f"{name}: {error}")
-    )
+    inputs = TouchInputs(lambda frame: None)
     inputs.start([TouchInput("left", "a:", TouchCalibration())])
     while len(runs) < 3:
         await sleep(0.001)
-    assert failed == ["left: not plugged in", "left: gone"]
+    failed = "touch source left: failed, restarting: "
+    assert caplog.messages == [f"{failed}not plugged in", f"{failed}gone"]
     assert (len(runs), paused) == (3, [1.0, 2.0])
     await inputs.close()
 

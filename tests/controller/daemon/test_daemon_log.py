@@ -24,12 +24,14 @@ from controller.daemon.fault_dumps import (
 from controller.daemon.latency import LatencyStatistics
 from controller.daemon.log import JsonFormatter, LogThread, RateLimitFilter
 from controller.daemon.service_manager import ServiceManager
+from controller.daemon.states import DaemonState, Operation
 from controller_bench import BenchLines, FarEnd
 from drivers import clock
 from drivers.host.wire import Reply
 from registry.limits import GuardLimits
 from virtual_loop import in_virtual_time
 
+FAULT = Operation(DaemonState.FAULT, "arc")
 LIMITS = GuardLimits(40.0, 500.0, 1.0)
 
 
@@ -259,7 +261,7 @@ async def test_failing_recorder_prevents_no_stop() -> None:
         def append(self, record: MessageRecord) -> None:
             raise MemoryError
 
-    far_end, recorder = FarEnd(), FaultDumps()
+    far_end, recorder = FarEnd(), FaultDumps(None)
     host = await BenchLines({"main": far_end}).amplifier("", LIMITS, name="main")
     recorder.follow({"main": host})
     await host.open()
@@ -292,7 +294,7 @@ def test_dump_that_fails_is_only_logged(
 ) -> None:
     """A file in place of the folder raises nothing at the daemon."""
     (tmp_path / "dumps").write_text("in the way", "utf-8")
-    FaultDumps().write(tmp_path / "dumps", cause="arc")
+    FaultDumps(tmp_path / "dumps").state_changed(Operation(), FAULT)
     wait_for_writers()
     (warning,) = caplog.messages
     assert str(tmp_path / "dumps") in warning
@@ -312,17 +314,17 @@ def test_dumps_use_one_thread_when_disk_hangs(
         released.wait(20)
         return tmp_path
 
-    dumps = FaultDumps()
+    dumps = FaultDumps(tmp_path)
     with monkeypatch.context() as patched, caplog.at_level(logging.WARNING):
         patched.setattr("controller.daemon.fault_dumps.write_dump", hang)
         for now[0] in (0.0, 10.0, 20.0):
-            dumps.write(tmp_path, cause="arc")
+            dumps.state_changed(Operation(), FAULT)
         assert hangs.wait(20)
         assert len(_writers()) == 1
         assert len(caplog.messages) == 2
         released.set()
         wait_for_writers()
     now[0] = 30.0
-    dumps.write(tmp_path, cause="arc")
+    dumps.state_changed(Operation(), FAULT)
     wait_for_writers()
     assert len(list(tmp_path.glob(DUMP_PATTERN))) == 1

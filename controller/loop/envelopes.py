@@ -11,6 +11,7 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -94,8 +95,17 @@ def thinned(envelopes: Envelopes, *, knots: int) -> Envelopes:
 
 def shapes_of(envelopes: Envelopes | None, rig: Rig) -> dict[str, Shape]:
     """Return envelopes as shapes, by ERA, with levels of full stroke; none without any."""
+    envelopes = envelopes or {}
+    strokes = {era.name: era.stroke for era in rig.eras}
+    each = [
+        knot / strokes[name] for name, envelope in envelopes.items() for knot in envelope.knots[:-1]
+    ]
+    # Without the rounding errors of the knot search, by which it may exceed 1; all at once.
+    levels = np.round(np.abs(each), _DIGITS) * np.exp(1j * np.angle(each))
+    knots = iter(levels.tolist())
     return {
-        name: _shape(envelope, rig.era(name).stroke) for name, envelope in (envelopes or {}).items()
+        name: Shape(envelope.step, tuple(islice(knots, len(envelope.knots) - 1)))
+        for name, envelope in envelopes.items()
     }
 
 
@@ -108,13 +118,6 @@ def _thinned(envelope: BaseEnvelope, steps: int) -> BaseEnvelope:
     times = np.minimum(step * np.arange(1, steps + 1), envelope.duration)
     knots = tuple(complex(value) for value in envelope.amplitude(times))
     return BaseEnvelope(envelope.frequency, envelope.start, knots, step)
-
-
-def _shape(envelope: BaseEnvelope, stroke: float) -> Shape:
-    """Return an envelope in full levels, without the rounding errors of the knot search."""
-    knots = np.array(envelope.knots[:-1], dtype=complex) / stroke
-    knots = np.round(np.abs(knots), _DIGITS) * np.exp(1j * np.angle(knots))  # else it may exceed 1
-    return Shape(envelope.step, tuple(knots.tolist()))
 
 
 def duration_of(shape: Shape | None) -> float:

@@ -22,14 +22,13 @@ knots: none exceeds the stroke. Single precision changes contrasts by some hundr
 import math
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import blas, lapack
 
-from model.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
+from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 from model.transients import base_motion
 from model.transients.base_motion import KNOT_STEP
 from model.transients.time_response import PlateInTime
@@ -77,7 +76,7 @@ class Carrier:
     frequency: float
     hats: Complex64Array
     steady: ComplexArray
-    residual_form: ComplexArray
+    residual_form: Complex64Array
     gain_variance: float
 
 
@@ -125,7 +124,13 @@ def solve_carrier(
     flat = states.reshape(len(states), -1)
     form = flat.conj().T @ residual_form @ flat
     _add_errors(form, len(plate.eras), gain_variance)
-    return Carrier(frequency, hats.astype(np.complex64, order="C"), steady, form, gain_variance)
+    return Carrier(
+        frequency,
+        np.ascontiguousarray(hats, dtype=np.complex64),
+        steady,
+        np.asarray(form, dtype=np.complex64),
+        gain_variance,
+    )
 
 
 def onset_knots(
@@ -145,9 +150,9 @@ def onset_knots(
     combined: Complex = hats @ combinations
     count = combinations.shape[1]
     form = _summed(combined, gain_variance)
-    wanted = weights[:t, 0, 0] * steady[:t].sum(axis=1)
+    wanted = (weights[:t, 0, 0] * steady[:t].sum(axis=1)).astype(np.complex64)
     along = np.tensordot(wanted, combined[:, :t].conj(), axes=(0, 1)).reshape(-1, count)
-    settled = np.tile(amplitudes @ combinations.conj(), _STEPS - free)
+    settled = np.tile((amplitudes @ combinations.conj()).astype(np.complex64), _STEPS - free)
     held = form[: free * count, free * count :] @ settled
     right = _rises(rise)[:free] @ along - held.reshape(free, count)
     knots = bounded_minimum(form[: free * count, : free * count], right, combinations)
@@ -166,7 +171,7 @@ def _combinations(hats: Complex64Array, amplitudes: ComplexArray) -> Complex64Ar
 
 
 @cache
-def _rises(rise: float) -> FloatArray:
+def _rises(rise: float) -> Float32Array:
     """The raised cosine that takes a time [s], as the hat of each knot meets it.
 
     By knot, and by sample and knot of `Carrier.hats`.
@@ -176,7 +181,7 @@ def _rises(rise: float) -> FloatArray:
     wanted[:_STEPS] = base_motion.rise(times, rise).reshape(_STEPS, _SAMPLES)
     since = np.arange(_STEPS)[::-1]  # steps since a hat began
     met = wanted[np.arange(_STEPS)[:, None] + since]
-    return np.asarray(met.transpose(0, 2, 1).reshape(_STEPS, -1))
+    return np.asarray(met.transpose(0, 2, 1).reshape(_STEPS, -1), dtype=np.float32)
 
 
 def ending_knots(
@@ -199,7 +204,7 @@ def ending_knots(
         vibration = np.linalg.norm(amplitudes @ carrier.steady) ** 2
         target = np.linalg.norm(found.steady[: found.targets] @ start) ** 2
         quiet_form, quiet_right = while_ending(found, start, carrier.gain_variance)
-        weight = _QUIET_WEIGHT * float(vibration / target)
+        weight = np.float32(_QUIET_WEIGHT * vibration / target)
         form = form + weight * quiet_form
         right += weight * quiet_right
     knots = bounded_minimum(form, right.reshape(-1, eras), np.eye(eras, dtype=np.complex64))
@@ -207,20 +212,21 @@ def ending_knots(
 
 
 def while_ending(found: Felt, start: ComplexArray, gain_variance: float) -> tuple[Complex, Complex]:
-    """Form and right side of the mean square at quiet fingers during an ending.
+    """Form, its upper triangle, and right side of the mean square at quiet fingers in an ending.
 
     An ending from a start (eras,) is the steady tone, and at each knot a hat of what the knot is
     above the start.
     """
     count = ENDING_KNOTS * _SAMPLES
     hats = found.hats[:, found.targets :, -ENDING_KNOTS:]
-    form = _summed(hats, gain_variance) / count
+    form = _summed(hats / np.float32(math.sqrt(count)), gain_variance)
     tones = start * found.steady[found.targets :]
     tones = tones.sum(axis=1, keepdims=True) + gain_variance * tones  # as errors have it
     by_knot = (hats.sum(axis=0).conj() * tones[:, None]).sum(axis=0)
     along = by_knot[::-1].cumsum(axis=0)[::-1].ravel() / count
     free = len(form) - len(start)
-    return form[:free, :free], form[:free] @ np.tile(start, ENDING_KNOTS) - along[:free]
+    lowered = blas.chemv(1.0, form.T, np.tile(start.conj(), ENDING_KNOTS), lower=1).conj()
+    return form[:free, :free], lowered[:free] - along[:free]
 
 
 def _expected_power(responses: ComplexArray, gain_variance: float) -> float:
@@ -232,15 +238,15 @@ def _expected_power(responses: ComplexArray, gain_variance: float) -> float:
 def _summed(responses: Complex, gain_variance: float) -> Complex:
     """Expected form over knots and ERAs, summed over time, of the squares over samples and rows.
 
-    responses (samples, d, knots, eras) as in `Felt.hats`. In the step before the last, each hat is
-    as that of the next knot in the last step, and so on.
+    Its upper triangle. responses (samples, d, knots, eras) as in `Felt.hats`. In the step before
+    the last, each hat is as that of the next knot in the last step, and so on.
     """
     knots, eras = responses.shape[2:]
-    flat = responses.reshape(-1, knots * eras)
-    form = flat.conj().T @ flat
-    by_knot = form.reshape(knots, eras, -1)
-    for later, knot in pairwise(by_knot[::-1]):
-        knot[:, :-eras] += later[:, eras:]
+    form = blas.cherk(1.0, responses.reshape(-1, knots * eras).T, lower=1).T
+    shift = eras
+    while shift < len(form):  # sums of 2, 4, 8 ... steps
+        form[:-shift, :-shift] += form[shift:, shift:]
+        shift *= 2
     _add_errors(form, eras, gain_variance)
     return form
 
@@ -329,9 +335,10 @@ _ITERATIONS = 30
 def bounded_minimum(form: Complex, right: Complex, combinations: Complex64Array) -> ComplexArray:
     """Minimise x^H form x - 2 Re right^H x where no ERA exceeds its stroke; its knots (k, eras).
 
-    form: Hermitian, positive semidefinite, over knots and combinations; right (k, c); combinations
-    (eras, c): orthonormal. The unbounded solution where it is within the bounds; otherwise by
-    alternating directions (ADMM: Boyd and others, 2011, section 5), whose result is so exactly.
+    form: over knots and combinations, the upper triangle of a positive semidefinite one; right (k,
+    c); combinations (eras, c): orthonormal. The unbounded solution where it is within the bounds;
+    otherwise by alternating directions (ADMM: Boyd and others, 2011, section 5), whose result is so
+    exactly.
     """
     single = form.astype(np.complex64)
     size = float(single.diagonal().real.mean())
@@ -341,19 +348,20 @@ def bounded_minimum(form: Complex, right: Complex, combinations: Complex64Array)
     to_knots, back = combinations.T, combinations.conj()
     _, found, _ = lapack.cposv(single, right.ravel())
     knots = found.reshape(right.shape) @ to_knots
-    if np.abs(knots).max() <= 1:
-        return np.asarray(knots, dtype=complex)
+    feasible = _within(knots)
+    if (feasible == knots).all():
+        return feasible
     penalty = _PENALTY * size
     diagonal += penalty
     inverse = _inverse(single)
-    feasible, dual = _within(knots), np.zeros_like(knots)
+    dual = np.zeros_like(feasible)
     for _ in range(_ITERATIONS):
-        pulled = right + penalty * ((feasible - dual) @ back)
+        pulled = (right + penalty * ((feasible - dual) @ back)).astype(np.complex64)
         knots = (inverse @ pulled.ravel()).reshape(right.shape) @ to_knots
         relaxed = _RELAXATION * knots + (1 - _RELAXATION) * feasible + dual
         feasible = _within(relaxed)
         dual = relaxed - feasible
-    return np.asarray(_within(feasible.astype(complex)), dtype=complex)
+    return feasible
 
 
 def _inverse(A: Complex64Array) -> Complex64Array:
@@ -363,6 +371,7 @@ def _inverse(A: Complex64Array) -> Complex64Array:
     return np.asarray(np.triu(upper) + np.triu(upper, 1).conj().T)
 
 
-def _within(knots: Complex) -> Complex:
+def _within(knots: Complex) -> ComplexArray:
     """Reduced to magnitudes within 1 by 1e-12 more, so that rounding never exceeds it."""
-    return np.asarray(knots * np.minimum((1 - 1e-12) / np.maximum(np.abs(knots), 1e-30), 1.0))
+    exact = knots.astype(complex)
+    return np.asarray(exact * np.minimum((1 - 1e-12) / np.maximum(np.abs(exact), 1e-30), 1.0))

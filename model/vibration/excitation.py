@@ -57,12 +57,11 @@ def base_amplitudes(excitation: Excitation, eras: Sequence[Era]) -> tuple[FloatA
     unknown = [name for name in excitation if name not in names]
     if unknown:
         raise InputError(f"the rig has no ERA {unknown[0]!r}; it has {', '.join(names)}")
-    frequencies = np.array(sorted({tone.frequency for tone in excitation.values()}))
+    frequencies = sorted({tone.frequency for tone in excitation.values()})
     amplitudes = np.zeros((len(frequencies), len(eras)), dtype=complex)
     for name, tone in excitation.items():
-        row = np.searchsorted(frequencies, tone.frequency)
-        amplitudes[row, names.index(name)] = tone.phasor
-    return frequencies, amplitudes
+        amplitudes[frequencies.index(tone.frequency), names.index(name)] = tone.phasor
+    return np.array(frequencies), amplitudes
 
 
 def tone_amplitudes(

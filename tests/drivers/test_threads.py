@@ -16,7 +16,7 @@ async def test_cancelled_work_is_undone_once() -> None:
     may_open, closed, closings = threading.Event(), threading.Event(), []
 
     def open_port() -> str:
-        may_open.wait(20)
+        may_open.wait(60)
         return "port"
 
     def close_port(port: str) -> None:
@@ -31,7 +31,7 @@ async def test_cancelled_work_is_undone_once() -> None:
     assert opening.cancelled()
     assert closings == []
     may_open.set()
-    assert await asyncio.to_thread(closed.wait, 20)
+    assert await asyncio.to_thread(closed.wait, 60)
     assert closings == ["port"]
 
 
@@ -55,7 +55,7 @@ async def test_result_at_the_moment_of_cancellation_is_undone() -> None:
     )
     with pytest.raises(asyncio.CancelledError):
         await opening
-    assert await asyncio.to_thread(closed.wait, 20)
+    assert await asyncio.to_thread(closed.wait, 60)
 
 
 def test_result_after_the_end_of_the_loop_is_undone() -> None:
@@ -64,7 +64,7 @@ def test_result_after_the_end_of_the_loop_is_undone() -> None:
 
     async def give_up() -> None:
         opening = asyncio.create_task(
-            in_thread(lambda: may_open.wait(20), name="opening", undo=lambda _: closed.set())
+            in_thread(lambda: may_open.wait(60), name="opening", undo=lambda _: closed.set())
         )
         await asyncio.sleep(0)
         opening.cancel()
@@ -72,7 +72,7 @@ def test_result_after_the_end_of_the_loop_is_undone() -> None:
 
     asyncio.run(give_up())
     may_open.set()
-    assert closed.wait(20)
+    assert closed.wait(60)
 
 
 def test_program_ends_while_work_hangs() -> None:

@@ -51,7 +51,7 @@ class SlowFile(io.StringIO):
 
     def write(self, text: str) -> int:
         self.is_writing.set()
-        self.may_go_on.wait(20)
+        self.may_go_on.wait(60)
         self.text += text
         return len(text)
 
@@ -64,7 +64,7 @@ def test_slow_file_drops_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trace._root, "handlers", [writer])
     trace._root.setLevel("DEBUG")
     trace.frame(Direction.OUT, b"", "first", str)
-    assert file.is_writing.wait(20)
+    assert file.is_writing.wait(60)
     for _ in range(25):
         trace.frame(Direction.OUT, b"", "later", str)
     assert writer.dropped == 15

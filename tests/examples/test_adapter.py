@@ -24,7 +24,7 @@ from scpi_generator import Generator, on_tcp
 SCRIPT = Path(era_haptics.__file__).parents[1] / "examples" / "adapter" / "scpi.py"
 LIMITS = GuardLimits(20.0, 900.0, 1.0)
 FULL = 5.0  # V
-PATIENCE = 20.0  # s
+PATIENCE = 60.0  # s
 HOST = """
 import asyncio, sys
 from drivers.contents import Layer, Tone

@@ -71,7 +71,7 @@ async def test_address_is_taken_and_kept_without_supply(
                 await move(amplifier, "FW-1")
             await amplifier.disarm(0.0)
             await move(amplifier, "FW-1")
-            async with asyncio.timeout(10):  # it is kept behind its reply
+            async with asyncio.timeout(60):  # it is kept behind its reply
                 while not (kept.is_file() and kept.stat().st_size):  # noqa: ASYNC110 - another process writes it
                     await asyncio.sleep(0.01)
     with running_firmware(firmware, *options(line, "--addresses", str(kept))) as (url, _):

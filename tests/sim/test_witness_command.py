@@ -130,7 +130,7 @@ SESSION = """
 0.012 wire1 < 0101010101010101010101010101010105BDAD53A200
 """
 DAMAGED = "0.020 wire1 > 00 05 0C 03 01 08 02 07 05 3C 50 CD 6A 00\n"
-TIMEOUT = 30  # s; for a loaded machine, not an expectation
+TIMEOUT = 120  # s; for a loaded machine, not an expectation
 LIMITS = {0: {"frequency_hz": [40, 500], "level": 1.0}}
 CONFIG = {"wires": {"a": "serial"}, "amplifiers": {"m": {"wire": "a", "channels": LIMITS}}}
 

@@ -32,8 +32,8 @@ async def opened_lines() -> AsyncIterator[Lines]:
 
 
 async def read_for_ever(amplifier: Amplifier) -> None:
-    """Read the status until an error, for five seconds at most."""
-    async with asyncio.timeout(5.0):
+    """Read the status until an error, for a minute at most."""
+    async with asyncio.timeout(60.0):
         while True:
             await amplifier.read_status()
 

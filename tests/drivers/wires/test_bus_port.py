@@ -59,8 +59,8 @@ async def opened(
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Let the event loop turn until a condition holds, for ten seconds at most."""
-    async with asyncio.timeout(10.0):
+    """Let the event loop turn until a condition holds, for a minute at most."""
+    async with asyncio.timeout(60.0):
         while True:
             if condition():
                 return

@@ -29,7 +29,7 @@ class _Hanging:
 
     def open(self, *_: object) -> "_Hanging":
         self.is_opening.set()
-        self.may_open.wait(20)
+        self.may_open.wait(60)
         return self
 
     def fileno(self) -> int:
@@ -41,7 +41,7 @@ class _Hanging:
         return can.Message(arbitration_id=0x701, is_extended_id=False, data=[5])
 
     def close(self) -> None:
-        self.may_close.wait(20)
+        self.may_close.wait(60)
         for descriptor in self._pipe:
             os.close(descriptor)
         self.is_closed.set()
@@ -83,7 +83,7 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> I
     yield device
     for event in (device.may_open, device.may_read, device.may_close):
         event.set()
-    assert device.is_closed.wait(20)
+    assert device.is_closed.wait(60)
 
 
 @pytest.mark.parametrize("kind", OPENINGS)
@@ -95,10 +95,10 @@ async def test_close_does_not_wait_for_a_device_that_hangs(
     opened = await OPENINGS[kind]()
     opened.close()
     with caplog.at_level(logging.WARNING, "drivers"):
-        await asyncio.wait_for(opened.wait_closed(), 10)
+        await asyncio.wait_for(opened.wait_closed(), 30)
     assert not device.is_closed.is_set()
     assert "era-close" in caplog.text
     device.may_read.set()
     device.may_close.set()
-    assert await asyncio.to_thread(device.is_closed.wait, 20)
+    assert await asyncio.to_thread(device.is_closed.wait, 60)
     assert HEARD == []

@@ -50,7 +50,7 @@ async def server(*replies: bytes, accepted: asyncio.Event | None = None) -> Asyn
         yield f"can+socketcand://127.0.0.1:{listening.sockets[0].getsockname()[1]}/can0#5"
     finally:
         listening.close()
-        async with asyncio.timeout(10.0):
+        async with asyncio.timeout(60.0):
             await ended.wait()
         await asyncio.sleep(0)  # the connection ends
 
@@ -122,7 +122,7 @@ async def test_slcan_is_closed_then_opened_at_its_bit_rate_and_closed_at_the_end
         port.close()
         await port.wait_closed()
         text = b""
-        async with asyncio.timeout(10.0):
+        async with asyncio.timeout(60.0):
             while len(text) < len(SLCAN_SPOKEN):
                 text += await asyncio.to_thread(os.read, master, 100)
     finally:

@@ -33,7 +33,7 @@ def let_solve(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     event, solved = threading.Event(), Placement.solved
 
     def wait(placement: Placement) -> LoadedPlate | None:
-        assert event.wait(20)
+        assert event.wait(60)
         return solved(placement)
 
     monkeypatch.setattr(Placement, "solved", wait)

@@ -303,7 +303,7 @@ def test_amplifier_is_disarmed_as_soon_as_the_card_ends(
             return staged
 
     def end() -> None:
-        assert playing.wait(10.0)
+        assert playing.wait(60.0)
         raise trouble
 
     monkeypatch.setattr(table_check, "BlockingAmplifier", Observed)

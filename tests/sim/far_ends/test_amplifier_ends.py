@@ -22,7 +22,7 @@ from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.far_end import FarEnd, TcpEnd, TerminalEnd
 
-TIMEOUT = 15.0  # s; of a busy machine
+TIMEOUT = 60.0  # s; of a busy machine
 IDENTITY = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, 1065, 66)  # read of 66 registers, TCP
 IDENTITY_SIZE = 9 + 2 * 66
 HELLO = encode_frame(Frame(kind=1, address=1, sequence=1, payload=b"", version=0))

@@ -23,7 +23,7 @@ from sim.control.context import SimulationContext
 from sim.process.view import PlateView, draw
 
 ROOT = example_rig_path().parent.parent
-TIMEOUT = 30  # s; for a loaded machine, not an expectation
+TIMEOUT = 120  # s; for a loaded machine, not an expectation
 
 
 async def start(arguments: Sequence[str]) -> asyncio.subprocess.Process:

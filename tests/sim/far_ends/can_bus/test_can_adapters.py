@@ -15,7 +15,7 @@ from sim.far_ends.can_bus.bus import CanBus
 from sim.faults.fault_window import Faults
 from sim.transport.far_end import TcpEnd, TerminalEnd
 
-TIMEOUT = 5.0  # s; for a loaded machine, not an expectation
+TIMEOUT = 60.0  # s; for a loaded machine, not an expectation
 FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))
 
 

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.testing import CliRunner
 
@@ -55,29 +54,6 @@ def test_page_lists_every_command_with_its_options() -> None:
 def test_page_is_current() -> None:
     """Written anew by the program that stands in the page."""
     assert insert(PAGE, command_reference(), writer=WRITER) == PAGE, f"python {WRITER}"
-
-
-def test_help_has_four_sections_in_the_order_of_the_page() -> None:
-    """Every command is in one of them, and the page lists commands in the order of the help."""
-    group = load_commands()[0]
-    text = group.get_help(typer.Context(group, info_name="era"))
-    titles = re.findall(r"^(\w+):$", text, re.MULTILINE)
-    assert titles == ["Options", "Try", "Plate", "Run", "Amplifier"]
-    names = re.findall(r"^  ([a-z]\S+)  ", text.partition("Try:")[2], re.MULTILINE)
-    assert sorted(names) == sorted(group.commands)
-    on_page = re.findall(r"^### era (\S+)", PAGE, re.MULTILINE)
-    assert list(dict.fromkeys(on_page)) == names
-
-
-def test_no_list_of_commands_cuts_a_summary_off() -> None:
-    """`era --help` and that of each group, on a terminal of 80 columns, which click fills to 78."""
-    era = load_commands()[0]
-    groups = [era, *(one for one in era.commands.values() if isinstance(one, TyperGroup))]
-    assert len(groups) > 5
-    for one in groups:
-        context = typer.Context(one, info_name="era", terminal_width=78)
-        listed = one.get_help(context).partition("Options:")[2]
-        assert [line for line in listed.splitlines() if line.endswith("...")] == [], one.name
 
 
 def test_every_command_with_json_tells_its_keys() -> None:

@@ -10,7 +10,6 @@ from controller.api.schema import headline
 from controller.api.topics import StateEvent
 from controller.daemon.api_views import learning_summary
 from controller.daemon.config_sections import (
-    CalibrationSection,
     DaemonSection,
     DumpSection,
     LogSection,
@@ -60,13 +59,6 @@ def test_a_section_is_told_in_its_row(key: str, section: type[Section]) -> None:
     found = re.search(r"`\{(.*?)\}`", row[1])
     assert found is not None
     assert found[1].split(", ") == list(section.model_fields)
-
-
-def test_a_calibration_is_told_below() -> None:
-    """Every way to say how a sensor lies stands in the paragraph below the table."""
-    text = (REFERENCE / "daemon.md").read_text("utf-8")
-    below = text.partition("`calibration` is ")[2].partition("\n\n")[0]
-    assert [key for key in CalibrationSection.model_fields if key not in below] == []
 
 
 async def test_every_metric_is_on_its_page(tmp_path: Path) -> None:

@@ -231,13 +231,6 @@ def test_data_sheets_are_those_of_the_definition(name: str) -> None:
     assert (DOCS / name).read_text("utf-8") == FILES[name](), f"python {WRITER} docs/reference"
 
 
-def test_pages_have_the_length_that_a_reader_bears() -> None:
-    """The meaning in 400 lines, a wire in 200."""
-    lengths = {name: page(name).count("\n") for name in ("protocol", "serial", "modbus", "can")}
-    assert lengths.pop("protocol") <= 400
-    assert max(lengths.values()) <= 200
-
-
 def test_monitor_reads_the_frames_of_the_page_by_the_dbc() -> None:
     """`cantools` finds type, number of words and every word of the set."""
     database = cantools.database.load_file(DOCS / "amplifier.dbc")

@@ -1,7 +1,6 @@
 """Work in threads, finished or cancelled."""
 
 import asyncio
-import contextlib
 import subprocess
 import sys
 import threading
@@ -9,30 +8,6 @@ import threading
 import pytest
 
 from drivers.threads import in_thread
-
-
-async def test_cancelled_work_is_undone_once() -> None:
-    """The task ends at once; a device opened afterwards is closed by its thread."""
-    may_open, closed, closings = threading.Event(), threading.Event(), []
-
-    def open_port() -> str:
-        may_open.wait(60)
-        return "port"
-
-    def close_port(port: str) -> None:
-        closings.append(port)
-        closed.set()
-
-    opening = asyncio.create_task(in_thread(open_port, name="opening", undo=close_port))
-    await asyncio.sleep(0)
-    opening.cancel()
-    with contextlib.suppress(asyncio.CancelledError):
-        await opening
-    assert opening.cancelled()
-    assert closings == []
-    may_open.set()
-    assert await asyncio.to_thread(closed.wait, 60)
-    assert closings == ["port"]
 
 
 async def test_result_at_the_moment_of_cancellation_is_undone() -> None:

@@ -251,31 +251,6 @@ CHECKS: Mapping[str, Callable[[Played, Truth], None]] = {
 }
 
 
-def response_differences(one: Played, other: Played) -> list[float]:
-    """Differences of the plate's responses to two streams, relative to the largest."""
-    return [
-        _apart(mine.phasors, yours.phasors)
-        for mine, yours in zip(_touched(one), _touched(other), strict=True)
-        if mine.phasors is not None and yours.phasors is not None
-    ]
-
-
-def rounding(played: Played, truth: Truth) -> list[float]:
-    """Bounds of the relative change by rounding every level and phase to the amplifier's steps."""
-    points = np.array(list(SENSORS.values()))
-    shares = []
-    for heard in _touched(played):
-        _, together = truth.fields(heard, points)
-        tones = heard.patterns[-1]["drive"]
-        steps = 0.0
-        for name, tone in tones.items():
-            alone = replace(heard, patterns=({"drive": {name: {**tone, "level": 1.0}}},))
-            step = 0.5 * (LEVEL_STEP + tone["level"] * math.radians(PHASE_STEP))
-            steps = steps + step * np.abs(truth.fields(alone, points)[1][0])
-        shares.append(float(np.max(steps) / np.abs(together).max()))
-    return shares
-
-
 def _touched(played: Played) -> list[Heard]:
     """Situations with fingers, each of which must have a pattern."""
     touched = [heard for heard in played.heard if heard.situation.fingers]

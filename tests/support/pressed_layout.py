@@ -15,12 +15,12 @@ from controller.effects.player import EffectPlayer
 from controller.loop.envelopes import RAMPS_ONLY
 from controller.loop.observer import Applied
 from drivers import clock
-from drivers.protocol.records import Values
 from model.arrays import FloatArray
 from model.finger.perception import detection_threshold
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
+from rig_on_wire import after_each
 from sim.far_ends.wires import Wire
 from virtual_loop import run_virtual
 
@@ -117,16 +117,14 @@ class _Starts(Chain):
 
     def __post_init__(self) -> None:
         """Note when a tone starts."""
-        obey, amplifier = self.far.device.handle, self.far.amplifier
+        amplifier = self.far.amplifier
 
-        def handle(name: str, values: Values, now: float) -> Values:
-            reply = obey(name, values, now)
+        def note(*_: object) -> None:
             tones = [tone for each in amplifier.outputs for tone in each]
             origins = {tone.origin for tone in tones if tone.transition.last}
             self.starts += sorted(origins - {*self.starts})
-            return reply
 
-        self.far.device.handle = handle  # type: ignore[method-assign]
+        after_each(self.far.device, note)
 
     async def press(self, id: int, way: Callable[[float], Position], held: float) -> list[Felt]:
         """Press once; records end where the finger moves."""

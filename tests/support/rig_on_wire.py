@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from typing import cast
@@ -16,6 +16,7 @@ from drivers.host.group import Group
 from drivers.host.line import Line
 from drivers.host.serial_wire import SerialWire
 from drivers.opening import Lines
+from drivers.protocol.records import Values
 from model.rig.rig import Channel, Rig
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
@@ -62,6 +63,20 @@ class FarSide:
         self.bench.advance(clock.now())
         ends = [tone.silent_from for output in self.amplifier.outputs for tone in output]
         return max(ends, default=self.bench.time)
+
+
+def after_each(
+    device: AmplifierDevice, note: Callable[[str, Values, Values, float], object]
+) -> None:
+    """Call with each request that a device carries out: its name, values, reply and time [s]."""
+    obey = device.handle
+
+    def handle(name: str, values: Values, now: float) -> Values:
+        reply = obey(name, values, now)  # a refusal changes nothing
+        note(name, values, reply, now)
+        return reply
+
+    device.handle = handle  # type: ignore[method-assign]
 
 
 @asynccontextmanager

@@ -12,12 +12,12 @@ from chain import Chain
 from committed_sets import CommittedSets
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from drivers.protocol.records import Values
 from model.finger.perception import detection_threshold
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from paper_table import smooth_rig
+from rig_on_wire import after_each
 from sim.far_ends.wires import Wire
 
 LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)
@@ -40,15 +40,9 @@ class Fingers(Chain):
 
     def __post_init__(self) -> None:
         """Note what requests of the host change."""
-        obey, sets = self.far.device.handle, CommittedSets()
+        sets = CommittedSets()
         self.committed = sets.all
-
-        def handle(name: str, values: Values, now: float) -> Values:
-            reply = obey(name, values, now)
-            sets.note(name, values, reply, now)
-            return reply
-
-        self.far.device.handle = handle  # type: ignore[method-assign]
+        after_each(self.far.device, sets.note)
 
     def contrasts(self, *, over: float = 0.25) -> Mapping[int, float]:
         """Level of each finger's content over all others there [dB], of the last seconds.

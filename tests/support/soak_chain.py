@@ -23,11 +23,10 @@ from controller.loop.observer import Applied, Observer
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from drivers.opening import Lines
-from drivers.protocol.records import Values
 from memory_machine import live_in_memory
 from newest_contact import BuzzNewestContact
 from paper_plate import make_paper_rig
-from rig_on_wire import far_side, on_two_amplifiers
+from rig_on_wire import after_each, far_side, on_two_amplifiers
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.wires import Wire
 from sim.witness.witness import OperatorCommand
@@ -222,15 +221,12 @@ class _Run:
 
     def _listen(self, name: str, device: AmplifierDevice) -> None:
         """Note what an amplifier is asked, and what becomes of it."""
-        obey = device.handle
 
-        def handle(request: str, values: Values, now: float) -> Values:
+        def note(request: str, *_: object) -> None:
             self.counts["requests"] += 1
-            reply = obey(request, values, now)  # a refusal changes nothing
             self.checks.exchanged(name, request)
-            return reply
 
-        device.handle = handle  # type: ignore[method-assign]
+        after_each(device, note)
         device.listeners.append(
             lambda event, at: self.note("amplifier", name, event["state"], event["fault"])
         )

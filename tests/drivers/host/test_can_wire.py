@@ -33,21 +33,6 @@ def wire() -> CanWire:
     return wire
 
 
-def test_hello_starts_the_node() -> None:
-    """Network management, an upload of 2000:5 (CiA 301, 7.2.4.3.5), then a message of type 1.
-
-    It has no words; numbers are by node.
-    """
-    wire = CanWire(500_000, sequence=255)
-    for node in (5, 6):
-        sent = unpack_frames(wire.request(node, "Hello", {}))
-        assert [(frame.id, frame.data.hex()) for frame in sent] == [
-            (0, f"010{node}"),
-            (0x600 + node, "4000200500000000"),
-            (0x200 + node, "0100010000000000"),
-        ]
-
-
 def test_versions_of_another_protocol_end_hello() -> None:
     """Bit 2 for version 2: such an amplifier has the object, and does not reply to the message."""
     wire = CanWire(500_000, sequence=0)

@@ -40,11 +40,6 @@ BYTES = {
         "01 04 0580 0005 312D",
     ),
 }
-# After an Arm and its read a Set has tag 3: its token 7, exact and played, no part missing.
-TAKEN = "01 04 0A 0003 0000 0007 0005 0000 604C"
-REFUSED = "01 04 0A 0003 0407 0000 0000 0000 B2BE"  # BAD_CHANNEL, channel 7
-# State 4, no fault, high voltage, latch 0, 250 ms, 25 °C, 1800 V, token 0, 4 channels, 8 layers.
-STATUS = "0004 0000 0001 0000 00FA 00FA 0708 0000 0408"
 
 
 class Peer:
@@ -89,37 +84,6 @@ def test_request_has_the_bytes_written_by_hand(case: str) -> None:
     ]
     assert wire.request(1, name, values) == over_tcp[0]
     assert wire.received(over_tcp[1]) == [More(over_tcp[2])]
-
-
-def test_replies_have_the_bytes_written_by_hand() -> None:
-    """The status of Arm with zeros behind it, what was taken of a set, and a refused one."""
-    wire, peer = ModbusWire(115_200, is_rtu=True, number=0), Peer(is_rtu=True)
-    (more,) = wire.received(peer.reply(wire.request(1, *ARM)))
-    assert isinstance(more, More)
-    response = peer.reply(more.data)
-    assert response[:-2] == bytes.fromhex(f"01 04 56 0001 0000 {STATUS}") + bytes(64)
-    assert [type(each) for each in wire.received(response)] == [Reply]
-    (more,) = wire.received(peer.reply(wire.request(1, "Set", SET)))
-    assert isinstance(more, More)
-    assert peer.reply(more.data) == bytes.fromhex(TAKEN)
-    taken = {"token": 7, "exact": 1, "staged": 0, "played": 1, "missing": 0}
-    assert wire.received(bytes.fromhex(TAKEN)) == [Reply(taken)]
-
-    wire = ModbusWire(115_200, is_rtu=True, number=2)
-    bad = {**SET, "token": 8, "stream": [1, 20, 500, 0x0070, 2200, 2000, 0]}
-    (more,) = wire.received(peer.reply(wire.request(1, "Set", bad)))
-    assert isinstance(more, More)
-    assert peer.reply(more.data) == bytes.fromhex(REFUSED)
-    assert wire.received(bytes.fromhex(REFUSED)) == [Nak("BAD_CHANNEL", 7)]
-
-
-@pytest.mark.parametrize("is_rtu", [True, False])
-def test_identity_is_that_of_every_version(is_rtu: bool) -> None:
-    """66 registers from 1065 on, read at once."""
-    wire, peer = ModbusWire(0, is_rtu=is_rtu, number=0), Peer(is_rtu=is_rtu)
-    request = wire.request(1, "Hello", {})
-    assert request[-8 if is_rtu else -6 :][:6] == bytes.fromhex("01 04 0429 0042")
-    assert wire.received(peer.reply(request)) == [Reply(peer.amplifier.identity)]
 
 
 def test_as_many_registers_are_read_as_the_reply_can_have() -> None:

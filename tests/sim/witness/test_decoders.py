@@ -111,19 +111,6 @@ def test_bytes_of_the_pages_mean_what_stands_beside_them(kind: str) -> None:
             assert {name: values[name] for name in must} == must
 
 
-def test_set_of_the_pages_has_the_words_of_the_first_page() -> None:
-    """All layers and commands, as the page on messages writes them."""
-    text = (DOCS / "protocol.md").read_text(encoding="utf-8").partition("## A finger joins")[2]
-    shown_words = text.partition("The amplifier replies")[0]
-    rows = re.findall(r"(?m)^ {4,6}((?:[0-9A-F]{4}[ ·]+)*[0-9A-F]{4})", shown_words)
-    words = [int(word, 16) for row in rows for word in re.findall(r"[0-9A-F]{4}", row)]
-    for kind in ("serial", "modbus-tcp", "slcan"):
-        (message,) = [
-            each for _, each in decoded(kind) if isinstance(each, Request) and each.name == "Set"
-        ]
-        assert message.values["stream"] == words[3:]
-
-
 def tcp(number: int, pdu: str) -> bytes:
     """Return an ADU of Modbus TCP for unit 1: transaction, 0, length, unit, PDU."""
     data = bytes.fromhex(pdu)

@@ -1,13 +1,9 @@
-"""Amplifiers of protocol 3 on a CAN bus: bytes by hand, a foreign reader, and damage.
+"""Amplifiers of protocol 3 on a CAN bus: bytes by hand, of which some are lost.
 
 Frames are written as identifier and data in hexadecimal digits.
 """
 
-from collections.abc import Iterator
-
-import canopen
 import pytest
-from canopen.sdo.client import SdoClient
 
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
@@ -66,34 +62,3 @@ def test_set_without_one_of_its_frames_is_not_played(bus: Bus, lost: int) -> Non
     assert bus.level(0.1) == 0.0
     bus.put(0.11, *((can_id, f"03{data[2:]}") for can_id, data in SET), COMMIT)
     assert bus.level(0.11) == 0.5
-
-
-class Reader(canopen.Network):
-    """The package `canopen` on the bus, without threads."""
-
-    def __init__(self, bus: Bus) -> None:
-        super().__init__()
-        self._bus = bus
-
-    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Put a frame on the bus, and hand over what comes back."""
-        for answer, reply in self._bus.put(0.0, (can_id, bytes(data).hex())):
-            self.notify(answer, bytearray.fromhex(reply), 0.0)
-
-
-@pytest.fixture
-def read(bus: Bus) -> Iterator[SdoClient]:
-    """Its client of the objects of node 1."""
-    node = canopen.RemoteNode(1, canopen.ObjectDictionary())
-    node.associate_network(Reader(bus))
-    yield node.sdo
-    node.remove_network()
-
-
-def test_identity_is_read_by_a_foreign_master(read: SdoClient) -> None:
-    """1018: vendor 0, product 1, revision 1, crc32 of SIM-a; 2000: texts, and version 3 alone."""
-    numbers = [int.from_bytes(read.upload(0x1018, each), "little") for each in range(5)]
-    assert numbers == [4, 0, 1, 1, 0x3D504003]
-    texts = [read.upload(0x2000, each) for each in range(1, 5)]
-    assert texts == [b"era-haptics", b"simulated amplifier", b"SIM-a", b"1"]
-    assert [read.upload(0x2000, each) for each in (0, 5)] == [b"\x05", b"\x08\x00"]

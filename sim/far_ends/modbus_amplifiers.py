@@ -89,10 +89,9 @@ def _split_rtu(data: bytes, *, is_ended: bool = False) -> tuple[list[Adu], bytes
 def _first_request(data: bytes) -> tuple[Adu | None, bytes]:
     """Take the first valid request, with what is before it; returns what is left, too."""
     for start in range(len(data)):
-        end = start + request_size(data[start:])
-        request = checked(data[start:end])
+        request = checked(data, start, request_size(data[start:]))
         if request is not None:
-            return request, data[end:]
+            return request, data[start + len(request.raw) :]
     return None, data[-RTU_MAX:]
 
 

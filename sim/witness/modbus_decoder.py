@@ -51,7 +51,7 @@ def split_rtu(direction: Direction, data: bytes) -> tuple[list[Adu], bytes]:
     found: list[Adu] = []
     begin = 0
     while begin + _RTU_MIN <= len(data):
-        adu = checked(data[begin : begin + size_of(data[begin:])])
+        adu = checked(data, begin, size_of(data[begin:]))
         if adu is None:
             begin += 1
             continue

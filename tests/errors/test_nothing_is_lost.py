@@ -158,7 +158,7 @@ def fill_disk(pid: int) -> None:
 
     A file that was longer than the limit at once would say nothing about a write that fails.
     """
-    end, limit = time.monotonic() + 20, -1
+    end, limit = time.monotonic() + 120, -1
     while (size := recorded(pid)) != limit:
         if size > limit:
             limit = size + 8199  # more than comes while this is done

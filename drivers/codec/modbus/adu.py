@@ -73,9 +73,11 @@ def split_tcp(data: bytes) -> tuple[list[Adu], bytes]:
     return found, data
 
 
-def checked(frame: bytes) -> Adu | None:
-    """Return what an RTU frame holds if its CRC is valid, else None."""
-    if len(frame) < _RTU_MIN or crc16(frame[:-2]) != frame[-2:]:
+def checked(data: bytes, start: int = 0, size: int | None = None) -> Adu | None:
+    """Return what an RTU frame of a size holds if it is whole and its CRC valid, else None."""
+    size = len(data) - start if size is None else size
+    frame = data[start : start + size]
+    if not _RTU_MIN <= size == len(frame) or crc16(frame[:-2]) != frame[-2:]:
         return None
     return Adu(frame[0], frame[1:-2], raw=frame)
 
@@ -189,13 +191,11 @@ class ResponseReader:
 
     def _next_rtu(self, to: RequestAdu | None) -> Adu | None:
         for start in range(len(self._buffer) - 4):
-            size = self._rtu_size(start, to)
-            if size and start + size <= len(self._buffer):
-                adu = checked(self._buffer[start : start + size])
-                if adu is not None:
-                    self._counters.invalid_frames += start > 0
-                    self._buffer = self._buffer[start + size :]
-                    return adu
+            adu = checked(self._buffer, start, self._rtu_size(start, to))
+            if adu is not None:
+                self._counters.invalid_frames += start > 0
+                self._buffer = self._buffer[start + len(adu.raw) :]
+                return adu
         if len(self._buffer) > 2 * RTU_MAX:
             self.clear()
         return None

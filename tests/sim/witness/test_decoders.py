@@ -135,6 +135,8 @@ PING: tuple[Heard, ...] = (
     (">", tcp(6, "04 0C80 0002"), "read on", {}),
 )
 """With tag 8 and session 7."""
+PART = rtu("01 04 04")
+"""The first of a response: its checksum is the first register, the tag."""
 OFF = "0000 0000 0001 0000 0000 0000 0000 00FA 0708 0000 0101 0000 0000 0000 0000"
 """Registers of a status without a tag: state 1, one channel and one layer."""
 TONES = ("201 04 00 11 05 01 00 64 00", "201 04 01 02 00 D0 07 E8 03")
@@ -178,6 +180,16 @@ TALKS: dict[str, tuple[str, tuple[Heard, ...]]] = {
     "broadcast on RTU": (
         "modbus-rtu",
         ((">", rtu("00 10 0800 0002 04 0003 0005"), "Stop", {"ramp": 5}),),
+    ),
+    "parts, the first with a checksum of its own": (
+        "modbus-rtu",
+        (
+            (">", rtu(f"01 10 0C00 0002 04 {PART[3:].hex()} 0007"), "Ping", {"session": 7}),
+            ("<", rtu("01 10 0C00 0002"), "carried out", {}),
+            (">", rtu("01 04 0C80 0002"), "read on", {}),
+            ("<", PART, "", {}),
+            ("<", rtu(f"{PART.hex()} 0000")[len(PART) :], "reply", {}),
+        ),
     ),
     "frames in any order, and a copy": (
         "slcan",

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from controller.cli.layout import layout_app
+from controller.cli.commands import app
 from controller.effects import layout_check
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
@@ -178,8 +178,8 @@ def run(folder: Path, text: str, *options: str) -> tuple[int, str]:
     """Exit status and output of the command."""
     (folder / "layout.yaml").write_text(text, encoding="utf-8")
     save_table(table(), folder / "table.npz")
-    arguments = ["check", str(folder / "layout.yaml"), str(folder / "table.npz"), *options]
-    result = CliRunner().invoke(layout_app, arguments)
+    files = [str(folder / name) for name in ("layout.yaml", "table.npz")]
+    result = CliRunner().invoke(app, ["layout", "check", *files, *options])
     return result.exit_code, result.stdout
 
 

@@ -17,8 +17,8 @@ from scipy.special import chdtrc
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.identification.derivatives import by_mass_at
-from model.identification.kalman import State, Updated
 from model.identification.settled import Touched
+from model.identification.settled_update import State, Updated
 
 WINDOW: Final = 8
 _UNLIKELY_TOGETHER, _UNLIKELY_ALONE, _UNLIKELY_REST = 1e-7, 1e-6, 1e-2

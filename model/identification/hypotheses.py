@@ -19,9 +19,9 @@ from model.choice import best_first, ranked_by
 from model.identification.alarm import places_on
 from model.identification.alterations import Alteration, Altered, Crack, Hand, scores
 from model.identification.derivatives import by_mass_at
-from model.identification.kalman import State, Updated, update
 from model.identification.parameters import Space
 from model.identification.settled import Touched, finger_covariance
+from model.identification.settled_update import State, Updated, update
 
 _SPRING, _THICKNESS, _GAIN, _PHASE = 0.3, 0.05, 0.3, 0.5  # of logarithms, and radians
 _MASS = 5e-3
@@ -29,10 +29,10 @@ _COST_OF_CHANGE = 4.0
 _UNLIKELY, _FAR_AHEAD, _ROUGHLY = 1e-4, 25.0, 4.0
 _STARTS, _ALTERED_STARTS = 3, 2
 _ALTERATIONS: tuple[Alteration, ...] = (Hand(), Crack())
-_FIRST_ITERATIONS, _ALTERED_ITERATIONS, _ITERATIONS = 5, 10, 30
+_FIRST_EVALUATIONS, _ALTERED_EVALUATIONS, _EVALUATIONS = 10, 15, 40
 BY_MASS = "a mass"
 _WITHIN_REACH = 300.0  # of the least cost
-_FOLLOWED = 3  # of the least cost after the first iterations
+_FOLLOWED = 3  # of the least cost after the first evaluations
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
     """Find the one change that explains patterns, from the state before it."""
     space = patterns[0].space
     tried = [
-        _Tried(name, changed, wider, update(wider, patterns, iterations=_FIRST_ITERATIONS))
+        _Tried(name, changed, wider, update(wider, patterns, evaluations=_FIRST_EVALUATIONS))
         for name, changed in _kinds(space)
         for wider in [_widened(before, space, changed)]
     ]
@@ -94,7 +94,7 @@ def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
         followed.remove(each.name)
         x = np.concatenate([each.after.state.x, each.after.fingers])
         measured = each.altered or patterns
-        after = update(each.prior, measured, iterations=_ITERATIONS, start=x)
+        after = update(each.prior, measured, evaluations=_EVALUATIONS, start=x)
         tried[number] = replace(each, after=after)
     tried = ranked_by(tried, lambda each: -each.cost)
     best = tried[0]
@@ -166,7 +166,7 @@ def _by_mass(before: State, patterns: Sequence[Touched]) -> list[_Tried]:
         start = before.x.copy()
         start[mass] = size / space.std[mass]
         start[mass + 1 : mass + 3] = (place - sides / 2) / space.std[mass + 1 : mass + 3]
-        after = update(wider, patterns, iterations=_FIRST_ITERATIONS, start=start)
+        after = update(wider, patterns, evaluations=_FIRST_EVALUATIONS, start=start)
         found.append(_Tried(BY_MASS, changed, wider, after))
     return found
 
@@ -184,7 +184,7 @@ def _by_alteration(
     for size, place in _scan(before, patterns, alteration, 1.0)[:_ALTERED_STARTS]:
         theta = altered[0].parameters(place, alteration.start(size))
         start = np.concatenate([before.x, theta])
-        after = update(wider, altered, iterations=_ALTERED_ITERATIONS, start=start)
+        after = update(wider, altered, evaluations=_ALTERED_EVALUATIONS, start=start)
         found.append(_Tried(alteration.name, changed, wider, after, altered))
     return found
 

@@ -22,11 +22,11 @@ from model.identification.forward import ForwardModel, Sensor
 from model.identification.hypotheses import Explanation, explain
 from model.identification.identified_rig import rig_with
 from model.identification.identify import Identification, solved_for
-from model.identification.kalman import State, update
 from model.identification.noise import NoiseLevel
 from model.identification.parameters import FINGER_PARTS, KINDS, MODE_SHIFTS, Space, space_of
 from model.identification.posterior import THEORY
 from model.identification.settled import SettledPattern, Touched
+from model.identification.settled_update import State, update
 from model.identification.stages import Setting
 from model.identification.values import Values
 from model.rig.rig import Rig
@@ -36,7 +36,7 @@ from model.structure.modal_elasticity import lowest_elastic
 _EARLY, _HELD = 4, 6  # patterns that are explained together, at first and at last
 _AFTER_ALARM = 2  # patterns before a change counts as unexplained
 _CERTAIN = 12.0  # of the cost: by how much an early explanation is better than any other
-_ITERATIONS = 3
+_EVALUATIONS = 20
 _FINGER = KINDS["fingers"].std
 
 _NOT_STATED = (
@@ -167,7 +167,7 @@ class LivePlate:
             self._held.append(touched)
             self._since_alarm += 1
             return self._explained(pattern.time)
-        after = update(drifted, [touched], iterations=_ITERATIONS, theory=self._theory)
+        after = update(drifted, [touched], evaluations=_EVALUATIONS, theory=self._theory)
         taken = Taken.of(touched, self._state, self._time, after, self._places)
         suspect = self._alarm.take(taken)
         if suspect is not None:

@@ -8,6 +8,8 @@ from scipy.optimize import least_squares
 
 from model.arrays import ComplexArray, FloatArray
 
+_INSIDE = 0.1  # standard deviations from a bound: nearer to one steps begin too small
+
 
 @dataclass(frozen=True, eq=False)
 class Found:
@@ -65,9 +67,10 @@ def search(
     def jacobian(y: FloatArray) -> FloatArray:
         return both(y)[1]
 
+    inside = np.minimum(_INSIDE, np.ptp(bounds, axis=0) / 4)
     found = least_squares(
         residuals,
-        np.clip(start, bounds[0] + 1e-9, bounds[1] - 1e-9),
+        np.clip(start, bounds[0] + inside, bounds[1] - inside),
         jacobian,
         bounds=(bounds[0], bounds[1]),
         x_scale="jac",

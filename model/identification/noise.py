@@ -9,7 +9,7 @@ from collections import deque
 
 import numpy as np
 
-from model.identification.kalman import Updated
+from model.identification.settled_update import Updated
 
 _PATTERNS = 60
 _FIRST = 8.0

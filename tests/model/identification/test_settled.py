@@ -11,9 +11,9 @@ from model.arrays import FloatArray
 from model.identification.alarm import WINDOW, Alarm, Taken
 from model.identification.forward import Sensor
 from model.identification.in_service import Known, LivePlate
-from model.identification.kalman import State, Updated
 from model.identification.noise import NoiseLevel
 from model.identification.settled import SettledPattern, Touched
+from model.identification.settled_update import State, Updated, update
 from model.rig.file import example_rig_path, load_rig
 from settled_patterns import settled_patterns
 
@@ -54,6 +54,23 @@ def test_update_does_not_depend_on_a_phase_that_is_unknown(
     np.testing.assert_allclose(after, before, atol=1e-9)
     counted = state_after(known, turned(pattern, 2.0, has_phase=True))
     assert np.abs(counted - before).max() > 0.1
+
+
+def test_update_within_bounds_explains_a_pattern(known: Known, pattern: SettledPattern) -> None:
+    """Of a plate that was not measured, whose ERAs at corners can be off inwards alone.
+
+    A hundred parameters are free for eight numbers: at the most likely state these are explained to
+    their errors, by no more changes than eight directions of the prior are likely to make.
+    """
+    touched = Touched.of(known.model, pattern, 0.5)
+    found = update(known.state, [touched], evaluations=20)
+    predicted, _ = touched.predicted(found.state.x, found.fingers)
+    residuals = (predicted - pattern.numbers) / touched.std
+    assert residuals @ residuals < found.count
+    assert found.cost < 3 * found.count
+    space = known.model.space
+    assert (found.state.x >= space.lower).all()
+    assert (found.state.x <= space.upper).all()
 
 
 def test_numbers_change_as_their_derivatives_say(known: Known, pattern: SettledPattern) -> None:

@@ -1,4 +1,4 @@
-"""Iterated update of a plate by settled patterns, the fingers of each estimated with it."""
+"""Update of a plate by settled patterns, the fingers of each estimated with it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray
+from model.identification.least_squares import search
 from model.identification.settled import Measured, finger_count, finger_covariance
 
-_CONVERGED = 3e-3  # standard deviations
-_MAX_STEP = 1.5
-_BACK, _MIN_SHARE = 0.3, 0.01  # of a step that leads up
+_LEAST = 1e-14  # of the largest variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,15 +48,15 @@ def update(
     before: State,
     patterns: Sequence[Measured],
     *,
-    iterations: int,
+    evaluations: int,
     start: FloatArray | None = None,
     theory: FloatArray | None = None,
 ) -> Updated:
-    """Most likely state after patterns, by Gauss-Newton steps from the state or from a start.
+    """Most likely state after patterns within its bounds, from the state or from a start.
 
-    start: of the plate (p,), or of plate and fingers (p + q,); theory (p,): variances of what the
-    theory gets wrong, which count in how unlikely an innovation is, and only there. In the form of
-    the innovation: only a matrix as large as the patterns' numbers is inverted.
+    evaluations: of the model, at most; start: of the plate (p,), or of plate and fingers (p + q,);
+    theory (p,): variances of what the theory gets wrong, which count in how unlikely an innovation
+    is, and only there.
     """
     space = patterns[0].space
     settled = [each.pattern for each in patterns]
@@ -66,48 +65,36 @@ def update(
     centre = np.concatenate([before.x, np.zeros(q)])
     values = np.concatenate([each.pattern.numbers for each in patterns])
     std = np.concatenate([each.std for each in patterns])
+    loose = np.flatnonzero(np.diagonal(prior) > 0)
+    variance, axes = np.linalg.eigh(prior[np.ix_(loose, loose)])
+    rows = (axes / np.sqrt(np.maximum(variance, _LEAST * variance.max()))).T
     at = centre.copy()
     if start is not None:
         at[: len(start)] = start
-    # From the state itself steps are short; from elsewhere they are taken back where they lead up.
-    weights = None if start is None else linalg.pinvh(prior)
-    best, reached, target, share = np.inf, at, at, 1.0
-    for _ in range(iterations):
-        predicted, H = _linearised(patterns, at, p, q)
-        cost = 0.0
-        if weights is not None:
-            moved = at - centre
-            cost = float((((values - predicted) / std) ** 2).sum() + moved @ weights @ moved)
-        if cost > best:
-            share *= _BACK
-            if share < _MIN_SHARE:
-                break
-            at = reached + share * (target - reached)
-            continue
-        best, reached = cost, at
-        innovation = values - predicted - H @ (centre - at)
-        gain = prior @ H.T
-        S = linalg.cho_factor(H @ gain + np.diag(std**2))
-        weighted = linalg.cho_solve(S, innovation)
-        target = centre + gain @ weighted
-        target[:p] = np.clip(target[:p], space.lower, space.upper)
-        change = np.abs(target - at).max()
-        # What is loose moves far where a step's slopes no longer hold.
-        share = min(1.0, _MAX_STEP / max(change, 1e-12))
-        at = reached + share * (target - reached)
-        if change < _CONVERGED:
-            break
-    if weights is not None:
-        at = reached
+
+    def linearised(y: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        z = centre.copy()
+        z[loose] = y
+        predicted, H = _linearised(patterns, z, p, q)
+        return (predicted - values) / std + 0j, H[:, loose] / std[:, None] + 0j
+
+    bounds = np.full((2, p + q), [[-np.inf], [np.inf]])
+    bounds[:, :p] = space.lower, space.upper
+    found = search(
+        linearised,
+        at[loose],
+        bounds[:, loose],
+        prior=(rows, rows @ centre[loose]),
+        evaluations=evaluations,
+    )
+    at[loose] = found.y
     predicted, H = _linearised(patterns, at, p, q)
     gain = prior @ H.T
     inverse = linalg.inv(H @ gain + np.diag(std**2))
     covariance = prior - gain @ inverse @ gain.T
     residuals = (values - predicted) / std
-    # Of the change that led there: (x - x0)^T P^-1 (x - x0) through the numbers it explains.
+    # Of the change that led there.
     innovation = values - predicted - H @ (centre - at)
-    weighted = inverse @ innovation
-    changes = float(weighted @ H @ gain @ weighted)
     wrong = np.zeros(p + q)
     wrong[:p] = 0.0 if theory is None else theory
     expected = H @ (gain + wrong[:, None] * H.T) + np.diag(std**2)
@@ -119,7 +106,7 @@ def update(
         State(at[:p], (own + own.T) / 2),
         nis,
         len(values),
-        float(residuals @ residuals) + changes,
+        2 * found.cost,
         float(residuals @ residuals),
         float(std**2 @ np.diagonal(inverse)),
         at[p:],

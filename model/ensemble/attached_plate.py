@@ -81,10 +81,11 @@ class AttachedPlate:
         """
         each = {name: getattr(self, name)[[frequency] * len(deviations)] for name in _BY_FREQUENCY}
         g, w2 = each["receptance"], -each["minus_omega2"].astype(float)[:, None]
-        factor = np.maximum(1 + self.thickness * deviations, LEAST_THICKNESS)[:, None]
-        stiffness = 1 / g.astype(complex) + w2
-        receptance = (1 / (factor * (factor**2 * stiffness - w2))).astype(np.complex64)
-        by_loss = each["by_loss"] * (factor**3).astype(np.float32) * (receptance / g) ** 2
+        factor = np.maximum(1 + self.thickness * deviations, LEAST_THICKNESS)
+        stiffness = (1 / g.astype(complex) + w2)[:, None]
+        at = self.omega[[frequency]]
+        receptance = modal_receptance(stiffness, at, factor)[:, 0].astype(np.complex64)
+        by_loss = each["by_loss"] * (factor[:, None] ** 3).astype(np.float32) * (receptance / g) ** 2
         each |= {"receptance": receptance, "by_loss": by_loss}
         return replace(self, **each, thickness=0.0)
 
@@ -137,7 +138,7 @@ def attach(
     w2 = (w**2)[:, None]
     elasticity = ModalElasticity.of(plate, omega**2, losses, dispersion)
     stiffness = elasticity.stiffness(w)
-    g = 1 / (stiffness - w2)
+    g = modal_receptance(stiffness, w)
     by_loss = -1j * stiffness.imag * g**2
     k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))
     log_damping = math.log(uncertainty.damping)

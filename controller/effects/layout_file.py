@@ -3,17 +3,16 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, Strict
+from pydantic import Field
 
 from controller.effects.band import TunedSection
 from controller.effects.effect import Effect, Level
 from controller.effects.layout import BUZZ, SurfaceLayout, default_effects
 from controller.effects.region import Region
 from controller.effects.registry import effect_kind
-from controller.effects.shapes import Circle, Polygon, Rectangle, Shape
 from model.config.document import Document, KeyPath, read_document
-from model.config.sections import Quantity, Section, Validation
-from model.config.units import LENGTH
+from model.config.sections import Section, Validation
+from model.config.shapes import ShapedSection
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.rig.sections import Identifier
@@ -21,34 +20,11 @@ from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
 
 _MAX_REGIONS = 256
-_LENGTH = Annotated[float, Quantity(LENGTH, at_least=-10, at_most=10)]
-_POINT = Annotated[tuple[_LENGTH, _LENGTH], Strict(strict=False)]  # a list in the file
-_SIZE = Annotated[float, Quantity(LENGTH, above=0, at_most=10)]
-_SHAPES = ("rectangle", "circle", "polygon")
-
-_TOLERANCE = 1e-9  # m; rounding errors at the edge of the plate
 
 
-class RectangleSection(Section):
-    """Two opposite corners."""
-
-    start: _POINT
-    end: _POINT
-
-
-class CircleSection(Section):
-    """A centre and a radius."""
-
-    at: _POINT
-    radius: _SIZE
-
-
-class RegionSection(TunedSection):
+class RegionSection(ShapedSection, TunedSection):
     """A region of the plate and its effects."""
 
-    rectangle: RectangleSection | None = None
-    circle: CircleSection | None = None
-    polygon: Annotated[list[_POINT], Field(min_length=3, max_length=64)] | None = None
     on_press: Identifier | None = None
     on_move: Identifier | None = None
     on_release: Identifier | None = None
@@ -143,16 +119,9 @@ def _check_region(
     region = validation.part(path, RegionSection)
     if region is None:
         return
-    given = [shape for shape in _SHAPES if getattr(region, shape) is not None]
-    if len(given) != 1:
-        found = " and ".join(given) or "none"
-        validation.add(path, f"must have one of {', '.join(_SHAPES)}, got {found}")
-    elif plate is not None and not _is_on(plate, _shape(region)):
-        validation.add(
-            (*path, given[0]),
-            f"must lie on the plate of {plate.length:g} m by {plate.width:g} m; coordinates start "
-            "at its south-west corner",
-        )
+    sides = None if plate is None else (plate.length, plate.width)
+    if problem := region.shape_problem(sides):
+        validation.add((*path, *problem[0]), problem[1])
     uses = [region.on_press, region.on_move, region.on_release]
     if uses == [None, None, None]:
         for key in ("level", "band", "frequency", "own", "may_share"):
@@ -203,29 +172,10 @@ def _check_use(
         validation.add(path, f"{name} must end by itself; give it a duration")
 
 
-def _is_on(plate: Plate, shape: Shape) -> bool:
-    """Whether a shape lies on the plate."""
-    return all(
-        -_TOLERANCE <= x <= plate.length + _TOLERANCE
-        and -_TOLERANCE <= y <= plate.width + _TOLERANCE
-        for x, y in shape.corners()
-    )
-
-
-def _shape(region: RegionSection) -> Shape:
-    """Return the shape of a region."""
-    if region.rectangle is not None:
-        (x0, y0), (x1, y1) = region.rectangle.start, region.rectangle.end
-        return Rectangle(min(x0, x1), min(y0, y1), abs(x1 - x0), abs(y1 - y0))
-    if region.circle is not None:
-        return Circle(*region.circle.at, region.circle.radius)
-    return Polygon(tuple(region.polygon or ()))
-
-
 def _region(name: str, section: RegionSection) -> Region:
     return Region(
         name=name,
-        shape=_shape(section),
+        shape=section.shape,
         on_press=section.on_press,
         on_move=section.on_move,
         on_release=section.on_release,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from controller.effects.band import Band
-from controller.effects.shapes import Shape
+from model.config.shapes import Shape
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, Strict
+from pydantic import Field
 
 from model.arrays import FloatArray
 from model.config.document import read_document
-from model.config.sections import Quantity, Section, Validation
-from model.config.units import LENGTH
+from model.config.sections import Section, Validation
+from model.config.shapes import Polygon, PolygonSection
 from model.errors import InputError
 from model.rig.sections import Identifier
 from model.structure.plate import Plate
@@ -30,10 +30,6 @@ PROPORTION_TOLERANCE = 0.02
 _PICTURE_SIDE = 1000  # pixels of the longer side of the picture proposed
 _ON_EDGE = 1e-9  # m
 _MAX_CANDIDATES = 2000
-
-Lengths = Annotated[float, Quantity(LENGTH, at_least=-10, at_most=10)]
-PointSection = Annotated[tuple[Lengths, Lengths], Strict(strict=False)]  # a list in the file
-PolygonSection = Annotated[list[PointSection], Field(min_length=3, max_length=64)]
 
 
 @dataclass(frozen=True)
@@ -86,8 +82,8 @@ def area_of(where: str, plate: Plate) -> Area:
         )
     document = read_document(path, if_empty="it must have polygons, each a name with its corners")
     polygons = Validation(document, _PolygonsSection).finish().polygons
-    corners = [np.array(polygon, dtype=float) for polygon in polygons.values()]
-    return Area(document.text, length, width, partial(_in_any, corners))
+    shapes = [Polygon(tuple(each)) for each in polygons.values()]
+    return Area(document.text, length, width, partial(_in_any, shapes))
 
 
 def everywhere(points: FloatArray) -> NDArray[np.bool_]:
@@ -119,29 +115,16 @@ def candidates_of(area: Area, *, count: int) -> tuple[FloatArray, float]:
     return places, spacing
 
 
-def in_polygon(polygon: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
-    """Whether points (n, 2) are in a polygon (k, 2), its edges included; by crossings of a ray."""
-    x, y = points.T[:, :, None]
-    (x0, y0), (x1, y1) = polygon.T, np.roll(polygon, -1, axis=0).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossing = x < x0 + (y - y0) * (x1 - x0) / (y1 - y0)
-    inside = (((y0 > y) != (y1 > y)) & crossing).sum(axis=1) % 2 == 1
-    side = np.array([x1 - x0, y1 - y0])
-    share = ((x - x0) * side[0] + (y - y0) * side[1]) / np.maximum((side**2).sum(axis=0), 1e-30)
-    share = np.clip(share, 0, 1)
-    gap = np.hypot(x - x0 - share * side[0], y - y0 - share * side[1])
-    return np.asarray(inside | (gap.min(axis=1) <= _ON_EDGE))
-
-
 def _on_edge(length: float, width: float, points: FloatArray) -> NDArray[np.bool_]:
     """Whether points (n, 2) are on the edge of a plate."""
     gaps = np.minimum(np.abs(points), np.abs([length, width] - points))
     return np.asarray((gaps <= _ON_EDGE).any(axis=1))
 
 
-def _in_any(polygons: Sequence[FloatArray], points: FloatArray) -> NDArray[np.bool_]:
-    """Whether points (n, 2) are in any of some polygons (k, 2)."""
-    return np.asarray(np.any([in_polygon(each, points) for each in polygons], axis=0))
+def _in_any(polygons: Sequence[Polygon], points: FloatArray) -> NDArray[np.bool_]:
+    """Whether points (n, 2) are in any of some polygons, their edges included."""
+    found = [any(each.contains(x, y) for each in polygons) for x, y in points.tolist()]
+    return np.array(found, dtype=bool)
 
 
 def _is_white(

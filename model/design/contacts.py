@@ -7,15 +7,21 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, Strict
 
 from model.arrays import FloatArray, IntArray, least_gap
 from model.choice import best_of
 from model.config.document import read_document
 from model.config.sections import Quantity, Section, Validation
+from model.config.shapes import (
+    Point,
+    PointSection,
+    Rectangle,
+    Shape,
+    ShapedSection,
+    box_of,
+)
 from model.config.units import LENGTH
-from model.design.area import PointSection, PolygonSection, everywhere, in_polygon
 from model.errors import InputError
 from model.finger import MAX_CONTACTS
 from model.rig.sections import Identifier
@@ -118,8 +124,7 @@ class ContactRule:
 
 def anywhere(plate: Plate, contents: int = 1) -> ContactRule:
     """Fingers with contents and DEFAULT_QUIET ones anywhere on a plate."""
-    whole = _Shape(np.zeros(2), np.array([plate.length, plate.width]), everywhere)
-    draw = partial(_drawn, (whole,), plate)
+    draw = partial(_drawn, [Rectangle(0.0, 0.0, plate.length, plate.width)], plate)
     return ContactRule(DEFAULT_QUIET[contents == 1], DEFAULT_APART, draw, contents=contents)
 
 
@@ -137,15 +142,9 @@ def contact_rule(path: Path | None, plate: Plate, contents: int = 1) -> ContactR
     validation = Validation(document, _ContactsSection)
     for name in validation.mapping(("regions",)):
         region = validation.part(("regions", name), _RegionSection)
-        if region is not None and len(region.shapes) != 1:
-            validation.add(("regions", name), "must have one of rectangle, circle and polygon")
-        elif region is not None and not (shape := _shape(region)).is_on(plate):
-            (x0, y0), (x1, y1) = shape.low.tolist(), shape.high.tolist()
-            validation.add(
-                ("regions", name),
-                f"must be on the plate, from (0, 0) to ({plate.length:g}, {plate.width:g}) m, got "
-                f"({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) m",
-            )
+        problem = region and region.shape_problem((plate.length, plate.width))
+        if problem:
+            validation.add(("regions", name, *problem[0]), problem[1])
     section = validation.finish()
     given = tuple(np.array([*each.first, *each.quiet]) for each in section.sets)
     problems = [
@@ -172,68 +171,32 @@ def contact_rule(path: Path | None, plate: Plate, contents: int = 1) -> ContactR
         )
     if problems:
         raise InputError(f"{document.source}: {problems[0]}")
-    shapes = [_shape(region) for region in section.regions.values()]
-    draw = partial(_drawn, shapes, plate)
+    draw = partial(_drawn, [region.shape for region in section.regions.values()], plate)
     return ContactRule((low, high), section.apart, draw, given, contents)
 
 
-@dataclass(frozen=True, eq=False)
-class _Shape:
-    """A shape in a box from low to high [m], by a function of points."""
-
-    low: FloatArray
-    high: FloatArray
-    contains: Callable[[FloatArray], NDArray[np.bool_]]
-
-    def is_on(self, plate: Plate) -> bool:
-        """Whether all of it is on a plate."""
-        size = np.array([plate.length, plate.width])
-        return bool((self.low >= -_ROUNDING).all() and (self.high <= size + _ROUNDING).all())
-
-    def draw(self, rng: np.random.Generator, plate: Plate) -> FloatArray:
-        """A place [m] of the plate in it; raises InputError where there is none."""
-        for _ in range(_MAX_TRIES):
-            place = rng.uniform(self.low, self.high)
-            if plate.contains(*place.tolist()) and self.contains(place[None])[0]:
-                return np.asarray(place)
-        raise InputError("regions of --contacts must have an area, got one that has none")
-
-
 def _drawn(
-    shapes: Sequence[_Shape], plate: Plate, rng: np.random.Generator, count: int
+    shapes: Sequence[Shape], plate: Plate, rng: np.random.Generator, count: int
 ) -> FloatArray:
     """Draw each finger in one of some shapes, each as likely as another."""
     chosen = rng.integers(len(shapes), size=count)
-    return np.array([shapes[number].draw(rng, plate) for number in chosen])
+    return np.array([_place_in(shapes[number], plate, rng) for number in chosen])
 
 
-def _in_circle(at: FloatArray, radius: float, points: FloatArray) -> NDArray[np.bool_]:
-    return np.asarray(np.hypot(*(points - at).T) <= radius)
+def _place_in(shape: Shape, plate: Plate, rng: np.random.Generator) -> Point:
+    """A place [m] of the plate in a shape; raises InputError where there is none."""
+    box = box_of(shape)
+    for _ in range(_MAX_TRIES):
+        x, y = rng.uniform(*box).tolist()
+        if plate.contains(x, y) and shape.contains(x, y):
+            return x, y
+    raise InputError("regions of --contacts must have an area, got one that has none")
 
 
-class _RectangleSection(Section):
-    start: PointSection
-    end: PointSection
-
-
-class _CircleSection(Section):
-    at: PointSection
-    radius: Annotated[float, Quantity(LENGTH, above=0, at_most=10)]
-
-
-class _RegionSection(Section):
+class _RegionSection(ShapedSection):
     """A region; what it plays, in a surface layout, does not matter here."""
 
     model_config = ConfigDict(extra="ignore")
-
-    rectangle: _RectangleSection | None = None
-    circle: _CircleSection | None = None
-    polygon: PolygonSection | None = None
-
-    @property
-    def shapes(self) -> list[object]:
-        """Those given."""
-        return [each for each in (self.rectangle, self.circle, self.polygon) if each is not None]
 
 
 class _SetSection(Section):
@@ -261,14 +224,3 @@ class _ContactsSection(Section):
     sets: Annotated[list[_SetSection], Field(min_length=1, max_length=1000, default_factory=list)]
     effects: Any = None
     elsewhere: Any = None
-
-
-def _shape(region: _RegionSection) -> _Shape:
-    if region.rectangle is not None:
-        corners = np.array([region.rectangle.start, region.rectangle.end])
-        return _Shape(corners.min(axis=0), corners.max(axis=0), everywhere)
-    if region.circle is not None:
-        at, radius = np.array(region.circle.at), region.circle.radius
-        return _Shape(at - radius, at + radius, partial(_in_circle, at, radius))
-    polygon = np.array(region.polygon, dtype=float)
-    return _Shape(polygon.min(axis=0), polygon.max(axis=0), partial(in_polygon, polygon))

@@ -24,7 +24,7 @@ from model.structure.attachments import (
     drive_forces,
     full_strokes,
 )
-from model.structure.modal_elasticity import Dispersion, ModalElasticity
+from model.structure.modal_elasticity import Dispersion, ModalElasticity, modal_receptance
 from model.structure.plate import Plate
 
 LEAST_THICKNESS = 0.1
@@ -85,7 +85,9 @@ class AttachedPlate:
         stiffness = (1 / g.astype(complex) + w2)[:, None]
         at = self.omega[[frequency]]
         receptance = modal_receptance(stiffness, at, factor)[:, 0].astype(np.complex64)
-        by_loss = each["by_loss"] * (factor[:, None] ** 3).astype(np.float32) * (receptance / g) ** 2
+        by_loss = (
+            each["by_loss"] * (factor[:, None] ** 3).astype(np.float32) * (receptance / g) ** 2
+        )
         each |= {"receptance": receptance, "by_loss": by_loss}
         return replace(self, **each, thickness=0.0)
 

@@ -11,8 +11,8 @@ from controller.effects.effect import NoSensation, Sensation
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
-from controller.effects.shapes import Circle, Polygon, Rectangle
 from controller.sources.contacts import Contact, ContactKey
+from model.config.shapes import Circle, Polygon, Rectangle
 
 CENTRE = (0.2, 0.1)
 KNOB = Region("knob", Circle(*CENTRE, 0.05), on_move="dial")

@@ -16,9 +16,9 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.ramp import Ramp
 from controller.effects.region import Region
-from controller.effects.shapes import Circle, Polygon, Rectangle
 from controller.effects.texture import Texture
 from controller.sources.contacts import Contact, ContactKey
+from model.config.shapes import Circle, Polygon, Rectangle
 
 
 def finger(id: int, x: float = 0.05, y: float = 0.05, *, since: float = 0.0) -> Contact:

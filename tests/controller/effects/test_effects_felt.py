@@ -15,8 +15,8 @@ from controller.effects.effect import Effect
 from controller.effects.layout import SurfaceLayout
 from controller.effects.ramp import Ramp
 from controller.effects.region import Region
-from controller.effects.shapes import Circle, Rectangle
 from long_form import in_turn, shortly
+from model.config.shapes import Circle, Rectangle
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from paper_table import smooth_rig

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from controller.effects.shapes import Circle, Rectangle
 from typer.testing import CliRunner
 
 from controller.cli.commands import app
@@ -24,7 +25,6 @@ from controller.effects.layout_file import load_layout
 from controller.effects.ramp import Ramp
 from controller.effects.region import Region
 from controller.effects.representative import strongest_target
-from controller.effects.shapes import Circle, Rectangle
 from controller.effects.texture import Texture
 from model.rig.uncertainty import Uncertainty
 from model.table.build import build_table

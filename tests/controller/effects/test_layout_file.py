@@ -10,18 +10,12 @@ from controller.effects.click import Click
 from controller.effects.detents import Detents
 from controller.effects.dial import Dial
 from controller.effects.effect import Effect
-from controller.effects.layout_file import (
-    CircleSection,
-    LayoutSection,
-    RectangleSection,
-    RegionSection,
-    load_layout,
-)
+from controller.effects.layout_file import LayoutSection, RegionSection, load_layout
 from controller.effects.ramp import Ramp
-from controller.effects.shapes import Rectangle
 from controller.effects.texture import Texture
 from key_tables import key_rows
 from model.config.document import ConfigError
+from model.config.shapes import CircleSection, Rectangle, RectangleSection
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 

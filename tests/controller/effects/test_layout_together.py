@@ -17,13 +17,13 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.layout_together import check_together, matrix_of
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
-from controller.effects.shapes import Rectangle
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.content import Prediction
 from controller.loop.envelopes import RAMPS_ONLY
 from controller.loop.intent import HapticIntent
 from controller.loop.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
+from model.config.shapes import Rectangle
 from model.drive_modes import DRIVE_MODES
 from model.table.answer import answer
 from model.table.effect_level import EffectLevels

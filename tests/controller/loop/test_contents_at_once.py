@@ -14,7 +14,6 @@ from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
-from controller.effects.shapes import Rectangle
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.decision import ENDED, Decider
 from controller.loop.envelopes import RAMPS_ONLY
@@ -29,6 +28,7 @@ from drivers.contents import Layer
 from drivers.errors import CommandRefused
 from drivers.host.members import Played
 from model.arrays import Complex64Array
+from model.config.shapes import Rectangle
 from model.errors import InputError
 from model.table.pattern import Pattern
 from several_fingers import ABOVE, LEFT, RIGHT, fingers_on, table

@@ -10,8 +10,8 @@ from controller.daemon.api_views import PlateView
 from controller.effects.buzz import Buzz
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
-from controller.effects.shapes import Rectangle
 from controller.sources.contacts import Contact, ContactKey
+from model.config.shapes import Rectangle
 from model.finger.perception import detection_threshold
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table
 from virtual_loop import in_virtual_time

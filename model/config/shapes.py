@@ -1,10 +1,15 @@
-"""Shapes of regions on the plate."""
+"""Shapes of regions on the plate, and how files state them."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, TypeAlias
+from typing import Annotated, Any, Protocol, TypeAlias
+
+from pydantic import Field, Strict
+
+from model.config.sections import Quantity, Section
+from model.config.units import LENGTH
 
 Point: TypeAlias = tuple[float, float]
 
@@ -156,3 +161,65 @@ def _is_on_side(x: float, y: float, start: Point, end: Point) -> bool:
     along = ((x - start[0]) * (end[0] - start[0]) + (y - start[1]) * (end[1] - start[1])) / length
     across = ((x - start[0]) * (end[1] - start[1]) - (y - start[1]) * (end[0] - start[0])) / length
     return abs(across) <= _TOLERANCE and -_TOLERANCE <= along <= length + _TOLERANCE
+
+
+_Length = Annotated[float, Quantity(LENGTH, at_least=-10, at_most=10)]
+PointSection = Annotated[tuple[_Length, _Length], Strict(strict=False)]  # a list in the file
+PolygonSection = Annotated[list[PointSection], Field(min_length=3, max_length=64)]
+
+
+class RectangleSection(Section):
+    """Two opposite corners."""
+
+    start: PointSection
+    end: PointSection
+
+
+class CircleSection(Section):
+    """A centre and a radius."""
+
+    at: PointSection
+    radius: Annotated[float, Quantity(LENGTH, above=0, at_most=10)]
+
+
+class ShapedSection(Section):
+    """A section of one shape."""
+
+    rectangle: RectangleSection | None = None
+    circle: CircleSection | None = None
+    polygon: PolygonSection | None = None
+
+    @property
+    def shape(self) -> Shape:
+        """That shape."""
+        if self.rectangle is not None:
+            (x0, y0), (x1, y1) = self.rectangle.start, self.rectangle.end
+            return Rectangle(min(x0, x1), min(y0, y1), abs(x1 - x0), abs(y1 - y0))
+        if self.circle is not None:
+            return Circle(*self.circle.at, self.circle.radius)
+        return Polygon(tuple(self.polygon or ()))
+
+    def shape_problem(self, sides: Point | None) -> tuple[tuple[str, ...], str] | None:
+        """Where and why it has not one shape, on a plate of these sides [m]; None if it has.
+
+        sides: None for any plate.
+        """
+        given = [name for name in ShapedSection.model_fields if getattr(self, name) is not None]
+        if len(given) != 1:
+            known, found = ", ".join(ShapedSection.model_fields), " and ".join(given) or "none"
+            return (), f"must have one of {known}, got {found}"
+        (x0, y0), (x1, y1) = box_of(self.shape)
+        length, width = sides or (x1, y1)
+        d = _TOLERANCE
+        if sides is None or (min(x0, y0) >= -d and x1 <= length + d and y1 <= width + d):
+            return None
+        return (given[0],), (
+            f"must lie on the plate of {length:g} m by {width:g} m, got ({x0:g}, {y0:g}) to "
+            f"({x1:g}, {y1:g}) m; coordinates start at its south-west corner"
+        )
+
+
+def box_of(shape: Shape) -> tuple[Point, Point]:
+    """South-west and north-east corner of the box around a shape."""
+    xs, ys = zip(*shape.corners(), strict=True)
+    return (min(xs), min(ys)), (max(xs), max(ys))

@@ -257,8 +257,7 @@ SHARED int find_candidates(candidates *to, const plates *on, const rules *by, co
             const int first = of->is_ranked ? 0 : ends[0], end = of->is_ranked ? count : ends[1];
             float level = of->level[content] * (float)of->contents, margin = by->margin;
             const int others = (int)find_others(is_other, of, content, k), start = to->count;
-            const int is_single = of->starts[content + 1] - of->starts[content] == 1;
-            const int ways = is_single && others > 0 && others <= by->max_by_point ? 2 : 1;
+            const int ways = others > 0 && others <= by->max_by_point ? 2 : 1;
             const arena mark = *memory;
             for (int way = 0; way < ways && (!way || to->count > start); way++) {
                 for (;;) {

@@ -11,17 +11,6 @@ PERCENTILE = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Fingertips:
-    """Points of the fingers, target fingers first.
-
-    weights (k, p): in the mean over each fingertip; gains (t,): factors on the targets.
-    """
-
-    weights: Float32Array
-    gains: Float32Array
-
-
-@dataclass(frozen=True, eq=False)
 class Contrasts:
     """Measures at the loudest quiet point on plates (..., d).
 
@@ -49,22 +38,25 @@ def felt(
     power: Float32Array | FloatArray,
     threshold: Float32Array,
     starts: IntArray,
-    fingertips: Fingertips,
+    weights: Float32Array,
+    targets: int,
 ) -> Felt:
     """Measure squared amplitudes (m, k p, d) of tones; starts (c,): the first tone of each drive.
 
-    threshold (m,) [m/s²]. Tones of one drive are felt as the root of the sum of their squares over
-    thresholds; their peak accelerations add (paper Eq. 28). The result has plates (c, d).
+    threshold (m,) [m/s²]; weights (k, p): of the points in the mean over each fingertip; targets:
+    number of fingers that are, which come first. Tones of one drive are felt as the root of the sum
+    of their squares over thresholds; their peak accelerations add (paper Eq. 28). The result has
+    plates (c, d).
     """
     is_mixed = len(starts) < len(power)
     sensed = power / (threshold**2)[:, None, None]
     if is_mixed:
         sensed = np.add.reduceat(sensed, starts, axis=0)
-    found = felt_at(*over_fingertips(sensed, fingertips.weights), fingertips.gains)
+    found = felt_at(*over_fingertips(sensed, weights), targets)
     if found.contrast is None or not is_mixed:
         return found
     peak = np.add.reduceat(np.sqrt(power), starts, axis=0)
-    peaks = felt_at(*over_fingertips(peak * peak, fingertips.weights), fingertips.gains)
+    peaks = felt_at(*over_fingertips(peak * peak, weights), targets)
     if peaks.contrast is None:
         raise AssertionError("fingers are the same")
     return Felt(found.level, replace(found.contrast, acceleration=peaks.contrast.felt))
@@ -83,16 +75,15 @@ def over_fingertips(
     return means, np.asarray(loudest)
 
 
-def felt_at(means: Float32Array, loudest: Float32Array, gains: Float32Array) -> Felt:
+def felt_at(means: Float32Array, loudest: Float32Array, targets: int) -> Felt:
     """Measure drives of which every fingertip feels so much, as `over_fingertips`.
 
-    gains (t,): factors on the targets, which come first.
+    targets: number of fingers that are, which come first.
     """
-    t = len(gains)
-    level = np.minimum.reduce(means[:, :t] * gains[:, None], axis=1)
-    if means.shape[1] == t:
+    level = np.minimum.reduce(means[:, :targets], axis=1)
+    if means.shape[1] == targets:
         return Felt(level, None)
-    loud = np.maximum(np.sqrt(np.maximum.reduce(loudest[:, t:], axis=1)), 1e-30)
+    loud = np.maximum(np.sqrt(np.maximum.reduce(loudest[:, targets:], axis=1)), 1e-30)
     contrast = level / loud
     return Felt(level, Contrasts(loud, contrast, contrast))
 

@@ -139,7 +139,7 @@ def _candidates(asked: Asked, rows: IntArray) -> tuple[Candidates, bool]:
     formed = touched.forms(rows, tips.few, tips.few_weights, table.error_power, tips.fine)
     fingers = FingersOnPlate(
         *(touched, rows, tips, table.thresholds, table.error_power, formed),
-        *(np.arange(0), np.arange(0), np.ones(1, dtype=np.float32), 1.0),
+        *(np.arange(0), np.arange(0), 1.0),
     )
     candidate_count = MIN_CANDIDATES + (count // 2 if count > 1 else 0)
     found: list[tuple[int, int, int, float, Complex64Array]] = []
@@ -159,7 +159,7 @@ def _candidates(asked: Asked, rows: IntArray) -> tuple[Candidates, bool]:
                 forms = replace(forms, wanted=float(highest), level_margin=0.0)
                 searched, is_limited = _SEARCH.search(forms), True
             ways = [searched]
-            by_point = len(stream.targets) == 1 <= len(others) <= MAX_FINGERS_BY_POINT
+            by_point = 1 <= len(others) <= MAX_FINGERS_BY_POINT
             if by_point and searched.score.any():
                 ways.append(_SEARCH.search(view.by_point(forms, at)))
             hertz = table.frequencies[rows[at]]
@@ -221,8 +221,7 @@ def _best_tone(asked: Asked, found: Candidates, own: FloatArray, loudest: FloatA
     contrast = None
     if contents.with_onset and len(near) > 1:
         drives, targets = (found.rows[near], found.weights[near]), [*contents.streams[0].targets]
-        gains = np.ones(len(targets))
-        contrast = onset_contrast(asked.table, asked.tips, targets, quiet, gains, *drives)
+        contrast = onset_contrast(asked.table, asked.tips, targets, quiet, *drives)
     if contrast is None:
         return best_of(robust)
     return int(near[best_of(robust[near] * contrast**ONSET_WEIGHT)])
@@ -233,18 +232,14 @@ def onset_contrast(
     tips: FingertipShapes,
     targets: list[int],
     quiet: list[int],
-    gains: FloatArray,
     rows: IntArray,
     weights: Complex64Array,
 ) -> FloatArray | None:
-    """Contrast (m,) along a plain ramp of tones at rows (m,), weights (m, n); None if unsolved.
-
-    gains: factors on the targets.
-    """
+    """Contrast (m,) along a plain ramp of tones at rows (m,), weights (m, n); None if unsolved."""
     if table.onsets is None:
         return None
     # An onset's target counts by the plain mean over its points.
-    scales = tips.fine.shape[1] * tips.fine_weights[targets] * gains[:, None]
+    scales = tips.fine.shape[1] * tips.fine_weights[targets]
     return table.onsets.contrast(
         rows,
         weights,

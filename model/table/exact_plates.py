@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.ensemble.measures import Felt, Fingertips, felt
+from model.ensemble.measures import Felt, felt
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import (
     FingertipLoad,
@@ -81,8 +81,8 @@ def felt_on(
     """Measures of an excitation on plates, (1, d)."""
     rows, power = powers_on(table, question, excitation, plates)
     weights = table.read_fingertips(question.contacts).fine_weights
-    fingertips = Fingertips(weights, np.array(question.gains))
-    return felt(power, table.thresholds[rows], np.zeros(1, dtype=int), fingertips)
+    one, targets = np.zeros(1, dtype=int), len(question.targets)
+    return felt(power, table.thresholds[rows], one, weights, targets)
 
 
 def powers_on(

@@ -11,7 +11,7 @@ import numpy as np
 from model.arrays import Complex64Array, Float32Array, IntArray
 from model.drive_modes.forms import Forms, Weights
 from model.ensemble.draws import Drawing
-from model.ensemble.measures import Felt, Fingertips, felt, felt_at
+from model.ensemble.measures import Felt, felt, felt_at
 from model.ensemble.touched_plate import LoadedContacts, TouchedPlate, gram, outer
 from model.table.pulse_gains import PulseResponses
 from model.table.question import Question
@@ -35,8 +35,7 @@ class FingersOnPlate:
     touched: the table's plate with k fingers on it; rows (f,): of its frequencies; tips: of the
     fingers; threshold (all,) [m/s²], error_power (all, eras): mean square of the discretisation
     error of each ERA's field, at all of the plate's frequencies; contacts: at the rows; targets,
-    quiet: indices of fingers; gains: factors on the fields of the targets that make all levels the
-    same; wanted: their amplitude to threshold.
+    quiet: indices of fingers; wanted: amplitude to threshold of the targets.
     """
 
     touched: TouchedPlate
@@ -47,7 +46,6 @@ class FingersOnPlate:
     contacts: LoadedContacts
     targets: IntArray
     quiet: IntArray
-    gains: Float32Array
     wanted: float
 
     @classmethod
@@ -76,7 +74,6 @@ class FingersOnPlate:
             touched.forms(rows, tips.few, tips.few_weights, error_power, fine),
             fingers[:t],
             fingers[t:],
-            np.array(question.gains, dtype=np.float32),
             10 ** (question.level_db_sl / 20),
         )
 
@@ -88,7 +85,6 @@ class FingersOnPlate:
             self,
             targets=np.array(targets),
             quiet=np.array(quiet, dtype=int),
-            gains=np.ones(len(targets), dtype=np.float32),
             wanted=10 ** (level_db_sl / 20),
         )
 
@@ -97,13 +93,13 @@ class FingersOnPlate:
 
         background (f, eras, eras): mean power of the rest of the plate, for no quiet finger.
         """
-        contacts, gains, targets = self.contacts, self.gains, self.targets
+        contacts, targets = self.contacts, self.targets
         fields, weights = contacts.fields.take(targets, axis=1), self.tips.few_weights[targets]
         mean = (weights[:, None] @ fields)[:, :, 0]
-        by_target = np.asarray(mean.swapaxes(0, 1) * gains[:, None, None])
+        by_target = np.asarray(mean.swapaxes(0, 1))
         # What the field differs over a target is no uncertainty of its level.
         expected = contacts.uncertain.take(targets, axis=1) + outer(mean)
-        power = expected.swapaxes(0, 1) * (gains**2)[:, None, None, None]
+        power = expected.swapaxes(0, 1)
         quiet = (
             contacts.power.take(self.quiet, axis=1)
             if background is None
@@ -167,7 +163,7 @@ class FingersOnPlate:
         )
         return replace(
             steady,
-            targets=np.asarray(mean.swapaxes(0, 1) * self.gains[:, None, None]),
+            targets=mean.swapaxes(0, 1),
             quiet=np.ascontiguousarray(steady.quiet + gram(during) - gram(lasting)),
             level_margin=0.0,
             few=None,
@@ -202,9 +198,10 @@ class FingersOnPlate:
             with_powers=len(starts) < len(rows),
         )
         if sensed.powers is None:
-            return felt_at(sensed.means, sensed.loudest, self.gains)
+            return felt_at(sensed.means, sensed.loudest, len(self.targets))
         power = sensed.powers * (threshold.take(rows) ** 2)[:, None, None]
-        return felt(power, threshold.take(rows), starts, Fingertips(tips.fine_weights, self.gains))
+        targets = len(self.targets)
+        return felt(power, threshold.take(rows), starts, tips.fine_weights, targets)
 
     def _expected(self, background: Complex64Array) -> Complex64Array:
         """The mean power under errors of the gains, (f, eras, eras)."""

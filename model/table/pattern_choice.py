@@ -111,14 +111,17 @@ def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) 
 
 
 def pattern_of(
+    question: Question,
     tones: Tones,
     *,
     eras: Sequence[Era],
     frequencies: FloatArray,
     threshold: str,
 ) -> Pattern:
-    """The pattern of one target's tone."""
-    (nominal, robust), (contrast, median, promised) = tones.level_db_sl[0], tones.contrast_db[0]
+    """The pattern of the only content's tone; its level is that of the weakest target."""
+    contrast, median, promised = tones.contrast_db[0]
+    nominal = min(tones.level_db_sl[target][0] for target in range(len(question.targets)))
+    robust = question.level_db_sl + float(decibels(tones.stroke_factor))
     drive = [(tones.rows[0], tones.weights[0])]
     return Pattern(
         excitation=excitation_of(drive, eras, frequencies, gain=tones.gains[0]),
@@ -158,7 +161,7 @@ def _search(
     if candidates.over_effect is not None and question.quiet:
         found = found[:MAX_DURING_EFFECT]
         return found + _during_effect(question, drive_mode, candidates, forms, found)
-    return found + _by_point(question, drive_mode, candidates, forms, found)
+    return found + _by_point(question, drive_mode, candidates, forms)
 
 
 def _best(
@@ -182,24 +185,17 @@ def _by_point(
     drive_mode: str,
     candidates: Candidates,
     forms: Forms,
-    drives: Sequence[tuple[float, Weights]],
 ) -> list[tuple[float, Weights]]:
     """Drives that minimise over the points of the quiet fingers.
 
-    Where nulls are narrow, with few fingers and small errors, these do better. For several targets
-    at the frequencies of the drives found, since their search takes long.
+    Where nulls are narrow, with few fingers and small errors, these do better.
     """
     if drive_mode != UNRESTRICTED:
         return []
     if not 1 <= len(question.quiet) <= MAX_FINGERS_BY_POINT:
         return []
-    at = np.arange(forms.frequency_count)
-    if len(question.targets) > 1:
-        at = _rows_of([drive for _, drive in drives if len(drive.tones()) == 1])
-    if len(at) == 0:
-        return []
-    by_point = candidates.fingers.by_point(forms.at(at), candidates.playable[at])
-    found = _drives_of(PHASED.search(by_point), at)
+    by_point = candidates.fingers.by_point(forms, candidates.playable)
+    found = _drives_of(PHASED.search(by_point), np.arange(forms.frequency_count))
     return [found[each] for each in best_first([score for score, _ in found])[:ALTERNATIVES]]
 
 

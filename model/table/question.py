@@ -5,8 +5,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TypeAlias
 
-import numpy as np
-
 from model.config.points import in_metres
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
@@ -31,20 +29,15 @@ class Question:
     """Contacts and a level for `LocalizationTable.query`.
 
     targets: fingers that feel it, one or more; quiet: fingers that must not; level_db_sl: at every
-    target; softer_db: reduction of that level for each target, empty for none; drive_mode: a name
-    in DRIVE_MODES, None for the table's own; playable: drive modes of the amplifiers; frequencies:
-    their lowest and highest [Hz]; envelopes: whether amplifiers play any (`model.table.timing`);
-    loads: of each contact relative to the rig's fingertip (`Fingertip.scaled`), targets first;
-    empty for 1.
-
-    With softer_db, level and contrast of the answer are those of the weakest target, relative to
-    its own level.
+    target; drive_mode: a name in DRIVE_MODES, None for the table's own; playable: drive modes of
+    the amplifiers; frequencies: their lowest and highest [Hz]; envelopes: whether amplifiers play
+    any (`model.table.timing`); loads: of each contact relative to the rig's fingertip
+    (`Fingertip.scaled`), targets first; empty for 1.
     """
 
     targets: tuple[Point, ...]
     quiet: tuple[Point, ...] = ()
     level_db_sl: float = STRONG_DB_SL
-    softer_db: tuple[float, ...] = ()
     drive_mode: str | None = None
     playable: tuple[str, ...] = DRIVE_MODES
     frequencies: tuple[float, float] = (0.0, math.inf)
@@ -64,16 +57,6 @@ class Question:
                 f"level must be between {low:g} and {high:g} dB SL, got {self.level_db_sl:g}; 20 "
                 "is strong, 12 is felt, 0 is the threshold"
             )
-        if self.softer_db and len(self.softer_db) != len(self.targets):
-            raise InputError(
-                f"softer_db must have one value per target ({len(self.targets)}), "
-                f"got {len(self.softer_db)}"
-            )
-        for softer in self.softer_db:
-            if not 0 <= softer <= MAX_LEVEL_DB_SL:  # False for NaN
-                raise InputError(
-                    f"softer_db must be between 0 and {MAX_LEVEL_DB_SL:g} dB, got {softer}"
-                )
         if self.loads and len(self.loads) != count:
             raise InputError(
                 f"loads must have one value per contact ({count}), got {len(self.loads)}"
@@ -100,12 +83,6 @@ class Question:
     def contacts(self) -> tuple[Point, ...]:
         """All contacts [m], targets first."""
         return (*self.targets, *self.quiet)
-
-    @property
-    def gains(self) -> tuple[np.float32, ...]:
-        """Factors on the fields of the targets that make all levels the same."""
-        softer = self.softer_db or (0.0,) * len(self.targets)
-        return tuple(np.float32(10 ** (each / 20)) for each in softer)
 
     def check_on(self, plate: Plate) -> None:
         """Raise InputError for a contact off the plate."""

@@ -165,7 +165,6 @@ class LocalizationTable:
                 tips,
                 [*range(count)],
                 [*range(count, len(tips.fine))],
-                np.array(question.gains),
             ),
             over_effect=over_effect,
             ringing=self._ringing(over_effect.duration) if over_effect else None,
@@ -396,21 +395,21 @@ class LocalizationTable:
         )
 
     def _tone(self, question: Question, band: tuple[int, int]) -> Pattern | None:
-        """The best pattern of one tone for one target, None where that hardly reaches the level."""
-        if len(question.targets) > 1 or not question.quiet:
-            return None
+        """The best pattern of one tone, None where that hardly reaches the level."""
+        count = len(question.targets)
         contents = Contents(
             question.contacts,
             question.loads,
-            (Stream((0,), question.level_db_sl, (band,)),),
-            tuple(range(1, len(question.contacts))),
+            (Stream(tuple(range(count)), question.level_db_sl, (band,)),),
+            tuple(range(count, len(question.contacts))),
             is_strict=True,
             with_onset=not question.envelopes,
         )
-        found = choose_tones(self, contents)
+        found = choose_tones(self, contents) if question.quiet else None
         if found is None:
             return None
         return pattern_of(
+            question,
             found,
             eras=self.eras,
             frequencies=self.frequencies,

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.errors import InputError
 from model.structure.attachments import Era
 from model.vibration.excitation import Excitation
 
@@ -131,9 +130,6 @@ class BaseMotions:
 KNOT_STEP = 0.005
 """Time between knots [s]; five fit into the shortest decay of a plate that needs shaped endings."""
 
-MAX_KNOTS = 32
-"""More than any amplifier accepts."""
-
 
 @dataclass(frozen=True)
 class BaseEnvelope:
@@ -148,18 +144,6 @@ class BaseEnvelope:
     start: complex
     knots: tuple[complex, ...]
     step: float = KNOT_STEP
-
-    def __post_init__(self) -> None:
-        """Refuse envelopes that no amplifier can play."""
-        if not 1 <= len(self.knots) <= MAX_KNOTS:
-            raise InputError(f"envelope: knots must be 1 to {MAX_KNOTS}, got {len(self.knots)}")
-        if not all(map(cmath.isfinite, (self.start, *self.knots))):
-            raise InputError("envelope: knots must be finite numbers")
-        if not (0 < self.step < math.inf and 0 < self.frequency < math.inf):
-            raise InputError(
-                f"envelope: frequency and step must be above zero, got {self.frequency:g} Hz and "
-                f"{self.step:g} s"
-            )
 
     @property
     def duration(self) -> float:

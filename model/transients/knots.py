@@ -260,10 +260,7 @@ def _add_errors(form: Complex, eras: int, gain_variance: float) -> None:
 
 def steady_states(plate: PlateInTime, omega: float) -> ComplexArray:
     """Steady state z of the plate at omega [rad/s], each ERA alone at full stroke, (eras, 2 r)."""
-    count = len(plate.eras)
-    strokes = np.array([era.stroke for era in plate.eras], dtype=complex)
-    carrier = np.full(count, 1j * omega)
-    return plate.particular(range(count), carrier, strokes, 0 * strokes)[0]
+    return np.asarray(plate.following(np.array([1j * omega]))[0][0])
 
 
 def hat_accelerations(
@@ -276,7 +273,7 @@ def hat_accelerations(
     """
     s = 1j * omega
     times = step * (np.arange(steps * samples) + 0.5) / samples
-    a0, a1 = _linear_ramps(plate, s, step)
+    a1, a0 = (each[0] / step for each in plate.following(np.array([s])))
     b0, b1 = a0 @ plate.displacement.T, a1 @ plate.displacement.T
     forced = s**2 * (b0 + times[:, None, None] * b1) + 2 * s * b1
     exponentials = np.exp(np.outer(times, plate.eigenvalues - s))
@@ -295,11 +292,11 @@ def ending_states(plate: PlateInTime, omega: float, *, step: float, steps: int) 
     whose top is after step 1, 2, ...
     """
     s = 1j * omega
-    a0, a1 = _linear_ramps(plate, s, step)
+    steady, slope = (each[0] for each in plate.following(np.array([s])))
+    a0, a1 = slope / step, steady / step
     times = step * np.arange(steps + 1)
     decay = np.exp(np.outer(times, plate.eigenvalues - s))
     linear_ramps = a0 + times[:, None, None] * a1 - decay[:, None] * a0
-    steady = steady_states(plate, omega)
     columns = [steady - linear_ramps[steps] + linear_ramps[steps - 1]]
     for knot in range(1, steps):
         since = steps - knot
@@ -316,13 +313,6 @@ def mean_square(plate: PlateInTime, duration: float) -> ComplexArray:
     rates = plate.eigenvalues.conj()[:, None] + plate.eigenvalues
     shapes = plate.acceleration.conj().T @ plate.acceleration
     return np.asarray(shapes * np.expm1(rates * duration) / (rates * duration))
-
-
-def _linear_ramps(plate: PlateInTime, s: complex, step: float) -> tuple[ComplexArray, ComplexArray]:
-    """Particular solutions (eras, 2 r) for the base of each ERA rising by its stroke in a step."""
-    count = len(plate.eras)
-    slopes: ComplexArray = np.array([era.stroke / step + 0j for era in plate.eras])
-    return plate.particular(range(count), np.full(count, s), 0 * slopes, slopes)
 
 
 # With this penalty (relative to the mean of the diagonal) and over-relaxation the forms that

@@ -107,13 +107,10 @@ def ramped_responses(
     return line.in_time(found)
 
 
-def _by_motion(plate: PlateInTime, frequency: float) -> tuple[ComplexArray, ComplexArray]:
+def _by_motion(plate: PlateInTime, frequency: float) -> tuple[ComplexArray, ...]:
     """Force of each ERA by its motion [N/m] and by its velocity [N s/m], (eras,) each."""
-    gains = np.array([era.gain(np.array(frequency)) for era in plate.eras])
-    springs, dampers = (
-        gains * [getattr(era, key) for era in plate.eras] for key in ("stiffness", "damping")
-    )
-    return springs, dampers
+    gains = np.array([era.gain(np.array(frequency)) for era in plate.eras], dtype=complex)
+    return tuple(np.asarray(gains * each) for each in (plate.springs, plate.dampers))
 
 
 def _held_by(

@@ -113,15 +113,12 @@ def ramp_responses(
     ramp is over the base moves as the sum of three exponentials, see
     `model.transients.base_motion.raised_cosine`.
     """
-    f, eras = len(omega), len(plate.eras)
     side = np.pi / ramp
     coefficients = np.array([0.5, -0.25, -0.25])
-    omegas = omega[:, None] + [0, side, -side]
-    rows = np.broadcast_to(np.arange(eras)[:, None], (f, eras, 3)).ravel()
-    s = np.broadcast_to(1j * omegas[:, None, :], (f, eras, 3)).ravel()
-    strokes = np.array([plate.eras[row].stroke + 0j for row in rows])
-    states = plate.particular(rows.tolist(), s, strokes, 0 * strokes)[0].reshape(f, eras, 3, -1)
-    accelerations = states @ plate.displacement.T * (s**2).reshape(f, eras, 3, 1)
+    s = np.asarray(1j * (omega[:, None] + [0, side, -side]), dtype=complex)
+    states, _ = plate.following(s.ravel())
+    states = states.reshape(len(omega), 3, len(plate.eras), -1).swapaxes(1, 2)
+    accelerations = states @ plate.displacement.T * (s**2)[:, None, :, None]
 
     rising = times < ramp
     phase_factors = coefficients * np.exp(1j * np.outer(times, [0, side, -side]))  # (n, 3)

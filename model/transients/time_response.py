@@ -126,8 +126,8 @@ class PlateInTime:
         era, each = motions.era[active], motions.omega[active]
         tau, s = moments[number] - motions.start[active], 1j * each
         phase_factor = np.exp(s * tau)
-        c = self._dampers[era]
-        impedance = self._springs[era] + c * s  # force by displacement
+        c = self.dampers[era]
+        impedance = self.springs[era] + c * s  # force by displacement
         is_first = np.ones(len(each), dtype=bool)
         is_first[1:] = (each[1:] != each[:-1]) | (number[1:] != number[:-1])
         omegas = each[is_first]
@@ -162,38 +162,30 @@ class PlateInTime:
         return [number for number, era in enumerate(self.eras) if era.gains]
 
     @cached_property
-    def _springs(self) -> FloatArray:
+    def springs(self) -> FloatArray:
+        """Stiffness [N/m] of each ERA."""
         return np.array([era.stiffness for era in self.eras])
 
     @cached_property
-    def _dampers(self) -> FloatArray:
+    def dampers(self) -> FloatArray:
+        """Damping [N s/m] of each ERA."""
         return np.array([era.damping for era in self.eras])
 
-    def particular(
-        self,
-        eras: Sequence[int],
-        s: ComplexArray,
-        c0: Sequence[complex] | ComplexArray,
-        c1: Sequence[complex] | ComplexArray,
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """z(t) = (a0 + a1 t) exp(s t), (n, 2 r) each, for bases y(t) = (c0 + c1 t) exp(s t) [m].
+    def following(self, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """z (f, eras, 2 r) of each ERA alone at full stroke times exp(s t), s (f,) [1/s].
 
-        eras, s [1/s], c0, c1: (n,), one ERA alone in each row. s must not be an eigenvalue, as no
-        imaginary number is where anything damps. An ERA's measured gain is taken at the frequency
-        of s; what it does between two frequencies while c1 lasts is not modelled.
+        And its derivative by s: a base that rises as t exp(s t) leads to (derivative + t z) exp(s
+        t). No s may be an eigenvalue, as no imaginary number is where anything damps. An ERA's
+        measured gain is taken at the frequency of s; what it does between two frequencies while the
+        base rises is not modelled.
         """
-        k = np.array([self.eras[era].stiffness for era in eras])
-        c = np.array([self.eras[era].damping for era in eras])
-        c0, c1 = np.asarray(c0), np.asarray(c1)
-        input_vector = self.participation.T[list(eras)]
-        for row, era in enumerate(eras):
-            if self.eras[era].gains:
-                input_vector[row] *= self.eras[era].gain(s[row].imag / (2 * np.pi))
-        force0 = input_vector * (k * c0 + c * (c1 + s * c0))[:, None]
-        force1 = input_vector * ((k + c * s) * c1)[:, None]
-        denominator = s[:, None] - self.eigenvalues
-        a1 = force1 / denominator
-        return (force0 - a1) / denominator, a1
+        gains = np.stack([era.gain(s.imag / (2 * np.pi)) for era in self.eras], axis=1)
+        gains *= [era.stroke for era in self.eras]
+        forces = gains * (self.springs + s[:, None] * self.dampers)
+        away = s[:, None, None] - self.eigenvalues
+        z = forces[..., None] * self.participation.T / away
+        by_velocity = (gains * self.dampers)[..., None] * self.participation.T
+        return z, (by_velocity - z) / away
 
     @cached_property
     def acceleration(self) -> ComplexArray:

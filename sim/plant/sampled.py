@@ -65,14 +65,11 @@ class SampledPlant:
     def _use(self, plate: LoadedPlate) -> None:
         """Go on with a plate; find its forced vibration for bases of 1 m and of 1 m/s."""
         self._current = plate
-        count = len(self._bases)
-        still = np.zeros(2 * count, dtype=complex)
-        ones, zeros = np.ones(count), np.zeros(count)
-        solutions, _ = plate.plate.particular(
-            [*range(count)] * 2, still, np.r_[ones, zeros], np.r_[zeros, ones]
+        strokes = np.array([[era.stroke] for era in plate.plate.eras])
+        self._by_base, self._by_slope = (
+            found[0] / strokes @ plate.plate.vectors.T @ plate.plate.to_free.T
+            for found in plate.plate.following(np.zeros(1, dtype=complex))
         )
-        halves = solutions @ plate.plate.vectors.T @ plate.plate.to_free.T
-        self._by_base, self._by_slope = halves[:count], halves[count:]
 
     @property
     def _forced(self) -> ComplexArray:

@@ -9,7 +9,6 @@ import pytest
 from scipy.optimize import minimize
 
 from model.drive_modes.tones import excitation_of
-from model.errors import InputError
 from model.reduction.reduced_plate import reduce_plate
 from model.structure.attachments import footprints_of
 from model.table.pattern import ONSET_RAMP
@@ -188,22 +187,6 @@ def test_ramped_onset_and_ending_are_raised_cosines():
         tone = 1e-4 * math.sin(2 * math.pi * 50.0 * time + 0.3)
         assert motion(up[se], time) == pytest.approx(share * tone, abs=1e-17)
         assert motion(down[se], time) == pytest.approx((1 - share) * tone, abs=1e-17)
-
-
-@pytest.mark.parametrize(
-    ("frequency", "knots", "step", "place"),
-    [
-        (100.0, (), 0.005, "got 0"),
-        (100.0, (1e-5 + 0j,) * 33, 0.005, "got 33"),
-        (100.0, (complex("nan"),), 0.005, "knots"),
-        (100.0, (1e-5 + 0j,), 0.0, "above"),
-        (0.0, (1e-5 + 0j,), 0.005, "above"),
-    ],
-)
-def test_envelope_refuses_values_no_amplifier_plays(frequency, knots, step, place):
-    """No knots, too many, not finite ones, no frequency and no step."""
-    with pytest.raises(InputError, match=place):
-        BaseEnvelope(frequency, 0j, knots, step)
 
 
 def random_form(seed: int, n: int):

@@ -50,16 +50,17 @@ class Turns:
 
     def add(self, connection: Connection) -> None:
         """Serve a client that has lines."""
-        waiting = (self._urgent, self._first.waiting, self._others.waiting)
+        lanes = (self._first.waiting, self._others.waiting)
         if connection.is_urgent:
-            for each in waiting:
+            for waiting in lanes:
                 with contextlib.suppress(ValueError):
-                    each.remove(connection)
-            self._urgent.append(connection)
+                    waiting.remove(connection)
+            if connection not in self._urgent:
+                self._urgent.append(connection)
             if not self._is_urgent_due:
                 self._is_urgent_due = True
                 asyncio.get_running_loop().call_soon(self._take_urgent)
-        elif not any(connection in each for each in waiting):
+        elif not any(connection in each for each in (*lanes, self._urgent)):
             (self._first if self._is_first(connection) else self._others).add(connection)
 
     def _take_urgent(self) -> None:
@@ -111,9 +112,8 @@ class _Lane:
         self._deferred_since: float | None = None
 
     def add(self, connection: Connection) -> None:
-        """Let a client wait for its turn, unless it does."""
-        if connection not in self.waiting:
-            self.waiting.append(connection)
+        """Let a client wait for its turn."""
+        self.waiting.append(connection)
         self._schedule()
 
     def _schedule(self, delay: float = 0.0) -> None:

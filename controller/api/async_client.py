@@ -32,6 +32,7 @@ from controller.api.link import DaemonLink
 from controller.api.methods import (
     DEFAULT_LEASE,
     METHODS,
+    SILENCING,
     ArmResult,
     ClearParams,
     HelloParams,
@@ -44,8 +45,6 @@ MAX_QUEUED_EVENTS = 1000  # not yet taken; the oldest is dropped
 _MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.05, 0.5  # s
 _REPEATED_FOR = 0.3  # s; requests whose connection is lost, as by a daemon with many clients
 _RENEWAL_INTERVAL = 0.25  # s; within it a lost lease is noticed, however long it was
-
-_SILENCING = {name for name, method in METHODS.items() if method.silences}
 
 _T = TypeVar("_T")
 _ResultT = TypeVar("_ResultT", bound=Message)
@@ -218,14 +217,14 @@ class AsyncClient(AsyncCalls):
         What `clear` acknowledges is what this client has seen, in its last `status`, `stop` or
         state event.
         """
-        if self._lease_lost is not None and method not in _SILENCING:
+        if self._lease_lost is not None and method not in SILENCING:
             raise self._lease_lost.with_traceback(None)
         if isinstance(params, ClearParams) and params.epoch is None and self._seen is not None:
             params = params.model_copy(update={"epoch": self._seen[1]})
         if method == "stop":
             self._release()
         found = await self._within_timeout(self._send(method, params))
-        if method in _SILENCING:
+        if method in SILENCING:
             self._release()
         elif isinstance(params, HelloParams):
             self._name = params.client

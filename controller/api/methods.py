@@ -254,3 +254,6 @@ METHODS: dict[str, Method] = {
     ),
 }
 """Every method of the API, by name: the one place where a method is registered."""
+
+SILENCING = frozenset(name for name, method in METHODS.items() if method.silences)
+"""Methods that end what plays."""

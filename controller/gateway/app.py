@@ -20,7 +20,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from controller.api.async_client import AsyncClient
-from controller.api.client_protocol import RESPONSE_TIMEOUT, Unreachable
+from controller.api.client_protocol import RESPONSE_TIMEOUT, Unreachable, read_line, result_of
 from controller.api.jsonrpc import (
     ErrorCode,
     RpcError,
@@ -30,7 +30,7 @@ from controller.api.jsonrpc import (
     request_line,
     unknown_method,
 )
-from controller.api.methods import METHODS, DisarmParams, RequestedBy, StatusResult
+from controller.api.methods import METHODS, SILENCING, StatusResult
 from controller.api.rate_limit import RateLimiter, Rates
 from controller.gateway.access import SUBPROTOCOL, Access
 from controller.gateway.bridge import bridge, client_name
@@ -46,8 +46,6 @@ MAX_OPENING_RATE, OPENING_BURST = 10.0, 32.0  # 1/s; of a host's connections to 
 # a burst
 MAX_TOTAL_RATE, TOTAL_BURST = 16.0, 48.0  # the same of all hosts together: fewer than the daemon
 # accepts of one process, so that there are always some for the gateway's own
-# Over the own connection, whoever sends them; with their parameters.
-_SILENCING: dict[str, type[RequestedBy]] = {"stop": RequestedBy, "disarm": DisarmParams}
 _METRICS_TIME = 0.5  # s; for which the same metrics are given
 _MAX_DISARMS = 8  # at once; the daemon carries out as many of one client
 TRY_AGAIN_LATER = 1013  # close code in the registry of RFC 6455
@@ -129,38 +127,32 @@ class Gateway:
         try:
             if method not in HTTP_METHODS:
                 raise unknown_method(method, HTTP_METHODS)
-            reply = await self._request(request, method, await _body(request))
+            return JSONResponse(await self._request(request, method, await _body(request)))
         except RpcError as error:
-            reply = json.loads(error_line(None, error))
+            failed = json.loads(error_line(None, error))["error"]
+            content = {"error": failed["message"], "code": failed["code"], "data": failed["data"]}
+            return JSONResponse(content, HTTP_STATUS[error.code])
         except (ClientDisconnect, asyncio.CancelledError):  # cancelled when the gateway ends
             return Response(status_code=400)  # sent to nowhere
-        if "error" not in reply:
-            return JSONResponse(reply["result"])
-        failed = reply["error"]
-        content = {"error": failed["message"], "code": failed["code"], "data": failed["data"]}
-        return JSONResponse(content, HTTP_STATUS[failed["code"]])
 
-    async def _request(self, request: Request, method: str, params: bytes) -> dict[str, Any]:
-        """The daemon's response, over the connection that this one keeps; raises RpcError."""
+    async def _request(self, request: Request, method: str, params: bytes) -> Any:
+        """The daemon's result, over the connection that this one keeps; raises RpcError."""
         name = client_name("http", request)
         try:
-            if method in _SILENCING:
-                return {"result": await self._silence(name, method, params)}
+            if method in SILENCING:  # over the own connection, whoever sends them
+                return await self._silence(name, method, params)
             kept: KeptLink = request.state.daemon
             if not (kept.is_open or self._may_connect(request)):
                 raise RpcError(ErrorCode.BUSY, "too many connections", remedy="keep one open")
-            reply: dict[str, Any] = json.loads(
-                await kept.request(self._daemon, name, method, params)
-            )
+            return result_of(read_line(await kept.request(self._daemon, name, method, params)))
         except Unreachable as error:
             raise RpcError(ErrorCode.LINK, str(error)) from error
-        return reply
 
     async def _silence(self, name: str, method: str, params: bytes) -> Any:
         """The result of a stop or disarm of a client; raises RpcError and Unreachable."""
         read = read_request(request_line(name, method, params))
-        given = read_params(_SILENCING[method], read)
-        given = given.model_copy(update={"client": given.client or name})
+        given = read_params(METHODS[method].params, read)
+        given = given.model_copy(update={"client": read.params.get("client") or name})
         async with contextlib.nullcontext() if method == "stop" else self._disarms:
             result = await self._own.call(method, given, METHODS[method].result)
         return result.model_dump(mode="json")

@@ -11,11 +11,11 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import RpcError, read_request
 from controller.api.link import DaemonLink
+from controller.api.methods import SILENCING
 from controller.gateway.field import DrawnField
 
 SEND_TIMEOUT = 5.0  # s; for one frame
 _LAST_FRAMES = 0.1  # s; for those that a browser which is given up has sent
-_SILENCING = ("stop", "disarm")
 _MAX_NAME = 80  # characters; as in the API
 
 UNSUPPORTED_DATA = 1003  # close code of RFC 6455
@@ -69,7 +69,7 @@ async def _silence(socket: WebSocket, link: DaemonLink) -> None:
             while link.is_open:
                 text = (await socket.receive()).get("text") or ""
                 line = text.encode()
-                if b"\n" not in line and _method_of(line) in _SILENCING:
+                if b"\n" not in line and _method_of(line) in SILENCING:
                     link.write(line + b"\n")
 
 

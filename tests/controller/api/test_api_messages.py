@@ -1,6 +1,8 @@
 """Lines of the API: what is read, what is refused with which code and key, what is written."""
 
+import inspect
 import json
+from typing import get_args
 
 import pytest
 from hypothesis import given
@@ -8,6 +10,7 @@ from hypothesis import strategies as st
 
 import api_page
 import client_stub
+from controller.api.connection import Connection
 from controller.api.jsonrpc import (
     ErrorCode,
     InvalidRequest,
@@ -20,6 +23,7 @@ from controller.api.jsonrpc import (
 )
 from controller.api.methods import METHODS, ArmParams, SubscribeParams
 from controller.api.schema import Empty, Message
+from controller.daemon.api_service import ApiService
 from page_part import insert
 
 
@@ -234,3 +238,13 @@ def test_reference_page_is_up_to_date() -> None:
 def test_stub_of_the_clients_is_up_to_date() -> None:
     """Editors and mypy see of each method what is registered of it."""
     assert client_stub.stub() == client_stub.STUB.read_text("utf-8")
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_handler_takes_and_returns_what_is_registered(name: str) -> None:
+    """The daemon finds its handlers by name, so that nothing else compares them."""
+    handler = getattr(ApiService, f"_{name}")
+    parameters = [each.annotation for each in inspect.signature(handler).parameters.values()]
+    assert parameters[1:] == [Connection, METHODS[name].params]
+    result = inspect.signature(handler).return_annotation
+    assert METHODS[name].result in (result, *get_args(result))

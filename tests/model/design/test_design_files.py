@@ -77,7 +77,7 @@ def test_regions_off_the_plate_are_refused(tmp_path, shape) -> None:
         "  on: {rectangle: {start: [0, 0], end: [12 in, 9 in]}}\n"
         f"  off: {{{shape}}}\n"
     )
-    with pytest.raises(InputError, match=r"contacts\.yaml:3: regions\.off.*\(0\.3048, 0\.2286\) m"):
+    with pytest.raises(InputError, match=r"contacts\.yaml:3: regions\.off.*0\.3048 m by 0\.2286 m"):
         contact_rule(path, PLATE)
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from controller.effects.shapes import Circle, Rectangle
 from typer.testing import CliRunner
 
 from controller.cli.commands import app
@@ -26,6 +25,7 @@ from controller.effects.ramp import Ramp
 from controller.effects.region import Region
 from controller.effects.representative import strongest_target
 from controller.effects.texture import Texture
+from model.config.shapes import Circle, Rectangle
 from model.rig.uncertainty import Uncertainty
 from model.table.build import build_table
 from model.table.file import save_table

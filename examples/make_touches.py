@@ -11,10 +11,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
+from pythonosc.osc_message_builder import OscMessageBuilder
 
-from controller.sources.capture import RecordedDatagram, write_capture
+from controller.sources.capture import HEADER, RecordedDatagram
 from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import tuio_datagram
+from controller.sources.tuio import ADDRESS
 
 PLATE = np.array([0.3048, 0.2286])  # metres
 MARGIN, APART = 0.015, 0.06  # metres
@@ -61,6 +63,30 @@ def one_person(rng: np.random.Generator) -> list[tuple]:
         for number, place in enumerate(draw_places(count, rng) / PLATE):
             paths.append(((start + number * apart, up), [place, place]))
     return paths
+
+
+def tuio_datagram(frame: TouchFrame, sequence: int) -> bytes:
+    """Encode a frame as a sender with the name of its source would, with all positions."""
+    bundle = OscBundleBuilder(IMMEDIATELY)
+    messages: list[tuple[str | int | float, ...]] = [
+        ("source", frame.source),
+        ("alive", *(touch.id for touch in frame.touches)),
+        *(("set", touch.id, touch.x, touch.y, 0.0, 0.0, 0.0) for touch in frame.touches),
+        ("fseq", sequence),
+    ]
+    types = {str: "s", int: "i", float: "f"}
+    for arguments in messages:
+        message = OscMessageBuilder(ADDRESS)
+        for argument in arguments:
+            message.add_arg(argument, types[type(argument)])
+        bundle.add_content(message.build())
+    return bytes(bundle.build().dgram)
+
+
+def write_capture(path: Path | str, datagrams: Sequence[RecordedDatagram]) -> None:
+    """Write datagrams in order of time, to a microsecond; `read_capture` checks them."""
+    lines = [f"{each.time:.6f} {each.payload.hex()}" for each in datagrams]
+    Path(path).write_text("\n".join([HEADER, *lines]) + "\n", encoding="ascii")
 
 
 def record(name: str, paths: Sequence[tuple], rng: np.random.Generator) -> None:

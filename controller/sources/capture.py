@@ -10,7 +10,7 @@ comments. Malformed datagrams are kept as received.
 
 import asyncio
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -84,12 +84,6 @@ def _lines(path: Path) -> list[str]:
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: must be a TUIO capture, got a binary file") from error
     return lines
-
-
-def write_capture(path: Path | str, datagrams: Iterable[RecordedDatagram]) -> None:
-    """Write datagrams in order of time, to a microsecond; `read_capture` checks them."""
-    lines = [f"{each.time:.6f} {each.payload.hex()}" for each in datagrams]
-    Path(path).write_text("\n".join([HEADER, *lines]) + "\n", encoding="ascii")
 
 
 async def replay_capture(datagrams: Sequence[RecordedDatagram], host: str, port: int) -> None:

@@ -12,9 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
-from pythonosc.osc_message_builder import OscMessageBuilder
-
 from controller.sources.contacts import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
 from controller.sources.datagrams import Datagram, Datagrams, Peer, listen
 from controller.sources.osc import OscError, osc_messages
@@ -214,24 +211,6 @@ def _is_complete_bundle(datagram: bytes) -> bool:
     except OscError:
         return False
     return bundle.alive is not None and set(bundle.alive) <= bundle.positions.keys()
-
-
-def tuio_datagram(frame: TouchFrame, sequence: int) -> bytes:
-    """Encode a frame as a sender with the name of its source would, with all positions."""
-    bundle = OscBundleBuilder(IMMEDIATELY)
-    messages: list[tuple[str | int | float, ...]] = [
-        ("source", frame.source),
-        ("alive", *(touch.id for touch in frame.touches)),
-        *(("set", touch.id, touch.x, touch.y, 0.0, 0.0, 0.0) for touch in frame.touches),
-        ("fseq", sequence),
-    ]
-    types = {str: "s", int: "i", float: "f"}
-    for arguments in messages:
-        message = OscMessageBuilder(ADDRESS)
-        for argument in arguments:
-            message.add_arg(argument, types[type(argument)])
-        bundle.add_content(message.build())
-    return bytes(bundle.build().dgram)
 
 
 class TuioSource(TouchSource):

@@ -19,7 +19,6 @@ import pytest
 
 import patient_daemon
 from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import tuio_datagram
 from daemon_bench import far_end, holding, until, until_state
 from daemon_process import (
     REACTION,
@@ -34,6 +33,7 @@ from daemon_process import (
     ready,
     silent_from,
 )
+from examples.make_touches import tuio_datagram
 from sim.faults.fault_window import FaultWindow
 from tuio_messages import free_port, panel
 

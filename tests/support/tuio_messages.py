@@ -8,9 +8,9 @@ from typing import Any
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
-from controller.sources.capture import RecordedDatagram, write_capture
+from controller.sources.capture import RecordedDatagram
 from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import tuio_datagram
+from examples.make_touches import tuio_datagram, write_capture
 
 
 def message(*arguments: Any, address: str = "/tuio/2Dcur") -> Any:

@@ -17,10 +17,10 @@ from controller.daemon.config import TouchInput
 from controller.daemon.touch_inputs import MAX_SOURCES_PER_CLIENT, ApiTouches, TouchInputs
 from controller.sources.calibration import TouchCalibration
 from controller.sources.touch import Touch, TouchFrame, TouchSource
-from controller.sources.tuio import tuio_datagram
 from daemon_bench import ready_daemon, until
 from daemon_process import Journal
 from drivers import clock
+from examples.make_touches import tuio_datagram
 from model.errors import InputError
 from model.structure.plate import Material, Plate
 from tuio_messages import free_port, panel

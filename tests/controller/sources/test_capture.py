@@ -18,9 +18,9 @@ from controller.sources.capture import (
     RecordedDatagram,
     read_capture,
     replay_capture,
-    write_capture,
 )
 from drivers.errors import LinkError
+from examples.make_touches import write_capture
 from model.calibration.responses_file import read_functions
 from model.errors import InputError
 from model.rig.file import load_rig

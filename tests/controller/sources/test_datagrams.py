@@ -17,7 +17,8 @@ from controller.sources.contacts import Change, ContactTracker
 from controller.sources.datagrams import BACKLOG_THRESHOLD, Datagram, Datagrams, Peer, listen
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import TuioReader, tuio_datagram, without_superseded
+from controller.sources.tuio import TuioReader, without_superseded
+from examples.make_touches import tuio_datagram
 from model.structure.plate import Plate
 from paper_plate import make_paper_rig
 from tuio_messages import bundle, cursor, message

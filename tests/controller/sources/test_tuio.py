@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import TuioReader, TuioSource, tuio_datagram
+from controller.sources.tuio import TuioReader, TuioSource
+from examples.make_touches import tuio_datagram
 from model.errors import InputError
 from tuio_messages import bundle, cursor, frame, message
 from virtual_sockets import in_virtual_time_on_sockets

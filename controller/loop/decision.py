@@ -82,10 +82,7 @@ class Decider:
         self._intent_source = intent_source
         self._intent_due = math.inf  # s; when the intent may change without a touch
         self._builder = SetBuilder(
-            rig,
-            support=capabilities.envelope_support,
-            ramp_max=capabilities.ramp_max,
-            timing=timing,
+            rig, capabilities.envelope_support, capabilities.ramp_max, timing
         )
         self._selector = Selector(
             table,
@@ -107,7 +104,7 @@ class Decider:
     def replace_answers(self, table: LocalizationTable, timing: Timing | None) -> None:
         """Answer by another table of this plate from now on; what plays stays until it changes."""
         self._table, self._timing = table, timing
-        self._builder = self._builder.with_timing(timing)
+        self._builder = replace(self._builder, timing=timing)
         levels = None if timing is None else timing.levels
         self._selector.replace(table, levels, self._builder.shape)
 

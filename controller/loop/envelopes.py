@@ -118,8 +118,3 @@ def _thinned(envelope: BaseEnvelope, steps: int) -> BaseEnvelope:
     times = np.minimum(step * np.arange(1, steps + 1), envelope.duration)
     knots = tuple(complex(value) for value in envelope.amplitude(times))
     return BaseEnvelope(envelope.frequency, envelope.start, knots, step)
-
-
-def duration_of(shape: Shape | None) -> float:
-    """Return how long a shape takes [s]; 0 for none."""
-    return 0.0 if shape is None else shape.step * (len(shape.knots) + 1)

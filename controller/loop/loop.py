@@ -6,7 +6,7 @@ import math
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from typing import Any
 
-from controller.loop.capabilities import PlaybackCapabilities, playback_capabilities
+from controller.loop.capabilities import playback_capabilities
 from controller.loop.decision import RELEASE_RAMP, Decider, Decision
 from controller.loop.intent import IntentSource
 from controller.loop.observer import Observer, applied_by, silenced_by
@@ -87,10 +87,12 @@ class Controller:
         self._connected = connected
         self.watchdog = watchdog
         """Watchdog of armed amplifiers [s]."""
-        self._group = Group({}, watchdog=watchdog)
+        self.group = Group({}, watchdog=watchdog)
+        """All amplifiers together."""
         self.missing: frozenset[str] = frozenset()
         """Names of amplifiers whose loss, or absence, has closed all others."""
-        self._known: dict[str, Amplifier] = {}
+        self.amplifiers: dict[str, Amplifier] = {}
+        """Amplifiers by name, as identified last; empty before."""
         self.observers = [observer]
         self._intent_source = intent_source
         self._timing = timing
@@ -107,19 +109,9 @@ class Controller:
         self._expiry: asyncio.TimerHandle | None = None
 
     @property
-    def amplifiers(self) -> Mapping[str, Amplifier]:
-        """Amplifiers by name, as identified last; empty before."""
-        return self._known
-
-    @property
-    def group(self) -> Group:
-        """All amplifiers together."""
-        return self._group
-
-    @property
     def is_open(self) -> bool:
         """Whether all amplifiers are open together, armed or not, and none was lost."""
-        return self._group.is_open
+        return self.group.is_open
 
     @property
     def is_released(self) -> bool:
@@ -129,19 +121,14 @@ class Controller:
     @property
     def degraded(self) -> tuple[str, ...]:
         """Names of amplifiers that do not reply but may still play; nothing new is played then."""
-        return self._group.degraded
+        return self.group.degraded
 
     @property
     def is_preparing(self) -> bool:
         """Whether a change of contacts is on its way to the amplifiers."""
         if self._decider_if_open is not None and self._decider_if_open.is_choosing:
             return True
-        return self._group.last_sent_at < self._changed_at
-
-    @property
-    def capabilities(self) -> PlaybackCapabilities:
-        """Capabilities of the open amplifiers together; raises CommandError before `open`."""
-        return self._decider.capabilities
+        return self.group.last_sent_at < self._changed_at
 
     @property
     def drive_mode(self) -> str:
@@ -178,13 +165,13 @@ class Controller:
             amplifiers = {name: await self._amplifier(lines, name) for name in self._urls}
             self._connected(amplifiers)
             async with self._sending:  # to those of before
-                self._group = Group(amplifiers, watchdog=self.watchdog)  # a stop reaches them now
-            await self._group.open()
+                self.group = Group(amplifiers, watchdog=self.watchdog)  # a stop reaches them now
+            await self.group.open()
             for name, amplifier in amplifiers.items():
                 self._serial_numbers[name] = amplifier.identity["serial_number"]
-                if name in self._known:
-                    amplifier.ledger.go_on_from(self._known[name].ledger)
-                self._known[name] = amplifier
+                if name in self.amplifiers:
+                    amplifier.ledger.go_on_from(self.amplifiers[name].ledger)
+                self.amplifiers[name] = amplifier
             decider = Decider(
                 self._rig,
                 self.table,
@@ -219,8 +206,8 @@ class Controller:
 
     async def arm(self) -> None:
         """Switch the high voltage on, so that touches are felt; `run` must run or start at once."""
-        was_armed = self._group.is_armed
-        await self._group.arm()
+        was_armed = self.group.is_armed
+        await self.group.arm()
         self._is_armed_anew = True
         if not was_armed:  # else what plays goes on
             self._decider.playing.may_play = frozenset()
@@ -230,11 +217,11 @@ class Controller:
 
     async def disarm(self) -> None:
         """Ramp to silence, then switch the high voltage off."""
-        await self._group.disarm()
+        await self.group.disarm()
 
     def stop(self) -> Coroutine[Any, Any, Mapping[str, Stopped]]:
         """Quick-stop every amplifier; latched until `clear`; see `Group.stop`."""
-        return self._with_missing(self._group.stop())
+        return self._with_missing(self.group.stop())
 
     async def _with_missing(
         self, stopping: Awaitable[Mapping[str, Stopped]]
@@ -245,7 +232,7 @@ class Controller:
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone; nothing arms by itself."""
-        await self._group.clear()
+        await self.group.clear()
 
     async def close(self) -> None:
         """Release the amplifiers, and end `run`."""
@@ -255,11 +242,11 @@ class Controller:
 
     async def release(self) -> None:
         """Ramp to zero in 50 ms, confirm it by reading back, disarm and close all lines."""
-        if self._lines_if_open is not None and self._group.lost_by:
-            self.missing = frozenset(self._group.lost_by)
+        if self._lines_if_open is not None and self.group.lost_by:
+            self.missing = frozenset(self.group.lost_by)
         lines = self._lines_if_open  # those of now: others may be opened meanwhile
         try:
-            await self._group.close(CLOSING_RAMP)
+            await self.group.close(CLOSING_RAMP)
         finally:
             try:
                 if lines is not None:
@@ -294,11 +281,11 @@ class Controller:
         decision = decider.decide(now)
         try:
             async with self._sending:
-                if self._group.is_armed:
+                if self.group.is_armed:
                     await self._send(decider, decision, now)
                 # Not after a set that was given up: the next cycle silences it first.
                 if self._is_heartbeat_due:
-                    await self._group.beat()
+                    await self.group.beat()
                     self._heartbeat_due = clock.now() + HEARTBEAT
         except (Preempted, LinkDegraded):
             pass  # what plays is unknown, and decided anew
@@ -317,7 +304,7 @@ class Controller:
     def deliver(self, frame: TouchFrame) -> None:
         """Process a touch frame; to be called in the loop's thread."""
         # Contacts that came since the last cycle have not been decided yet.
-        is_undecided = self._group.is_armed and self._wake.is_set()
+        is_undecided = self.group.is_armed and self._wake.is_set()
         change = self._tracker.update(frame, keeps_taps=is_undecided)
         if change:
             self._follow(change, frame.time)
@@ -334,9 +321,9 @@ class Controller:
     @property
     def _is_heartbeat_due(self) -> bool:
         """Whether to feed the watchdogs now; pending silence has priority."""
-        if not self._group.is_armed or self._decider.is_silence_pending:
+        if not self.group.is_armed or self._decider.is_silence_pending:
             return False
-        return clock.now() >= min(self._heartbeat_due, self._group.lost_from)
+        return clock.now() >= min(self._heartbeat_due, self.group.lost_from)
 
     @property
     def _decider(self) -> Decider:
@@ -348,10 +335,10 @@ class Controller:
         """Act on a change of contacts at a time [s], also while amplifiers are being awaited."""
         self._decider.note(time)
         self._wake.set()
-        if self._group.is_armed:
+        if self.group.is_armed:
             self._changed_at = clock.now()
         if self._decider.is_silence_pending:
-            self._group.abort_exchange()
+            self.group.abort_exchange()
         self._report_change(change)
 
     def _schedule_expiry(self) -> None:
@@ -380,7 +367,7 @@ class Controller:
         if decision is None:
             if now >= decider.playing.due:
                 await self._go_on(decider, now)
-        elif decision.started and self._group.degraded:
+        elif decision.started and self.group.degraded:
             ends = decider.only_ends(decision)
             if ends.sets:  # unreported
                 played = await self._play(decider, ends.sets)
@@ -392,7 +379,7 @@ class Controller:
 
     async def _go_on(self, decider: Decider, now: float) -> None:
         """Prolong the layers that are due, and report those that have ended by themselves."""
-        due = {} if self._group.degraded else decider.renewal(now)
+        due = {} if self.group.degraded else decider.renewal(now)
         if due:
             decider.playing.renewed(due, await self._play(decider, due), now=clock.now())
         if (ended := decider.ended(now)) is not None:
@@ -435,7 +422,7 @@ class Controller:
     async def _silence(self, decider: Decider, ramp: float) -> float:
         """Silence all layers of all amplifiers; returns when [s] that was sent."""
         try:
-            sent_at = await self._group.silence(ramp)
+            sent_at = await self.group.silence(ramp)
         except BaseException:
             decider.forget()
             raise
@@ -450,14 +437,14 @@ class Controller:
         Whatever is raised instead leaves it unknown what plays.
         """
         try:
-            if self._group.is_set_incomplete:
-                await self._group.silence(RELEASE_RAMP)  # before the next pattern
+            if self.group.is_set_incomplete:
+                await self.group.silence(RELEASE_RAMP)  # before the next pattern
             layers = {
                 name: [each.layers[name] for each in sets.values()] for name in self._rig.amplifiers
             }
-            return await self._group.apply(layers)
+            return await self.group.apply(layers)
         except BaseException as error:
-            is_overtaken = isinstance(error, Preempted) or not self._group.is_armed
+            is_overtaken = isinstance(error, Preempted) or not self.group.is_armed
             if isinstance(error, CommandRefused) and not is_overtaken:
                 return error
             decider.forget()
@@ -471,8 +458,8 @@ class Controller:
         until = min(now + IDLE_INTERVAL, self._tracker.next_expiry)
         if self._decider_if_open is not None:
             until = min(until, self._decider_if_open.due)
-        if self._group.is_armed:
-            until = min(until, self._heartbeat_due, self._group.lost_from)
+        if self.group.is_armed:
+            until = min(until, self._heartbeat_due, self.group.lost_from)
         pause = max(0.0, until - now)
         timer = asyncio.get_running_loop().call_later(pause, self._wake.set)
         try:

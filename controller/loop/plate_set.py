@@ -4,8 +4,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from controller.loop.envelopes import EnvelopeSupport, duration_of, thinned
-from controller.loop.routing import Drive, continues_any_tone, route, shaped
+from controller.loop.envelopes import EnvelopeSupport, thinned
+from controller.loop.routing import Drive, route, shaped
 from drivers.contents import Layer
 from model.rig.rig import Rig
 from model.table.pattern import Pattern
@@ -20,45 +20,30 @@ FADE_RAMP = 0.020
 
 @dataclass(frozen=True)
 class PlateSet:
-    """What one layer plays on every amplifier, by name; ramp [s]: the longest of them.
+    """What one layer plays on every amplifier, by name.
 
-    plain: the same along its ramp, where an amplifier's ledger refuses its onset or ending; None
-    without either.
+    settled_after [s]: from the commit until the last fade or onset has ended; has_endings: whether
+    it ends along shaped endings. plain: the same along its ramp, where an amplifier's ledger
+    refuses its onset or ending; None without either.
     """
 
     layers: Mapping[str, Layer]
-    ramp: float
+    settled_after: float
+    has_endings: bool = False
     plain: "PlateSet | None" = None
 
-    @property
-    def has_endings(self) -> bool:
-        """Whether it ends along shaped endings."""
-        return any(tone.ending for layer in self.layers.values() for tone in layer.tones)
 
-    @property
-    def settled_after(self) -> float:
-        """Time [s] after the commit when the last fade or onset has ended."""
-        tones = [tone for layer in self.layers.values() for tone in layer.tones]
-        return max([self.ramp, *(duration_of(tone.onset) for tone in tones)])
-
-
+@dataclass(frozen=True)
 class SetBuilder:
     """Builds the sets of one rig.
 
     timing: shapes patterns; None for ramps only. ramp_max [s]: of all amplifiers.
     """
 
-    def __init__(
-        self, rig: Rig, *, support: EnvelopeSupport, ramp_max: float, timing: Timing | None
-    ) -> None:
-        self._rig = rig
-        self._support = support
-        self._ramp_max = ramp_max
-        self._timing = timing
-
-    def with_timing(self, timing: Timing | None) -> "SetBuilder":
-        """Return a builder that shapes by another timing."""
-        return SetBuilder(self._rig, support=self._support, ramp_max=self._ramp_max, timing=timing)
+    rig: Rig
+    support: EnvelopeSupport
+    ramp_max: float
+    timing: Timing | None
 
     def shape(
         self,
@@ -72,8 +57,8 @@ class SetBuilder:
 
         is_continued: whether it needs no onset; is_ended: whether it may have an ending.
         """
-        has_onset = self._support.onset_knots > 0 and not is_continued
-        has_ending = self._support.ending_knots > 0 and is_ended
+        has_onset = self.support.onset_knots > 0 and not is_continued
+        has_ending = self.support.ending_knots > 0 and is_ended
         pattern = replace(
             pattern,
             onset=pattern.onset if has_onset else None,
@@ -81,9 +66,9 @@ class SetBuilder:
         )
         adds_onset = has_onset and pattern.onset is None
         adds_ending = has_ending and pattern.ending is None
-        if self._timing is None or not (adds_onset or adds_ending):
+        if self.timing is None or not (adds_onset or adds_ending):
             return pattern
-        return self._timing.with_envelopes(question, pattern, onset=adds_onset, ending=adds_ending)
+        return self.timing.with_envelopes(question, pattern, onset=adds_onset, ending=adds_ending)
 
     def build_pattern(
         self,
@@ -108,8 +93,8 @@ class SetBuilder:
         """
         layers = route(
             pattern.excitation,
-            self._rig,
-            ramp=min(pattern.ramp, self._ramp_max),
+            self.rig,
+            ramp=min(pattern.ramp, self.ramp_max),
             number=number,
             playing=playing,
             restarts=restarts,
@@ -119,17 +104,17 @@ class SetBuilder:
         pattern = replace(pattern, ramp=ramp)
         plain = PlateSet(layers, ramp)
         if is_shaped:
-            is_continued = not restarts and continues_any_tone(pattern.excitation, playing)
+            is_continued = any(tone.keep_phase for layer in layers.values() for tone in layer.tones)
             is_ended = lasts > KNOT_STEP * ONSET_KNOTS
             pattern = self.shape(question, pattern, is_continued, is_ended=is_ended)
         if not (pattern.onset or pattern.ending):
             return plain, pattern
         if pattern.onset:
-            knots = max(1, self._support.onset_knots // among)
-            onset = thinned(pattern.onset, knots=knots)
+            onset = thinned(pattern.onset, knots=max(1, self.support.onset_knots // among))
             pattern = replace(pattern, onset=onset)
-        layers = shaped(layers, self._rig, onset=pattern.onset, ending=pattern.ending)
-        return PlateSet(layers, ramp, plain), pattern
+            ramp = max(ramp, *[each.duration for each in onset.values()])
+        layers = shaped(layers, self.rig, onset=pattern.onset, ending=pattern.ending)
+        return PlateSet(layers, ramp, bool(pattern.ending), plain), pattern
 
     def build_renewal(self, playing: PlateSet, *, valid_for: float) -> PlateSet:
         """Build the set that prolongs another for a time [s]."""
@@ -137,13 +122,13 @@ class SetBuilder:
             name: Layer(layer.number, ramp=layer.ramp, valid_for=valid_for, renew=True)
             for name, layer in playing.layers.items()
         }
-        return PlateSet(layers, playing.ramp)
+        return PlateSet(layers, playing.settled_after)
 
     def build_end(self, number: int, *, has_endings: bool) -> PlateSet:
         """Build the set that ends a layer along its endings, or along a ramp."""
-        ramp = min(FADE_RAMP, self._ramp_max)
-        plain = PlateSet(route({}, self._rig, ramp=ramp, number=number), ramp)
+        ramp = min(FADE_RAMP, self.ramp_max)
+        plain = PlateSet(route({}, self.rig, ramp=ramp, number=number), ramp)
         if not has_endings:
             return plain
-        layers = {name: Layer(number, ramp=ramp) for name in self._rig.amplifiers}
-        return PlateSet(layers, ramp, plain)
+        layers = {name: Layer(number, ramp=ramp) for name in self.rig.amplifiers}
+        return PlateSet(layers, ramp, plain=plain)

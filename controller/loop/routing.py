@@ -48,18 +48,15 @@ def route(
             f"pattern must drive ERAs of the rig, got {', '.join(unknown)}; build a table for this "
             "rig"
         )
-    restarted = _restarted(excitation, {} if restarts else playing or {})
+    before: Drive = playing or {}
+    restarted = _restarted(excitation, {} if restarts else before)
     strokes = {era.name: era.stroke for era in rig.eras}
-    drive = {
-        name: _tone(excitation.get(name), rig, channel.number, strokes[name], restarted=restarted)
-        for name, channel in rig.wiring.items()
-    }
-    max_rise = max((_rise(drive[name], (playing or {}).get(name)) for name in drive), default=0.0)
-    min_ramp = max_rise / rig.limits.slew
-    ramp = min_ramp if min_ramp > ramp else ramp  # ledgers refuse NaN
     wired: dict[str, list[Tone]] = {name: [] for name in rig.amplifiers}
     for name, channel in rig.wiring.items():
-        wired[channel.amplifier].append(drive[name])
+        tone = _tone(excitation.get(name), rig, channel.number, strokes[name], restarted=restarted)
+        wired[channel.amplifier].append(tone)
+        min_ramp = _rise(tone, before.get(name)) / rig.limits.slew
+        ramp = min_ramp if min_ramp > ramp else ramp  # ledgers refuse NaN
     return {
         name: Layer(number, tuple(tones), ramp=ramp, valid_for=valid_for)
         for name, tones in wired.items()
@@ -125,12 +122,6 @@ def phasor_of(tone: Tone) -> complex:
 def continues_all_tones(excitation: physics.Excitation, playing: Drive) -> bool:
     """Whether all tones of an excitation continue what ERAs play now."""
     return not _restarted(excitation, playing)
-
-
-def continues_any_tone(excitation: physics.Excitation, playing: Drive) -> bool:
-    """Whether any tone of an excitation continues what ERAs play now."""
-    restarted = _restarted(excitation, playing)
-    return any(tone.frequency not in restarted for tone in excitation.values())
 
 
 def _restarted(excitation: physics.Excitation, playing: Drive) -> set[float]:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from controller.api.calls import AsyncCalls
-from controller.api.channel import Channel
 from controller.api.client_protocol import (
     RESPONSE_TIMEOUT,
     ConnectionLost,
@@ -28,7 +27,7 @@ from controller.api.client_protocol import (
     touches_at,
 )
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.link import DaemonLink
+from controller.api.link import Channel, DaemonLink
 from controller.api.methods import (
     DEFAULT_LEASE,
     METHODS,

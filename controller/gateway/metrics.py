@@ -55,42 +55,45 @@ def exposition(status: StatusResult | None) -> bytes:
 
 def metrics_of(status: StatusResult) -> Iterator[Metric]:
     """Metrics of one status."""
-    state = GaugeMetricFamily("era_state", "1 for the current state.", labels=["state"])
-    for name in get_args(DaemonStateName):
-        state.add_metric([name], float(name == status.state))
-    yield state
-    yield _gauge(
-        "era_armed", "Whether a client holds the lease.", float(status.armed_by is not None)
-    )
-    yield _gauge(
-        "era_assume_energised",
-        "Whether a lost amplifier may still be playing.",
-        float(status.assume_energised),
-    )
-    yield _gauge("era_contacts", "Fingers on the plate.", len(status.contacts))
-    yield _gauge("era_uptime_seconds", "Time since the daemon started.", status.uptime_s)
+    yield _one_of("era_state", "1 for the current state.", get_args(DaemonStateName), status.state)
     for name, text, value in (
+        ("armed", "Whether a client holds the lease.", status.armed_by is not None),
         (
-            "promised_contrast",
+            "assume_energised",
+            "Whether a lost amplifier may still be playing.",
+            status.assume_energised,
+        ),
+        ("contacts", "Fingers on the plate.", len(status.contacts)),
+        ("uptime_seconds", "Time since the daemon started.", status.uptime_s),
+        (
+            "promised_contrast_decibels",
             "Felt contrast that nine of ten plates within the rig's uncertainty give.",
             status.robust_felt_contrast_db,
         ),
         (
-            "predicted_contrast",
+            "predicted_contrast_decibels",
             "Felt contrast of the pattern as modelled.",
             status.predicted_felt_contrast_db,
         ),
-        ("predicted_level", "Predicted level at the target.", status.predicted_level_db_sl),
+        (
+            "predicted_level_decibels",
+            "Predicted level at the target.",
+            status.predicted_level_db_sl,
+        ),
     ):
         if value is not None:
-            yield _gauge(f"era_{name}_decibels", text, value)
+            yield _gauge(f"era_{name}", text, float(value))
     rejected = CounterMetricFamily(
         "era_rejected_touches", "Touches rejected as contacts.", labels=["reason"]
     )
     for reason, count in status.rejected_touches.items():
         rejected.add_metric([reason], count)
     yield rejected
-    yield _latency(status.latency_ms)
+    yield _histogram(
+        "era_touch_to_wire_seconds",
+        "From a touch to the last byte of the command.",
+        status.latency_ms,
+    )
     if status.learning is not None:
         yield from _learning(status.learning)
     yield from _amplifiers(status.amplifiers)
@@ -100,14 +103,22 @@ def _gauge(name: str, text: str, value: float) -> Metric:
     return GaugeMetricFamily(name, text, value=value)
 
 
+def _one_of(name: str, text: str, states: Iterable[str], current: str) -> Metric:
+    """1 for the current one of several states, 0 for the others."""
+    metric = GaugeMetricFamily(name, text, labels=["state"])
+    for state in states:
+        metric.add_metric([state], float(state == current))
+    return metric
+
+
 def _learning(learning: LearningSummary) -> Iterator[Metric]:
     """What is learned of the plate."""
-    state = GaugeMetricFamily(
-        "era_learning_state", "1 for what happens to measured patterns.", labels=["state"]
+    yield _one_of(
+        "era_learning_state",
+        "1 for what happens to measured patterns.",
+        get_args(LearningStateName),
+        learning.state,
     )
-    for name in get_args(LearningStateName):
-        state.add_metric([name], float(name == learning.state))
-    yield state
     yield _gauge(
         "era_robust_answers",
         "Whether answers are those of a plate that is not known.",
@@ -131,12 +142,6 @@ def _learning(learning: LearningSummary) -> Iterator[Metric]:
         "era_reading_to_answers_seconds",
         "From the end of a measurement to the answers that follow it.",
         learning.latency_ms,
-    )
-
-
-def _latency(latency: LatencySummary) -> Metric:
-    return _histogram(
-        "era_touch_to_wire_seconds", "From a touch to the last byte of the command.", latency
     )
 
 

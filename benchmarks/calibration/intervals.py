@@ -24,7 +24,7 @@ from model.errors import InputError
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 
-_CHUNK, _SHOWN = 20, 100  # plates
+_CHUNK = 20  # plates
 _NORMAL = 1.645  # standard errors either side: 90 %
 
 
@@ -53,7 +53,7 @@ def deviations(
 
 
 def main(count: int, form: str) -> None:
-    """Print tables of kinds of values by the number of sensors, of a hundred plates and more."""
+    """Print tables of kinds of values by the number of sensors, of more and more plates."""
     rig = load_rig(RIG)
     held: dict[tuple[str, int], list[float]] = defaultdict(list)
     sizes: dict[tuple[str, int], list[float]] = defaultdict(list)
@@ -75,9 +75,8 @@ def main(count: int, form: str) -> None:
                 for kind, (off, size) in found.items():
                     held[kind, sensors_of(seed)] += (off < _NORMAL).tolist()
                     sizes[kind, sensors_of(seed)].append(size)
-        if (first + some) % _SHOWN == 0 or first + some == count:
-            print(f"form errors {form}: {first + some} plates, {refused} refused")
-            show(held, sizes)
+        print(f"form errors {form}: {first + some} plates, {refused} refused")
+        show(held, sizes)
 
 
 def show(

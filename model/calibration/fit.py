@@ -237,12 +237,22 @@ def _noise_left(problem: Problem, z: FloatArray, found: Found, weight: FloatArra
     by_gain = np.abs(weight * model) ** 2
     total = by_gain.sum(axis=2, keepdims=True)
     left = 1 - by_gain / np.where(total > 0, total, 1)
-    size = np.linalg.norm(found.jacobian, axis=0)
-    scaled = found.jacobian / np.where(size > 0, size, 1)
-    rows, strength, _ = np.linalg.svd(scaled, full_matrices=False)
-    leverage = (rows[:, strength > 1e-9 * strength[0]] ** 2).sum(axis=1)
+    leverage = (_directions(found)[0] ** 2).sum(axis=1)
     left[inside] -= leverage[: 2 * inside.sum()].reshape(2, -1).mean(axis=0)
     return np.asarray(left)
+
+
+def _directions(found: Found) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Singular vectors (m, k) of the derivatives, and what each moves by one standard error (n, k).
+
+    Then a mask (n,) of what none of them determines.
+    """
+    size = np.linalg.norm(found.jacobian, axis=0)
+    size[size == 0] = 1e-300
+    rows, strength, columns = np.linalg.svd(found.jacobian / size, full_matrices=False)
+    seen = strength > 1e-9 * strength[0]
+    blind = (np.abs(columns[~seen]) > 1e-6).any(axis=0)
+    return rows[:, seen], columns[seen].T / strength[seen] / size[:, None], blind
 
 
 def _result(
@@ -252,12 +262,8 @@ def _result(
     rows = int(used.any(axis=2).sum())
     freedom = max(len(found.residuals) - 2 * rows - int(searched.sum()), 1)
     chi2 = float((found.residuals**2).sum()) / freedom
-    size = np.linalg.norm(found.jacobian, axis=0)
-    size[size == 0] = 1e-300
-    _, strength, directions = np.linalg.svd(found.jacobian / size, full_matrices=False)
-    seen = strength > 1e-9 * strength[0]
-    blind = (np.abs(directions[~seen]) > 1e-6).any(axis=0)
-    root = directions[seen].T / strength[seen] / size[:, None] * math.sqrt(max(chi2, 1.0))
+    _, root, blind = _directions(found)
+    root = root * math.sqrt(max(chi2, 1.0))
     error = np.zeros(len(z))
     error[searched] = np.where(blind, np.inf, np.linalg.norm(root, axis=1))
     model, by_z = problem.responses(z)

@@ -150,12 +150,14 @@ def test_shaped_onset_keeps_most_of_the_steady_contrast(setup, target, quiet, fr
 
 
 def test_onset_of_many_eras_is_as_good_as_of_few():
-    """Of eight, more than it combines: within the stroke, 6 dB more than a ramp, and of no jump."""
-    table = build_table(load_rig(EXAMPLES / "eight_eras.yaml"), frequencies=np.array([100.0]))
+    """Of sixteen, more than it combines: within the stroke, to the pattern, 6 dB above a ramp."""
+    table = build_table(load_rig(EXAMPLES / "table.yaml"), frequencies=np.array([130.0]))
+    size = np.array([table.plate.length / 0.3048, table.plate.width / 0.2286])
     shaper = Shaper(table.in_time, gain_variance=VARIANCE)
     transients = Transients(table.in_time)
     gained = []
-    for target, quiet, _ in PAIRS:
+    for *places, _ in PAIRS:
+        target, quiet = (tuple((size * place).tolist()) for place in places)
         question = Question(
             (target,), (quiet,), level_db_sl=20.0, envelopes=True, drive_mode="phased"
         )

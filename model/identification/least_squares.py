@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from model.arrays import ComplexArray, FloatArray
 
@@ -68,6 +67,8 @@ def search(
         return both(y)[1]
 
     inside = np.minimum(_INSIDE, np.ptp(bounds, axis=0) / 4)
+    from scipy.optimize import least_squares  # a daemon reads what was fitted, but fits nothing
+
     found = least_squares(
         residuals,
         np.clip(start, bounds[0] + inside, bounds[1] - inside),

@@ -121,19 +121,17 @@ class Supervisor(Operator):
                 await self._controller.run()
             except Exception as error:
                 _logger.exception("control loop failed, stopping all amplifiers")
-                while not await self._is_stopped_after(error):
-                    pass
+                await self._stop_after(error)
             await asyncio.sleep(_RECHECK)
 
-    async def _is_stopped_after(self, error: Exception) -> bool:
-        """Whether a failed control loop is stopped; it sends no heartbeat before. Else pause."""
-        try:
-            await self._fail(error)
-        except Exception:
-            _rate_limited_logger.exception("stop after a failure of the control loop failed")
-            await asyncio.sleep(_RECHECK)
-            return False
-        return True
+    async def _stop_after(self, error: Exception) -> None:
+        """Stop after a failure of the control loop, until that works; no heartbeat goes before."""
+        while True:
+            try:
+                return await self._fail(error)
+            except Exception:
+                _rate_limited_logger.exception("stop after a failure of the control loop failed")
+                await asyncio.sleep(_RECHECK)
 
     async def close(self, cause: str) -> None:
         """Ramp down, read back, disarm and close the amplifiers; ends `run`."""
@@ -144,20 +142,16 @@ class Supervisor(Operator):
 
     async def _open(self) -> None:
         """Open and verify the amplifiers; without a good reply they are searched for."""
+        event = DaemonEvent(Trigger.OPENED, "every amplifier has replied")
         try:
             await self._controller.open()
-            if self._closing.is_set():
-                await self._controller.close()
-                return
         except (LinkError, CommandRefused, FrameError) as error:
-            if self._closing.is_set():
-                return
             self._link_changed("retry", (), str(error))
             event = DaemonEvent(Trigger.NOT_FOUND, str(error), SEARCHING)
+        if self._closing.is_set():
+            await self._controller.close()
+        else:
             await self._in_background(self.handle(event))
-            return
-        opened = DaemonEvent(Trigger.OPENED, "every amplifier has replied")
-        await self._in_background(self.handle(opened))
 
     @property
     def _must_reopen(self) -> bool:

@@ -87,24 +87,20 @@ def test_daemon_does_not_start_when_log_not_writable(tmp_path: Path) -> None:
     assert not (tmp_path / "era.sock").exists()
 
 
-def test_daemon_refuses_to_start_with_few_descriptors(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_daemon_refuses_to_start_with_few_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Below 64 its own files and 40 clients would use them up."""
     monkeypatch.setattr("controller.daemon.run.allow_many_descriptors", lambda: 63)
     with pytest.raises(InputError, match="64, got 63"):
-        run_daemon(write_daemon(tmp_path, {"main": "sim://"}), dashboard=None)
+        run_daemon(Path("missing.yaml"), dashboard=None)
 
 
-def test_daemon_refuses_to_start_with_little_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_daemon_refuses_to_start_with_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Within 300 MB of addresses a library waits for more of them for ever."""
     limits = {resource.RLIMIT_AS: (300 << 20, resource.RLIM_INFINITY)}
     others = resource.getrlimit
     monkeypatch.setattr(resource, "getrlimit", lambda what: limits.get(what) or others(what))
     with pytest.raises(InputError, match="512 MB, got 300 MB"):
-        run_daemon(write_daemon(tmp_path, {"main": "sim://"}), dashboard=None)
+        run_daemon(Path("missing.yaml"), dashboard=None)
 
 
 def test_daemon_refuses_pipe_as_log_or_trace(tmp_path: Path) -> None:

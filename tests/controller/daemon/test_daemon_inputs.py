@@ -117,7 +117,10 @@ async def test_inputs_run_beside_each_other(
     assert (panels["a:"].ended, panels["c:"].ended) == (["x\x1b[2J"], ["z"])
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+LEFT: list[TouchInputs] = []
+"""With a source that never ends: kept, for what is collected ends with a warning."""
+
+
 def test_closing_waits_for_no_source_that_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """A plug-in that swallows its cancellation holds neither a reload nor the exit."""
     started = asyncio.Event()
@@ -133,10 +136,10 @@ def test_closing_waits_for_no_source_that_goes_on(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("controller.daemon.touch_inputs._CLOSE_TIMEOUT", 0.0)
 
     async def serve() -> None:
-        inputs = TouchInputs(lambda frame: None)
-        inputs.start([TouchInput("left", "a:", TouchCalibration())])
+        LEFT.append(TouchInputs(lambda frame: None))
+        LEFT[0].start([TouchInput("left", "a:", TouchCalibration())])
         await started.wait()
-        await inputs.close()
+        await LEFT[0].close()
 
     program = threading.Thread(target=asyncio.run, args=(serve(),), daemon=True)
     program.start()

@@ -122,48 +122,55 @@ def study_convergence(
     resolve. progress is called with the number of solved meshes, the reference first, and of all.
     """
     high = rig.limits.frequency_max
-    checked = np.asarray(frequencies, dtype=float)
+    checked, points = np.asarray(frequencies, dtype=float), _raster(rig.plate)
     if (checked > high).any():
         raise InputError(
             f"frequencies must be at most the rig's limits.frequency of {high:g} Hz, got "
             f"{checked.max():g} Hz; take lower frequencies or raise the limit"
         )
-    reference = _reference(rig)
-    solved = _solved(rig, reference)
-    exact = _natural_frequencies(rig, solved)
+
+    def response(of: FreePlate, eras: Sequence[Era]) -> ComplexArray:
+        return of.acceleration(eras, checked, points, loads=rig.masses)
+
+    reference = _solved(rig, _reference(rig))
+    exact, exact_response = _natural_frequencies(rig, reference), response(reference, rig.eras)
     supported = exact > _MIN_FREQUENCY_RATIO * rig.plate.lowest_bending_frequency
-    (exact_response,) = _responses(rig, solved, rig.eras, frequencies=checked)
-    size = np.linalg.norm(exact_response, axis=2)
     errors = []
     for done, mesh in enumerate(meshes, start=1):
         progress(done, 1 + len(meshes))
-        free = _solved(rig, mesh)
-        (response,) = _responses(rig, free, rig.eras, frequencies=checked)
-        difference = np.linalg.norm(response - exact_response, axis=2)
-        errors.append(
-            MeshError(
-                mesh,
-                dof=mesh.dof,
-                frequency=_natural_frequencies(rig, free)[supported] / exact[supported] - 1,
-                response=(difference / size).max(axis=1),
-                estimate=_estimate(rig, free, checked),
-            )
-        )
+        free, estimate = _solved(rig, mesh), None
+        if isinstance(mesh, SpectralMesh):
+            estimate = estimate_error(
+                free, mesh.finer(), rig.eras, checked, points, loads=rig.masses
+            ).max(axis=1)
+        found = _relative_error(response(free, rig.eras), exact_response).max(axis=1)
+        of_frequencies = _natural_frequencies(rig, free)[supported] / exact[supported] - 1
+        errors.append(MeshError(mesh, mesh.dof, of_frequencies, found, estimate))
     progress(1 + len(meshes), 1 + len(meshes))
-    by_place, by_foot = _changes(
-        rig,
-        [_nearer_the_middle(era, rig.plate) for era in rig.eras],
-        [replace(era, foot=era.foot + FOOT) for era in rig.eras],
-        frequencies=checked,
+    accurate = rig.mesh if rig.plate.is_layered else Mesh.accurate(rig.plate, frequency_max=high)
+    plain = _solved(rig, accurate)
+    before = response(plain, rig.eras)
+    by_place, by_foot = (
+        _relative_error(response(plain, eras), before).max(axis=1)
+        for eras in (
+            [_nearer_the_middle(era, rig.plate) for era in rig.eras],
+            [replace(era, foot=era.foot + FOOT) for era in rig.eras],
+        )
     )
     return Convergence(
-        reference,
+        reference.mesh,
         checked,
         exact[supported],
         tuple(errors),
         by_place=by_place,
         by_foot=by_foot,
     )
+
+
+def _relative_error(found: ComplexArray, exact: ComplexArray) -> FloatArray:
+    """Of fields over points (f, eras, points), relative L2, (f, eras)."""
+    size = np.linalg.norm(exact, axis=2)
+    return np.asarray(np.linalg.norm(found - exact, axis=2) / size)
 
 
 def _nearer_the_middle(era: Era, plate: Plate) -> Era:
@@ -173,19 +180,6 @@ def _nearer_the_middle(era: Era, plate: Plate) -> Era:
         for at, side in ((era.x, plate.length), (era.y, plate.width))
     )
     return replace(era, x=float(x), y=float(y))
-
-
-def _changes(rig: Rig, *layouts: Sequence[Era], frequencies: FloatArray) -> tuple[FloatArray, ...]:
-    """Change of the response by other ERAs, relative L2, the worst driven ERA, (f,) for each."""
-    mesh: PlateMesh = rig.mesh
-    if not rig.plate.is_layered:
-        mesh = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
-    free = _solved(rig, mesh)
-    before, *others = _responses(rig, free, rig.eras, *layouts, frequencies=frequencies)
-    size = np.linalg.norm(before, axis=2)
-    return tuple(
-        np.asarray((np.linalg.norm(after - before, axis=2) / size).max(axis=1)) for after in others
-    )
 
 
 def _reference(rig: Rig) -> PlateMesh:
@@ -200,24 +194,6 @@ def _reference(rig: Rig) -> PlateMesh:
 def _natural_frequencies(rig: Rig, free: FreePlate) -> FloatArray:
     solved = natural_modes(rig, MODE_COUNT, support="eras", mesh=free.mesh, free=free)
     return solved.frequencies
-
-
-def _responses(
-    rig: Rig, free: FreePlate, *layouts: Sequence[Era], frequencies: FloatArray
-) -> list[ComplexArray]:
-    """Acceleration fields of a plate on each layout, (f, eras, points)."""
-    points = _raster(rig.plate)
-    return [free.acceleration(eras, frequencies, points, loads=rig.masses) for eras in layouts]
-
-
-def _estimate(rig: Rig, free: FreePlate, frequencies: FloatArray) -> FloatArray | None:
-    """Estimated error of the response, the worst driven ERA (f,)."""
-    if not isinstance(free.mesh, SpectralMesh):
-        return None
-    error = estimate_error(
-        free, free.mesh.finer(), rig.eras, frequencies, _raster(rig.plate), loads=rig.masses
-    )
-    return np.asarray(error.max(axis=1))
 
 
 def _solved(rig: Rig, mesh: PlateMesh) -> FreePlate:
@@ -277,8 +253,8 @@ def estimate_error(
 
     better = solve_free_plate(free.plate, finer, frequency_max=free.frequency_max)
     own, exact = response(free), response(better)
-    error = np.linalg.norm(own - exact, axis=2)
+    error = _relative_error(own, exact)
     if isinstance(free.modes, SpectralModes):
         softer = response(replace(free, modes=free.modes.softer()))
-        error += np.linalg.norm(own - softer, axis=2)
-    return np.asarray(error / np.linalg.norm(exact, axis=2))
+        error += np.linalg.norm(own - softer, axis=2) / np.linalg.norm(exact, axis=2)
+    return error

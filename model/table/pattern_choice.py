@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
+from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 from model.choice import best_first, best_of
 from model.drive_modes import ALTERNATIVES, UNRESTRICTED, find_drives, max_sensation
 from model.drive_modes.coherent import CoherentResult
@@ -116,20 +116,35 @@ def pattern_of(
     *,
     eras: Sequence[Era],
     frequencies: FloatArray,
-    threshold: str,
+    thresholds: Float32Array,
+    threshold_name: str,
+    background: Complex64Array | None,
 ) -> Pattern:
-    """The pattern of the only content's tone; its level is that of the weakest target."""
-    contrast, median, promised = tones.contrast_db[0]
+    """The pattern of the only content's tone; its level is that of the weakest target.
+
+    thresholds (f,) [m/s²], background (f, eras, eras): as of `Candidates`, at all frequencies.
+    """
     nominal = min(tones.level_db_sl[target][0] for target in range(len(question.targets)))
-    robust = question.level_db_sl + float(decibels(tones.stroke_factor))
-    drive = [(tones.rows[0], tones.weights[0])]
-    return Pattern(
-        excitation=excitation_of(drive, eras, frequencies, gain=tones.gains[0]),
+    pattern = partial(
+        Pattern,
+        excitation=excitation_of(
+            [(tones.rows[0], tones.weights[0])], eras, frequencies, gain=tones.gains[0]
+        ),
         ramp=ONSET_RAMP,
         level_db_sl=nominal,
-        robust_level_db_sl=robust,
+        robust_level_db_sl=question.level_db_sl + float(decibels(tones.stroke_factor)),
         drive_mode=UNRESTRICTED,
-        threshold=threshold,
+        threshold=threshold_name,
+    )
+    if background is not None:
+        weights: ComplexArray = np.multiply(tones.gains[0], tones.weights[0])
+        drive = [(tones.rows[0], weights)]
+        around = _level_around(drive, background, thresholds)
+        return pattern(
+            contrast_db=None, quiet_level_db_sl=None, surroundings_contrast_db=nominal - around
+        )
+    contrast, median, promised = tones.contrast_db[0]
+    return pattern(
         contrast_db=contrast,
         quiet_level_db_sl=nominal - contrast,
         robust_quiet_level_db_sl=tones.loudest_db_sl,
@@ -137,6 +152,19 @@ def pattern_of(
         robust_felt_contrast_db=promised,
         median_felt_contrast_db=median,
     )
+
+
+def _level_around(
+    drive: Sequence[tuple[int, ComplexArray | Complex64Array]],
+    background: Complex64Array,
+    thresholds: Float32Array,
+) -> float:
+    """Level [dB SL] of the rest of the plate, root mean square, of weights by row."""
+    power = sum(
+        float(np.vdot(w, background[row] @ w).real) / float(thresholds[row]) ** 2
+        for row, w in drive
+    )
+    return float(decibels(math.sqrt(max(power, 1e-60))))
 
 
 def _forms(question: Question, candidates: Candidates) -> Forms:
@@ -332,12 +360,8 @@ def _pattern(
         threshold=candidates.threshold_name,
     )
     if candidates.background is not None:
-        rest = sum(
-            float(np.vdot(w, candidates.background[row] @ w).real)
-            / float(candidates.threshold[row]) ** 2
-            for row, w in drive.tones()
-        )
-        surroundings = nominal[0] - float(decibels(math.sqrt(max(rest, 1e-60))))
+        around = _level_around(drive.tones(), candidates.background, candidates.threshold)
+        surroundings = nominal[0] - around
         return pattern(
             contrast_db=None, quiet_level_db_sl=None, surroundings_contrast_db=surroundings
         )

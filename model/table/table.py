@@ -145,8 +145,10 @@ class LocalizationTable:
                 f"these amplifiers play, got {self.frequencies[0]:g} to {self.frequencies[-1]:g} "
                 "Hz; build a table with others: era table build --frequencies"
             )
+        background = None if question.quiet else self.background(question.targets)
         if drive_mode == UNRESTRICTED and over_effect is None:
-            found = self._tone(question, (int(playable[0]), int(playable[-1]) + 1))
+            band = int(playable[0]), int(playable[-1]) + 1
+            found = self._tone(question, band, background)
             if found is not None:
                 return found
         tips = self.read_fingertips(question.contacts)
@@ -156,7 +158,7 @@ class LocalizationTable:
             frequencies=self.frequencies,
             playable=playable,
             fingers=self._fingers(question, tips),
-            background=None if question.quiet else self.background(question.targets),
+            background=background,
             threshold=self.thresholds,
             threshold_name=self.threshold,
             onset_contrast=partial(
@@ -394,7 +396,9 @@ class LocalizationTable:
             error_power=self.error_power,
         )
 
-    def _tone(self, question: Question, band: tuple[int, int]) -> Pattern | None:
+    def _tone(
+        self, question: Question, band: tuple[int, int], background: Complex64Array | None
+    ) -> Pattern | None:
         """The best pattern of one tone, None where that hardly reaches the level."""
         count = len(question.targets)
         contents = Contents(
@@ -402,10 +406,11 @@ class LocalizationTable:
             question.loads,
             (Stream(tuple(range(count)), question.level_db_sl, (band,)),),
             tuple(range(count, len(question.contacts))),
+            background=background,
             is_strict=True,
             with_onset=not question.envelopes,
         )
-        found = choose_tones(self, contents) if question.quiet else None
+        found = choose_tones(self, contents)
         if found is None:
             return None
         return pattern_of(
@@ -413,5 +418,7 @@ class LocalizationTable:
             found,
             eras=self.eras,
             frequencies=self.frequencies,
-            threshold=self.threshold,
+            thresholds=self.thresholds,
+            threshold_name=self.threshold,
+            background=background,
         )

@@ -53,8 +53,8 @@ _TARGET_WEIGHT = 2.0
 # zero makes the ending as loud for the quiet finger as a plain ramp.
 _QUIET_WEIGHT = 0.03
 
-# Combinations of ERAs in an onset. With all of sixteen its contrast is lower, with six of eight
-# 1 dB lower in one of ten cases.
+# Least combinations of ERAs in an onset; more for more than six quiet fingers. With all of sixteen
+# its contrast is lower, with six of eight 1 dB lower in one of ten cases.
 _COMBINATIONS = 8
 
 _SAMPLES = 5  # for each step; a demodulated response changes little within a millisecond
@@ -162,12 +162,12 @@ def onset_knots(
 
 def _combinations(hats: Complex64Array, amplitudes: ComplexArray) -> Complex64Array:
     """Orthonormal combinations (eras, c) of ERAs, the amplitudes among them."""
-    eras = len(amplitudes)
-    if eras <= _COMBINATIONS:
+    eras, count = len(amplitudes), max(_COMBINATIONS, hats.shape[1] // 4)
+    if eras <= count:
         return np.eye(eras, dtype=np.complex64)
     flat = hats.reshape(-1, eras)
     _, vectors = np.linalg.eigh(flat.conj().T @ flat)
-    some = np.column_stack([amplitudes, vectors[:, 1 - _COMBINATIONS :]])
+    some = np.column_stack([amplitudes, vectors[:, 1 - count :]])
     return np.asarray(np.linalg.qr(some)[0], dtype=np.complex64)
 
 

@@ -1,7 +1,6 @@
 """The daemon: control loop, drivers and API assembled from a configuration."""
 
 import asyncio
-import contextlib
 import logging
 import signal
 from collections.abc import Awaitable, Callable, Mapping
@@ -28,7 +27,6 @@ from controller.loop.loop import Controller
 from controller.loop.observer import Observer
 from controller.sources.touch import TouchFrame
 from drivers import clock
-from drivers.errors import DriverError
 from drivers.garbage_collection import no_long_collections, without_collections
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.opening import Lines
@@ -264,9 +262,8 @@ class Daemon:
         self._supervisor.connected(amplifiers)
 
     def _deliver(self, frame: TouchFrame) -> None:
-        """Pass touches to the control loop; ignore them while it is not running."""
-        with contextlib.suppress(DriverError):
-            self._controller.deliver(frame)
+        """Pass touches to the control loop."""
+        self._controller.deliver(frame)
 
     def _follow_state(self, old: Operation, new: Operation) -> None:
         """Learn of the plate from when all amplifiers are open."""

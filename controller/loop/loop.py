@@ -333,11 +333,13 @@ class Controller:
 
     def _follow(self, change: Change, time: float) -> None:
         """Act on a change of contacts at a time [s], also while amplifiers are being awaited."""
-        self._decider.note(time)
+        decider = self._decider_if_open
+        if decider is not None:  # else the amplifiers were never open
+            decider.note(time)
         self._wake.set()
         if self.group.is_armed:
             self._changed_at = clock.now()
-        if self._decider.is_silence_pending:
+        if decider is not None and decider.is_silence_pending:
             self.group.abort_exchange()
         self._report_change(change)
 

@@ -10,7 +10,7 @@ import logging
 import random
 from collections import Counter
 from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, TextIO, get_args
@@ -273,8 +273,7 @@ class _Run:
             must_be_felt = is_new and self._must_be_felt()
             self.witness.touched(must_be_felt=must_be_felt)
             placed = tuple(Touch(*touch) for touch in touches)
-            with suppress(DriverError):  # not opened yet; a daemon ignores it as well
-                self.controller.deliver(TouchFrame(sequence.source, now + stamp, placed))
+            self.controller.deliver(TouchFrame(sequence.source, now + stamp, placed))
             self.counts["touches that must be felt"] += must_be_felt
 
     @property

@@ -44,6 +44,23 @@ async def test_amplifier_that_refuses_at_the_start_is_opened_again_later() -> No
 
 
 @in_virtual_time
+async def test_finger_before_any_amplifier_obeys_ends_with_its_source() -> None:
+    """The loop turns as without one, and what comes then plays."""
+    async with watched(refuses=True) as daemon:
+        daemon.touch()
+        await asyncio.sleep(3)
+        assert len(daemon.cycles) < 20
+        daemon.obey()
+        await asyncio.sleep(1)
+        await daemon.handle(ARM)
+        await asyncio.sleep(0.1)
+        assert not any(daemon.far_end.levels)
+        daemon.touch()
+        await asyncio.sleep(0.1)
+        assert any(daemon.far_end.levels)
+
+
+@in_virtual_time
 async def test_unforeseen_exception_in_the_control_loop_is_a_fault(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -232,7 +232,8 @@ class Members:
                 self._limit = None
         except Exception as error:
             self.note(error)
-            if limit.expired() and (isinstance(error, TimeoutError | Preempted)):
+            is_lost = isinstance(error, LinkTimeout) and self.state is GroupState.LOST
+            if limit.expired() and isinstance(error, TimeoutError | Preempted) and not is_lost:
                 raise Preempted("given up, since silence comes first") from error
             if self.is_degraded_only(error):
                 raise LinkDegraded(str(error)) from error
@@ -241,6 +242,8 @@ class Members:
                 raise Preempted("a stop or disarm came first") from error
             replying = [name for name, each in self.amplifiers.items() if not each.silence_cause]
             await self.stop(waits_for=replying)
+            if is_lost:  # also where it was degraded when this began
+                raise LinkTimeout(next(iter(self.lost_by.values()), str(error))) from error
             raise
 
     async def _play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | CommandRefused:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from drivers.contents import Shape
-from drivers.errors import CommandRefused, DriverError
+from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkError
 from drivers.host.group import Group
 from drivers.host.jobs import JointStart
 from drivers.host.sensors import read_measured
@@ -150,6 +150,22 @@ async def test_arming_anew_stops_what_cannot_be_disarmed(
     with pytest.raises(DriverError):
         await group.arm()
     assert ends[0].levels("a") == [0.0, 0.0]
+
+
+@grouped(("a",), ("b",), wire="serial")
+async def test_set_in_the_moment_of_a_loss_says_that_it_is_lost(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """Before any heartbeat has found it: a loop that goes on would wait for ever."""
+    await group.apply({name: [layer(0, tone())] for name in "ab"})
+    ends[1].outward = lambda name, data: []
+    with pytest.raises(LinkDegraded):
+        await group.beat()
+    await asyncio.sleep(group.lost_from - ends[0].loop.time())
+    with pytest.raises(LinkError) as lost:
+        await group.apply({name: [layer(0, tone())] for name in "ab"})
+    assert not isinstance(lost.value, LinkDegraded)
+    assert (ends[0].levels("a"), group.is_open) == ([0.0, 0.0], False)
 
 
 @grouped(("a",), wire="serial")

@@ -7,9 +7,8 @@ from model.commands.config_cli import config_app
 from model.commands.design_cli import design_app
 from model.commands.figure_cli import figure_app
 from model.commands.plate_cli import materials, plate_app, show
-from model.commands.table_build_cli import build
 from model.commands.table_cli import query, table_app
-from model.commands.table_export_cli import contrast_map, export, plot
+from model.commands.table_files_cli import build, contrast_map, export, plot
 from model.commands.table_show_cli import show as show_table
 from model.commands.table_show_cli import verify
 from model.errors import InputError

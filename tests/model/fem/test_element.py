@@ -42,20 +42,6 @@ def test_rigidities_equal_hand_calculation():
     np.testing.assert_allclose(inertia, np.diag([5.4, 1.8e-6, 1.8e-6]), rtol=1e-12)
 
 
-def test_shape_functions_are_nodal(element):
-    """They are 1 at their own node, 0 at the others, and add up to 1 everywhere."""
-    nodes = np.array(element.side)
-    np.testing.assert_allclose(element.shape(nodes), np.eye(len(nodes)), atol=1e-12)
-    between = element.shape(np.linspace(-1, 1, 17))
-    np.testing.assert_allclose(between.sum(axis=1), 1.0, rtol=1e-12)
-
-
-@pytest.mark.parametrize(("name", "side"), [("Q3", 0.2**0.5), ("Q4", (3 / 7) ** 0.5)])
-def test_high_order_nodes_are_gauss_lobatto(name, side):
-    """Abramowitz and Stegun, Table 25.6: the outermost inner nodes are 0.2^½ and (3/7)^½."""
-    assert ELEMENTS[name].side[-2] == pytest.approx(side, rel=1e-14)
-
-
 def test_three_motions_take_no_force(element):
     """Up and down, and both tilts; there are no spurious modes."""
     stiffness = element.stiffness(PLATE, DX, DY)

@@ -7,7 +7,6 @@ import pytest
 
 from benchmarks.layers.gap import air_pressure, cell_middles
 from long_form import in_turn
-from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import parse_rig
 from model.spectral.mesh import SpectralMesh
@@ -113,9 +112,3 @@ def test_modes_over_air_answer_as_the_direct_solution(closed):
     exact = direct_responder(plate, mesh)(eras, frequencies, points)
     error = np.linalg.norm(found - exact, axis=2) / np.linalg.norm(exact, axis=2)
     assert error.max() < 0.01
-
-
-def test_air_gap_refuses_a_depth_of_none():
-    """A gap of nothing has no air."""
-    with pytest.raises(InputError, match=r"^air gap: depth must be above zero, got 0"):
-        AirGap(0.0)

@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 
 from model.errors import InputError
-from model.structure.attachments import Era, PointLoad
+from model.structure.attachments import Era, Fingertip, PointLoad
 from model.structure.materials import material
-from model.structure.plate import Layer, Material, Plate
+from model.structure.plate import AirGap, Layer, Material, Plate
 from paper_plate import make_paper_rig
 
 GLASS = Material("glass", 70e9, 2500.0, 0.2)
@@ -68,8 +68,12 @@ def test_material_refuses_an_unknown_name_with_a_suggestion(name, message):
                 "mass": [math.nan, -0.1],
                 "stiffness": [-1.0],
                 "damping": [math.inf],
+                "foot": [-1e-3, math.nan],
             },
         ),
+        (Era("A", 0.1, 0.1, 1e4, 1.0, 0.0, 1e-4), {"stroke": [0.0], "foot": [-1e-3, math.nan]}),
+        (Fingertip(), {"damping": [0.0], "stiffness": [-1.0], "phalanx_mass": [math.nan, 0.0]}),
+        (AirGap(1e-3), {"depth": [0.0, -1e-3, math.nan]}),
     ],
     ids=lambda value: type(value).__name__,
 )

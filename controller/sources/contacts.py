@@ -168,13 +168,11 @@ class ContactTracker:
         self, key: ContactKey, touch: Touch, known: Contact | None, time: float
     ) -> Contact:
         """Return the contact of a touch, down since a time [s] unless it is known."""
-        return Contact(
-            key,
-            touch.x * self._plate.length,
-            (1 - touch.y) * self._plate.width,
-            since=time if known is None else known.since,
-            load=1.0 if known is None else _load(known, touch, time),
-        )
+        since, load = (time, 1.0) if known is None else (known.since, known.load)
+        if time - since >= LANDING:
+            load = followed(load, touch.load)
+        x, y = touch.x * self._plate.length, (1 - touch.y) * self._plate.width
+        return Contact(key, x, y, since, load)
 
     def _contact_to_evict(self, newcomer: ContactKey) -> ContactKey | None:
         """Return the contact to lift for another one, if any.
@@ -225,11 +223,6 @@ class ContactTracker:
             self._newest = max(self._newest, source.received)
         self._sources, self.contacts = sources, tuple(self._contacts.values())
         self.next_expiry = min(ends, default=math.inf)
-
-
-def _load(known: Contact, touch: Touch, time: float) -> float:
-    """Return the load of a known contact with its touch at a time [s]."""
-    return known.load if time - known.since < LANDING else followed(known.load, touch.load)
 
 
 def _input_of(key: ContactKey) -> str:

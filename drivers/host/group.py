@@ -7,7 +7,6 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import Any, TypeVar
 
-from drivers import clock
 from drivers.errors import (
     CommandError,
     CommandRefused,
@@ -158,8 +157,8 @@ class Group(Members):
         name = amplifier.name
         if amplifier.silence_cause is None:
             # The status first, unless the wire is too slow for that.
-            pause = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
-            if (now := clock.now()) - self._running_read_at.get(name, 0.0) >= pause:
+            now, pause = amplifier.line.time(), amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
+            if now - self._running_read_at.get(name, 0.0) >= pause:
                 self._running_read_at[name] = now
                 await amplifier.read_status(Priority.HEARTBEAT)
             self.check_none_since(before)

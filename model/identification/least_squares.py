@@ -7,8 +7,6 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 
-_INSIDE = 0.1  # standard deviations from a bound: nearer to one steps begin too small
-
 
 @dataclass(frozen=True, eq=False)
 class Found:
@@ -33,13 +31,15 @@ def search(
     robust: float | None = None,
     evaluations: int = 60,
     tolerance: float = 1e-8,
+    inside: float = 1e-9,
 ) -> Found:
     """Minimize complex residuals (m,) with derivatives (m, n), from a start within bounds (2, n).
 
     All in standard deviations. prior: rows (k, n) and what they are to give (k,), by default each
     argument by itself and zero; robust: standard deviations from which a residual counts as its
     magnitude, not its square. evaluations: at most; a plate that fits takes ten. tolerance: of the
-    sum of squares, relative.
+    sum of squares, relative; inside: how far from its bounds a start is at least, without which a
+    start that is zero begins with small steps.
     """
     rows, targets = (np.eye(len(start)), np.zeros(len(start))) if prior is None else prior
     last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
@@ -66,12 +66,12 @@ def search(
     def jacobian(y: FloatArray) -> FloatArray:
         return both(y)[1]
 
-    inside = np.minimum(_INSIDE, np.ptp(bounds, axis=0) / 4)
     from scipy.optimize import least_squares  # a daemon reads what was fitted, but fits nothing
 
+    least = np.minimum(inside, np.ptp(bounds, axis=0) / 4)
     found = least_squares(
         residuals,
-        np.clip(start, bounds[0] + inside, bounds[1] - inside),
+        np.clip(start, bounds[0] + least, bounds[1] - least),
         jacobian,
         bounds=(bounds[0], bounds[1]),
         x_scale="jac",

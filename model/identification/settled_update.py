@@ -11,6 +11,7 @@ from model.identification.least_squares import search
 from model.identification.settled import Measured, finger_count, finger_covariance
 
 _LEAST = 1e-14  # of the largest variance
+_INSIDE = 0.1  # standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +87,7 @@ def update(
         bounds[:, loose],
         prior=(rows, rows @ centre[loose]),
         evaluations=evaluations,
+        inside=_INSIDE,
     )
     at[loose] = found.y
     predicted, H = _linearised(patterns, at, p, q)

@@ -377,7 +377,9 @@ class HostRules:
         )
 
     def _expect_stop(self, session: AmplifierSession, time: float) -> None:
-        """A stop command must be sent to this amplifier."""
+        """A stop command must be sent to this amplifier, unless a stop went out at this moment."""
+        if session.is_stopped and session.last_stop == time:
+            return
         session.stop_requested_at = time
 
         def is_sent() -> bool:

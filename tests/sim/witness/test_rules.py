@@ -133,6 +133,13 @@ def test_arm_may_be_withdrawn_before_its_reply() -> None:
     assert "token" not in talk.found
 
 
+def test_stop_in_the_moment_of_its_request_is_not_awaited_again() -> None:
+    """The host had begun to stop by itself, of which its operator's stop takes part."""
+    talk = Talk().armed().playing().sends(hand.STOP, (5,)).told("operator_command", "stop")
+    talk.rest(0.028).replies(hand.STOP, hand.status(hand.STOPPED, latch=1, token=5))
+    assert talk.found == []
+
+
 def test_stop_of_what_a_stop_has_silenced_needs_no_second_confirmation() -> None:
     """A broadcast for another amplifier of the line reaches it too."""
     talk = Talk().armed()

@@ -28,6 +28,7 @@ from model.identification.forward import PlateAt
 from model.identification.parameters import Space
 from model.identification.settled import SettledPattern, Touched
 from model.reduction.receptance import TERMS, combined
+from model.structure.attachments import coupled_forces
 from model.structure.plate import Plate
 
 # m, of slopes by places (no closed form: `model.reduction.place_slopes`): right to 0.1 %, and
@@ -258,7 +259,7 @@ class AlteredPlate:
         within = coordinates @ _receptance(plate, alteration, points, points) @ coordinates.T
         T = plate.left[0] @ A
         within = within - A.T @ (plate.stiffness[0][:, None] * T)
-        self._columns = T @ np.linalg.inv(np.eye(len(Z)) + Z[:, None] * within)
+        self._columns = T @ coupled_forces(within, Z, np.eye(len(Z), dtype=complex))
         n, observed = plate.base.shape[1], plate.model.observed
         change = (self._columns[observed] * Z) @ T[:n].T
         self.responses: ComplexArray = plate.responses[0] - plate.scale[0] * change

@@ -22,7 +22,12 @@ from model.identification.values import Values
 from model.reduction.free_plate import FreePlate
 from model.reduction.receptance import TERMS, FreeReceptance, combined
 from model.rig.rig import Rig
-from model.structure.attachments import Fingertip, attached_stiffness, footprints_of
+from model.structure.attachments import (
+    Fingertip,
+    attached_stiffness,
+    coupled_forces,
+    footprints_of,
+)
 from model.structure.modal_elasticity import ModalElasticity, lowest_elastic
 from model.structure.plate import LOSS_FREQUENCY
 
@@ -217,8 +222,8 @@ class PlateAt:
         A = shapes @ moved + combined(self.functions.truncated(TERMS), self.located.truncated)
         # Nothing holds the plate at the sensors, the last ones.
         count = Z.shape[1] - len(model.pads)
-        reaction = A[:, :, :count] * Z[:, None, :count]
-        reaction = reaction @ np.linalg.inv(np.eye(count) + reaction[:, :count])
+        forces = coupled_forces(A[:, :count, :count], Z[:, :count], np.eye(count, dtype=complex))
+        reaction = A[:, :, :count] @ forces * Z[:, None, :count]
         self.left = np.repeat(np.eye(Z.shape[1], dtype=complex)[None], len(w), axis=0)
         self.left[:, :, :count] -= reaction
         self.receptance = A - reaction @ A[:, :count]

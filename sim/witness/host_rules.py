@@ -102,15 +102,16 @@ class HostRules:
 
     # frames
 
-    def is_preempting(self, session: AmplifierSession, request: Request) -> bool:
+    def is_preempting(self, session: AmplifierSession, time: float, request: Request) -> bool:
         """Whether a request may come before a reply that is pending on its wire.
 
-        It silences, or reads whether a stop has.
+        It silences, or reads whether a stop has, also one that a disarm's reading has confirmed.
         """
         if request.name == "Set":
             layers = session.amplifier.sets.whole(request.values["token"])
             return layers is not None and not is_vibrating(layers)
-        is_silencing = session.is_disarming or session.first_stop is not None
+        is_unconfirmed = session.is_disarming or session.first_stop is not None
+        is_silencing = is_unconfirmed or time < self._last_silencing + _CONFIRMED
         return request.name in _SILENCING or (request.name == "GetStatus" and is_silencing)
 
     def check_order(

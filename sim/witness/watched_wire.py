@@ -203,7 +203,7 @@ class WatchedWire:
             session.report_always("garbage", time, f"host sent {request.name}: {problem}")
         if request.problem:
             return
-        if self._host.is_preempting(session, request):
+        if self._host.is_preempting(session, time, request):
             self._preempted_by = sent.number
         elif not self.is_disturbed(sent.begun):
             is_to_each = self._kind == "modbus-tcp" and len(self.sessions) > 1

@@ -53,7 +53,7 @@ def design(
     seed: int = 0,
     workers: int = 1,
 ) -> tuple[RankedLayout, ...]:
-    """Find or compare layouts of ERAs, the best robust felt contrast first, as `era design` does.
+    """Find or compare layouts of ERAs, the best promised felt contrast first, as `era design` does.
 
     eras: how many, as many as the rig's for None; layouts: None to search, `random:N` or a file to
     rank layouts; where: `edge`, `anywhere` or a file; contacts: a file, anywhere for None;

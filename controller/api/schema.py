@@ -193,7 +193,7 @@ class ContactStatus(Message):
     )
     leak_db_sl: float | None = Field(
         None,
-        description="of the contents of others where it is now, on the plate as modelled: more "
+        description="of the contents of others where it is now, on the nominal plate: more "
         "than promised while it moves; in the status only, null where there are none",
     )
     held_back: str | None = Field(
@@ -221,9 +221,7 @@ class Playing(Message):
         description="of the newest content, by ERA, without silent ones"
     )
     robust_felt_contrast_db: float | None = Field(None, description=PROMISED)
-    predicted_felt_contrast_db: float | None = Field(
-        None, description="the same on the plate as modelled"
-    )
+    predicted_felt_contrast_db: float | None = Field(None, description="the same, nominal")
     robust_contrast_db: float | None = Field(
         None, description="promised contrast in peak acceleration"
     )

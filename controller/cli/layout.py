@@ -105,7 +105,7 @@ def _lines(each: "CheckedEffect") -> list[str]:
             f"  {_span(each.promised_contrasts)} dB above what a resting second finger feels, on "
             "nine of ten plates"
         )
-        lines.append(f"  {_span(each.contrasts)} dB on the plate as modelled")
+        lines.append(f"  {_span(each.contrasts)} dB nominal")
     if each.held_back_db > _SHOWN_FROM:
         held = f"  up to {each.held_back_db:.1f} dB weaker"
         lines.append(f"{held} so that it feels half of it at most")

@@ -21,7 +21,7 @@ def _show_learning(learning: LearningSummary) -> list[str]:
     state = learning.state.replace("_", " ")
     lines = [f"  plate {state.upper() if learning.robust else state}: {learning.cause}"]
     if learning.robust:
-        lines.append("    answers are robust ones, of a plate that is not known")
+        lines.append("    answers promise what a plate that is not known gives")
     if learning.remedy:
         lines.append(f"    remedy: {learning.remedy}")
     if learning.readings:

@@ -72,7 +72,7 @@ def metrics_of(status: StatusResult) -> Iterator[Metric]:
         ),
         (
             "predicted_contrast_decibels",
-            "Felt contrast of the pattern as modelled.",
+            "Felt contrast of the pattern, nominal.",
             status.predicted_felt_contrast_db,
         ),
         (

@@ -1,4 +1,4 @@
-"""`era design`: places of ERAs for the best robust felt contrast, searched or given."""
+"""`era design`: places of ERAs for the best promised felt contrast, searched or given."""
 
 import json
 import time
@@ -88,7 +88,7 @@ def design(
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find or rank places of ERAs for the best robust felt contrast."""
+    """Find or rank places of ERAs for the best promised felt contrast."""
     from model.config.document import read_document
     from model.design.area import area_of
     from model.design.contacts import contact_rule

@@ -124,35 +124,35 @@ def _print_answer(answer: dict[str, Any], uncertainty: Uncertainty) -> None:
         )
     basis = ", threshold extrapolated" if answer["is_level_extrapolated"] else ""
     rows = [
-        ("level at the target", answer["robust_level_db_sl"], f"dB SL or more{basis}"),
-        ("  as modelled", answer["level_db_sl"], "dB SL"),
+        ("level at the target", answer["robust_level_db_sl"], f"dB SL promised{basis}"),
+        ("  nominal", answer["level_db_sl"], "dB SL"),
     ]
     if answer["contrast_db"] is not None:
         awareness = "not felt" if answer["is_imperceptible_to_quiet"] else "may be felt"
         rows += [
-            ("felt contrast to quiet fingers", answer["robust_felt_contrast_db"], "dB or more"),
-            ("  typically", answer["median_felt_contrast_db"], "dB"),
-            ("  as modelled", answer["felt_contrast_db"], "dB"),
-            ("  as acceleration", answer["robust_contrast_db"], "dB or more"),
-            ("  in the first 100 ms", answer["transient_contrast_db"], "dB as modelled"),
+            ("felt contrast to quiet fingers", answer["robust_felt_contrast_db"], "dB promised"),
+            ("  median", answer["median_felt_contrast_db"], "dB"),
+            ("  nominal", answer["felt_contrast_db"], "dB"),
+            ("  as acceleration", answer["robust_contrast_db"], "dB promised"),
+            ("  in the first 100 ms", answer["transient_contrast_db"], "dB nominal"),
             (
                 "loudest quiet finger",
                 answer["robust_quiet_level_db_sl"],
-                f"dB SL or less, {awareness}",
+                f"dB SL promised, {awareness}",
             ),
             ("level that leaves it at -10", answer["usable_level_db_sl"], _usable(answer)),
         ]
     else:
         rows += [
-            ("contrast to rest of the plate", answer["surroundings_contrast_db"], "dB as modelled"),
-            ("  to its 95th percentile", answer["surroundings_contrast_95_db"], "dB as modelled"),
+            ("contrast to rest of the plate", answer["surroundings_contrast_db"], "dB nominal"),
+            ("  to its 95th percentile", answer["surroundings_contrast_95_db"], "dB nominal"),
             ("area above half the target", 1e4 * answer["area_above_half_m2"], "cm²"),
             ("energy within 5 cm", 100 * answer["energy_share_near"], "%"),
         ]
-    rows.append(("residual after the end", answer["residual_db"], "dB as modelled"))
+    rows.append(("residual after the end", answer["residual_db"], "dB nominal"))
     for name, value, unit in rows:
         print(f"{name:30s} {value:6.1f} {unit}")
-    print(f"'or more', 'or less': nine of ten plates within the rig's uncertainty ({uncertainty})")
+    print(f"promised: what nine of ten plates within the rig's uncertainty give ({uncertainty})")
     print(f"solved in {1000 * answer['solve_time_s']:.1f} ms")
 
 
@@ -197,10 +197,12 @@ def _answer(
             f"{_cell(finger['foreign_level_db_sl'], 'dB SL'):>14s}  quiet"
         )
     if found["robust_worst_db"] is not None:
-        print(f"worst finger: {found['robust_worst_db']:.1f} dB or more")
+        print(f"worst finger: {found['robust_worst_db']:.1f} dB promised")
     for line in found["applied"]:
         print(f"changed: {line}")
-    print(f"promised to nine of ten plates within the rig's uncertainty ({table.uncertainty})")
+    print(
+        f"promised: what nine of ten plates within the rig's uncertainty give ({table.uncertainty})"
+    )
     print(f"solved in {1000 * found['solve_time_s']:.1f} ms")
 
 

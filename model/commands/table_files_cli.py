@@ -201,7 +201,7 @@ def _show(found: "ContrastMap") -> None:
     import numpy as np
 
     for mode, promised in found.promised_db.items():
-        print(f"{mode}: felt contrast of nine of ten plates to the quiet fingers, dB")
+        print(f"{mode}: promised felt contrast to the quiet fingers, dB")
         for row in promised[::-1]:
             print("".join("   -" if np.isnan(value) else f"{value:4.0f}" for value in row))
         known, nominal = (of[np.isfinite(of)] for of in (promised, found.nominal_db[mode]))
@@ -209,7 +209,7 @@ def _show(found: "ContrastMap") -> None:
             low, median, high = np.percentile(known, [10, 50, 90])
             print(
                 f"median {median:.1f} dB, one place in ten below {low:.1f}, one above {high:.1f}; "
-                f"median as modelled {np.median(nominal):.1f}"
+                f"median nominal {np.median(nominal):.1f}"
             )
         print()
 

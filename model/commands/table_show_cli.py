@@ -167,7 +167,7 @@ def _show_summary(summary: dict[str, Any]) -> None:
             f"contrast to {others} other{'s' if others > 1 else ''}",
             f"median {with_error(f'robust_felt_contrast_{others}_quiet_median')}, one in ten "
             f"below {with_error(f'robust_felt_contrast_{others}_quiet_tenth_percentile')}; "
-            f"as modelled {with_error(f'felt_contrast_{others}_quiet_median')}",
+            f"nominal {with_error(f'felt_contrast_{others}_quiet_median')}",
         )
         for others in (1, 2, 3)
     ]
@@ -206,7 +206,7 @@ def _show_map(cells: "WeakCells", *, listed: bool) -> None:
 
     from model.table.weak_cells import text_map
 
-    print("felt contrast of nine of ten plates, dB, to the median other finger; * marks weak cells")
+    print("promised felt contrast, dB, to the median other finger; * marks weak cells")
     if np.isfinite(cells.errors_db).any():
         median, tenth = np.sqrt(np.nanmean(cells.errors_db**2, axis=1))
         print(f"± {median:.1f} dB by the choice of other fingers, to one in ten ± {tenth:.1f} dB")

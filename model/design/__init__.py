@@ -1,1 +1,1 @@
-"""Places of ERAs that give the best robust felt contrast over a distribution of contacts."""
+"""Places of ERAs that give the best promised felt contrast over a distribution of contacts."""

@@ -190,7 +190,7 @@ def contrast_figure(design: Design) -> Figure:
         axes.set_ylim(0, 100 * plate.width)
         axes.set_title(f"{quiet} quiet: median {judged.median_db(quiet):.1f} dB")
         axes.label_outer()
-    figure.colorbar(image, ax=grid, label="contrast of nine of ten plates / dB")
+    figure.colorbar(image, ax=grid, label="promised contrast / dB")
     return figure
 
 
@@ -207,7 +207,7 @@ def count_figure(design: Design) -> Figure:
     for count, low, high in zip(counts[1:], means, means[1:], strict=False):
         axes.annotate(f"{high - low:+.1f}", (count, high), (0, 7), textcoords="offset points")
     axes.set_xlabel("ERAs")
-    axes.set_ylabel("contrast of nine of ten plates / dB")
+    axes.set_ylabel("promised contrast / dB")
     axes.set_xticks(counts)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)

@@ -52,7 +52,7 @@ def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
         _cross_out(axes, table, weak.grid, below)
         axes.set_title(title)
         axes.label_outer()
-    figure.colorbar(image, ax=grid, label="felt contrast of nine of ten plates / dB")
+    figure.colorbar(image, ax=grid, label="promised felt contrast / dB")
     figure.suptitle(
         f"Mode {table.drive_mode}: felt contrast from each cell to one other finger\n"
         f"(crosses: below {WANTED_CONTRAST_DB:g} dB; dots: ERAs)"
@@ -90,7 +90,7 @@ def contrast_figure(table: LocalizationTable, overview: Overview) -> Figure:
     axes.axvline(WANTED_CONTRAST_DB, color="0.5", ls=":", lw=1)
     axes.set_xlim(left=0)
     axes.set_ylim(0, 100)
-    axes.set_xlabel("felt contrast of nine of ten plates / dB")
+    axes.set_xlabel("promised felt contrast / dB")
     axes.set_ylabel("contact sets with at least this contrast / %")
     axes.grid(color="0.9")
     figure.legend(loc="outside lower center", ncols=3, fontsize=9, frameon=False)
@@ -112,7 +112,7 @@ def contrast_map_figure(table: LocalizationTable, found: ContrastMap) -> Figure:
             draw_fingertip(axes, finger, felt=False)
         axes.set_title(mode)
         axes.label_outer()
-    figure.colorbar(image, ax=list(panels), label="felt contrast of nine of ten plates / dB")
+    figure.colorbar(image, ax=list(panels), label="promised felt contrast / dB")
     return figure
 
 
@@ -137,7 +137,7 @@ def answer_figure(table: LocalizationTable) -> Figure:
     draw_level_scale(figure, [axes], shrink=0.8)
     axes.set_title(
         f"Felt contrast at least {pattern.robust_felt_contrast_db:.0f} dB on nine of ten plates, "
-        f"{pattern.felt_contrast_db:.0f} dB as modelled\n"
+        f"{pattern.felt_contrast_db:.0f} dB nominal\n"
         f"{_in_words(table, pattern)}",
         fontsize=10,
         pad=20,

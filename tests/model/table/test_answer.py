@@ -394,7 +394,7 @@ def test_the_command_answers_as_python_does(table_file):
     assert found["applied"] == list(same.applied)
     assert found["solve_time_s"] > 0
     printed = run(table_file, *options).stdout
-    assert f"worst finger: {found['robust_worst_db']:.1f} dB or more" in printed
+    assert f"worst finger: {found['robust_worst_db']:.1f} dB promised" in printed
 
 
 def test_a_batch_holds_lines_with_contents(table_file, tmp_path):

@@ -76,7 +76,7 @@ for name, tone in table.drive_of(pattern.excitation).items():
     print(name, {key: round(value, 3) for key, value in tone.items()})
 print(
     f"felt contrast at least {pattern.robust_felt_contrast_db:.1f} dB on nine of ten plates within "
-    f"the rig's uncertainty, {pattern.felt_contrast_db:.1f} dB on the plate as modelled"
+    f"the rig's uncertainty, {pattern.felt_contrast_db:.1f} dB on the nominal plate"
 )
 show(era.draw_pattern(table, pattern, target, quiet=quiet), "pattern")
 

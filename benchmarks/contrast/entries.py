@@ -4,12 +4,12 @@
 
 Writes a file for each method, for `python -m benchmarks.contrast score`. All but the paper's drive
 every ERA at one frequency of the table's 47, the one where the method itself does best on the plate
-as modelled:
+nominal plate:
 
 - random: any frequency, levels and phases
 - time-reversal: each ERA by the conjugate of its field at the target
 - inverse-filter: least squares for 1 at the target and 0 at the others, Tikhonov's 1e-3
-- paper: one or two ERAs at full stroke, each at any frequency, the best as modelled
+- paper: one or two ERAs at full stroke, each at any frequency, the best nominally
 - era-haptics: `era.query`, mode phased
 - hindsight: climbed on the very plates that judge, at the four frequencies of best promise
 """
@@ -44,7 +44,7 @@ FREQUENCIES_IN_HINDSIGHT = 4
 
 @dataclass(frozen=True, eq=False)
 class _Case:
-    """A contact set on its plate, and the fields (f, points, eras) as modelled."""
+    """A contact set on its plate, and the fields (f, points, eras) on the nominal plate."""
 
     found: DataSet
     table: LocalizationTable
@@ -82,7 +82,7 @@ class _Case:
         }
 
     def best(self, weights: ComplexArray) -> Excitation:
-        """Of weights (f, eras), those of the best contrast as modelled."""
+        """Of weights (f, eras), those of the best nominal contrast."""
         size = np.abs(np.einsum("fpe,fe->fp", self.fields, weights))
         contrast = (size @ self.weights) / size[:, ~self.is_target].max(axis=1)
         row = int(contrast.argmax())

@@ -51,7 +51,7 @@ class CheckedEffect:
 
     @property
     def contrasts(self) -> list[float]:
-        """Level above that of the resting finger on the plate as modelled [dB]."""
+        """Level above that of the resting finger on the nominal plate [dB]."""
         return [
             each.felt_db_sl - each.resting_db_sl
             for each in self.touches

@@ -21,7 +21,7 @@ def leaks_db_sl(
 ) -> dict[ContactKey, float]:
     """Return what each contact feels of contents that are not for it, at its loudest point [dB SL].
 
-    On the plate as modelled with the contacts where they are; a few milliseconds.
+    On the nominal plate with the contacts where they are; a few milliseconds.
     """
     if not contacts:  # lifted, while what plays is not known to have ended
         return {}

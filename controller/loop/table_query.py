@@ -31,7 +31,7 @@ class TableAnswer:
     """The question that was finally answered, its pattern, and the level felt of it [dB SL].
 
     felt_db_sl: over the duration of a pulse whose level is felt, onset included, or the steady one
-    in a band, both on the plate as modelled; else the steady level of nine of ten plates.
+    in a band, both on the nominal plate; else the steady level of nine of ten plates.
     promised_contrast_db: to the loudest quiet finger, on nine of ten plates, over the duration of
     such a pulse, else of the steady vibration; None without one. held_back_db: by how much it is
     weaker so that quiet fingers feel half of it at most.

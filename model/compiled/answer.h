@@ -61,8 +61,8 @@ typedef struct {
     int is_apart, *rows;
     float *weights;     /* (contents, n) */
     float *gains;       /* (contents) within the stroke */
-    float *contrast;    /* (k, 3) [dB] as modelled, half of plates, promised; NaN where there is none */
-    float *level;       /* (k, 2) [dB SL] of its own content, as modelled and promised */
+    float *contrast;    /* (k, 3) [dB] nominal, half of plates, promised; NaN where there is none */
+    float *level;       /* (k, 2) [dB SL] of its own content, nominal and promised */
     float *foreign;     /* (k) [dB SL] of other contents, which few plates exceed */
     float *of_all;      /* worst contrast promised [dB]; loudest at quiet fingers [dB SL]; least factor on levels */
 } answered;

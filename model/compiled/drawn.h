@@ -1,4 +1,4 @@
-/* Tones on the plate as modelled and on drawn ones: `model.ensemble.touched_plate.TouchedPlate.drawn` in C. */
+/* Tones on the nominal plate and on drawn ones: `model.ensemble.touched_plate.TouchedPlate.drawn` in C. */
 #ifndef DRAWN_H
 #define DRAWN_H
 
@@ -30,17 +30,17 @@ typedef struct {
     size_t m, padded;
     const int *rows;
     float *error;      /* (m) */
-    float *at_nodes;   /* (m, 1 + nodes, points), that as modelled first */
+    float *at_nodes;   /* (m, 1 + nodes, points), the nominal one first */
     float *by_force;   /* (m, bases, 2, a + 1, padded): real and imaginary parts; by the loss factor last */
     float *forces;     /* (m, bases, 4, a): by loss, damping, own stiffness, and gain */
 } tones;
 
 INLINE size_t groups_of(const draws *by) { return by->count / by->bases / LANES + (by->count / by->bases % LANES > 0); }
 
-/* Groups of LANES plates, of which the first is the plate as modelled alone. */
+/* Groups of LANES plates, of which the first is the nominal plate alone. */
 INLINE size_t group_count(const draws *by) { return 1 + by->bases * groups_of(by); }
 
-/* Which plates, from that as modelled on, are in a group; how many. */
+/* Which plates, from the nominal one on, are in a group; how many. */
 INLINE size_t plates_of(const draws *by, size_t group, size_t *first) {
     const size_t each = by->count / by->bases, groups = groups_of(by);
     if (!group) return *first = 0, 1;

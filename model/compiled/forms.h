@@ -13,7 +13,7 @@ typedef struct {
     const float *error;        /* (f, n) */
 } grouped;
 
-/* At LANES frequencies: (groups p, n) h; (fine, n); (groups, n, n) R, and without what is as modelled. */
+/* At LANES frequencies: (groups p, n) h; (fine, n); (groups, n, n) R, and without what is nominal. */
 typedef struct {
     value *fields, *fine, *power, *uncertain;
 } formed;

@@ -1,4 +1,4 @@
-/* What fingers feel of all contents together, on the plate as modelled and on drawn ones. */
+/* What fingers feel of all contents together, on the nominal plate and on drawn ones. */
 #ifndef PROMISE_H
 #define PROMISE_H
 

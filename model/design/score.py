@@ -41,7 +41,7 @@ from model.structure.attachments import (
 )
 
 LEVEL_RESERVE = 1.2
-"""Factor on the wanted level for what nine of ten plates need beyond the plate as modelled."""
+"""Factor on the wanted level for what nine of ten plates need beyond the nominal plate."""
 
 BEST_FREQUENCIES = 3
 """Frequencies of each set at which the maximum over the quiet fingers is minimised."""
@@ -200,7 +200,7 @@ class Scorer:
         fields = t * scale[:, None]
         h = fields[0]
 
-        # Changes of the plate as modelled.
+        # Changes of the nominal plate.
         motion = -(A[0] @ (K[0] * mounts.force[:, None]))
         motion.reshape(f, -1)[:, :: n + 1] += mounts.stroke
         t, L, released, G_f = t[0], L[0], released[0], G_f[0]

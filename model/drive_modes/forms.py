@@ -66,7 +66,7 @@ class Forms:
       rest of the plate
     - threshold: (f,) [m/s²]; wanted: amplitude to threshold for every target
     - few, fine: (f, q, p, eras) fields of each ERA at few points of each quiet fingertip, by whose
-      mean the expected power counts the plate as modelled, each times the root of its weight; and
+      mean the expected power counts the nominal plate, each times the root of its weight; and
       at many points, of which the loudest counts. None where the mean is good enough
     """
 

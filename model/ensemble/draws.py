@@ -19,7 +19,7 @@ class Drawing:
     """How many plates are drawn, of how many thicknesses.
 
     bases: thicknesses at which the changes by all else that is uncertain are computed, each for as
-    many plates; 1 for the plate as modelled.
+    many plates; 1 for the nominal plate.
     """
 
     count: int

@@ -23,7 +23,7 @@ from model.ensemble.attached_plate import AttachedPlate
 
 MODELLED = 0
 THICKER, THINNER = 1, 2
-"""Thicknesses by a standard deviation from that as modelled, by index."""
+"""Thicknesses by a standard deviation from the nominal one, by index."""
 
 
 @lru_cache(maxsize=8)
@@ -66,7 +66,7 @@ class PlateOnEras:
     def of(cls, plate: AttachedPlate, *node_counts: int) -> "PlateOnEras":
         """Eliminate the attachments of a plate of so many `thickness_nodes`, several counts.
 
-        Where its thickness is certain there is that as modelled alone.
+        Where its thickness is certain there is the nominal one alone.
         """
         deviations, first = [np.zeros(1)], {}
         if plate.thickness > 0:

@@ -66,7 +66,7 @@ class Changes:
 
 @dataclass(frozen=True, eq=False)
 class Sensed:
-    """Amplitudes to threshold of m tones at k fingertips, as modelled and on d drawn plates.
+    """Amplitudes to threshold of m tones at k fingertips, nominal and on d drawn plates.
 
     means: (m, k, 1 + d) mean amplitude over each fingertip; loudest: (m, k, 1 + d) squared
     amplitude at its loudest point; powers: (m, k p, 1 + d) at all points, None unless wanted.
@@ -209,7 +209,7 @@ class TouchedPlate:
         *,
         with_powers: bool = False,
     ) -> Sensed:
-        """What is felt on the plate as modelled and on drawn ones of tones at rows (m,).
+        """What is felt on the nominal plate and on drawn ones of tones at rows (m,).
 
         weights (m, n): of the ERAs; points (k p, r): shapes; shares (k, p): of the points in the
         mean over fingertips; error_power (f, n): mean square of the discretisation error of each
@@ -282,7 +282,7 @@ def drawn_on(
 ) -> tuple[Draws, int, tuple[int, int], int]:
     """Drawn plates; how many thicknesses they have; for changes how many, and the first's index.
 
-    And that of the first of the plates' own. One, that as modelled, where it is certain.
+    And that of the first of the plates' own. One, the nominal one, where it is certain.
     """
     plate = on.plate
     first = on.first.get(by.thicknesses, MODELLED)

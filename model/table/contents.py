@@ -117,9 +117,9 @@ class Tones:
     """Tones of K contents, and what k fingers feel of them.
 
     rows (K,): of the table's frequencies; weights (K, n): up to full stroke; gains (K,): to the
-    levels, within the stroke; contrast_db (k, 3): as modelled, of half of the drawn plates and
+    levels, within the stroke; contrast_db (k, 3): nominal, of half of the drawn plates and
     promised, NaN without other contents or fingers; level_db_sl (k, 2): of a finger's own content,
-    as modelled and promised; foreign_db_sl (k,): of other contents, which nine of ten plates do not
+    nominal and promised; foreign_db_sl (k,): of other contents, which nine of ten plates do not
     exceed; worst_db: contrast of all fingers that is promised, NaN for one alone; loudest_db_sl: at
     quiet fingers; stroke_factor: least factor on the gains for the stroke; is_apart: whether the
     frequencies are.

@@ -414,10 +414,10 @@ def loudest_power(power: Float32Array, rows: IntArray, finger: int) -> Float32Ar
 
 
 def promise(values: Float32Array, percent: float = PROMISED_PERCENTILE) -> float:
-    """Percentile of the drawn plates, without the first, that as modelled."""
+    """Percentile of the drawn plates, without the first, the nominal one."""
     return float(percentile(values[1:].astype(float), percent))
 
 
 def figures(ratio: Float32Array) -> tuple[float, float, float]:
-    """Of ratios (1 + d,): as modelled, of half of the drawn plates, of nine of ten."""
+    """Of ratios (1 + d,): nominal, of half of the drawn plates, of nine of ten."""
     return float(ratio[0]), promise(ratio, 50), promise(ratio)

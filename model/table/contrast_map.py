@@ -23,7 +23,7 @@ class ContrastMap:
     """Contrast of a finger at every place to the same quiet fingers, by drive mode.
 
     x (nx,), y (ny,) [m]: of the places; quiet [m]; promised_db, nominal_db: felt contrast [dB] that
-    nine of ten plates within the rig's uncertainty give, and of the plate as modelled, each (ny,
+    nine of ten plates within the rig's uncertainty give, and of the nominal plate, each (ny,
     nx), NaN where the level is not reached and under a quiet finger.
     """
 

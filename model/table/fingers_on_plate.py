@@ -127,7 +127,7 @@ class FingersOnPlate:
         return found.take(self.quiet, axis=1)
 
     def forms_over(self, ringing: RampedRinging) -> Forms:
-        """Forms to search for a short effect, by quiet fingertip; its level is that as modelled.
+        """Forms to search for a short effect, by quiet fingertip; its level is the nominal one.
 
         A target counts by the mean of its demodulated acceleration over the duration, a quiet
         fingertip by its power, that after the end included. Ringing is that of the plate without

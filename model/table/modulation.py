@@ -280,7 +280,7 @@ def _promised(
 
 
 def _compared(layer: Layer, ratio: FloatArray) -> Layer:
-    """A layer with contrasts from ratios on plates (1 + d,), that as modelled first."""
+    """A layer with contrasts from ratios on plates (1 + d,), the nominal one first."""
     promised = _promise(ratio)
     return replace(
         layer,
@@ -292,7 +292,7 @@ def _compared(layer: Layer, ratio: FloatArray) -> Layer:
 
 
 def _promise(values: FloatArray, percent: float = PROMISED_PERCENTILE) -> float:
-    """Percentile of the drawn plates, without the first, that as modelled [dB]."""
+    """Percentile of the drawn plates, without the first, the nominal one [dB]."""
     return float(decibels(percentile(values[1:], percent)))
 
 

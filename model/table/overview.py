@@ -97,7 +97,7 @@ def contrast_distribution(
 def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
     """Summarize a table; felt contrast [dB]: median and tenth percentile over contact sets.
 
-    Robust contrasts are those of nine of ten plates, the others those of the plate as modelled;
+    Robust contrasts are those of nine of ten plates, the others those of the nominal plate;
     beside each one standard deviation by the choice of the sets.
     """
     weak = overview.cells

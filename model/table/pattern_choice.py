@@ -99,7 +99,7 @@ class Candidates:
 def choose_pattern(question: Question, drive_mode: str, candidates: Candidates) -> Pattern:
     """Choose the best pattern of a drive mode that reaches the level at the targets.
 
-    At nine of ten plates where possible, else at the plate as modelled. Raises InputError where
+    At nine of ten plates where possible, else at the nominal plate. Raises InputError where
     none does.
     """
     forms = _forms(question, candidates)
@@ -313,7 +313,7 @@ def _judged_over_effect(
 ) -> int:
     """Index of the drive of the best contrast over the duration of an effect.
 
-    Of those that reach the level over it on the plate as modelled, or come near the strongest.
+    Of those that reach the level over it on the nominal plate, or come near the strongest.
     """
     responses = over_effect.responses(_rows_of(drives))
     gains = [responses.gains(drive) for drive in drives]

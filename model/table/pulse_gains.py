@@ -13,7 +13,7 @@ from model.table.pattern import Pattern
 
 @dataclass(frozen=True)
 class PulseGains:
-    """Levels over the duration on the plate as modelled.
+    """Levels over the duration on the nominal plate.
 
     targets: level relative to the steady one [dB], of each; quiet_db_sl: level at the loudest quiet
     point over as long, at its strongest; None without one.
@@ -101,8 +101,8 @@ class OverEffect:
 def contrast_over_effect(ringing: FloatArray, steady: FloatArray, robust: FloatArray) -> FloatArray:
     """Contrast over a duration on nine of ten plates, as a ratio of amplitudes.
 
-    ringing: over the duration on the plate as modelled; steady, robust: of the steady vibration on
-    the plate as modelled, and on nine of ten. What other plates add at the quiet fingers is felt
+    ringing: over the duration on the nominal plate; steady, robust: of the steady vibration on
+    the nominal plate, and on nine of ten. What other plates add at the quiet fingers is felt
     over the duration as at the target; powers add.
     """
     others = np.maximum(robust**-2.0 - steady**-2.0, 0.0)
@@ -110,7 +110,7 @@ def contrast_over_effect(ringing: FloatArray, steady: FloatArray, robust: FloatA
 
 
 def robust_over_effect_db(pattern: Pattern, ringing_db: float) -> float:
-    """Contrast over a duration on nine of ten plates [dB], from that on the plate as modelled.
+    """Contrast over a duration on nine of ten plates [dB], from that on the nominal plate.
 
     pattern: with the steady contrasts.
     """

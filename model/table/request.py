@@ -124,7 +124,7 @@ class Layer:
     excitation: of all ERAs, empty where it is held back; level_db_sl, promised_level_db_sl: as
     modelled, and what nine of ten plates give; felt_contrast_db, median_felt_contrast_db,
     promised_contrast_db: level of the content above that of all others at this finger, or above
-    its own at the loudest quiet finger where it is the only content: as modelled, and that of half
+    its own at the loudest quiet finger where it is the only content: nominal, and that of half
     and of nine of ten plates, None where there is nothing to compare with; foreign_level_db_sl: of
     all other contents at this finger, which nine of ten plates do not exceed; verdict: `own`,
     `mixed` (below OWN_CONTRAST_DB), `shared` (the content of another finger) or `held back`, which

@@ -38,7 +38,7 @@ less variance than from places drawn freely.
 """
 
 Contrasts: TypeAlias = tuple[float, float]
-"""Felt contrast [dB] of nine of ten plates, and that of the plate as modelled."""
+"""Felt contrast [dB] of nine of ten plates, and that of the nominal plate."""
 
 Ask: TypeAlias = Callable[[Question], Contrasts | None]
 """Answers a question with quiet fingers, None where the level is not reached."""

@@ -60,7 +60,7 @@ def answering_after(seconds: float, monkeypatch: pytest.MonkeyPatch) -> asyncio.
 
 @in_virtual_time
 async def test_two_fingers_each_feel_their_own_within_1_db_of_the_promise() -> None:
-    """Measured at the fingertips over the wire, against the answer for the plate as modelled."""
+    """Measured at the fingertips over the wire, against the answer for the nominal plate."""
     async with fingers_on(table(), LAYOUT) as fingers:
         fingers.at = {1: LEFT, 2: RIGHT}
         await fingers.hold(1.0)

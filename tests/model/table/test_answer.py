@@ -48,7 +48,7 @@ def given(table, found, quiet, plates):
 
 
 def as_modelled(fingers):
-    """The plate as modelled, with so many fingers."""
+    """The nominal plate, with so many fingers."""
     one = np.ones(1)
     return Plates(
         one,

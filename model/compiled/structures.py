@@ -126,3 +126,21 @@ class FoundTones(Structure):
     """`answered`: tones, and what is felt of them."""
 
     _fields_ = _fields(i="is_apart", p="rows figures")
+
+
+class Shaping(Structure):
+    """`shaping`: how knots are found."""
+
+    _fields_ = _fields(
+        i="samples steps knots ending_knots iterations", f="ridge penalty relaxation", p="rise"
+    )
+
+
+class ShapedTone(Structure):
+    """`shaped_tone`: a tone whose onset or ending is shaped."""
+
+    _fields_ = [
+        *_fields(i="eras targets rows combinations", f="gain_variance weight"),
+        *_fields(p="hats steady amplitudes", i="total"),
+        *_fields(p="active residual"),
+    ]

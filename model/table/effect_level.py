@@ -18,6 +18,7 @@ from model.table.pattern import IMPERCEPTIBLE_DB_SL, ONSET_RAMP, Pattern
 from model.table.pulse_gains import PulseGains, PulseResponses, pulse_gains
 from model.table.question import SHAPED_FROM, Question
 from model.table.table import LocalizationTable
+from model.transients.knots import RISE
 from model.transients.loaded_ramps import (
     ramped_accelerations,
     ramped_responses,
@@ -25,7 +26,6 @@ from model.transients.loaded_ramps import (
     time_count,
 )
 from model.transients.onset import ringing_time
-from model.transients.shaping import RISE
 from model.vibration.excitation import Excitation, base_amplitudes
 
 MIN_CONTRAST_DB = 6.0

@@ -20,7 +20,7 @@ knots: none exceeds the stroke. Single precision changes contrasts by some hundr
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, TypeAlias
 
@@ -46,7 +46,7 @@ ENDING_KNOTS = 8
 # expected ratio of the two in the steady state: where a pattern leaves the quiet finger 20 dB below
 # the target, the ramp is not traded for more. Between half and twice this contrast changes by
 # 0.5 dB.
-_TARGET_WEIGHT = 2.0
+TARGET_WEIGHT = 2.0
 
 # Weight of a quiet finger's motion during an ending, relative to the target, against the plate's
 # residual vibration, relative to the steady one. Three times as much changes both by about 1 dB;
@@ -57,11 +57,17 @@ _QUIET_WEIGHT = 0.03
 # its contrast is lower, with six of eight 1 dB lower in one of ten cases.
 _COMBINATIONS = 8
 
-_SAMPLES = 5  # for each step; a demodulated response changes little within a millisecond
-_STEPS = ONSET_KNOTS + 9  # of an onset, until the plate has settled
+ALONE = 6
+"""Combinations of ERAs in the onset of fingers that are alone."""
+
+RISE = 0.040
+"""How long [s] a target takes to full vibration along its raised cosine."""
+
+SAMPLES = 5  # for each step; a demodulated response changes little within a millisecond
+STEPS = ONSET_KNOTS + 9  # of an onset, until the plate has settled
 
 # Relative to the mean of a form's diagonal: keeps it definite, costs no contrast.
-_RIDGE = 1e-6
+RIDGE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,32 +91,42 @@ class Carrier:
 class Felt:
     """Responses of some ERAs, as in `Carrier`, at t targets and at d rows of quiet fingers.
 
-    hats (samples, t + d, knots, eras), steady (t + d, eras).
+    hats (samples, t + d, knots, eras), steady (t + d, eras); combinations of ERAs in an onset.
     """
 
     targets: int
     hats: Complex64Array
     steady: ComplexArray
+    combinations: int
 
     @classmethod
-    def at(cls, carrier: Carrier, target_rows: FloatArray, quiet_rows: FloatArray) -> "Felt":
+    def at(
+        cls,
+        carrier: Carrier,
+        target_rows: FloatArray,
+        quiet_rows: FloatArray,
+        *,
+        combinations: int = 0,
+    ) -> "Felt":
         """Read all ERAs at rows (t, r) and (d, r) of shapes.
 
         target_rows: means under targets; quiet_rows: whose sum of squares is the mean square under
-        quiet fingers.
+        quiet fingers. combinations: 0 for as many as so many quiet fingers take.
         """
         rows = np.vstack([target_rows, quiet_rows])
         samples, r, knots, eras = carrier.hats.shape
         flat = carrier.hats.reshape(samples, r, -1).view(np.float32)
         hats = (rows.astype(np.float32) @ flat).view(np.complex64)
         hats = hats.reshape(samples, len(rows), knots, eras)
-        return cls(len(target_rows), hats, rows @ carrier.steady.T)
+        combinations = combinations or max(_COMBINATIONS, len(rows) // 4)
+        return cls(len(target_rows), hats, rows @ carrier.steady.T, combinations)
 
     def of(self, active: IntArray) -> "Felt":
         """That of active ERAs only."""
         if len(active) == self.steady.shape[1]:
             return self
-        return Felt(self.targets, self.hats[..., active], self.steady[:, active])
+        steady = np.ascontiguousarray(self.steady[:, active])
+        return replace(self, hats=self.hats[..., active], steady=steady)
 
 
 def solve_carrier(
@@ -119,8 +135,8 @@ def solve_carrier(
     """Solve one frequency [Hz]; residual_form: `hats.mean_square` for the time after an ending."""
     omega = 2 * math.pi * frequency
     steady = -(omega**2) * steady_states(plate, omega) @ plate.displacement.T
-    hats = hat_accelerations(plate, omega, step=KNOT_STEP, steps=_STEPS, samples=_SAMPLES)
-    hats = hats.reshape(_STEPS, _SAMPLES, *hats.shape[1:])[::-1].transpose(1, 3, 0, 2)
+    hats = hat_accelerations(plate, omega, step=KNOT_STEP, steps=STEPS, samples=SAMPLES)
+    hats = hats.reshape(STEPS, SAMPLES, *hats.shape[1:])[::-1].transpose(1, 3, 0, 2)
     states = ending_states(plate, omega, step=KNOT_STEP, steps=ENDING_KNOTS)
     flat = states.reshape(len(states), -1)
     form = flat.conj().T @ residual_form @ flat
@@ -134,35 +150,32 @@ def solve_carrier(
     )
 
 
-def onset_knots(
-    amplitudes: ComplexArray, found: Felt, *, gain_variance: float, rise: float
-) -> ComplexArray:
-    """Find the knots (ONSET_KNOTS, eras) in strokes; the last are the amplitudes (eras,).
+def onset_by_numpy(amplitudes: ComplexArray, found: Felt, gain_variance: float) -> ComplexArray:
+    """Find all knots (free, eras) in strokes but the last, the amplitudes (eras,).
 
-    found: of these ERAs; rise [s].
+    found: of these ERAs.
     """
     t, free = found.targets, ONSET_KNOTS - 1
     steady = amplitudes * found.steady
     power = _expected_power(steady[t:], gain_variance) / _expected_power(steady[:t], gain_variance)
     weights = np.ones((len(steady), 1, 1), dtype=np.float32)
-    weights[:t] = _TARGET_WEIGHT * math.sqrt(power)
+    weights[:t] = TARGET_WEIGHT * math.sqrt(power)
     hats = found.hats * weights
-    combinations = _combinations(hats, amplitudes)
+    combinations = _combinations(hats, amplitudes, found.combinations)
     combined: Complex = hats @ combinations
     count = combinations.shape[1]
     form = _summed(combined, gain_variance)
     wanted = (weights[:t, 0, 0] * steady[:t].sum(axis=1)).astype(np.complex64)
     along = np.tensordot(wanted, combined[:, :t].conj(), axes=(0, 1)).reshape(-1, count)
-    settled = np.tile((amplitudes @ combinations.conj()).astype(np.complex64), _STEPS - free)
+    settled = np.tile((amplitudes @ combinations.conj()).astype(np.complex64), STEPS - free)
     held = form[: free * count, free * count :] @ settled
-    right = _rises(rise)[:free] @ along - held.reshape(free, count)
-    knots = bounded_minimum(form[: free * count, : free * count], right, combinations)
-    return np.vstack([knots, amplitudes])
+    right = _rises()[:free] @ along - held.reshape(free, count)
+    return bounded_minimum(form[: free * count, : free * count], right, combinations)
 
 
-def _combinations(hats: Complex64Array, amplitudes: ComplexArray) -> Complex64Array:
+def _combinations(hats: Complex64Array, amplitudes: ComplexArray, count: int) -> Complex64Array:
     """Orthonormal combinations (eras, c) of ERAs, the amplitudes among them."""
-    eras, count = len(amplitudes), max(_COMBINATIONS, hats.shape[1] // 4)
+    eras = len(amplitudes)
     if eras <= count:
         return np.eye(eras, dtype=np.complex64)
     flat = hats.reshape(-1, eras)
@@ -171,24 +184,37 @@ def _combinations(hats: Complex64Array, amplitudes: ComplexArray) -> Complex64Ar
     return np.asarray(np.linalg.qr(some)[0], dtype=np.complex64)
 
 
+def risen() -> FloatArray:
+    """The raised cosine of the targets at each sample of each step, (steps, samples)."""
+    times = KNOT_STEP * (np.arange(STEPS * SAMPLES) + 0.5) / SAMPLES
+    return base_motion.rise(times, RISE).reshape(STEPS, SAMPLES)
+
+
 @cache
-def _rises(rise: float) -> Float32Array:
-    """The raised cosine that takes a time [s], as the hat of each knot meets it.
+def _rises() -> Float32Array:
+    """The raised cosine as the hat of each knot meets it.
 
     By knot, and by sample and knot of `Carrier.hats`.
     """
-    times = KNOT_STEP * (np.arange(_STEPS * _SAMPLES) + 0.5) / _SAMPLES
-    wanted = np.zeros((2 * _STEPS, _SAMPLES))
-    wanted[:_STEPS] = base_motion.rise(times, rise).reshape(_STEPS, _SAMPLES)
-    since = np.arange(_STEPS)[::-1]  # steps since a hat began
-    met = wanted[np.arange(_STEPS)[:, None] + since]
-    return np.asarray(met.transpose(0, 2, 1).reshape(_STEPS, -1), dtype=np.float32)
+    wanted = np.vstack([risen(), np.zeros((STEPS, SAMPLES))])
+    since = np.arange(STEPS)[::-1]  # steps since a hat began
+    met = wanted[np.arange(STEPS)[:, None] + since]
+    return np.asarray(met.transpose(0, 2, 1).reshape(STEPS, -1), dtype=np.float32)
 
 
-def ending_knots(
-    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: Felt | None = None
+def quiet_weight(
+    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: Felt
+) -> float:
+    """Weight of the mean square at quiet fingers in an ending, as `ending_by_numpy` has it."""
+    vibration = np.linalg.norm(amplitudes @ carrier.steady)
+    target = np.linalg.norm(found.steady[: found.targets] @ amplitudes[active])
+    return float(_QUIET_WEIGHT * (vibration / target) ** 2)
+
+
+def ending_by_numpy(
+    carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: Felt | None, weight: float
 ) -> ComplexArray:
-    """Find start and knots (1 + ENDING_KNOTS, active) in strokes; the last are zero.
+    """Find all knots (free, active) in strokes but the last, which are zero.
 
     amplitudes (eras,). The whole plate comes to rest. found: of the active ERAs, with quiet fingers
     that stay quiet meanwhile.
@@ -202,14 +228,10 @@ def ending_knots(
     right = -(form[eras:, :eras] @ start)
     form = form[eras:, eras:]
     if found is not None:
-        vibration = np.linalg.norm(amplitudes @ carrier.steady) ** 2
-        target = np.linalg.norm(found.steady[: found.targets] @ start) ** 2
         quiet_form, quiet_right = while_ending(found, start, carrier.gain_variance)
-        weight = np.float32(_QUIET_WEIGHT * vibration / target)
-        form = form + weight * quiet_form
-        right += weight * quiet_right
-    knots = bounded_minimum(form, right.reshape(-1, eras), np.eye(eras, dtype=np.complex64))
-    return np.vstack([start, knots, np.zeros(eras)])
+        form = form + np.float32(weight) * quiet_form
+        right += np.float32(weight) * quiet_right
+    return bounded_minimum(form, right.reshape(-1, eras), np.eye(eras, dtype=np.complex64))
 
 
 def while_ending(found: Felt, start: ComplexArray, gain_variance: float) -> tuple[Complex, Complex]:
@@ -218,7 +240,7 @@ def while_ending(found: Felt, start: ComplexArray, gain_variance: float) -> tupl
     An ending from a start (eras,) is the steady tone, and at each knot a hat of what the knot is
     above the start.
     """
-    count = ENDING_KNOTS * _SAMPLES
+    count = ENDING_KNOTS * SAMPLES
     hats = found.hats[:, found.targets :, -ENDING_KNOTS:]
     form = _summed(hats / np.float32(math.sqrt(count)), gain_variance)
     tones = start * found.steady[found.targets :]
@@ -318,9 +340,9 @@ def mean_square(plate: PlateInTime, duration: float) -> ComplexArray:
 
 # With this penalty (relative to the mean of the diagonal) and over-relaxation the forms that
 # shaping makes are within 0.1 dB of their minimum after 30 steps; found by trying 1e-4 to 0.3.
-_PENALTY = 0.03
-_RELAXATION = 1.6
-_ITERATIONS = 30
+PENALTY = 0.03
+RELAXATION = 1.6
+ITERATIONS = 30
 
 
 def bounded_minimum(form: Complex, right: Complex, combinations: Complex64Array) -> ComplexArray:
@@ -334,23 +356,23 @@ def bounded_minimum(form: Complex, right: Complex, combinations: Complex64Array)
     single = form.astype(np.complex64)
     size = float(single.diagonal().real.mean())
     diagonal = np.einsum("ii->i", single)
-    diagonal += _RIDGE * size
+    diagonal += RIDGE * size
     right = right.astype(np.complex64)
     to_knots, back = combinations.T, combinations.conj()
     _, found, _ = lapack.cposv(single, right.ravel())
     knots = found.reshape(right.shape) @ to_knots
     feasible = _within(knots)
     if feasible is not knots:
-        penalty = _PENALTY * size
+        penalty = PENALTY * size
         diagonal += penalty
         inverse = _inverse(single)
         offset = (inverse @ right.ravel()).reshape(right.shape) @ to_knots
         inverse *= penalty
         dual = np.zeros_like(feasible)
-        for _ in range(_ITERATIONS):
+        for _ in range(ITERATIONS):
             pulled = (feasible - dual) @ back
             knots = offset + (inverse @ pulled.ravel()).reshape(right.shape) @ to_knots
-            relaxed = _RELAXATION * knots + (1 - _RELAXATION) * feasible + dual
+            relaxed = RELAXATION * knots + (1 - RELAXATION) * feasible + dual
             feasible = _within(relaxed)
             dual = relaxed - feasible
     found = _within(feasible.astype(complex))

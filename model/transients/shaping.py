@@ -24,20 +24,11 @@ from model.finger.fingertip import FIVE_POINTS, fingertips_on
 from model.finger.grid import Grid
 from model.finger.perception import is_background
 from model.transients.base_motion import BaseEnvelope, Envelopes
-from model.transients.knots import (
-    Carrier,
-    Felt,
-    ending_knots,
-    mean_square,
-    onset_knots,
-    solve_carrier,
-)
+from model.transients.knots import ALONE, Carrier, Felt, mean_square, solve_carrier
+from model.transients.knots_kernel import ending_knots, onset_knots
 from model.transients.measures import ENDING_WINDOW
 from model.transients.time_response import PlateInTime
 from model.vibration.excitation import Excitation, base_amplitudes
-
-RISE = 0.040
-"""How long [s] a target takes to full vibration along its raised cosine."""
 
 _SURROUNDINGS = Grid(8, 6)  # twice as fine changes the contrast by 0.1 dB
 _KEPT = 16  # readings; of an onset and its ending, and of fingers that rest
@@ -82,10 +73,8 @@ class Shaper:
         envelopes: dict[str, BaseEnvelope] = {}
         for frequency, amplitudes, active in self._groups(excitation, helped=True):
             found = self._felt(frequency, tuple(targets), tuple(quiet)).of(active)
-            knots = onset_knots(
-                amplitudes[active], found, gain_variance=self._gain_variance, rise=RISE
-            )
-            envelopes.update(self._envelopes(frequency, np.vstack([0 * knots[0], knots]), active))
+            knots = onset_knots(amplitudes[active], found, self._gain_variance)
+            envelopes.update(self._envelopes(frequency, knots, active))
         return envelopes
 
     def ending(
@@ -149,8 +138,10 @@ class Shaper:
     ) -> Felt:
         weights, shapes = self._fingertips(targets)
         means = (weights[:, None] @ shapes)[:, 0]
-        quiet_rows = self._resting(quiet) if quiet else self._surroundings(targets)
-        return Felt.at(self._carrier(frequency), means, quiet_rows)
+        carrier = self._carrier(frequency)
+        if quiet:
+            return Felt.at(carrier, means, self._resting(quiet))
+        return Felt.at(carrier, means, self._surroundings(targets), combinations=ALONE)
 
     def _quiet_rows(self, positions: tuple[Position, ...]) -> FloatArray:
         """Rows (d, r) whose sum of squares is the mean square under the fingertips, summed."""

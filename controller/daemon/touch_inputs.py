@@ -19,7 +19,8 @@ from registry.plugins import failure_text
 
 _MIN_PAUSE, _MAX_PAUSE = 1.0, 30.0  # s; before a failed source is restarted
 _CLOSE_TIMEOUT = 0.2  # s
-MAX_SOURCES_PER_CLIENT = 64  # with fingers down, until it lifts them
+MAX_SOURCES_PER_CLIENT = 64  # with fingers down
+_SOURCE_TIMEOUT = 1.0  # s; without a frame, after which a source has no finger down any more
 
 _logger = logging.getLogger(__name__)
 
@@ -85,7 +86,8 @@ class ApiTouches:
         self._plate = plate
         self._deliver = deliver
         self._waiting: dict[str, list[TouchFrame]] = {}
-        self._sources: dict[object, set[str]] = {}  # with fingers down
+        # With fingers down, and the time [s] of the last frame.
+        self._sources: dict[object, dict[str, float]] = {}
         self._is_scheduled = False
 
     def add(self, client: object, params: TouchParams, *, client_name: str, now: float) -> None:
@@ -94,15 +96,17 @@ class ApiTouches:
         The same source name of two clients denotes two sources.
         """
         source = f"{API_SOURCES}:{client_name}:{params.source}"
-        sources = self._sources.setdefault(client, set())
-        sources.discard(source)
+        sources = self._sources.setdefault(client, {})
+        sources.pop(source, None)
         if params.touches:
+            for old in [each for each in sources if now - sources[each] > _SOURCE_TIMEOUT]:
+                del sources[old]
             if len(sources) >= MAX_SOURCES_PER_CLIENT:
                 raise InputError(
                     f"a client must have at most {MAX_SOURCES_PER_CLIENT} touch sources with "
                     "fingers down; lift some first"
                 )
-            sources.add(source)
+            sources[source] = now
         touches = tuple(
             Touch(point.id, point.x_m / self._plate.length, 1 - point.y_m / self._plate.width)
             for point in params.touches

@@ -64,7 +64,7 @@ async def test_touches_of_leaving_client_are_lifted() -> None:
 
 
 async def test_sources_of_client_are_bounded() -> None:
-    """64 with fingers down; lifting those of one source permits another."""
+    """64 with fingers down; lifting those of one source permits another, as does its silence."""
     touches = ApiTouches(PLATE, lambda frame: None)
     for number in range(MAX_SOURCES_PER_CLIENT):
         touches.add("a", params(str(number), (0.1, 0.1)), client_name="1", now=1)
@@ -72,6 +72,7 @@ async def test_sources_of_client_are_bounded() -> None:
         touches.add("a", params("more", (0.1, 0.1)), client_name="1", now=1)
     touches.add("a", params("0"), client_name="1", now=1)
     touches.add("a", params("more", (0.1, 0.1)), client_name="1", now=1)
+    touches.add("a", params("again", (0.1, 0.1)), client_name="1", now=2.5)
 
 
 @dataclass

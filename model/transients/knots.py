@@ -125,8 +125,8 @@ class Felt:
         """That of active ERAs only."""
         if len(active) == self.steady.shape[1]:
             return self
-        steady = np.ascontiguousarray(self.steady[:, active])
-        return replace(self, hats=self.hats[..., active], steady=steady)
+        hats, steady = map(np.ascontiguousarray, (self.hats[..., active], self.steady[:, active]))
+        return replace(self, hats=hats, steady=steady)
 
 
 def solve_carrier(

@@ -51,7 +51,8 @@ def ending_knots(
     knots[0] = amplitudes[active]
     weight = 0.0 if found is None else quiet_weight(carrier, amplitudes, active, found)
     given = ShapedTone(gain_variance=carrier.gain_variance, weight=weight, total=len(amplitudes))
-    given.point(active=active, residual=carrier.residual_form)
+    played = active.astype(np.int32)
+    given.active, given.residual = played.ctypes.data, carrier.residual_form.ctypes.data
     if not _found_by_kernel(knots, given, knots[0], found, is_ending=True):
         knots[1:-1] = ending_by_numpy(carrier, amplitudes, active, found, weight)
     return knots
@@ -73,8 +74,7 @@ def _found_by_kernel(
     if found is not None:
         given.targets, given.rows = found.targets, len(found.steady)
         given.combinations = found.combinations
-        given.steady = found.steady.ctypes.data
-        given.point(hats=found.hats)
+        given.hats, given.steady = found.hats.ctypes.data, found.steady.ctypes.data
     run(by.library.shaped_knots, c_void_p(knots[1:].ctypes.data), given, _rules(), int(is_ending))
     return True
 

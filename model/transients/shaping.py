@@ -46,6 +46,8 @@ class Shaper:
         """Prepare; gain_variance: of the ERAs' complex gains (`Uncertainty.gain_variance`)."""
         self._plate = plate
         self._gain_variance = gain_variance
+        self._names = [era.name for era in plate.eras]
+        self._strokes = np.array([era.stroke for era in plate.eras])
         self._residual_form = mean_square(plate, ENDING_WINDOW)
         self._carriers: dict[float, Carrier] = {}
         self._centres = _SURROUNDINGS.centres(plate.reduced.plate)
@@ -110,11 +112,11 @@ class Shaper:
 
     def _envelopes(self, frequency: float, knots: ComplexArray, active: IntArray) -> Envelopes:
         """From start and knots (n, active) in strokes."""
-        envelopes = {}
-        for era, column in zip(active, knots.T, strict=True):
-            start, *rest = (column * self._plate.eras[era].stroke).tolist()
-            envelopes[self._plate.eras[era].name] = BaseEnvelope(frequency, start, tuple(rest))
-        return envelopes
+        by_era = zip(active.tolist(), (knots * self._strokes[active]).T.tolist(), strict=True)
+        return {
+            self._names[era]: BaseEnvelope(frequency, start, tuple(rest))
+            for era, (start, *rest) in by_era
+        }
 
     def _groups(
         self, excitation: Excitation, *, helped: bool
@@ -123,13 +125,12 @@ class Shaper:
 
         helped: silent ERAs play too where there is one frequency.
         """
-        eras = self._plate.eras
-        frequencies, phasors = base_amplitudes(excitation, eras)
+        frequencies, phasors = base_amplitudes(excitation, self._plate.eras)
         helped = helped and len(frequencies) == 1
         return [
             (frequency, amplitudes, np.flatnonzero((amplitudes != 0) | helped))
             for frequency, amplitudes in zip(
-                frequencies.tolist(), phasors / [era.stroke for era in eras], strict=True
+                frequencies.tolist(), phasors / self._strokes, strict=True
             )
         ]
 

@@ -148,9 +148,10 @@ def touch(
     socket: Socket = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Put fingers on the plate for a while. The last one is the target, the others are quiet.
+    """Put fingers on the plate for a while, and show the status in the middle of it.
 
-    With --replay send a recorded TUIO stream to the daemon at its pace.
+    Each feels what the layout has at its place; without a layout the last one feels a buzz, and
+    the others are quiet. With --replay send a recorded TUIO stream to the daemon at its pace.
     """
     import asyncio
 

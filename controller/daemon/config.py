@@ -139,8 +139,9 @@ def changed_keys(old: DaemonConfig, new: DaemonConfig) -> list[str]:
 
 
 def is_daemon_document(document: Document) -> bool:
-    """Whether a document is a daemon's: it names a rig and does not describe a plate."""
-    return "rig" in document.data and "plate" not in document.data
+    """Whether a document is a daemon's: it has keys of one and does not describe a plate."""
+    keys = document.data.keys()
+    return bool(keys & DaemonSection.model_fields.keys()) and "plate" not in keys
 
 
 def rig_file_of(document: Document) -> Path | None:

@@ -123,19 +123,37 @@ def _draw_layout(axes: Axes, layout: SurfaceLayout, table: LocalizationTable) ->
     for region in layout.regions:
         corners = 100 * np.array(region.shape.corners())
         axes.add_patch(Outline(corners, facecolor="#f2f2f2", edgecolor="#555555", lw=1))
-        top = corners[corners[:, 1] >= corners[:, 1].max() - 1e-6]
-        axes.annotate(
-            region.name,
-            (top[:, 0].mean(), top[0, 1]),
-            xytext=(0, 2),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8,
-        )
+        _label_region(axes, region.name, corners)
     label_plate(axes)
     axes.set_xlim(-0.5, length + 0.5)
     axes.set_ylim(-0.5, width + 0.5)
     draw_eras(axes, table.eras, active=())
+
+
+def _label_region(axes: Axes, name: str, corners: FloatArray) -> None:
+    """Write the name above a region, or upright beside one that is much taller than wide."""
+    sides = np.ptp(corners, axis=0)
+    if sides[1] > 2 * sides[0]:
+        right = corners[corners[:, 0] >= corners[:, 0].max() - 1e-6]
+        axes.annotate(
+            name,
+            (right[0, 0], right[:, 1].mean()),
+            xytext=(2, 0),
+            textcoords="offset points",
+            va="center",
+            rotation=90,
+            fontsize=8,
+        )
+        return
+    top = corners[corners[:, 1] >= corners[:, 1].max() - 1e-6]
+    axes.annotate(
+        name,
+        (top[:, 0].mean(), top[0, 1]),
+        xytext=(0, 2),
+        textcoords="offset points",
+        ha="center",
+        fontsize=8,
+    )
 
 
 def _draw_touches(

@@ -211,7 +211,8 @@ def _show(result: dict[str, Any], *, own_count: int) -> None:
     reached = f"level reached in {100 * result['reached_share']:.0f} % of {result['sets']} sets"
     if result["starts_db"]:
         starts = len(result["starts_db"])
-        print(f"{starts} starts, the worst {result['gap_db']:.1f} dB behind; {reached}")
+        gap = f"{starts} starts, the worst {result['gap_db']:.1f} dB behind"
+        print(f"{gap if starts > 1 else '1 start'}; {reached}")
     else:
         print(f"{result['layout_count']} layouts, {result['unsupported']} unsupported; {reached}")
         _show_layouts(result["layouts"])

@@ -151,7 +151,7 @@ def _print_answer(answer: dict[str, Any], uncertainty: Uncertainty) -> None:
         ]
     rows.append(("residual after the end", answer["residual_db"], "dB nominal"))
     for name, value, unit in rows:
-        print(f"{name:30s} {value:6.1f} {unit}")
+        print(f"{name:30s} {value:z6.1f} {unit}")
     print(f"promised: what nine of ten plates within the rig's uncertainty give ({uncertainty})")
     print(f"solved in {1000 * answer['solve_time_s']:.1f} ms")
 

@@ -70,7 +70,20 @@ def kind_called(name: str) -> ConfigKind:
 
 def kind_of(document: Document) -> ConfigKind:
     """Return the kind of a document: a rig unless another kind recognises it."""
+    return kind_called(_name_of(document))
+
+
+def check_is_rig(document: Document) -> None:
+    """Refuse another kind of file as a whole instead of reporting each unknown key."""
+    if (name := _name_of(document)) != DEFAULT_KIND:
+        raise InputError(
+            f"{document.source}: must be a rig, got a {name} file; "
+            "era config init rig.yaml  writes one"
+        )
+
+
+def _name_of(document: Document) -> str:
     for name in _KINDS:
-        if name != DEFAULT_KIND and (kind := kind_called(name)).recognises(document):
-            return kind
-    return kind_called(DEFAULT_KIND)
+        if name != DEFAULT_KIND and kind_called(name).recognises(document):
+            return name
+    return DEFAULT_KIND

@@ -209,6 +209,7 @@ def count_figure(design: Design) -> Figure:
     axes.set_xlabel("ERAs")
     axes.set_ylabel("promised contrast / dB")
     axes.set_xticks(counts)
+    axes.margins(x=0.1)  # the last figure stands beside its point
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure

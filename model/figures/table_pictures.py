@@ -209,9 +209,9 @@ def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) ->
             )
     if len(frequencies) == 1:
         axes.text(
-            *(1, -0.02, f"{frequencies.pop():g} Hz"),
+            *(0.5, -0.02, f"{frequencies.pop():g} Hz"),  # between the names of corner ERAs
             transform=axes.transAxes,
-            ha="right",
+            ha="center",
             va="top",
             fontsize=9,
         )

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from model.arguments import expect_path, shown
 from model.config.document import Document, parse_document, read_document
+from model.config.kinds import check_is_rig
 from model.config.sections import Validation
 from model.errors import InputError
 from model.rig.checks import check_across
@@ -40,6 +41,8 @@ def parse_rig(source: str, text: str) -> Rig:
 
 def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
     """Make the rig of a document, with another mesh if one is given; raises as `load_rig`."""
+    if "plate" not in document.data:
+        check_is_rig(document)
     validation = Validation(document, RigSection)
     check_across(validation, mesh_given=mesh is not None)
     section = validation.finish()

@@ -137,7 +137,7 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
         content = read_arrays(path, _DTYPES, max_bytes=MAX_BYTES)
     except FileNotFoundError:
         raise InputError(
-            f"{path}: no such table; build one: era table build RIG -o {path}"
+            f"{path}: no such table; build one: era table build RIG -o {path.with_suffix('.npz')}"
         ) from None
     except UNREADABLE as error:
         why = "not a .npz file" if isinstance(error, BadZipFile) else error

@@ -14,7 +14,7 @@ from controller.sources.touch import Touch
 from model.commands.config_cli import config_app
 from model.config.document import ConfigError
 from model.errors import InputError
-from model.rig.file import example_rig_path
+from model.rig.file import example_rig_path, load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
 
 RUNNER = CliRunner()
@@ -186,6 +186,26 @@ def test_config_refuses_another_kind_of_file(folder: Path, text: str, remedy: st
     with pytest.raises(InputError, match=remedy) as caught:
         load_daemon_config(path)
     assert not isinstance(caught.value, ConfigError)
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"), [("rig: r.yaml\n", "daemon"), ("regions: {}\n", "layout")]
+)
+def test_rig_refuses_another_kind_of_file(folder: Path, text: str, kind: str) -> None:
+    """As a whole, not by each unknown key."""
+    path = folder / "other.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=f"must be a rig, got a {kind} file") as caught:
+        load_rig(path)
+    assert not isinstance(caught.value, ConfigError)
+
+
+def test_daemon_file_is_one_though_its_rig_is_misspelt(folder: Path) -> None:
+    """Its other keys tell, and the problems name the key that was meant."""
+    path = folder / "daemon.yaml"
+    path.write_text("rigg: rig.yaml\nlayout: l.yaml\n", encoding="utf-8")
+    checked = RUNNER.invoke(config_app, ["check", str(path)])
+    assert "did you mean rig?" in checked.output
 
 
 def test_calibrations_map_sensor_to_plate(folder: Path) -> None:

@@ -55,9 +55,16 @@ class Shaper:
         self._felt = lru_cache(_KEPT)(self._read)
         self._resting = lru_cache(_KEPT)(self._quiet_rows)
 
-    def prepare(self, frequency: float) -> None:
-        """Compute in advance everything for a frequency [Hz] that does not depend on contacts."""
-        self._carrier(frequency)
+    def prepare(self, frequency: float) -> Carrier:
+        """Everything for a frequency [Hz] that does not depend on contacts, computed once."""
+        if frequency not in self._carriers:
+            self._carriers[frequency] = solve_carrier(
+                self._plate,
+                frequency,
+                residual_form=self._residual_form,
+                gain_variance=self._gain_variance,
+            )
+        return self._carriers[frequency]
 
     def onset(
         self,
@@ -96,19 +103,9 @@ class Shaper:
             found = None
             if targets and quiet:
                 found = self._felt(frequency, tuple(targets), tuple(quiet)).of(active)
-            knots = ending_knots(self._carrier(frequency), amplitudes, active, found)
+            knots = ending_knots(self.prepare(frequency), amplitudes, active, found)
             envelopes.update(self._envelopes(frequency, knots, active))
         return envelopes
-
-    def _carrier(self, frequency: float) -> Carrier:
-        if frequency not in self._carriers:
-            self._carriers[frequency] = solve_carrier(
-                self._plate,
-                frequency,
-                residual_form=self._residual_form,
-                gain_variance=self._gain_variance,
-            )
-        return self._carriers[frequency]
 
     def _envelopes(self, frequency: float, knots: ComplexArray, active: IntArray) -> Envelopes:
         """From start and knots (n, active) in strokes."""
@@ -139,7 +136,7 @@ class Shaper:
     ) -> Felt:
         weights, shapes = self._fingertips(targets)
         means = (weights[:, None] @ shapes)[:, 0]
-        carrier = self._carrier(frequency)
+        carrier = self.prepare(frequency)
         if quiet:
             return Felt.at(carrier, means, self._resting(quiet))
         return Felt.at(carrier, means, self._surroundings(targets), combinations=ALONE)

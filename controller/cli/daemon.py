@@ -81,6 +81,10 @@ def daemon(
     if check:
         typer.echo(check_daemon(config))
         return
+    if dashboard is not None:
+        from controller.gateway.installed import require_gateway
+
+        require_gateway()
     run_daemon(config, dashboard=dashboard, trace=trace)
 
 

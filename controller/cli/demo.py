@@ -74,7 +74,9 @@ def demo(
     table, _ = cached_table(rig)
     if dashboard:
         from controller.cli.daemon import DASHBOARD
+        from controller.gateway.installed import require_gateway
 
+        require_gateway()
         print("Open the URL below, press Arm, and touch the plate; Ctrl-C ends it.", flush=True)
         asyncio.run(run_live(rig_file, table, wire=wire, dashboard=DASHBOARD, seed=drawn))
         return

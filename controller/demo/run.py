@@ -23,7 +23,6 @@ from controller.demo.far_end import SIM_OPTIONS, WATCHDOG, SimulatedPlate, simul
 from controller.demo.recorder import TouchRecorder
 from controller.demo.scene import Scene, example_layout
 from controller.demo.touch_row import TouchRow
-from controller.gateway.installed import require_gateway
 from controller.sources.capture import replay_capture
 from drivers import clock
 from drivers.errors import LinkError
@@ -112,9 +111,8 @@ async def run_live(
     Fingers in each strip of the plate feel a vibration of their own, those between them nothing.
     rig_file, wire, seed: as for `run_demo`; dashboard: HOST:PORT of the loopback. The daemon uses
     the default socket, so that `era status` and others reach it. Raises InputError if one runs
-    already or the gateway is not installed, and LinkError.
+    already, and LinkError.
     """
-    require_gateway()
     log = start_log(None, level="warning")
     try:
         layout = example_layout(load_rig(rig_file))

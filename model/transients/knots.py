@@ -359,10 +359,10 @@ def bounded_minimum(form: Complex, right: Complex, combinations: Complex64Array)
     diagonal += RIDGE * size
     right = right.astype(np.complex64)
     to_knots, back = combinations.T, combinations.conj()
-    _, found, _ = lapack.cposv(single, right.ravel())
-    knots = found.reshape(right.shape) @ to_knots
+    _, found, is_indefinite = lapack.cposv(single, right.ravel())  # by rounding
+    knots = (0 if is_indefinite else 1) * found.reshape(right.shape) @ to_knots
     feasible = _within(knots)
-    if feasible is not knots:
+    if is_indefinite or feasible is not knots:
         penalty = PENALTY * size
         diagonal += penalty
         inverse = _inverse(single)

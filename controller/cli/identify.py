@@ -1,6 +1,5 @@
 """`era rig identify`: the plate on the table, by its own ERAs and the sensors of its amplifiers."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,14 +14,19 @@ from controller.cli.plate_by_amplifiers import (
     rig_of_file,
     shown_progress,
 )
-from model.commands.options import JsonOption, next_line
+from model.commands.fitted_rig_cli import NO_FIT, check_rig_output, finish, write_fitted_rig
+from model.commands.options import JsonOption
 from model.errors import InputError
 
 if TYPE_CHECKING:
     from model.identification.measured_plate import DeviceSettings, MeasuredPlate
     from model.rig.rig import Rig
 
-REFUSED = 1
+_NOT_EXPLAINED = (
+    "chi² must be at most 2 for a plate that the model explains; no rig is written. Check that "
+    "nothing touches the plate, and by era rig check that it is that of the file and wired as it "
+    "says"
+)
 
 
 def identify(
@@ -104,13 +108,10 @@ def identify(
     import time
 
     from model.config.points import parse_frequencies
-    from model.files.array_file import whole_or_nothing
-    from model.files.replacing import check_ending, check_place
     from model.identification import identification_report
     from model.identification.identify import identify as fit
     from model.identification.measured_plate import DeviceSettings
     from model.identification.promise import expected_contrast
-    from model.rig.rewritten import rewritten_text
 
     settings: DeviceSettings | None = None
     if device is None:
@@ -131,13 +132,9 @@ def identify(
             periods or 2,
             seed,
         )
-    check_place(output, example="rig2.yaml")
-    check_ending(output, ".yaml", ".yml", what="a rig file")
     with rig_of_file(rig_file) as (document, rig):
         source = Path(document.source)
-        for taken in (rig_file, source):
-            if output.resolve() == taken.resolve():
-                raise InputError(f"--output must differ from {taken}; choose another name")
+        check_rig_output(output, rig_file, source)
         require_untouched(is_known=untouched, has_terminal=not as_json)
         if settings is not None:
             measured = _measured_by_device(rig, settings, is_shown=not as_json)
@@ -150,7 +147,7 @@ def identify(
         found = fit(rig, measured.measurement, seed=seed)
     except InputError as error:
         typer.echo(f"era: {error}; no rig is written", err=True)
-        raise typer.Exit(REFUSED) from error
+        raise typer.Exit(NO_FIT) from error
     expected = expected_contrast(found)
     rows = [
         measured_line(rig, measured),
@@ -159,31 +156,20 @@ def identify(
         *identification_report.fit_rows(found),
         *identification_report.contrast_rows(expected),
     ]
-    files = []
-    if found.is_explained:
-        comment = [f"{source.name} identified in place by `era rig identify`:"]
-        comment += [f"  {row}" for row in rows]
-        text = rewritten_text(document, rig, found.rig, comment="\n".join(comment))
-        with whole_or_nothing(output) as stream:
-            stream.write(text.encode())
-        files.append(str(output))
-    elapsed = time.perf_counter() - started
-    if as_json:
-        report = identification_report.as_json(found, expected) | measured_json(measured)
-        print(json.dumps(report | {"solve_time_s": elapsed, "files": files}))
-    else:
-        print("\n".join(rows))
-    if not found.is_explained:
-        typer.echo(
-            "era: chi² must be at most 2 for a plate that the model explains; no rig is written. "
-            "Check that nothing touches the plate, and by era rig check that it is that of the "
-            "file and wired as it says",
-            err=True,
-        )
-        raise typer.Exit(REFUSED)
-    if not as_json:
-        print(f"\nwrote {', '.join(files)}; computed in {elapsed:.1f} s")
-        print(next_line("era", "table", "build", output, "-o", output.with_suffix(".npz")))
+    made = f"{source.name} identified in place by `era rig identify`:"
+    files = (
+        write_fitted_rig(output, document, (rig, found.rig), [made, *rows])
+        if found.is_explained
+        else []
+    )
+    report = identification_report.as_json(found, expected) | measured_json(measured)
+    finish(
+        rows,
+        report if as_json else None,
+        files=files,
+        elapsed=time.perf_counter() - started,
+        refusal=None if found.is_explained else _NOT_EXPLAINED,
+    )
 
 
 def _measured_by_device(

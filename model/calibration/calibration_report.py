@@ -7,45 +7,37 @@ import numpy as np
 
 from model.calibration.calibration_result import Calibration, FittedParameter
 from model.counting import counted
+from model.identification.fit_report import quality_rows, value_rows
 from model.quantities import in_display_unit, percent, with_error
 from model.rig.rig import Rig
 
 
 def change_rows(calibration: Calibration) -> list[str]:
-    """Lines of all parameters: before -> after with its standard error."""
-    width = max(len(fitted.parameter.name) for fitted in calibration.parameters)
-    return [
-        f"{fitted.parameter.name:{width}}  {_change(fitted)}" for fitted in calibration.parameters
+    """Table of all parameters, and of ERAs that are not at the rig's places."""
+    moved = [
+        (
+            f"{each.name} place",
+            _millimetres(each.before),
+            f"{_millimetres(each.after)} ± {_millimetres(each.standard_error)} mm",
+        )
+        for each in calibration.moved
     ]
-
-
-def place_rows(calibration: Calibration) -> list[str]:
-    """Lines of ERAs that are not at the rig's places: before -> after with standard errors."""
-    return [
-        f"{moved.name} place  {_millimetres(moved.before)} -> {_millimetres(moved.after)} ± "
-        f"{_millimetres(moved.standard_error)} mm"
-        for moved in calibration.moved
-    ]
-
-
-def uncertainty_row(calibration: Calibration) -> str:
-    """Line of the uncertainty that the new rig states."""
-    return f"uncertainty in the new rig: {calibration.rig.uncertainty}"
+    return value_rows([*map(_change, calibration.parameters), *moved])
 
 
 def gain_rows(calibration: Calibration) -> list[str]:
-    """Lines of all ERAs: median and range of their gains, with standard error."""
+    """Lines of all ERAs: median and range over frequency of their gains, with standard error."""
     rows = []
     for number, era in enumerate(calibration.rig.eras):
         if era.name in calibration.dead_eras or not era.gains:
             rows.append(f"{era.name} gain  not measured")
             continue
-        size = np.array([row[1] for row in era.gains])
+        size = 100 * (np.array([row[1] for row in era.gains]) - 1)
         phase = np.degrees([row[2] for row in era.gains])
         error = float(np.nanmedian(calibration.gains_error[:, number]))
         rows.append(
-            f"{era.name} gain  {np.median(size):.3f} ({size.min():.3f} to {size.max():.3f}), "
-            f"phase {np.median(phase):+.1f} ({phase.min():+.1f} to {phase.max():+.1f}) degrees, "
+            f"{era.name} gain  {np.median(size):+.1f} % ({size.min():+.1f} to {size.max():+.1f}), "
+            f"phase {np.median(phase):+.1f}° ({phase.min():+.1f} to {phase.max():+.1f}), "
             f"± {100 * error:.2g} % at {counted(len(size), 'frequency', plural='frequencies')}"
         )
     return rows
@@ -69,18 +61,20 @@ def finding_rows(calibration: Calibration) -> list[str]:
     return rows
 
 
-def check_row(calibration: Calibration) -> str:
-    """Line of the self-check."""
-    held_out = calibration.held_out
-    if held_out is None:
-        return f"self-check: too few sensors; error of the fit {percent(calibration.error)}"
-    return (
-        f"self-check: held-out sensors {', '.join(held_out.sensors)} predicted within "
-        f"{percent(held_out.after)} rms of the response, by the old rig {percent(held_out.before)}"
+def check_rows(calibration: Calibration) -> list[str]:
+    """Lines of the new rig's uncertainty and of the held-out check."""
+    held, known = calibration.held_out, calibration.rig.uncertainty
+    if held is None:
+        return quality_rows(known, beside=f"error of the fit {percent(calibration.error)}")
+    return quality_rows(
+        known,
+        held_out=f"sensors {', '.join(held.sensors)}",
+        error=held.after,
+        beside=f"by the old rig {percent(held.before)}",
     )
 
 
-def as_json(calibration: Calibration, before: Rig, files: list[str]) -> dict[str, Any]:
+def as_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
     """All results for programs, units in the keys or beside the values."""
     held_out = calibration.held_out
     frequencies = calibration.frequencies
@@ -104,7 +98,11 @@ def as_json(calibration: Calibration, before: Rig, files: list[str]) -> dict[str
                 "frequency_hz": [row[0] for row in era.gains],
                 "magnitude": [row[1] for row in era.gains],
                 "phase_deg": np.degrees([row[2] for row in era.gains]).tolist(),
-                "standard_error": _known(calibration.gains_error[:, number]),
+                "standard_error": [
+                    float(error)
+                    for error in calibration.gains_error[:, number]
+                    if np.isfinite(error)
+                ],
             }
             for number, era in enumerate(calibration.rig.eras)
         },
@@ -142,7 +140,6 @@ def as_json(calibration: Calibration, before: Rig, files: list[str]) -> dict[str
         "good": calibration.is_good,
         "fingerprint_before": before.fingerprint,
         "fingerprint_after": calibration.rig.fingerprint,
-        "files": files,
     }
 
 
@@ -150,16 +147,12 @@ def _millimetres(place: tuple[float, float]) -> str:
     return f"({1e3 * place[0]:.1f}, {1e3 * place[1]:.1f})"
 
 
-def _known(errors: np.ndarray[Any, np.dtype[np.float64]]) -> list[float]:
-    return [float(error) for error in errors if np.isfinite(error)]
-
-
-def _change(fitted: FittedParameter) -> str:
+def _change(fitted: FittedParameter) -> tuple[str, str, str]:
     parameter = fitted.parameter
     before = in_display_unit(fitted.before, parameter.unit, digits=5)
     if fitted.standard_error is None:
-        return f"{before}  (not identified)"
+        return parameter.name, before, "not identified"
     note = "  (at its bound)" if fitted.at_bound else ""
     after = with_error(fitted.value, fitted.standard_error, parameter.unit)
     share = f" ({100 * (fitted.value / fitted.before - 1):+.1f} %)" if fitted.before else ""
-    return f"{before} -> {after}{share}{note}"
+    return parameter.name, before, f"{after}{share}{note}"

@@ -7,6 +7,7 @@ from model.diagnosis.causes import Explanation
 from model.diagnosis.plate_difference import NOTICEABLE_DB
 from model.diagnosis.plate_match import MAX_FIT_ERROR
 from model.diagnosis.verdict import MAX_DEVIATION, ChannelState, ChannelVerdict, Verdict
+from model.identification.fit_report import value_rows
 from model.quantities import in_display_unit, percent
 
 _REMEDIES: dict[ChannelState, str] = {
@@ -89,13 +90,16 @@ def _plate_rows(verdict: Verdict) -> list[str]:
         why = f"{parameter} would be off by {abs(match.z[at]):.1f} standard deviations"
     rows = [f"PLATE: the rig does not match the plate: {why}"]
     good = [each for each in verdict.explanations if explains(each) and each.share >= _MIN_SHARE]
-    for number, each in enumerate(good):
-        unit = each.cause.unit
-        rows.append(
-            f"  {'or ' if number else ''}{each.cause.key} {in_display_unit(each.value, unit)} "
-            f"instead of {in_display_unit(each.expected, unit)} would explain it: "
-            f"{percent(each.match.error)} unexplained, likelihood {percent(each.share)}"
+    changes = [
+        (
+            each.cause.key,
+            in_display_unit(each.expected, each.cause.unit),
+            f"{in_display_unit(each.value, each.cause.unit)} would explain it: "
+            f"{percent(each.match.error)} unexplained, likelihood {percent(each.share)}",
         )
+        for each in good
+    ]
+    rows += [f"  {row}" for row in value_rows(changes)]
     if good:
         rows.append(f"  correct {good[0].cause.key} in the rig, or the plate; then check again")
     else:

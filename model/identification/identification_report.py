@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from model.identification.fit_report import quality_rows, value_rows
 from model.identification.identify import MAX_CHI2, Identification
 from model.identification.parameters import KINDS
 from model.identification.promise import ExpectedContrast
@@ -32,11 +33,6 @@ class Estimate:
     unit: str
     key: str
 
-    def __str__(self) -> str:
-        unit = self.unit if self.unit in ("", "°") else f" {self.unit}"
-        found = with_error(self.difference, self.error, sign="+")
-        return f"{self.name}: {found}{unit} (before ± {self.before:.2g}{unit})"
-
 
 def estimates(found: Identification) -> list[Estimate]:
     """All parameters that were uncertain."""
@@ -60,27 +56,34 @@ def estimates(found: Identification) -> list[Estimate]:
 
 
 def parameter_rows(found: Identification) -> list[str]:
-    """Lines of what a rig file states, and of all else that differs from it significantly."""
-    return [
-        str(each)
-        for each in estimates(found)
-        if each.kind in _ALWAYS or abs(each.difference) > _SHOWN * each.error
-    ]
+    """Table of what a rig file states, and of all else that differs from it significantly.
+
+    By how much, those of the plate first and then ERA by ERA.
+    """
+    places = {era.name: place for place, era in enumerate(found.rig.eras)}
+    rows = []
+    for each in estimates(found):
+        if each.kind in _ALWAYS or abs(each.difference) > _SHOWN * each.error:
+            unit = each.unit if each.unit in ("", "°") else f" {each.unit}"
+            after = f"{with_error(each.difference, each.error, sign='+')}{unit}"
+            rows.append((each.name, f"± {each.before:.2g}{unit}", after))
+    return value_rows(sorted(rows, key=lambda row: places.get(row[0].rpartition(" ")[2], -1)))
 
 
 def fit_rows(found: Identification) -> list[str]:
     """Lines of how well the model explains the measurement."""
-    held = found.held_out
-    error = "too few sensors to tell"
-    if held is not None:
-        unexplained = percent(held.unexplained)
-        error = f"{percent(held.total)}, of which the model does not explain {unexplained}"
+    held, known = found.held_out, found.rig.uncertainty
     verdict = "explains" if found.is_explained else "does not explain"
-    rows = [
-        f"chi² {found.chi2:.2f}: the model {verdict} the measurement (at most {MAX_CHI2:g})",
-        f"responses left out are predicted within: {error}",
-    ]
-    if held is not None and held.unexplained > _MISTAKEN:
+    rows = [f"chi² {found.chi2:.2f}: the model {verdict} the measurement (at most {MAX_CHI2:g})"]
+    if held is None:
+        return [*rows, *quality_rows(known, beside="nothing is promised")]
+    rows += quality_rows(
+        known,
+        held_out="every fifth path",
+        error=held.total,
+        beside=f"the model leaves {percent(held.unexplained)} unexplained",
+    )
+    if held.unexplained > _MISTAKEN:
         rows.append(
             "the plate differs from the rig by more than its parameters, such as in thickness from "
             "end to end; errors of values and answers allow for that"

@@ -61,13 +61,13 @@ class Uncertainty:
     def __str__(self) -> str:
         """Its terms that are not none, as 'gain 5 %, phase 5°, damping x 1.5'."""
         percents = [
-            f"{key.replace('_', ' ')} {100 * getattr(self, key):g} %"
+            f"{key.replace('_', ' ')} {100 * getattr(self, key):.3g} %"
             for key in ("gain", "thickness", "stiffness", "common_gain", "field")
             if getattr(self, key)
         ]
         others = [
-            f"phase {self.phase_deg:g}°" if self.phase_deg else "",
-            f"damping x {self.damping:g}" if self.damping > 1 else "",
+            f"phase {self.phase_deg:.3g}°" if self.phase_deg else "",
+            f"damping x {self.damping:.4g}" if self.damping > 1 else "",
             f"fingertip x {math.exp(self.fingertip):.2g}" if self.fingertip else "",
         ]
         return ", ".join([*percents, *filter(None, others)]) or "none"

@@ -155,8 +155,8 @@ def test_uneven_plate_is_promised_less(rig: Rig, found: Identification) -> None:
         for each in (uneven, believed)
     )
     assert promised < too_much - 1
-    assert fit_rows(uneven)[2:]
-    assert not fit_rows(found)[2:]
+    assert fit_rows(uneven)[3:]
+    assert not fit_rows(found)[3:]
 
 
 def test_errors_of_an_uneven_plate_are_as_wide_as_paths_disagree(rig: Rig) -> None:

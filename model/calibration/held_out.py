@@ -10,9 +10,7 @@ from model.calibration.calibration_result import HeldOut
 from model.calibration.fit import Fit, Problem, solve
 from model.calibration.fitted_rig import predicted_by, rig_of_fit
 from model.calibration.variable_projection import row_rms
-
-_HELD_OUT_SHARE = 0.2  # of the sensors
-_LEAST_TO_HOLD_OUT = 5  # sensors
+from model.identification.held_out import SHARE, relative_rms
 
 
 def hold_out(
@@ -23,11 +21,9 @@ def hold_out(
     points (s, 2) [m]. Predicted by the rig as its file has it, without other form errors.
     """
     count = len(names)
-    candidates = np.flatnonzero(~problem.free_scales)
-    if len(candidates) == 0:
-        candidates = np.arange(count)
-    wanted = max(round(_HELD_OUT_SHARE * count), 1)
-    if count < _LEAST_TO_HOLD_OUT or len(candidates) <= wanted:
+    candidates = np.flatnonzero(~problem.free_scales | problem.free_scales.all())
+    wanted = round(count / SHARE)
+    if count < SHARE or len(candidates) <= wanted:
         return None
     evenly_spaced = np.linspace(0, len(candidates) - 1, wanted + 2)[1:-1].round().astype(int)
     unseen = np.zeros(count, dtype=bool)
@@ -63,6 +59,5 @@ def relative_error(
 
     Infinite where there is nothing to compare.
     """
-    share = np.abs(predicted - values) / size[:, :, None]
-    inside = np.broadcast_to(which, values.shape) & np.isfinite(share)
-    return float(np.sqrt((share[inside] ** 2).mean())) if inside.any() else float("inf")
+    squares = np.where(which, np.abs(predicted - values) ** 2, np.nan)
+    return relative_rms(squares, size[:, :, None] ** 2)

@@ -18,7 +18,9 @@ from model.identification.derivatives import jacobian
 from model.identification.fit import Problem, solve
 from model.identification.stages import Fitted, chi2
 
-_FOLDS = 5
+SHARE = 5
+"""One in so many is held out."""
+
 _EVALUATIONS = 8
 _PREDICTED = 0.1  # of the rms at a tone: standard error of a prediction that can be held against it
 _LEAST_VALUES = 16
@@ -42,7 +44,7 @@ class HeldOut:
 def hold_out(fitted: Fitted) -> HeldOut | None:
     """Predict paths from a fit to the others; None where these do not tell enough of them."""
     measurement, model = fitted.problem.measurement, fitted.problem.model
-    folds = (model.observed[measurement.at] + measurement.eras) % _FOLDS
+    folds = (model.observed[measurement.at] + measurement.eras) % SHARE
     squares, variance = np.empty((2, len(folds)))
     free, fits = np.flatnonzero(fitted.space.uncertain), []
     noise = min(chi2(fitted), 1.0)  # readings may be better than they are stated
@@ -65,11 +67,21 @@ def hold_out(fitted: Fitted) -> HeldOut | None:
     if predicted.sum() < _LEAST_VALUES:
         return None
 
-    def rms(parts: FloatArray) -> float:
-        return float(np.sqrt(max((parts / mean_square)[predicted].mean(), 0.0)))
-
-    total, unexplained = rms(squares), rms(squares - variance)
+    total, unexplained = (
+        relative_rms(parts[predicted], mean_square[predicted])
+        for parts in (squares, squares - variance)
+    )
     share = (unexplained / total) ** 2 if unexplained else 0.0
     off = np.array(fits) - np.mean(fits, axis=0)
     jackknife = (1 - 1 / len(fits)) * off.T @ off
     return HeldOut(total, unexplained, share * _IN_COMMON**2 * jackknife)
+
+
+def relative_rms(squares: FloatArray, mean_squares: FloatArray) -> float:
+    """Root mean square of errors, each relative to the rms of its responses, by their squares.
+
+    None where what is taken from squares, such as noise, exceeds them; infinite where all are NaN.
+    """
+    share = squares / mean_squares
+    known = share[np.isfinite(share)]
+    return float(np.sqrt(max(known.mean(), 0.0))) if len(known) else np.inf

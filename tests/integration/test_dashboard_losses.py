@@ -17,7 +17,7 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import DaemonStateName
 from controller.api.topics import LayoutEvent, StateEvent
 from controller.gateway.app import MAX_SESSIONS
-from daemon_bench import PATIENCE, running_daemon, until_state
+from daemon_bench import PATIENCE, ready, running_daemon
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard
 from gateway_bench import UNCONFIRMED, RawWebSocket, ScriptedDaemon, gateway_process
 from sim.faults.fault_window import FaultWindow
@@ -51,7 +51,7 @@ async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Pat
     listed below the loss.
     """
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
-        await until_state(era, "READY_TO_SWITCH_ON")
+        await ready(era)
         with gateway_process(tmp_path, bench.socket) as gateway:
             await open_dashboard(tab, gateway, DESKTOP)
             # Disarmed: no watchdog can make it another fault on a busy machine.

@@ -13,8 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from controller.api.async_client import AsyncClient
-from daemon_bench import PATIENCE, PLACE, READY, daemon_at, holding, until, until_state
-from daemon_process import ready
+from daemon_bench import PATIENCE, PLACE, READY, daemon_at, holding, ready, until, until_state
 from patient_daemon import wait_long
 from sound_card import SoftAmp, capture_on, jack_server
 
@@ -50,7 +49,7 @@ async def test_lost_server_is_a_fault_and_comes_back_disarmed(
             await daemon.client() as era,
             holding(era, PLACE),
         ):
-            await until_state(era, READY)
+            await ready(era)
             await era.arm("test", lease_s=60)
             await _until_playing(era)
             server.process.kill()

@@ -12,7 +12,7 @@ import pytest
 import model
 from controller.api.async_client import AsyncClient
 from controller.api.methods import StatusResult
-from daemon_bench import PATIENCE, holding, next_event, until, until_state
+from daemon_bench import PATIENCE, holding, next_event, ready, until
 from daemon_process import STARTING
 from long_form import shortly
 from patient_daemon import RESTING
@@ -41,7 +41,7 @@ async def example_daemon(name: str, folder: Path, cache: Path) -> AsyncIterator[
     try:
         await until(lambda: socket.is_socket() or process.returncode, patience=STARTING)
         async with await AsyncClient.connect(socket, name="test", timeout=PATIENCE) as era:
-            await until_state(era, "READY_TO_SWITCH_ON")
+            await ready(era)
             yield era
     finally:
         process.terminate()

@@ -93,7 +93,7 @@ async def ready_daemon(
 ) -> AsyncIterator[tuple[DaemonBench, AsyncClient]]:
     """A daemon that is ready to be armed, and a client of it; options: as for `daemon_at`."""
     async with running_daemon(folder, more, **options) as bench, await bench.client() as era:
-        await until_state(era, READY)
+        await ready(era)
         yield bench, era
 
 
@@ -242,6 +242,13 @@ async def until_state(client: AsyncClient, *states: str) -> str:
         assert clock.now() < end, f"daemon stays in {state}: {(await client.status()).cause}"
         await asyncio.sleep(0.01)
     return state
+
+
+async def ready(era: AsyncClient) -> None:
+    """Wait until it can be armed; acknowledge any stop, loss or fault, as of a busy machine."""
+    while await until_state(era, READY, "FAULT", "QUICK_STOP_ACTIVE") != READY:
+        with contextlib.suppress(RpcError):  # the cause may persist
+            await era.clear()
 
 
 async def next_event(client: AsyncClient, *topics: str) -> Notification:

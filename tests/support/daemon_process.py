@@ -22,11 +22,10 @@ from controller.api.jsonrpc import RpcError
 from daemon_bench import (
     ENABLED,
     PATIENCE,
-    READY,
     daemon_table,
     holding,
+    ready,
     until,
-    until_state,
     write_daemon,
 )
 from drivers.protocol.records import Refusal, Values
@@ -242,17 +241,10 @@ async def run_era(*arguments: object) -> tuple[int, str, str]:
 async def playing(daemon: DaemonProcess) -> AsyncIterator[AsyncClient]:
     """A client with a finger for which the amplifier plays."""
     async with await daemon.client() as era:
-        await until_state(era, READY)
+        await ready(era)
         await era.arm("test", lease_s=60)
         async with holding(era, far=daemon.far):
             yield era
-
-
-async def ready(era: AsyncClient) -> None:
-    """Wait until it can be armed; acknowledge any stop, loss or fault."""
-    while await until_state(era, READY, "FAULT", "QUICK_STOP_ACTIVE") != READY:
-        with contextlib.suppress(RpcError):  # the cause may persist
-            await era.clear()
 
 
 async def disarmed(era: AsyncClient) -> None:

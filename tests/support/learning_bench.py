@@ -23,7 +23,7 @@ from controller.demo.touch_row import FingerVibration, steady_contrast_db
 from controller.learning.estimator_process import EstimatorTimeouts
 from controller.learning.learning import Learning
 from controller.learning.learning_status import LearningState
-from daemon_bench import READY, daemon_at, far_end, until_state
+from daemon_bench import daemon_at, far_end, ready
 from drivers import clock
 from model.rig.rig import Rig
 from model.table.build import build_table
@@ -150,7 +150,7 @@ async def learning_bench(
             daemon_at(far, folder, "learn: learned.npz\n", changes=changes, table=_table) as bench,
             await bench.client() as era,
         ):
-            await until_state(era, READY)
+            await ready(era)
             async with era.armed("test", lease_s=60):
                 rng = np.random.default_rng(0)
                 learning = LearningBench(far, era, folder / "learned.npz", bench.daemon, rng)

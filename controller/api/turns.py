@@ -20,6 +20,8 @@ SHARE = 0.25  # of the event loop's time, for those that touch, and for the othe
 BURST = 0.02  # s of processor time, saved up
 MAX_DEFERRAL = 0.003  # s; of a turn by touches, which may follow each other without a gap
 _RECHECK = 0.0005  # s; of a turn that is deferred
+MAX_EXCESS = 3  # requests beyond a client's rate, after which it pauses
+PAUSE = 0.001  # s
 
 
 class Turns:
@@ -60,7 +62,9 @@ class Turns:
             if not self._is_urgent_due:
                 self._is_urgent_due = True
                 asyncio.get_running_loop().call_soon(self._take_urgent)
-        elif not any(connection in each for each in (*lanes, self._urgent)):
+        elif not connection.is_paused and not any(
+            connection in each for each in (*lanes, self._urgent)
+        ):
             (self._first if self._is_first(connection) else self._others).add(connection)
 
     def _take_urgent(self) -> None:
@@ -81,12 +85,25 @@ class Turns:
             self._serve(connection)
             reading_time += connection.reading_time
             connection.reading_time = 0.0
-            if connection.has_lines:
+            if connection.excess >= MAX_EXCESS and not connection.is_urgent:
+                self._pause(connection)
+            elif connection.has_lines:
                 self.add(connection)
             connection.close_if_finished()
             if time.perf_counter() >= end:
                 break
         budget.spend(self._processor_time() - began_at + reading_time)
+
+    def _pause(self, connection: Connection) -> None:
+        """Serve a client that exceeds its rate a little at a time, so that it delays no one."""
+        connection.is_paused = True
+        asyncio.get_running_loop().call_later(PAUSE, self._resume, connection)
+
+    def _resume(self, connection: Connection) -> None:
+        connection.is_paused = False
+        connection.excess = 0
+        if connection.has_lines:
+            self.add(connection)
 
 
 class _Lane:

@@ -50,7 +50,7 @@ class RateLimiter:
 
 
 class Rates:
-    """A token bucket for each process, host or whoever else."""
+    """A token bucket for each key, such as a process or a host."""
 
     def __init__(
         self, per_second: float, *, burst: float | None = None, clock: Callable[[], float]

@@ -139,7 +139,7 @@ class Gateway:
         """The daemon's result, over the connection that this one keeps; raises RpcError."""
         name = client_name("http", request)
         try:
-            if method in SILENCING:  # over the own connection, whoever sends them
+            if method in SILENCING:  # over the own connection, from any client
                 return await self._silence(name, method, params)
             kept: KeptLink = request.state.daemon
             if not (kept.is_open or self._may_connect(request)):

@@ -1,7 +1,7 @@
 """Messages between the daemon and its estimator, in Python's pickle format.
 
 A message is its length, 8 bytes, and its pickle. The estimator answers each request by one message,
-a list of replies. Both sides are the same program, and nobody else has their pipes.
+a list of replies. Both sides are the same program, and no other process has their pipes.
 """
 
 import io

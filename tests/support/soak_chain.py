@@ -174,7 +174,7 @@ class _Run:
             self.checks.violate(f"{len(left)} tasks are left: {names}")
 
     def _host(self) -> None:
-        """Start a host: a supervisor with its control loop; the witness is told what they do."""
+        """Start a host: a supervisor with its control loop; the witness hears what they do."""
         supervisor = self.supervisor = Supervisor(
             state_changed=(lambda old, new: self.note("state", new.state),),
             link_changed=self._link_changed,
@@ -306,7 +306,7 @@ class _Run:
         elif action.what == "ready":
             await self.turning.wait()  # as in a process, whose stall also keeps requests waiting
             if not self._is_armed:
-                if not await self._request("clear"):  # what nobody had seen yet
+                if not await self._request("clear"):  # what no client had seen yet
                     await self._request("clear")
                 await self._request("arm")
             at = self.loop.time() - START

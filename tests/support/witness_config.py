@@ -46,7 +46,7 @@ def sense(witness: Witness, now: float, name: str, amplifier: Amplifier) -> None
 
 
 def tell_first(owner: Any, method: str, tell: Callable[..., object]) -> None:
-    """Let somebody be told of each call of a method, before it is carried out."""
+    """Report each call of a method, before it is carried out."""
     carry_out = getattr(owner, method)
 
     def told(*arguments: Any) -> Any:

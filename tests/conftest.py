@@ -71,7 +71,7 @@ settings.register_profile(
 settings.load_profile("short")
 
 
-free_plate.finite_element_modes = lru_cache(12)(free_plate.finite_element_modes)
+free_plate.FiniteElementModes = lru_cache(12)(free_plate.FiniteElementModes)
 """Free plates are solved once in a process: hundreds of tests are of the same ones."""
 
 _plain_yaml = document.plain_yaml

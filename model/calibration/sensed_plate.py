@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.fem.mesh import check_frequencies
 from model.identification.derivatives import jacobian
 from model.identification.form_errors import reduced_modes
 from model.identification.forward import ForwardModel, PlateAt, Sensor
@@ -198,7 +197,7 @@ def sensed_plate(
     has_form: whether it may have form errors. Raises InputError for frequencies too high for its
     mesh.
     """
-    check_frequencies(rig.plate, rig.mesh, frequencies)
+    rig.mesh.check_frequencies(rig.plate, frequencies)
     sensors = [Sensor(f"sensor {n}", x=x, y=y) for n, (x, y) in enumerate(points.tolist())]
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(max(frequencies.max(), 200.0)))
     form = reduced_modes(rig, free) if has_form else None

@@ -7,16 +7,17 @@ damping is hysteretic: ((1 + i eta) K - omega² M) u = F.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy import sparse
+from scipy import linalg, sparse
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.fem.mesh import DOF_PER_NODE, Mesh, check_frequencies
+from model.fem.mesh import DOF_PER_NODE, Mesh
 from model.structure.attachments import (
     Era,
     Load,
@@ -30,11 +31,31 @@ from model.structure.plate import Plate
 
 RIGID_BODY_MODES = 3  # of a free plate: up and down, and two tilts
 
-NUS = (0.0, 0.4)
-"""Poisson's ratios of a difference: any two, since the stiffness is linear in between."""
+_ENERGY = (
+    ("ww", "shear", "vv", "ss"),
+    ("ww", "shear", "ss", "vv"),
+    ("wx", "-shear", "vv", "sv"),
+    ("wy", "-shear", "sv", "vv"),
+    ("xx", "shear", "vv", "rr"),
+    ("xx", "bending", "vv", "ss"),
+    ("xx", "twist", "ss", "vv"),
+    ("yy", "shear", "rr", "vv"),
+    ("yy", "bending", "ss", "vv"),
+    ("yy", "twist", "vv", "ss"),
+    ("xy", "coupled", "vs", "sv"),
+    ("xy", "twist", "sv", "vs"),
+)
+"""Stiffness between w and the rotations x and y: fields, rigidity, integrals along y and along x.
 
-SQUARES = (0.5, 1.5)
-"""Squares of s of a difference, about 1."""
+Slopes s, functions v, rotations r in shear (paper Eq. 17).
+"""
+
+
+def rigidities(plate: Plate) -> dict[str, float]:
+    """Bending, coupled and twist [N m], and shear [N/m] of a plate's section (paper Eq. 5 to 7)."""
+    D, nu = plate.flexural_rigidity, plate.material.nu
+    twist = (1 - nu) / 2 * D
+    return {"bending": D, "coupled": nu * D, "twist": twist, "shear": plate.shear_rigidity}
 
 
 @dataclass(frozen=True)
@@ -77,10 +98,38 @@ def assemble(plate: Plate, mesh: Mesh) -> PlateMatrices:
             f"mesh: must cover the plate of {plate.length:g} x {plate.width:g} m, got "
             f"{mesh.length:g} x {mesh.width:g} m; make the mesh for this plate"
         )
-    sizes = _sizes(mesh)
-    stiffness = np.array([mesh.element.stiffness(plate, *size) for size in sizes])
-    mass = np.array([mesh.element.mass(plate, *size) for size in sizes])
-    return PlateMatrices(plate, mesh, _assembled(mesh, stiffness), _assembled(mesh, mass))
+    density = plate.material.rho * plate.thickness
+    rotary = density * plate.thickness**2 / 12
+    along_x, along_y = mesh.along
+    value = sparse.kron(along_y.integrals["vv"], along_x.integrals["vv"])
+    mass = sparse.kron(value, np.diag([density, rotary, rotary]))  # paper Eq. 19 and 20
+    return PlateMatrices(plate, mesh, _stiffness(mesh, rigidities(plate)), sparse.csc_array(mass))
+
+
+def _stiffness(
+    mesh: Mesh, section: Mapping[str, float], by_side: str | None = None
+) -> sparse.csc_array:
+    """Stiffness (dof, dof) of a section's rigidities; or its derivative by one side, "x" or "y".
+
+    By the logarithm of the side at the same mass, where functions are stretched with it and the
+    rotations along it times its reciprocal s, as slopes are: each part is a power of s.
+    """
+    along_x, along_y = mesh.along
+    blocks: dict[str, Any] = {}
+    for of, rigidity, integral_y, integral_x in _ENERGY:
+        factor = -section[rigidity[1:]] if rigidity[0] == "-" else section[rigidity]
+        if by_side is not None:
+            integral = integral_x if by_side == "x" else integral_y
+            factor *= -(of.count(by_side) + integral.count("s"))
+        part = sparse.kron(along_y.integrals[integral_y], along_x.integrals[integral_x])
+        blocks[of] = blocks.get(of, 0) + factor * part
+    found: Any = 0
+    for of, block in blocks.items():
+        place = np.zeros((DOF_PER_NODE, DOF_PER_NODE))
+        place["wxy".index(of[0]), "wxy".index(of[1])] = 1
+        whole = sparse.kron(block, place, format="csc")
+        found = found + (whole if of[0] == of[1] else whole + whole.T)
+    return sparse.csc_array(found)
 
 
 def direct_acceleration(
@@ -95,10 +144,10 @@ def direct_acceleration(
 
     Each ERA alone at full stroke and phase zero, the others at rest. One sparse factorisation per
     frequency: the reference that `FreePlate.acceleration` is compared with. Raises InputError as
-    `check_frequencies`, and for points off the plate.
+    `Mesh.check_frequencies`, and for points off the plate.
     """
     check_of_theory(matrices.plate)
-    check_frequencies(matrices.plate, matrices.mesh, frequencies)
+    matrices.mesh.check_frequencies(matrices.plate, frequencies)
     touch = matrices.deflection_at(footprints_of(eras, loads))
     observe = matrices.deflection_at(points)
     result = np.empty((len(frequencies), len(eras), observe.shape[0]), dtype=complex)
@@ -147,18 +196,21 @@ def simply_supported_modes(
 def lowest_modes(
     stiffness: sparse.csc_array, mass: sparse.csc_array, count: int, *, shift: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Solve K phi = omega² M phi for the lowest eigenpairs by shift-invert Lanczos.
+    """Solve K phi = omega² M phi for the lowest eigenpairs; a few by shift-invert Lanczos.
 
     Returns omega² ascending (count,) and vectors (dof, count) of unit modal mass. shift [rad²/s²]:
     above zero, of the order of the lowest elastic omega²; K + shift M is then positive definite
     although K is singular for a free plate.
     """
     size = stiffness.shape[0]
-    if count >= size:
+    if count > size:
         raise InputError(
-            f"modes must be fewer than the mesh's {size} free degrees of freedom, got {count}; "
-            "take fewer modes or a finer mesh"
+            f"modes must be at most the mesh's {size} free degrees of freedom, got {count}; take "
+            "fewer modes or a finer mesh"
         )
+    if count >= size / 2:
+        some = (0, count - 1)
+        return linalg.eigh(stiffness.toarray(), mass.toarray(), subset_by_index=some)
     factor = factorise(stiffness + shift * mass)
     eigenvalues, vectors = eigsh(
         stiffness,
@@ -190,45 +242,16 @@ def factorise(matrix: sparse.sparray) -> SuperLU:
 def element_slopes(plate: Plate, mesh: Mesh, shapes: FloatArray) -> FloatArray:
     """Derivatives of the stiffness between shapes (dof, r) of a plate on a mesh, (3, r, r).
 
-    By the logarithms of length and width, at the same mass, and by Poisson's ratio: exactly, as
-    `model.spectral.shape_stiffness`, whose reasons hold for the elements' functions, too.
+    By the logarithms of length and width, at the same mass, and by Poisson's ratio: exactly, for
+    the reasons of `model.spectral.shape_stiffness`.
     """
-    sizes, element = _sizes(mesh), mesh.element
-    nominal = np.array([element.stiffness(plate, *size) for size in sizes])
-    slopes = np.zeros((3, *nominal.shape))
-    for axis in range(2):
-        for square, share in zip(SQUARES, (2.0, -2.0), strict=True):  # d s² / d ln side = -2
-            s = np.ones(DOF_PER_NODE)
-            s[1 + axis] = square**0.5
-            nodal = np.tile(s, nominal.shape[1] // DOF_PER_NODE)
-            stretched = [
-                element.stiffness(plate, dx / s[1], dy / s[2]) * s.prod() for dx, dy in sizes
-            ]
-            slopes[axis] += share * np.array(stretched) * np.outer(nodal, nodal)
-    nu, material = plate.material.nu, plate.material
-    slopes[2] = 2 * nu * nominal
-    for other, share in zip(NUS, (-1.0, 1.0), strict=True):
-        changed = replace(plate, material=replace(material, nu=other))
-        factor = share * (1 - other**2) / (NUS[1] - NUS[0])
-        slopes[2] += factor * np.array([element.stiffness(changed, *size) for size in sizes])
-    slopes[2] /= 1 - nu**2
-    return np.array([shapes.T @ (_assembled(mesh, slope) @ shapes) for slope in slopes])
-
-
-def _sizes(mesh: Mesh) -> list[tuple[float, float]]:
-    """Length and width [m] of each size of element: one, or four with strips along the edges."""
-    widths = [(size, mesh.strip) if mesh.strip else (size,) for size in mesh.element_size]
-    return [(dx, dy) for dy in widths[1] for dx in widths[0]]
-
-
-def _assembled(mesh: Mesh, matrices: FloatArray) -> sparse.csc_array:
-    """The whole plate's matrix (dof, dof) of those of each size of element, (sizes, n, n)."""
-    dofs = DOF_PER_NODE * mesh.connectivity[:, :, None] + np.arange(DOF_PER_NODE)
-    dofs = dofs.reshape(len(mesh.connectivity), -1)
-    side_x, side_y = mesh.element_sides
-    size_of = ((2 if mesh.strip else 1) * side_y[:, None] + side_x).ravel()
-    row, column = np.nonzero(matrices.any(axis=0))
-    values = matrices[:, row, column][size_of]
-    places = (dofs[:, row].ravel(), dofs[:, column].ravel())
-    size = DOF_PER_NODE * mesh.node_count
-    return sparse.csc_array(sparse.coo_array((values.ravel(), places), shape=(size, size)))
+    nu, section = plate.material.nu, rigidities(plate)
+    by_nu = {key: -value / (1 + nu) for key, value in section.items()}
+    by_nu["bending"] = 2 * nu / (1 - nu**2) * section["bending"]
+    by_nu["coupled"] = nu * by_nu["bending"] + section["bending"]
+    slopes = (
+        _stiffness(mesh, section, "x"),
+        _stiffness(mesh, section, "y"),
+        _stiffness(mesh, by_nu),
+    )
+    return np.array([shapes.T @ (slope @ shapes) for slope in slopes])

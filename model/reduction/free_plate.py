@@ -16,10 +16,10 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.fem.mesh import Mesh, check_frequencies
-from model.reduction.finite_element_modes import finite_element_modes
+from model.fem.mesh import Mesh
+from model.reduction.finite_element_modes import FiniteElementModes
 from model.reduction.receptance import FreeModes, FreeReceptance, between, combined
-from model.reduction.spectral_modes import spectral_modes
+from model.reduction.spectral_modes import SpectralModes
 from model.reduction.truncation import RESIDUAL_ORDER
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import (
@@ -150,7 +150,7 @@ class FreePlate:
     def _omega(self, frequencies: FloatArray) -> FloatArray:
         """omega [rad/s] of frequencies [Hz]; raises InputError for those out of range."""
         frequencies = np.asarray(frequencies, dtype=float)
-        check_frequencies(self.plate, self.mesh, frequencies)
+        self.mesh.check_frequencies(self.plate, frequencies)
         if len(frequencies) and frequencies.max() > self.frequency_max * (1 + 1e-9):
             raise InputError(
                 f"frequency must be at most {self.frequency_max:g} Hz, to which the plate was "
@@ -172,9 +172,9 @@ def solve_free_plate(plate: Plate, mesh: PlateMesh, *, frequency_max: float = 50
     cutoff_frequency = FREQUENCY_MARGIN * frequency_max
     modes: FreeModes
     if isinstance(mesh, Mesh):
-        modes = finite_element_modes(plate, mesh, shift=shift, cutoff_frequency=cutoff_frequency)
+        modes = FiniteElementModes(plate, mesh, shift=shift, cutoff_frequency=cutoff_frequency)
     else:
-        modes = spectral_modes(
+        modes = SpectralModes(
             plate,
             mesh,
             shift=shift,

@@ -20,7 +20,7 @@ from model.spectral.local_compliance import (
     unresolved_at,
 )
 from model.spectral.mesh import SpectralMesh
-from model.spectral.modes import Band, SpectralClass, SpectralPlate
+from model.spectral.modes import Band, SpectralPlate
 from model.structure.footprint import check_on_plate
 from model.structure.laminate_section import short_wave_plate
 from model.structure.modal_elasticity import Dispersion
@@ -39,21 +39,32 @@ class _Observed:
 
 
 class SpectralModes:
-    """Modes of a free plate in the polynomials of a mesh; see `FreeModes` of `receptance`."""
+    """All modes of a free plate below a cut-off, by class; see `FreeModes` of `receptance`.
+
+    shift [rad²/s²]: of the order of the lowest modes; cutoff_frequency [Hz]; frequency_max [Hz]: of
+    responses.
+    """
 
     def __init__(
         self,
         plate: Plate,
         mesh: SpectralMesh,
-        classes: tuple[SpectralClass, ...],
         *,
         shift: float,
-        band: Band,
+        cutoff_frequency: float,
+        frequency_max: float,
     ) -> None:
         self._plate = plate
         self._mesh = mesh
-        self._classes = classes
-        self._local_plate = local_plate(plate, mesh, band.middle)
+        band = Band(math.sqrt(shift) / (2 * math.pi), frequency_max)
+        spectral = SpectralPlate(plate, (mesh.nx, mesh.ny), band.middle)
+        cut = (2 * math.pi * cutoff_frequency) ** 2
+        self._classes = classes = tuple(
+            spectral.modes(each, shift=shift, cut=cut, band=band) for each in CLASSES
+        )
+        # The homogeneous plate that yields under a force in waves that the mesh does not resolve.
+        shortest = 2 * math.pi / mesh.shortest_wavelength
+        self._local_plate = short_wave_plate(plate, shortest, band.middle)
         self.eigenvalues = np.concatenate([part.eigenvalues for part in classes])
         self.losses = np.concatenate([part.losses for part in classes])
         dispersion = np.hstack([part.dispersion for part in classes])
@@ -133,22 +144,3 @@ class SpectralModes:
             unresolved = unresolved_at(self._local_plate, degrees, points)
             self._known[key] = _Observed(shapes, truncated, unresolved)
         return self._known[key]
-
-
-def local_plate(plate: Plate, mesh: SpectralMesh, frequency: float) -> Plate:
-    """The homogeneous plate that yields under a force in waves that a mesh does not resolve."""
-    return short_wave_plate(plate, 2 * math.pi / mesh.shortest_wavelength, frequency)
-
-
-def spectral_modes(
-    plate: Plate, mesh: SpectralMesh, *, shift: float, cutoff_frequency: float, frequency_max: float
-) -> SpectralModes:
-    """Solve the four symmetry classes of a free plate for all modes below a cutoff [Hz].
-
-    shift [rad²/s²]: of the order of the lowest modes; frequency_max [Hz]: of responses.
-    """
-    band = Band(math.sqrt(shift) / (2 * math.pi), frequency_max)
-    spectral = SpectralPlate(plate, (mesh.nx, mesh.ny), band.middle)
-    cut = (2 * math.pi * cutoff_frequency) ** 2
-    classes = tuple(spectral.modes(each, shift=shift, cut=cut, band=band) for each in CLASSES)
-    return SpectralModes(plate, mesh, classes, shift=shift, band=band)

@@ -13,7 +13,6 @@ from urllib.parse import quote
 
 from model.config.document import ConfigError, Document, Problem
 from model.config.kinds import CheckedFile, ConfigKind
-from model.fem.mesh import SHEAR_CORRECTION
 from model.rig.checks import STIFF_MOUNT
 from model.rig.file import example_rig_path, rig_of
 from model.rig.parts import limits_of
@@ -88,8 +87,7 @@ def _layer_costs(rig: Rig) -> list[str]:
 def _point_costs(rig: Rig) -> list[str]:
     """What stiff mounts cost that the rig says are points."""
     plate = rig.plate
-    decade = math.log(10) / (2 * math.pi * SHEAR_CORRECTION * plate.material.shear_modulus)
-    decade /= plate.thickness
+    decade = math.log(10) / (2 * math.pi * plate.shear_rigidity)
     mounts = [
         *((era.name, era.stiffness, era.foot) for era in rig.eras),
         *(

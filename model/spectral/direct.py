@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.fem.mesh import check_frequencies
 from model.spectral.functions import CLASSES, deflections_by_class
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh
@@ -44,7 +43,7 @@ def direct_spectral_acceleration(
     As `direct_acceleration` on finite elements, plus the compliance that the polynomials do not
     resolve. Raises InputError as it does.
     """
-    check_frequencies(plate, mesh, frequencies)
+    mesh.check_frequencies(plate, frequencies)
     check_of_theory(plate)
     attached = footprints_of(eras, loads)
     everywhere = np.concatenate([attached, as_footprints(points)])

@@ -34,7 +34,6 @@ from numpy.polynomial.legendre import leggauss
 from scipy import special
 
 from model.arrays import FloatArray, IntArray
-from model.fem.mesh import SHEAR_CORRECTION
 from model.structure.footprint import as_footprints, mean_over
 from model.structure.plate import Plate
 
@@ -114,10 +113,9 @@ def edge_compliance(plate: Plate, side: float, degrees: IntArray, foot: float) -
     side [m]; degrees (n,): along it, odd and even ones alike; foot [m]: radius of a disc there.
     """
     D, nu = plate.flexural_rigidity, plate.material.nu
-    shear = SHEAR_CORRECTION * plate.material.shear_modulus * plate.thickness
     resolved = 2 * (degrees - _UNRESOLVED) / side  # of directions phi, over |cos phi|
     bending = 1 / ((1 - nu) * (3 + nu) * np.pi * D * resolved**2)
-    decade = math.log(10) / (np.pi * shear)
+    decade = math.log(10) / (np.pi * plate.shear_rigidity)
     decades = np.log10(np.maximum(1, 1 / (2 * plate.thickness * resolved)))
     at_point = bending + decade * decades
     if not foot:
@@ -148,7 +146,6 @@ def unresolved_at(plate: Plate, degrees: tuple[int, int], places: FloatArray) ->
         centroids = mean_over(np.asarray, places, length=plate.length, width=plate.width)
         points = points + _TO_CENTROID * (centroids - points)
     D, nu, h = plate.flexural_rigidity, plate.material.nu, plate.thickness
-    shear = SHEAR_CORRECTION * plate.material.shear_modulus * h
     sides = np.array([plate.length, plate.width])
     p = np.array(degrees)
     cosine = np.clip(1 - 2 * points / sides, -1, 1)
@@ -170,9 +167,9 @@ def unresolved_at(plate: Plate, degrees: tuple[int, int], places: FloatArray) ->
     return Unresolved(
         places,
         bending * mean / (4 * np.pi * D),
-        images * logarithm / (2 * np.pi * shear),
+        images * logarithm / (2 * np.pi * plate.shear_rigidity),
         mean**-0.5,
-        images * math.log(10) / (2 * np.pi * shear),
+        images * math.log(10) / (2 * np.pi * plate.shear_rigidity),
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.spectral.local_compliance import edge_compliance
+from model.structure.discretisation import Discretisation
 from model.structure.plate import Plate
 
 POLYNOMIALS = "Legendre"
@@ -44,13 +45,8 @@ _POINTS_PER_DEGREE = 8  # of the raster that shows a field: fifty to a wavelengt
 
 
 @dataclass(frozen=True)
-class SpectralMesh:
+class SpectralMesh(Discretisation):
     """Legendre polynomials up to degrees nx along x and ny along y, over length by width [m]."""
-
-    nx: int
-    ny: int
-    length: float
-    width: float
 
     element_name: ClassVar[str] = POLYNOMIALS
     strip: ClassVar[float] = 0.0
@@ -127,10 +123,6 @@ class SpectralMesh:
         """The shortest bending wavelength [m] that it resolves."""
         sides = (self.length / (self.nx - _RESOLVES), self.width / (self.ny - _RESOLVES))
         return math.pi * max(sides)
-
-    def highest_frequency(self, plate: Plate) -> float:
-        """The highest frequency [Hz] whose bending waves in a plate it resolves."""
-        return plate.bending_frequency(self.shortest_wavelength)
 
     def finer(self) -> Self:
         """Degrees to compare with, for the discretisation error."""

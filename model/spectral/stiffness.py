@@ -73,42 +73,48 @@ class ClassFunctions:
         return self.deflections + self.interfaces * along
 
 
-def class_stiffness(of: ClassFunctions, section: Section) -> FloatArray:
-    """Stiffness (n, n) [N/m per m² of the orthonormal functions] of a section's real part."""
+def class_stiffness(of: ClassFunctions, section: Section, by_side: int | None = None) -> FloatArray:
+    """Stiffness (n, n) [N/m per m² of the orthonormal functions] of a section's real part.
+
+    Or its derivative by the logarithm of a side, 0 for length and 1 for width, at the same mass:
+    functions are stretched with the side and displacements along it times its reciprocal s, as
+    slopes are. Then each part is a power of s, of u_x,x u_x,x the fourth.
+    """
     x, y = of.x, of.y
     a, b = of.parity
     (wx, wy), (xx, xy), (yx, yy) = of.of_w, of.of_x, of.of_y
     stretch, across, twist, slip = (
         np.real(each) for each in (section.stretch, section.across, section.twist, section.slip)
     )
-    lever, shear = np.real(section.lever), float(np.real(section.shear))
+    lever, shear = np.real(section.lever)[None], np.full((1, 1), np.real(section.shear))
     w = slice(0, of.deflections)
     u = slice(w.stop, w.stop + of.interfaces * xx * xy)
     v = slice(u.stop, of.size)
     K = np.zeros((of.size, of.size))
 
-    def laid(matrix: FloatArray, along_x: FloatArray, along_y: FloatArray) -> FloatArray:
-        return _product(matrix, _product(along_x, along_y))
+    def laid(
+        matrix: FloatArray, along_x: FloatArray, along_y: FloatArray, *powers: int
+    ) -> FloatArray:
+        """One part of the energy; powers of s of both sides in it."""
+        factor = 1 if by_side is None else -powers[by_side]
+        return _product(factor * matrix, _product(along_x, along_y))
 
-    K[w, w] = shear * (
-        _product(x.slope_squares[a][:wx, :wx], np.eye(wy))
-        + _product(np.eye(wx), y.slope_squares[b][:wy, :wy])
-    )
+    K[w, w] = laid(shear, x.slope_squares[a][:wx, :wx], np.eye(wy), 2, 0)
+    K[w, w] += laid(shear, np.eye(wx), y.slope_squares[b][:wy, :wy], 0, 2)
     K[u, u] = (
-        laid(stretch, x.slope_squares[-a], np.eye(xy))
-        + laid(twist, np.eye(xx), y.slope_squares[b])
-        + laid(slip, np.eye(xx), np.eye(xy))
+        laid(stretch, x.slope_squares[-a], np.eye(xy), 4, 0)
+        + laid(twist, np.eye(xx), y.slope_squares[b], 2, 2)
+        + laid(slip, np.eye(xx), np.eye(xy), 2, 0)
     )
     K[v, v] = (
-        laid(stretch, np.eye(yx), y.slope_squares[-b])
-        + laid(twist, x.slope_squares[a], np.eye(yy))
-        + laid(slip, np.eye(yx), np.eye(yy))
+        laid(stretch, np.eye(yx), y.slope_squares[-b], 0, 4)
+        + laid(twist, x.slope_squares[a], np.eye(yy), 2, 2)
+        + laid(slip, np.eye(yx), np.eye(yy), 0, 2)
     )
-    K[u, v] = laid(across, x.slope_products[-a], y.slope_products[-b].T)
-    K[u, v] += laid(twist, x.slope_products[a].T, y.slope_products[b])
-    row = lever[None]
-    K[w, u] = laid(row, x.slope_products[a][:wx], np.eye(wy, xy))
-    K[w, v] = laid(row, np.eye(wx, yx), y.slope_products[b][:wy])
+    K[u, v] = laid(across, x.slope_products[-a], y.slope_products[-b].T, 2, 2)
+    K[u, v] += laid(twist, x.slope_products[a].T, y.slope_products[b], 2, 2)
+    K[w, u] = laid(lever, x.slope_products[a][:wx], np.eye(wy, xy), 2, 0)
+    K[w, v] = laid(lever, np.eye(wx, yx), y.slope_products[b][:wy], 0, 2)
     K[v, u], K[u, w], K[v, w] = K[u, v].T, K[w, u].T, K[w, v].T
     return K
 

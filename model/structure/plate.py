@@ -212,6 +212,8 @@ class AirGap:
 
 MAX_LOSS_EXPONENT = 2.0
 
+SHEAR_CORRECTION = 5 / 6
+
 LOSS_FREQUENCY = 150.0
 """Frequency [Hz] at which a plate has its loss factor, where that varies."""
 
@@ -273,6 +275,11 @@ class Plate:
     def flexural_rigidity(self) -> float:
         """Flexural rigidity D = E h³ / 12 (1 - nu²) [N m], paper Eq. 7."""
         return self.material.E * self.thickness**3 / (12 * (1 - self.material.nu**2))
+
+    @property
+    def shear_rigidity(self) -> float:
+        """Shear rigidity kappa G h [N/m], paper Eq. 7."""
+        return SHEAR_CORRECTION * self.material.shear_modulus * self.thickness
 
     @property
     def lowest_bending_frequency(self) -> float:

@@ -108,7 +108,7 @@ def test_interpolation_is_exact_for_polynomials_of_the_element(mesh):
 def test_mesh_strips_lie_along_every_edge():
     """Strips of 3 mm are the first and last elements; those between share the rest evenly."""
     mesh = Mesh(4, 3, 0.3, 0.2, ELEMENTS["Q5"], 0.003)
-    x, y = mesh.lines
+    x, y = (line.ends for line in mesh.along)
     np.testing.assert_allclose(x, [0, 0.003, 0.0765, 0.15, 0.2235, 0.297, 0.3])
     np.testing.assert_allclose(y, [0, 0.003, 0.003 + 0.194 / 3, 0.003 + 2 * 0.194 / 3, 0.197, 0.2])
 
@@ -141,14 +141,14 @@ def test_coarsest_mesh_is_the_coarsest_that_resolves_its_frequency(sides):
     """Its elements are short enough along both sides; one fewer along either is too long."""
     plate = Plate(*sides, 0.0015, ALUMINIUM)
     for frequency in (40.0, 500.0, 1637.0):
-        mesh = Mesh.coarsest(plate, frequency=frequency)
+        mesh = Mesh(1, 1, *sides).resolving(plate, frequency)
         assert mesh.highest_frequency(plate) >= frequency
         for fewer in ((mesh.nx - 1, mesh.ny), (mesh.nx, mesh.ny - 1)):
             if min(fewer):
                 assert Mesh(*fewer, *sides).highest_frequency(plate) < frequency
     exact = Mesh(12, 9, LENGTH, WIDTH)
     paper = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
-    again = Mesh.coarsest(paper, frequency=exact.highest_frequency(paper) * (1 - 1e-8))
+    again = exact.resolving(paper, exact.highest_frequency(paper) * (1 - 1e-8))
     assert (again.nx, again.ny) == (12, 9)
 
 

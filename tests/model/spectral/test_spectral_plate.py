@@ -11,7 +11,7 @@ from long_form import in_turn
 from model.errors import InputError
 from model.fem.mesh import Q5, Mesh
 from model.reduction.free_plate import solve_free_plate
-from model.reduction.spectral_modes import spectral_modes
+from model.reduction.spectral_modes import SpectralModes
 from model.rig.meshes import mesh_of
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.functions import CLASSES
@@ -115,7 +115,7 @@ def test_modes_are_those_of_a_full_eigen_solution(plate, degrees, frequency):
     """LAPACK on all unknowns of each class finds the same modes below a cut-off, and no others."""
     of = PLATES[plate]
     mesh = SpectralMesh(*degrees, of.length, of.width)
-    modes = spectral_modes(
+    modes = SpectralModes(
         of,
         mesh,
         shift=(2 * math.pi * 30) ** 2,

@@ -3,10 +3,11 @@
     python -m benchmarks.latency [--touches N] [--report]
 
 The daemon, floods and programs that load the machine are processes; the panel and the amplifiers,
-on pseudo-terminals, are this one. A touch is sent when the set of the one before has come and no
-other is under way, so that the next set is its own; a case with a planted delay proves that. Six
-minutes. Beside each figure is how busy other programs kept the processors: on a machine that is not
-left alone figures are upper bounds. --report: write docs/measured/latency.md.
+on pseudo-terminals or, beside floods, behind serial servers, are this one. A touch is sent when the
+set of the one before has come and no other is under way, so that the next set is its own; a case
+with a planted delay proves that. Six minutes. Beside each figure is how busy other programs kept
+the processors: on a machine that is not left alone figures are upper bounds. --report: write
+docs/measured/latency.md.
 """
 
 import argparse
@@ -94,7 +95,9 @@ async def opened(case: Case) -> AsyncIterator[Session]:
             session = await stack.enter_async_context(plain_session(rig))
         else:
             program = _PLANTED if case.is_planted else DAEMON
-            daemon = daemon_session(rig, program=program, is_two=case.is_two)
+            daemon = daemon_session(
+                rig, program=program, is_two=case.is_two, is_crowded=case.is_loaded
+            )
             session = await stack.enter_async_context(daemon)
         if case.is_loaded:
             await stack.enter_async_context(crowd.floods(session.socket, *crowd.ALL))
@@ -163,7 +166,7 @@ FURTHER: Sequence[tuple[str, str, str, _Act, tuple[tuple[str, int], ...]]] = (
     (
         "touch of the lease's holder beside these, slow readers and bad JSON, round trip",
         *("4 ERAs on 1", "99th 20 ms", trips),
-        (crowd.RECONNECTING, crowd.SLOW, crowd.MALFORMED),
+        (crowd.SLOW, crowd.MALFORMED, crowd.RECONNECTING),
     ),
     ("stop until the wire, beside all floods", "4 ERAs on 1", "99th 5 ms", stops, crowd.ALL),
 )
@@ -173,7 +176,8 @@ async def further_row(
     name: str, rig: str, goal: str, act: _Act, kinds: Sequence[tuple[str, int]], touches: int
 ) -> str:
     """Measure something else than taps; returns its row."""
-    async with daemon_session(_RIGS[rig]) as session, crowd.floods(session.socket, *kinds):
+    started = daemon_session(_RIGS[rig], is_crowded=bool(kinds))
+    async with started as session, crowd.floods(session.socket, *kinds):
         load = OtherLoad()
         text, others = await act(session, touches), load.processors()
     return _joined([name, rig, text, goal, f"{others:.2f}"])

@@ -1,24 +1,27 @@
 """Own calls and files on the way of a touch, and own calls for a finger that rests.
 
-Amplifiers are in this process, on a line of memory each, and not counted. A touch: from its frame
-to the last byte of its set, answer included, after the first such touch. A resting finger: for two
-seconds, its frames coming 20 times a second.
+Amplifiers are in this process, on a line of memory each, and not counted; time is virtual, so that
+the counts do not depend on the machine. A touch: from its frame to the last byte of its set, answer
+included, after the first such touch. A resting finger: for two seconds, its frames coming 20 times
+a second.
 """
 
 import asyncio
 import os
 import sys
-import time
 import types
 from collections import Counter
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.loop.loop import Controller
 from controller.loop.observer import Observer
 from controller.sources.touch import Touch, TouchFrame
+from drivers import clock
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.host.serial_wire import SerialWire
@@ -32,6 +35,8 @@ from sim.amplifier.contract import Amplifier as SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 _ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(_ROOT / "tests" / "support"))
+_run_virtual: Any = import_module("virtual_loop").run_virtual
 _OWN = tuple(f"{_ROOT / name}{os.sep}" for name in ("controller", "drivers", "model", "registry"))
 _DRIVERS = f"{_ROOT / 'drivers'}{os.sep}"
 _FRAME_INTERVAL, _RESTING = 0.05, 2.0  # s
@@ -59,7 +64,7 @@ class FarEnd:
     def _receive(self, data: bytes) -> None:
         profile = sys.getprofile()
         sys.setprofile(None)
-        self._end.receive(data, time.monotonic())
+        self._end.receive(data, clock.now())
         sys.setprofile(profile)
 
     def _reply(self, data: bytes) -> None:
@@ -166,6 +171,6 @@ def table(rigs: Mapping[str, str]) -> str:
         "|---|---|---|---|---|",
     ]
     for name, file in rigs.items():
-        cells = asyncio.run(measure(load_rig(_ROOT / "examples" / f"{file}.yaml")))
+        cells = _run_virtual(measure(load_rig(_ROOT / "examples" / f"{file}.yaml")))
         rows.append(f"| {' | '.join([name, *cells])} |")
     return "\n".join(rows)

@@ -1,8 +1,10 @@
-"""Amplifiers of a rig on pseudo-terminals, and a clock for what reaches them."""
+"""Amplifiers of a rig on pseudo-terminals, or behind serial servers, and a clock for what comes."""
 
 import asyncio
+import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from drivers.codec.serial_line.frame import Frame, FrameReader, frame_length, unpack_words
@@ -11,7 +13,7 @@ from drivers.protocol.table import MAX_WORDS, MESSAGES, read_request
 from model.rig.rig import Rig
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from sim.transport.pseudo_terminal import make_terminal
+from sim.transport.pseudo_terminal import PseudoTerminal, make_terminal
 
 BAUD = 921_600
 BITS = 10  # of a byte on the line: start, eight, stop
@@ -28,14 +30,70 @@ class Vibration:
     layers: frozenset[int]
 
 
-class _Terminal:
-    """One amplifier.
+class _Server:
+    """A serial server of this machine for one host: bytes need no thread of the kernel between.
+
+    on_data: called with bytes from the host, once `listen` was called.
+    """
+
+    def __init__(self, on_data: Callable[[bytes], None]) -> None:
+        self._on_data = on_data
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self._connected: socket.socket | None = None
+        self.url = f"serial+tcp://127.0.0.1:{self._listening.getsockname()[1]}"
+
+    def listen(self) -> None:
+        """Accept a host from now on, in the running event loop."""
+        self._listening.setblocking(False)
+        asyncio.get_running_loop().add_reader(self._listening, self._accept)
+
+    def _accept(self) -> None:
+        self._hang_up()
+        self._connected, _ = self._listening.accept()
+        self._connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._connected.setblocking(False)
+        asyncio.get_running_loop().add_reader(self._connected, self._read)
+
+    def _read(self) -> None:
+        assert self._connected is not None
+        with suppress(BlockingIOError):
+            data = b""
+            with suppress(ConnectionError):
+                data = self._connected.recv(4096)
+            if data:
+                self._on_data(data)
+            else:
+                self._hang_up()
+
+    def _hang_up(self) -> None:
+        if self._connected is not None:
+            asyncio.get_running_loop().remove_reader(self._connected)
+            self._connected.close()
+            self._connected = None
+
+    def write(self, data: bytes) -> None:
+        """Write to the host; lost without one, or if it does not read."""
+        if self._connected is not None:
+            with suppress(BlockingIOError, ConnectionError):
+                self._connected.send(data)
+
+    def close(self) -> None:
+        """Close both sockets."""
+        self._hang_up()
+        asyncio.get_running_loop().remove_reader(self._listening)
+        self._listening.close()
+
+
+class _Device:
+    """One amplifier; is_server: behind a serial server, not on a pseudo-terminal.
 
     bytes: on its line until now, of sets and commits with their replies; used [s]: its own time for
     them.
     """
 
-    def __init__(self, name: str, channels: int, changed: Callable[[], None]) -> None:
+    def __init__(
+        self, name: str, channels: int, changed: Callable[[], None], *, is_server: bool
+    ) -> None:
         self.vibrations: list[Vibration] = []
         self.stopped_at = self.changed_at = 0.0  # s; when the last stop, and set, arrived
         self.bytes, self.used = 0, 0.0
@@ -43,9 +101,14 @@ class _Terminal:
         self._reader, self._assembly = FrameReader(), Assembly()
         self._staged: dict[int, frozenset[int]] = {}
         self._end = SerialAmplifiers({1: Amplifier(name, channels=channels)}, self._reply)
-        self._terminal = make_terminal(self._arrived)
-        self._terminal.listen()
-        self.url = f"serial://{self._terminal.port}?baud={BAUD}"
+        self._line: _Server | PseudoTerminal
+        if is_server:
+            self._line = _Server(self._arrived)
+            self.url = self._line.url
+        else:
+            self._line = make_terminal(self._arrived)
+            self.url = f"serial://{self._line.port}?baud={BAUD}"
+        self._line.listen()
 
     def _arrived(self, data: bytes) -> None:
         now = time.monotonic()
@@ -65,7 +128,7 @@ class _Terminal:
     def _reply(self, data: bytes) -> None:
         if time.monotonic() - self.changed_at < QUIET:
             self.bytes += len(data)
-        self._terminal.write(data)
+        self._line.write(data)
 
     def _note(self, frame: Frame, now: float) -> None:
         """Note the layers that a set drives, once it plays."""
@@ -88,64 +151,65 @@ class _Terminal:
             self.vibrations.append(Vibration(token, now, layers))
 
     def close(self) -> None:
-        self._terminal.close()
+        self._line.close()
 
 
 class FarSide:
-    """All amplifiers of a rig; urls by name."""
+    """All amplifiers of a rig; urls by name; is_server: behind serial servers."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, *, is_server: bool = False) -> None:
         self._changed = asyncio.Event()
-        self._terminals: Sequence[_Terminal] = [
-            _Terminal(
+        self._devices: Sequence[_Device] = [
+            _Device(
                 name,
                 1 + max(each.number for each in rig.wiring.values() if each.amplifier == name),
                 self._changed.set,
+                is_server=is_server,
             )
             for name in rig.amplifiers
         ]
-        terminals = zip(rig.amplifiers, self._terminals, strict=True)
-        self.urls: Mapping[str, str] = {name: each.url for name, each in terminals}
+        devices = zip(rig.amplifiers, self._devices, strict=True)
+        self.urls: Mapping[str, str] = {name: each.url for name, each in devices}
 
     def close(self) -> None:
-        """Close the terminals."""
-        for each in self._terminals:
+        """Close their lines."""
+        for each in self._devices:
             each.close()
 
     def begin(self) -> None:
         """Forget what has arrived."""
-        for each in self._terminals:
+        for each in self._devices:
             each.vibrations.clear()
             each.stopped_at, each.bytes, each.used = 0.0, 0, 0.0
 
     def playing_since(self, count: int) -> float | None:
         """Return when [s] the last amplifier had got sets of so many layers; None until then."""
         found = []
-        for each in self._terminals:
+        for each in self._devices:
             layers: frozenset[int] = frozenset()
             for vibration in each.vibrations:
                 layers |= vibration.layers
                 if len(layers) >= count:
                     found.append(vibration.at)
                     break
-        return max(found) if len(found) == len(self._terminals) else None
+        return max(found) if len(found) == len(self._devices) else None
 
     def stopped_at(self) -> float | None:
         """Return when [s] the last amplifier got a stop; None until then."""
-        times = [each.stopped_at for each in self._terminals]
+        times = [each.stopped_at for each in self._devices]
         return max(times) if all(times) else None
 
     def sets(self) -> int:
         """Return how many sets with vibrations have arrived, each on some amplifier."""
-        return len({one.token for each in self._terminals for one in each.vibrations})
+        return len({one.token for each in self._devices for one in each.vibrations})
 
     def wire_time(self) -> float:
         """Return how long [s] the busiest line would take for its bytes of sets and replies."""
-        return max(each.bytes for each in self._terminals) * BITS / BAUD
+        return max(each.bytes for each in self._devices) * BITS / BAUD
 
     def used(self) -> float:
         """Return how long [s] this program took for what has arrived, in place of amplifiers."""
-        return sum(each.used for each in self._terminals)
+        return sum(each.used for each in self._devices)
 
     async def until(self, arrived: Callable[[], float | None], timeout: float) -> float | None:
         """Wait until something has arrived; None after a timeout [s]."""
@@ -161,7 +225,7 @@ class FarSide:
 
     async def quiet(self) -> None:
         """Wait until no set is under way."""
-        last = max(each.changed_at for each in self._terminals)
+        last = max(each.changed_at for each in self._devices)
         if (left := last + QUIET - time.monotonic()) > 0:
             await asyncio.sleep(left)
             await self.quiet()

@@ -1,7 +1,8 @@
 """Programs of the benchmark, their priorities and processor time, and load by others.
 
 Amplifiers and a panel would not use the daemon's processors: the program that represents them has
-the highest priority. The daemon has that of `examples/systemd`, floods the ordinary one.
+the highest priority. The daemon has that of `examples/systemd`, floods the ordinary one. A thread
+of the kernel, which carries the bytes of a pseudo-terminal, has the ordinary one as well.
 """
 
 import asyncio
@@ -45,11 +46,13 @@ async def running(
     """
     global _ended
     process = await asyncio.create_subprocess_exec(
-        *map(str, command), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
+        *map(str, command),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        start_new_session=nice != 0,
     )
     if nice:
-        with contextlib.suppress(PermissionError):
-            os.setpriority(os.PRIO_PROCESS, process.pid, nice)
+        _set_nice(process.pid, nice)
     _children.add(process.pid)
     try:
         line = b""
@@ -65,6 +68,18 @@ async def running(
         with contextlib.suppress(ProcessLookupError):
             process.terminate()
         await process.wait()
+
+
+def _set_nice(process: int, nice: int) -> None:
+    """Set the level of a process and of its session, as far as that is permitted.
+
+    Where sessions share the processors, the level of a process counts within its session only; that
+    of the session is as the unit's `CPUWeight=`.
+    """
+    with contextlib.suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, process, nice)
+    with contextlib.suppress(OSError):
+        Path(f"/proc/{process}/autogroup").write_text(str(nice), "ascii")
 
 
 def computed(process: int) -> float:

@@ -1,4 +1,4 @@
-"""A daemon, or the baseline, on the pseudo-terminals of a rig, and a panel that touches it."""
+"""A daemon, or the baseline, on the lines of a rig, and a panel that touches it."""
 
 import asyncio
 import math
@@ -60,12 +60,21 @@ class Session:
 
 @asynccontextmanager
 async def daemon_session(
-    rig_name: str, *, program: Sequence[object] = DAEMON, is_two: bool = False
+    rig_name: str,
+    *,
+    program: Sequence[object] = DAEMON,
+    is_two: bool = False,
+    is_crowded: bool = False,
 ) -> AsyncIterator[Session]:
-    """Run and arm a daemon for a rig of the examples; is_two: each half of it has a content."""
+    """Run and arm a daemon for a rig of the examples; is_two: each half of it has a content.
+
+    is_crowded: its amplifiers are behind serial servers. A pseudo-terminal's bytes are carried by a
+    thread of the kernel, of ordinary priority, which other programs keep from them for as long as
+    a watchdog lasts, whatever the priorities of the daemon and of its amplifiers.
+    """
     with TemporaryDirectory(prefix="era-latency-") as name:
         folder, port = Path(name), _free_port()
-        rig, far = _rig_on_terminals(rig_name, folder)
+        rig, far = _rig_on_lines(rig_name, folder, is_server=is_crowded)
         try:
             more = ""
             if is_two:
@@ -96,7 +105,7 @@ async def daemon_session(
 async def plain_session(rig_name: str) -> AsyncIterator[Session]:
     """Run the baseline for a rig of the examples."""
     with TemporaryDirectory(prefix="era-latency-") as name:
-        rig, far = _rig_on_terminals(rig_name, Path(name))
+        rig, far = _rig_on_lines(rig_name, Path(name))
         command = (sys.executable, "-m", "benchmarks.latency.plain", *far.urls.values())
         try:
             async with running(*command, nice=DAEMON_NICE) as (process, port):
@@ -181,12 +190,12 @@ def _fingers(rng: random.Random, rig: Rig, number: int, *, is_two: bool) -> tupl
             return first, second
 
 
-def _rig_on_terminals(rig_name: str, folder: Path) -> tuple[Rig, FarSide]:
-    """Write a rig into a folder with the URLs of terminals in place of its simulated amplifiers."""
+def _rig_on_lines(rig_name: str, folder: Path, *, is_server: bool = False) -> tuple[Rig, FarSide]:
+    """Write a rig into a folder with the URLs of a far side in place of simulated amplifiers."""
     text = (EXAMPLES / f"{rig_name}.yaml").read_text("utf-8")
     (folder / "rig.yaml").write_text(text, "utf-8")
     rig = load_rig(folder / "rig.yaml")
-    far = FarSide(rig)
+    far = FarSide(rig, is_server=is_server)
     for url in far.urls.values():
         text = text.replace('"sim://"', f'"{url}"', 1)
     (folder / "rig.yaml").write_text(text, "utf-8")

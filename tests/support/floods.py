@@ -79,8 +79,10 @@ def _unreading(path: str, count: str) -> None:
             for n in (2, 3)
         ),
     ]
+    data = b"".join(json.dumps(line).encode() + b"\n" for line in lines)
     for connection in connections:
-        connection.sendall(b"".join(json.dumps(line).encode() + b"\n" for line in lines))
+        with contextlib.suppress(OSError):  # closed in favour of another
+            connection.sendall(data)
     _print("ready")
     sys.stdin.read()
 

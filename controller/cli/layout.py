@@ -42,7 +42,7 @@ def check(
 
     from controller.effects.layout_check import check_layout
     from controller.effects.layout_file import load_layout
-    from controller.effects.layout_together import check_together, matrix_of
+    from controller.effects.layout_together import check_together, close_pairs, matrix_of
     from model.commands.options import progress_bar
     from model.files.replacing import check_picture_name
     from model.table.file import load_table
@@ -77,6 +77,7 @@ def check(
             print("\n".join(_matrix(*matrix_of(together))))
         touches = sum(len(each.touches) for each in checked)
         outcome = counted(problems, "problem") if problems else "good"
+        outcome += close_pairs(together)
         print(
             f"{layout_file}: {outcome}; {counted(touches, 'touch', plural='touches')} in "
             f"{elapsed:.1f} s"

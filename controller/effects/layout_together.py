@@ -19,6 +19,7 @@ from controller.loop.joint_answer import fingers_of, requests_of
 from controller.sources.contacts import Contact, ContactKey
 from model.arrays import FloatArray
 from model.choice import best_of
+from model.counting import counted
 from model.errors import InputError
 from model.table.answer import answer
 from model.table.modulation import with_modulation
@@ -30,6 +31,7 @@ MAX_PAIRS, MAX_TRIPLES = 150, 150
 """Of a layout with many regions those whose centres are nearest."""
 
 _POSITIONS = 4  # of a region: the middle, and those farthest from it and from each other
+_NAMED = 4  # pairs that are close
 _NEAREST = 0.02  # m; two fingertips side by side
 
 _Finger: TypeAlias = tuple[Contact, Target]
@@ -121,6 +123,25 @@ def matrix_of(together: Sequence[Together]) -> tuple[list[str], FloatArray]:
             at = (other, one) if len(rows) == 2 else (one, other)
             found[at] = np.fmin(found[at], each.worst_db)
     return names, found
+
+
+def close_pairs(together: Sequence[Together]) -> str:
+    """Say which two regions are felt as one at the same time, hardest to tell apart first.
+
+    Nothing where there are none.
+    """
+    pairs = [each for each in together if len(each.regions) == 2]
+    close = sorted(
+        (each for each in pairs if each.worst_db < MIN_CONTRAST_DB), key=lambda each: each.worst_db
+    )
+    if not close:
+        return ""
+    named = [f"{' with '.join(each.regions)} {each.worst_db:.1f} dB" for each in close[:_NAMED]]
+    more = f" and {len(close) - _NAMED} more" if len(close) > _NAMED else ""
+    return (
+        f", but {len(close)} of {counted(len(pairs), 'pair')} of regions below "
+        f"{MIN_CONTRAST_DB:g} dB at once: {', '.join(named)}{more}"
+    )
 
 
 def _target_in(layout: SurfaceLayout, region: Region) -> Target | None:

@@ -45,12 +45,16 @@ class _Play:
 
 @dataclass
 class _Finger:
-    """The region of a finger that is down since a time [s], where it entered, and its plays."""
+    """The region of a finger that is down since a time [s], where it entered, and its plays.
+
+    ended: name of the effect that ended last, "" before any has.
+    """
 
     since: float
     region: Region | None
     entered: tuple[float, float]
     plays: list[_Play] = field(default_factory=list)
+    ended: str = ""
 
 
 class EffectPlayer:
@@ -94,7 +98,7 @@ class EffectPlayer:
         self._waiting = {key: self._waiting[key] for key in self._waiting if key in clicking}
         return HapticIntent(
             tuple(target for target in targets if not self._waits(target, now, ends)),
-            "no effect plays for the contacts on the plate",
+            self._reason,
             until=min(ends, default=None),
             protected=frozenset(
                 key
@@ -102,6 +106,16 @@ class EffectPlayer:
                 if finger.region is not None and finger.region.is_protected
             ),
         )
+
+    @property
+    def _reason(self) -> str:
+        """Why nothing is felt, if that is so."""
+        ended = dict.fromkeys(each.ended for each in self._fingers.values() if each.ended)
+        if ended:
+            return (
+                f"{' and '.join(ended)} ended, no other effect plays for the contacts on the plate"
+            )
+        return "no effect plays for the contacts on the plate"
 
     def replace(self, layout: SurfaceLayout) -> None:
         """Play another layout from now on; fingers that rest feel no press of it.
@@ -261,6 +275,7 @@ class EffectPlayer:
         for play in finger.plays:
             result = play.run.feel(contact, now)
             if result is None:
+                finger.ended = play.name
                 continue
             if not isinstance(result, Sensation | NoSensation):
                 raise WrongResultError(play.run, result, Sensation)

@@ -52,7 +52,10 @@ def test_click_ends_after_its_duration() -> None:
     assert player.intent(here, 10.06).until == pytest.approx(10.09)
     assert wanted(player, here, 10.089) == {1: 18.0}
     assert wanted(player, here, 10.0901) == {}
-    assert player.intent(here, 10.1).until is None
+    after = player.intent(here, 10.1)
+    assert after.until is None
+    assert "click" in after.reason  # which was played, and is over
+    assert "click" not in player.intent([finger(2)], 10.2).reason
 
 
 @pytest.mark.parametrize("is_requested", [False, True])

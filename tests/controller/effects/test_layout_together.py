@@ -14,7 +14,7 @@ from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.effect import Effect
 from controller.effects.layout import SurfaceLayout
-from controller.effects.layout_together import check_together, matrix_of
+from controller.effects.layout_together import Together, check_together, close_pairs, matrix_of
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.loop.capabilities import PlaybackCapabilities
@@ -102,6 +102,16 @@ def test_places_are_the_worst_of_their_regions() -> None:
             assert each.worst_db <= centred.promised_worst_db
             assert each.worst_db <= min(each.contrasts)
     assert by_name["west", "near"].worst_db < by_name["west", "east"].worst_db
+
+
+def test_pairs_that_are_felt_as_one_are_named() -> None:
+    """Those below 6 dB, the rule's bound of what is mixed, the worst first; none of three."""
+    at, worst = (0.0, 0.0), {"ab": 3.2, "ac": 6.0, "bc": -1.0, "abc": -5.0}
+    found = [Together((*names,), (at, at), (db, db), db, ()) for names, db in worst.items()]
+    said = close_pairs(found)
+    assert "2 of 3 pairs" in said
+    assert said.index("b with c -1.0 dB") < said.index("a with b 3.2 dB")
+    assert close_pairs(found[1:2]) == ""
 
 
 def test_verdicts_follow_the_rule_and_what_regions_say() -> None:

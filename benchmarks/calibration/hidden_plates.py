@@ -165,7 +165,7 @@ def measure(
 
 
 def true_values(hidden: HiddenPlate) -> list[float]:
-    """The fitted values in the order of `model.calibration.sensed_plate.Parameters`."""
+    """The fitted values in the order of `model.calibration.sensed_plate.SensedPlate.rows`."""
     plate = hidden.rig.plate
     values = [plate.material.E, plate.loss_factor]
     return values + [

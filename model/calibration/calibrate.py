@@ -54,8 +54,7 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
     values[:, dead_eras] = np.nan
     check_enough_sensors(alive, responses)
     plate = sensed_plate(rig, responses.points, responses.frequencies, has_form=True)
-    free = np.ones(len(plate.parameters.rows), dtype=bool)
-    problem = Problem(plate, values, free, np.ones(len(alive), dtype=bool))
+    problem = Problem.of(plate, values)
 
     # All scales are free at first, so that a wrong one does not bias the fit.
     part = problem.at(alive)
@@ -64,8 +63,9 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
     if unlike.any():
         alive[alive] = ~unlike
         check_enough_sensors(alive, responses)
+        fit = fit.at(~unlike, part.plate.model.space)
         part = problem.at(alive)
-        fit = first_fit(part, part.x(fit.z))
+        fit = first_fit(part, fit.z)
     fit = solve(part, replace(fit, z=part.at_scales(fit.z, _relative(part.scales(fit.z)))))
     free_scales = part.free_scales
     if not all_scales:
@@ -100,14 +100,14 @@ def _relative(scales: FloatArray) -> FloatArray:
 
 def _first_fit(problem: Problem) -> Fit:
     """Fit from several starts, since a fit finds only the nearest minimum; return the best."""
-    parameters = problem.plate.parameters
+    plate = problem.plate
 
     def misfit(model: ComplexArray) -> float:
         return float(np.nanmedian(1 - modal_assurance(problem.values, model)))
 
-    starts = [parameters.moved(*start) for start in STARTS]
-    nearest = ranked_by(starts, lambda x: -misfit(problem.plate.responses(x)))
-    fits = [first_fit(problem, x) for x in nearest[:_STARTS]]
+    starts = [plate.moved(*start) for start in STARTS]
+    nearest = ranked_by(starts, lambda z: -misfit(plate.responses(z)))
+    fits = [first_fit(problem, z) for z in nearest[:_STARTS]]
     return best_by(fits, lambda fit: -misfit(fit.predicted))
 
 
@@ -115,14 +115,15 @@ def _identified(problem: Problem, start: Fit) -> tuple[Problem, Fit]:
     """Hold parameters that the data determine less than their prior does, and fit again."""
     fit = solve(problem, start)
     while True:
-        excess = np.where(problem.free, problem.x(fit.error), 0)
+        numbers = problem.plate.numbers
+        excess = np.where(problem.free, fit.error[numbers], 0)
         # Values of a plate that does not fit are meaningless.
         if not excess.max() > 1 or _fit_error(problem, fit) > MAX_FIT_ERROR:
             return problem, fit
-        free = problem.free.copy()
-        free[best_of(excess)] = False
-        problem, z = replace(problem, free=free), fit.z.copy()
-        z[problem.plate.parameters.numbers] *= free
+        searched, z = problem.searched.copy(), fit.z.copy()
+        least = numbers[best_of(excess)]
+        searched[least], z[least] = False, 0.0
+        problem = replace(problem, searched=searched)
         fit = solve(problem, replace(fit, z=z))
 
 
@@ -146,7 +147,7 @@ def _check_sides(problem: Problem, fit: Fit) -> None:
     """Raise InputError where the responses fit a plate of another size better."""
     if _fit_error(problem, fit) > MAX_FIT_ERROR:
         return
-    plate, space = problem.plate.parameters.rig.plate, problem.model.space
+    plate, space = problem.plate.rig.plate, problem.plate.model.space
     offs = space.values(fit.z, "side").tolist()
     for key, side, off in zip(("length", "width"), (plate.length, plate.width), offs, strict=True):
         if abs(off) > _MAX_SIDE * KINDS["side"].std:
@@ -164,7 +165,7 @@ def _with_median_scale_one(problem: Problem, fit: Fit) -> Fit:
     middle = float(np.median(scales))
     common = KINDS["sensor_scale"].std * math.sqrt(math.pi / (2 * len(scales)))  # of a median
     error = fit.error.copy()
-    error[problem.model.space.groups["sensor_scale"]] /= abs(middle)
+    error[problem.plate.model.space.groups["sensor_scale"]] /= abs(middle)
     return replace(
         fit,
         z=problem.at_scales(fit.z, scales / middle),
@@ -184,15 +185,15 @@ def _report(
     dead_sensors: tuple[str, ...],
     dead_eras: tuple[str, ...],
 ) -> Calibration:
-    fitted, x, scales = problem.plate.parameters, problem.x(fit.z), problem.scales(fit.z)
-    before = fitted.rig
+    fitted, scales, before = problem.plate, problem.scales(fit.z), problem.plate.rig
     rig = rig_of_fit(problem, fit)
     responses, gains = predicted_by(rig, problem, points, fit)
     eras = tuple(
         replace(era, gains=gain_rows(gains[:, number], frequencies) or era.gains)
         for number, era in enumerate(rig.eras)
     )
-    at_bound = np.abs(fitted.bounds - x).min(axis=0) < 1e-6
+    bounds = np.array([fitted.model.space.lower, fitted.model.space.upper])
+    at_bound = (np.abs(bounds - fit.z).min(axis=0) < 1e-6)[fitted.numbers]
     parameters = tuple(
         FittedParameter(
             row,
@@ -203,8 +204,8 @@ def _report(
         )
         for row, value, error, free, bound in zip(
             fitted.rows,
-            fitted.values(x),
-            fitted.slopes(x) * problem.x(fit.error),
+            fitted.values(fit.z),
+            fitted.errors(fit.z, fit.error),
             problem.free,
             at_bound,
             strict=True,

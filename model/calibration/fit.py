@@ -19,7 +19,7 @@ sigma of the noise: scales that sensors have in common are part of it.
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,14 @@ from scipy.optimize import nnls
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.sensed_plate import SensedPlate
-from model.calibration.variable_projection import project_gains, projection_slopes, row_rms
-from model.identification.derivatives import jacobian
-from model.identification.forward import ForwardModel
-from model.identification.least_squares import Found, search
+from model.calibration.variable_projection import (
+    fit_with_gains,
+    project_gains,
+    projection_slopes,
+    responses_of,
+    row_rms,
+)
+from model.identification.least_squares import Found
 from model.identification.parameters import FORM, Space
 
 _MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
@@ -47,75 +51,65 @@ _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong b
 class Problem:
     """The plate of a rig with its form errors, and the measured values (f, e, s), NaN where none.
 
-    free (n,), free_scales (s,): masks of the rig's values to be fitted, and of the scales without a
-    tolerance; has_form: whether form errors are fitted, or held at zero.
+    searched (p,), free_scales (s,): masks of the parameters to be fitted, and of the scales without
+    a tolerance.
     """
 
     plate: SensedPlate
     values: ComplexArray
-    free: NDArray[np.bool_]
+    searched: NDArray[np.bool_]
     free_scales: NDArray[np.bool_]
-    has_form: bool = True
+
+    @classmethod
+    def of(cls, plate: SensedPlate, values: ComplexArray) -> Self:
+        """Search everything but the gains of channels, with scales that no tolerance holds."""
+        space = plate.model.space
+        searched = space.uncertain & ~space.of("gain")
+        return cls(plate, values, searched, np.ones(values.shape[2], dtype=bool))
 
     def at(self, kept: NDArray[np.bool_]) -> "Problem":
         """Select some of the sensors (s,)."""
-        return replace(
-            self,
-            plate=self.plate.at_some(kept),
-            values=self.values[:, :, kept],
-            free_scales=self.free_scales[kept],
+        return Problem(
+            self.plate.at_some(kept),
+            self.values[:, :, kept],
+            self.searched[_of_sensors(self.plate.model.space, kept)],
+            self.free_scales[kept],
         )
 
-    @cached_property
-    def model(self) -> ForwardModel:
-        """The model of what is fitted."""
-        model = self.plate.model
-        if self.has_form:
-            return model
-        space = model.space.without("place", "mode_shifts", *(set(FORM) - {"sensor_scale"}))
-        return replace(model, space=space, last_places={})
+    @property
+    def without_form(self) -> "Problem":
+        """The same with form errors held at zero, but for scales."""
+        form = self.plate.model.space.of("place", "mode_shifts", *{*FORM} - {"sensor_scale"})
+        return replace(self, searched=self.searched & ~form)
 
     @property
-    def frequencies(self) -> FloatArray:
-        """Of the values (f,) [Hz]."""
-        return self.model.frequencies
-
-    @cached_property
-    def searched(self) -> NDArray[np.bool_]:
-        """Mask (p,) of what is searched."""
-        found = self.model.space.uncertain.copy()
-        found[self.plate.parameters.numbers] = self.free
-        return found
-
-    def x(self, z: FloatArray) -> FloatArray:
-        """The rig's values (n,) of parameters z (p,)."""
-        return z[self.plate.parameters.numbers]
+    def free(self) -> NDArray[np.bool_]:
+        """Mask of the rig's values that are searched (n,)."""
+        return self.searched[self.plate.numbers]
 
     def scales(self, z: FloatArray) -> FloatArray:
         """Scales of sensors (s,) of parameters z (p,)."""
-        return 1 + self.model.space.values(z, "sensor_scale")
+        return 1 + self.plate.model.space.values(z, "sensor_scale")
 
     def scale_errors(self, fit: "Fit") -> FloatArray:
         """Standard errors of the scales that no tolerance holds (s,), 0 of others."""
-        return self.free_scales * self.model.space.values(fit.error, "sensor_scale")
+        return self.free_scales * self.plate.model.space.values(fit.error, "sensor_scale")
 
     def at_scales(self, z: FloatArray, scales: FloatArray) -> FloatArray:
         """Parameters z (p,) with other scales of sensors (s,)."""
-        found, own = z.copy(), self.model.space.groups["sensor_scale"]
-        found[own] = (scales - 1) / self.model.space.std[own]
+        space, found = self.plate.model.space, z.copy()
+        own = space.groups["sensor_scale"]
+        found[own] = (scales - 1) / space.std[own]
         return found
 
     def responses(self, z: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Responses (f, e, s) as sensors read them, and derivatives (n, f, e, s) by n searched."""
-        plate = self.model.at(z)
-        by_z = jacobian(plate)[..., self.searched].transpose(3, 0, 2, 1)
-        return np.swapaxes(plate.responses, 1, 2), by_z
+        return responses_of(self.plate.model, z, self.searched)
 
     def tolerances(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rows (m, n) that hold what is searched of scales and form errors; their targets (m,)."""
-        space = self.model.space
-        held = space.uncertain.copy()
-        held[self.plate.parameters.numbers] = False
+        space, held = self.plate.model.space, self.searched.copy()
+        held[self.plate.numbers] = False
         held[space.groups["sensor_scale"]] = ~self.free_scales
         rows, targets = np.eye(space.size)[held], np.zeros(held.sum())
         if self.free_scales.all():
@@ -125,6 +119,15 @@ class Problem:
             mean[0, own] = _HOLD * space.std[own] / len(self.free_scales)
             rows, targets = np.vstack([rows, mean]), np.append(targets, mean @ start)
         return rows[:, self.searched], targets
+
+
+def _of_sensors(space: Space, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask (p,) of the parameters that remain of a space with some of the sensors (s,)."""
+    own = np.ones(space.size, dtype=bool)
+    for kind in ("sensor_gain", "sensor_phase", "sensor_scale"):
+        own[space.groups[kind]] = kept
+    own[space.groups["sensor_place"]] = np.repeat(kept, 2)
+    return own
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,18 +152,13 @@ class Fit:
 
     def at(self, kept: NDArray[np.bool_], space: Space) -> "Fit":
         """Select some of the sensors (s,) of a space as the start of another fit."""
-        own = np.ones(space.size, dtype=bool)
-        for kind in ("sensor_gain", "sensor_phase", "sensor_scale"):
-            own[space.groups[kind]] = kept
-        own[space.groups["sensor_place"]] = np.repeat(kept, 2)
-        return replace(self, z=self.z[own], used=self.used[:, :, kept])
+        return replace(self, z=self.z[_of_sensors(space, kept)], used=self.used[:, :, kept])
 
 
-def first_fit(problem: Problem, x: FloatArray) -> Fit:
-    """Fit from starting values x (n,), all scales free and no form errors, despite outliers."""
+def first_fit(problem: Problem, z: FloatArray) -> Fit:
+    """Fit from starting values z (p,), all scales free and no form errors, despite outliers."""
     free = np.ones(len(problem.free_scales), dtype=bool)
-    problem = replace(problem, has_form=False, free_scales=free)
-    z = problem.plate.parameters.full(x)
+    problem = replace(problem.without_form, free_scales=free)
     used = np.isfinite(problem.values)
     # Without residuals to judge by, peaks of a row are clipped at first.
     clipped = replace(problem, values=_without_peaks(problem.values, used))
@@ -201,23 +199,15 @@ def _search(
     problem: Problem, start: FloatArray, weight: FloatArray, *, robust: float | None = None
 ) -> tuple[FloatArray, Found]:
     """Parameters (p,), and what the search of some of them ended with."""
-    searched, inside, space = problem.searched, weight > 0, problem.model.space
-
-    def full(y: FloatArray) -> FloatArray:
-        whole = start.copy()
-        whole[searched] = y
-        return whole
-
-    def linearised(y: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        model, by_z = problem.responses(full(y))
-        _, left = project_gains(model, problem.values, weight)
-        _, slopes = projection_slopes(model, by_z, problem.values, weight)
-        return left[inside], slopes[:, inside].T
-
-    bounds = np.array([space.lower, space.upper])[:, searched]
-    prior = problem.tolerances(start)
-    found = search(linearised, start[searched], bounds, prior=prior, robust=robust)
-    return full(found.y), found
+    return fit_with_gains(
+        problem.plate.model,
+        problem.values,
+        weight,
+        start,
+        problem.searched,
+        prior=problem.tolerances(start),
+        robust=robust,
+    )
 
 
 def _deviation(problem: Problem, z: FloatArray, weight: FloatArray) -> FloatArray:

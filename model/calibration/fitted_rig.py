@@ -32,7 +32,7 @@ _FOREIGN_MASS = KINDS["foreign_mass"].std * math.sqrt(math.prod(MASS_CELLS))  # 
 
 def rig_of_fit(problem: Problem, fit: Fit) -> Rig:
     """Rig with fitted values, and ERAs at the places where they clearly are; gains unchanged."""
-    rig = problem.plate.parameters.rig_at(problem.x(fit.z))
+    rig = problem.plate.rig_at(fit.z)
     moves = {moved.name: moved.after for moved in moved_eras(problem, fit)}
     eras = tuple(
         replace(era, x=moves[era.name][0], y=moves[era.name][1]) if era.name in moves else era
@@ -43,7 +43,7 @@ def rig_of_fit(problem: Problem, fit: Fit) -> Rig:
 
 def moved_eras(problem: Problem, fit: Fit) -> tuple[MovedEra, ...]:
     """List the ERAs that are off their places by several standard errors."""
-    rig, space, found = problem.plate.parameters.rig, problem.model.space, []
+    rig, space, found = problem.plate.rig, problem.plate.model.space, []
     sides = np.array([rig.plate.length, rig.plate.width])
     places, errors = (space.values(x, "place").reshape(-1, 2) for x in (fit.z, fit.error))
     for era, place, error in zip(rig.eras, places, errors, strict=True):
@@ -65,7 +65,7 @@ def predicted_by(
     rig: Rig, problem: Problem, points: FloatArray, fit: Fit
 ) -> tuple[ComplexArray, ComplexArray]:
     """Responses (f, e, s) of a rig at points (s, 2) [m], and its gains (f, e) that fit best."""
-    model = sensed_plate(rig, points, problem.frequencies).responses()
+    model = sensed_plate(rig, points, problem.plate.model.frequencies).responses()
     weight = fit.used / fit.noise[:, :, None]
     gains, _ = project_gains(model * problem.scales(fit.z), problem.values, weight)
     return model, gains
@@ -110,8 +110,7 @@ def uncertainty_of(
     express, and at least the median error at held-out sensors, which is that of the field. What is
     not identified keeps the value of the rig before.
     """
-    rows = problem.plate.parameters
-    errors = rows.slopes(problem.x(fit.z)) * problem.x(fit.error)
+    errors, era_count = problem.plate.errors(fit.z, fit.error), len(problem.plate.rig.eras)
     relative = {
         kind: [
             math.hypot(
@@ -125,8 +124,8 @@ def uncertainty_of(
     whole = {
         "modulus": 1,
         "loss_factor": 1,
-        "stiffness": len(rows.rig.eras),
-        "damping": len(rows.rig.eras),
+        "stiffness": era_count,
+        "damping": era_count,
     }
     known = {kind: len(values) == whole[kind] for kind, values in relative.items()}
 

@@ -29,7 +29,7 @@ def hold_out(
     unseen = np.zeros(count, dtype=bool)
     unseen[candidates[evenly_spaced]] = True
     part = problem.at(~unseen)
-    seen = solve(part, fit.at(~unseen, problem.model.space))
+    seen = solve(part, fit.at(~unseen, problem.plate.model.space))
     rig, scales = rig_of_fit(part, seen), problem.scales(fit.z)
     responses, gains = predicted_by(rig, problem, points, replace(fit, used=fit.used & ~unseen))
     predicted = gains[:, :, None] * responses * scales
@@ -47,9 +47,9 @@ def hold_out(
 
 def initial_responses(problem: Problem) -> ComplexArray:
     """Responses (f, e, s) of the rig before the fit, with its gains."""
-    rig = problem.plate.parameters.rig
-    gains = np.column_stack([era.gain(problem.frequencies) for era in rig.eras])
-    return np.asarray(gains[:, :, None] * problem.plate.responses())
+    plate = problem.plate
+    gains = np.column_stack([era.gain(plate.model.frequencies) for era in plate.rig.eras])
+    return np.asarray(gains[:, :, None] * plate.responses())
 
 
 def relative_error(

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.identification.derivatives import jacobian
 from model.identification.form_errors import reduced_modes
-from model.identification.forward import ForwardModel, PlateAt, Sensor
+from model.identification.forward import ForwardModel, Sensor
 from model.identification.identified_rig import rig_with
 from model.identification.parameters import FORM, KINDS, Space, space_of
 from model.identification.values import Values
@@ -31,6 +30,7 @@ _LOSS_STD, _MIN_LOSS_STD = 0.7, 0.003  # of itself, and at least
 _DAMPING_STD, _MIN_DAMPING_RATIO_STD = 0.7, 0.015
 _BOLT_STD = 0.05  # of the plate's mass that an ERA carries
 _MODE_SHIFT = 0.003  # of an eigenvalue: theory and mesh
+_GAIN_STD, _MAX_GAIN = 1.0, 8.0  # of the logarithm of a channel's gain
 _LOWEST, _HIGHEST = 0.1, 1.2  # of modes that shift: of the lowest frequency, of the highest tone
 _UNITS = {
     "modulus": "Pa",
@@ -79,114 +79,90 @@ class Parameter:
 
 
 @dataclass(frozen=True, eq=False)
-class Parameters:
-    """The n parameters of a rig: modulus and loss factor, then those of every ERA.
+class SensedPlate:
+    """A rig's plate with sensors at points, without the rig's gains, and what is fitted of the rig.
 
-    space: of the forward model, in which all others are known; x (n,): in prior standard
-    deviations from the rig's values.
+    model: its space has the n fitted values, and form errors if there are any; all else is known.
+    Parameters z (p,) are those of the space, in standard deviations from the rig's values.
     """
 
     rig: Rig
-    space: Space
-    rows: tuple[Parameter, ...]
+    model: ForwardModel
 
-    @classmethod
-    def of(
-        cls, rig: Rig, sensors: tuple[str, ...] = (), *, form_modes: int | None = None
-    ) -> "Parameters":
-        """Those of a rig with sensors by name; form_modes: that may shift, beside form errors."""
-        rows = [Parameter("modulus", ""), Parameter("loss_factor", "")]
-        for era in rig.eras:
-            rows += [Parameter(kind, era.name) for kind in ("stiffness", "damping", "bolt_mass")]
-        return cls(rig, _space(rig, sensors, form_modes), tuple(rows))
+    @cached_property
+    def rows(self) -> tuple[Parameter, ...]:
+        """The fitted values: modulus and loss factor, then those of every ERA, (n,)."""
+        of_eras = (
+            Parameter(kind, era.name)
+            for era in self.rig.eras
+            for kind in ("stiffness", "damping", "bolt_mass")
+        )
+        return (Parameter("modulus", ""), Parameter("loss_factor", ""), *of_eras)
 
     @cached_property
     def numbers(self) -> IntArray:
-        """Where each is in the space, (n,)."""
-        names = [era.name for era in self.rig.eras]
-        found = []
-        for row in self.rows:
-            group = self.space.groups[_KINDS.get(row.kind, row.kind)]
-            found.append(group.start + (names.index(row.era) if row.era else 0))
-        return np.array(found)
-
-    @property
-    def bounds(self) -> FloatArray:
-        """Lower and upper bounds of x, (2, n)."""
-        return np.array([self.space.lower, self.space.upper])[:, self.numbers]
-
-    def full(self, x: FloatArray) -> FloatArray:
-        """All parameters of the space."""
-        found = np.zeros(self.space.size)
-        found[self.numbers] = x
-        return found
-
-    def rig_at(self, x: FloatArray) -> Rig:
-        """The rig with the values of x (n,)."""
-        values = Values.of(self.rig, self.space, self.full(x))
-        return rig_with(self.rig, values, self.rig.uncertainty)
-
-    def values(self, x: FloatArray) -> FloatArray:
-        """Values at x (n,) in their units."""
-        rig = self.rig_at(x)
-        return np.array([row.of(rig) for row in self.rows])
-
-    def slopes(self, x: FloatArray) -> FloatArray:
-        """Derivatives of the values by x (n,)."""
-        is_factor = np.array([row.is_factor for row in self.rows])
-        return self.space.std[self.numbers] * np.where(is_factor, self.values(x), 1.0)
-
-    def moved(self, modulus: float, stiffness: float) -> FloatArray:
-        """Values x (n,) of a modulus and stiffnesses by logarithms of factors on the rig's."""
-        logarithms = {"modulus": modulus, "stiffness": stiffness}
-        found = np.array([logarithms.get(row.kind, 0.0) for row in self.rows])
-        return np.asarray(found / self.space.std[self.numbers])
-
-
-@dataclass(frozen=True, eq=False)
-class SensedPlate:
-    """A rig's plate with sensors at points, without the rig's gains."""
-
-    parameters: Parameters
-    model: ForwardModel
+        """Where each fitted value is in the space, (n,)."""
+        names, groups = [era.name for era in self.rig.eras], self.model.space.groups
+        return np.array(
+            [
+                groups[_KINDS.get(row.kind, row.kind)].start
+                + (names.index(row.era) if row.era else 0)
+                for row in self.rows
+            ]
+        )
 
     def at_some(self, kept: NDArray[np.bool_]) -> "SensedPlate":
         """Select some of the sensors (s,)."""
         sensors = list(compress(self.model.sensors, kept))
-        model = replace(self.model, sensors=sensors, last_places={})
-        return replace(self, model=model).of(self.parameters.rig)
+        return SensedPlate(self.rig, replace(self.model, sensors=sensors, last_places={})).of(
+            self.rig
+        )
 
     def of(self, rig: Rig) -> "SensedPlate":
         """The same of a rig with other values of its plate's modulus, thickness and loss factor.
 
         And of its ERAs and masses.
         """
-        names = tuple(sensor.name for sensor in self.model.sensors)
         shifting = None
         if self.model.form is not None:
             natural = np.sqrt(np.maximum(self.model.modes.eigenvalues, 0)) / (2 * np.pi)
             highest = _HIGHEST * self.model.frequencies.max()
             lowest = _LOWEST * rig.plate.lowest_bending_frequency
             shifting = int(((natural > lowest) & (natural < highest)).sum())
-        parameters = Parameters.of(rig, names, form_modes=shifting)
+        space = _space(rig, tuple(sensor.name for sensor in self.model.sensors), shifting)
         eras = tuple(replace(era, gains=()) for era in rig.eras)
-        model = replace(self.model, rig=replace(rig, eras=eras), space=parameters.space)
-        return SensedPlate(parameters, model)
+        return SensedPlate(rig, replace(self.model, rig=replace(rig, eras=eras), space=space))
 
-    def at(self, x: FloatArray) -> PlateAt:
-        """The plate for parameters x (n,)."""
-        return self.model.at(self.parameters.full(x))
+    def responses(self, z: FloatArray | None = None) -> ComplexArray:
+        """Acceleration per base displacement [1/s²] of each ERA, (f, e, s); of z, else the rig."""
+        z = np.zeros(self.model.space.size) if z is None else z
+        return np.swapaxes(self.model.at(z).responses, 1, 2)
 
-    def responses(self, x: FloatArray | None = None) -> ComplexArray:
-        """Acceleration per base displacement [1/s²] of each ERA, (f, e, s); of x, else the rig."""
-        x = np.zeros(len(self.parameters.rows)) if x is None else x
-        return np.swapaxes(self.at(x).responses, 1, 2)
+    def rig_at(self, z: FloatArray) -> Rig:
+        """The rig with the fitted values of z."""
+        own = np.zeros(len(z))
+        own[self.numbers] = z[self.numbers]
+        values = Values.of(self.rig, self.model.space, own)
+        return rig_with(self.rig, values, self.rig.uncertainty)
 
-    def slopes(self, x: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """Responses (f, e, s), and derivatives by x (n, f, e, s)."""
-        plate = self.at(x)
-        by_x = np.moveaxis(jacobian(plate)[..., self.parameters.numbers], 3, 0)
-        return np.swapaxes(plate.responses, 1, 2), np.swapaxes(by_x, 2, 3)
+    def values(self, z: FloatArray) -> FloatArray:
+        """The fitted values at z in their units (n,)."""
+        rig = self.rig_at(z)
+        return np.array([row.of(rig) for row in self.rows])
+
+    def errors(self, z: FloatArray, error: FloatArray) -> FloatArray:
+        """Standard errors of the fitted values at z in their units (n,), by those of z (p,)."""
+        is_factor = np.array([row.is_factor for row in self.rows])
+        slopes = self.model.space.std[self.numbers] * np.where(is_factor, self.values(z), 1.0)
+        return np.asarray(slopes * error[self.numbers])
+
+    def moved(self, modulus: float, stiffness: float) -> FloatArray:
+        """Parameters z of a modulus and stiffnesses by logarithms of factors on the rig's."""
+        space = self.model.space
+        found = np.zeros(space.size)
+        for kind, logarithm in (("modulus", modulus), ("stiffness", stiffness)):
+            found[space.groups[kind]] = logarithm / space.std[space.groups[kind]]
+        return found
 
 
 def sensed_plate(
@@ -201,9 +177,8 @@ def sensed_plate(
     sensors = [Sensor(f"sensor {n}", x=x, y=y) for n, (x, y) in enumerate(points.tolist())]
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(max(frequencies.max(), 200.0)))
     form = reduced_modes(rig, free) if has_form else None
-    parameters = Parameters.of(rig)
-    model = ForwardModel(rig, sensors, frequencies, parameters.space, free, form=form)
-    return SensedPlate(parameters, model).of(rig)
+    space = _space(rig, (), None)
+    return SensedPlate(rig, ForwardModel(rig, sensors, frequencies, space, free, form=form)).of(rig)
 
 
 def _space(rig: Rig, sensors: tuple[str, ...], form_modes: int | None) -> Space:
@@ -235,13 +210,10 @@ def _space(rig: Rig, sensors: tuple[str, ...], form_modes: int | None) -> Space:
             np.maximum(2 * unit - damping, damping),
         ),
         "bolt_mass": (_BOLT_STD * share, -bolt, np.maximum(5 * share - bolt, bolt)),
+        "gain": (_GAIN_STD, -_MAX_GAIN, _MAX_GAIN),
     }
     if form_modes is not None:
         # Places may leave the plate, whose shapes go on by their slopes.
         kinds |= {kind: (KINDS[kind].std, -np.inf, np.inf) for kind in (*FORM, "place")}
         kinds["mode_shifts"] = (_MODE_SHIFT, -np.inf, np.inf)
-    columns = np.repeat([[0.0], [-np.inf], [np.inf]], space.size, axis=1)
-    for kind, (std, lower, upper) in kinds.items():
-        part = space.groups[kind]
-        columns[0, part], columns[1, part], columns[2, part] = std, lower / std, upper / std
-    return replace(space, std=columns[0], lower=columns[1], upper=columns[2])
+    return space.knowing_all_but(kinds)

@@ -7,10 +7,71 @@ follow from any model, so that only its parameters are searched, with the deriva
 residual by these (Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
+from model.identification.derivatives import jacobian
+from model.identification.forward import ForwardModel
+from model.identification.least_squares import Found, search
+
+
+def fit_with_gains(
+    model: ForwardModel,
+    values: ComplexArray,
+    weight: FloatArray,
+    start: FloatArray,
+    searched: NDArray[np.bool_],
+    *,
+    prior: tuple[FloatArray, FloatArray] | None = None,
+    robust: float | None = None,
+    drives: Sequence[int] | None = None,
+    tolerance: float | None = None,
+) -> tuple[FloatArray, Found]:
+    """Fit some parameters (p,) of a model to values (f, e, s), every gain g beside them.
+
+    weight (f, e, s): zero where nothing was measured; start (p,), of which searched are changed;
+    prior, robust: see `search`; drives (e,): number of the ERA that each channel drives, its own by
+    default; tolerance: relative standard deviation of |g| from 1, none by default. Returns
+    parameters (p,), and what the search of some of them ended with.
+    """
+    inside = weight > 0
+    rows, of_eras = inside.any(axis=2), slice(None) if drives is None else list(drives)
+
+    def full(y: FloatArray) -> FloatArray:
+        whole = start.copy()
+        whole[searched] = y
+        return whole
+
+    def linearised(y: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        found, by_y = responses_of(model, full(y), searched)
+        found, by_y = found[:, of_eras], by_y[:, :, of_eras]
+        gains, left = project_gains(found, values, weight, tolerance=tolerance)
+        by_gain, slopes = projection_slopes(found, by_y, values, weight, tolerance=tolerance)
+        if tolerance is None:
+            return left[inside], slopes[:, inside].T
+        size = np.abs(gains)
+        wander = ((size - 1) / tolerance)[rows]
+        by_wander = ((gains.conj() * by_gain).real / size / tolerance)[:, rows]
+        return (
+            np.concatenate([left[inside], wander]),
+            np.hstack([slopes[:, inside], by_wander]).T,
+        )
+
+    bounds = np.array([model.space.lower, model.space.upper])[:, searched]
+    found = search(linearised, start[searched], bounds, prior=prior, robust=robust)
+    return full(found.y), found
+
+
+def responses_of(
+    model: ForwardModel, z: FloatArray, searched: NDArray[np.bool_]
+) -> tuple[ComplexArray, ComplexArray]:
+    """Responses (f, e, s) as sensors read them, and derivatives (n, f, e, s) by n searched."""
+    plate = model.at(z)
+    by_z = jacobian(plate, searched)[..., searched].transpose(3, 0, 2, 1)
+    return np.swapaxes(plate.responses, 1, 2), by_z
 
 
 def project_gains(
@@ -18,24 +79,21 @@ def project_gains(
     values: ComplexArray,
     weight: FloatArray,
     *,
-    expected: FloatArray | None = None,
-    tolerance: float = 0.0,
+    tolerance: float | None = None,
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return gains (f, e) that minimize sum |weight (values - gain model)|², and that residual.
 
-    model, values, weight (f, e, s), weight zero where nothing was measured. expected (e,):
-    magnitudes known beforehand to a relative standard deviation `tolerance`; they add
-    ((|gain| - expected) / (tolerance expected))² to each row. Without them the gain of a row
-    without values is NaN.
+    model, values, weight (f, e, s), weight zero where nothing was measured; the gain of a row
+    without values is NaN. tolerance: relative standard deviation of |gain| from 1, which adds
+    ((|gain| - 1) / tolerance)² to each row.
     """
     values = np.where(weight > 0, values, 0)
     inner, power = _inner_and_power(model, values, weight)
-    if expected is None:
+    if tolerance is None:
         gains = np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)
     else:
-        precision = 1 / (tolerance * expected) ** 2
-        size = np.abs(inner)
-        magnitude = (size + precision * expected) / (power + precision)
+        size, precision = np.abs(inner), tolerance**-2
+        magnitude = (size + precision) / (power + precision)
         gains = magnitude * np.where(size > 0, inner / np.where(size > 0, size, 1), 1)
     residual = weight * (values - np.nan_to_num(gains)[..., None] * model)
     return gains, residual
@@ -47,32 +105,24 @@ def projection_slopes(
     values: ComplexArray,
     weight: FloatArray,
     *,
-    expected: FloatArray | None = None,
-    expected_slopes: FloatArray | None = None,
-    tolerance: float = 0.0,
+    tolerance: float | None = None,
 ) -> tuple[ComplexArray, ComplexArray]:
     """Derivatives (n, f, e) of the gains of `project_gains`, and (n, f, e, s) of the residual.
 
-    slopes (n, f, e, s), expected_slopes (n, e): derivatives of model and expected.
+    slopes (n, f, e, s): derivatives of the model.
     """
     values = np.where(weight > 0, values, 0)
     inner, power = _inner_and_power(model, values, weight)
-    gains, _ = project_gains(model, values, weight, expected=expected, tolerance=tolerance)
-    gains = np.nan_to_num(gains)
+    gains = np.nan_to_num(project_gains(model, values, weight, tolerance=tolerance)[0])
     by_inner = np.einsum("nfes,fes->nfe", slopes.conj(), weight**2 * values)
     by_power = 2 * np.einsum("nfes,fes->nfe", slopes, weight**2 * model.conj()).real
-    if expected is None or expected_slopes is None:
+    if tolerance is None:
         by_gain = (by_inner - gains * by_power) / np.where(power > 0, power, 1)
     else:
-        precision = 1 / (tolerance * expected) ** 2
-        by_expected = expected_slopes[:, None]
         size = np.where(np.abs(inner) > 0, np.abs(inner), 1)
         phase_factor = np.where(np.abs(inner) > 0, inner / size, 1)
         turned = phase_factor.conj() * by_inner
-        by_precision = -2 * precision / expected * by_expected
-        by_magnitude = turned.real - precision * by_expected
-        by_magnitude -= np.abs(gains) * (by_power + by_precision)
-        by_magnitude /= power + precision
+        by_magnitude = (turned.real - np.abs(gains) * by_power) / (power + tolerance**-2)
         by_gain = phase_factor * (by_magnitude + 1j * np.abs(gains) / size * turned.imag)
     return by_gain, -weight * (by_gain[..., None] * model + gains[..., None] * slopes)
 

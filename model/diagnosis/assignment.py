@@ -59,7 +59,7 @@ def match_shapes(plate: SensedPlate, values: ComplexArray) -> ShapeMatch:
     """Compare values (f, e, s) with a rig's ERAs on plates of other modulus and stiffnesses."""
     best: tuple[float, ShapeMatch] | None = None
     for start in [(0.0, 0.0), *STARTS]:
-        mac = _mac(values, plate.responses(plate.parameters.moved(*start)))
+        mac = _mac(values, plate.responses(plate.moved(*start)))
         found = ShapeMatch(mac, start)
         score = float(
             sum(_typical(mac[:, i, j]) for i, j in enumerate(found.nearest) if _driven(mac, i))

@@ -22,6 +22,7 @@ from model.diagnosis.plate_match import Match, match_plate
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.spectral.mesh import stretched
+from model.structure.attachments import Era
 
 _SIZES = (0.6, 0.67, 0.75, 0.82, 0.88, 0.94, 1.06, 1.13, 1.21, 1.33, 1.5, 1.67)
 _STIFFNESSES = (0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
@@ -35,17 +36,58 @@ _CORRELATION = 4.0  # errors of a model are correlated over sensors and frequenc
 
 @dataclass(frozen=True)
 class Cause:
-    """A parameter of the rig that may differ: its value [unit], and the rig with it scaled.
+    """A value of the rig that may differ: of the plate, or of one ERA or all, "" for all.
 
-    is_geometry: whether the plate must be solved again.
+    factors: by which it is tried; of bolts shares of the plate's mass, which are added.
     """
 
     key: str
     unit: str
-    value: Callable[[Rig], float]
-    scaled: Callable[[Rig, float], Rig]
+    what: str
     factors: tuple[float, ...]
-    is_geometry: bool = False
+    era: str = ""
+
+    @property
+    def is_geometry(self) -> bool:
+        """Whether the plate must be solved again."""
+        return self.what in ("length", "width")
+
+    def value(self, rig: Rig) -> float:
+        """The value in a rig [unit], of all ERAs their mean."""
+        if self.what == "modulus":
+            return rig.plate.material.E
+        if self.key.startswith("plate."):
+            return float(getattr(rig.plate, self.what))
+        return float(np.mean([getattr(era, self.what) for era in rig.eras if self._is_of(era)]))
+
+    def scaled(self, rig: Rig, factor: float) -> Rig:
+        """The rig with another value; raises InputError for one that it cannot have."""
+        plate, what = rig.plate, self.what
+        if what in ("thickness", "modulus"):
+            return replace(rig, plate=plate.scaled(**{what: factor}))
+        if what == "loss_factor":
+            return replace(
+                rig, plate=replace(plate, loss_factor=min(plate.loss_factor * factor, 0.9))
+            )
+        if self.is_geometry:
+            return _stretched(rig, *((factor, 1.0) if what == "length" else (1.0, factor)))
+        return replace(
+            rig,
+            eras=tuple(
+                self._changed(era, factor, plate.mass) if self._is_of(era) else era
+                for era in rig.eras
+            ),
+        )
+
+    def _is_of(self, era: Era) -> bool:
+        return self.era in ("", era.name)
+
+    def _changed(self, era: Era, factor: float, plate_mass: float) -> Era:
+        if self.what == "bolt_mass":
+            return replace(era, bolt_mass=era.bolt_mass + factor * plate_mass)
+        # One that is loose damps less, too.
+        damping = era.damping * min(factor, 1.0) if self.era else era.damping
+        return replace(era, stiffness=era.stiffness * factor, damping=damping)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,28 +105,17 @@ def causes_of(rig: Rig) -> list[Cause]:
     """Causes that are tried."""
     moduli = tuple(size**2 for size in _SIZES)
     return [
-        Cause("plate.thickness", "m", lambda r: r.plate.thickness, _thickness, _SIZES),
-        Cause(
-            "plate.length",
-            "m",
-            lambda r: r.plate.length,
-            lambda r, factor: _stretched(r, factor, 1.0),
-            _SIZES,
-            is_geometry=True,
+        Cause("plate.thickness", "m", "thickness", _SIZES),
+        Cause("plate.length", "m", "length", _SIZES),
+        Cause("plate.width", "m", "width", _SIZES),
+        Cause("plate.material.E", "Pa", "modulus", moduli),
+        Cause("plate.loss_factor", "", "loss_factor", _LOSSES),
+        Cause("eras.stiffness", "N/m", "stiffness", _STIFFNESSES),
+        Cause("eras.bolt_mass", "kg", "bolt_mass", _MASSES),
+        *(
+            Cause(f"eras.{era.name}.stiffness", "N/m", "stiffness", _STIFFNESSES, era.name)
+            for era in rig.eras
         ),
-        Cause(
-            "plate.width",
-            "m",
-            lambda r: r.plate.width,
-            lambda r, factor: _stretched(r, 1.0, factor),
-            _SIZES,
-            is_geometry=True,
-        ),
-        Cause("plate.material.E", "Pa", lambda r: r.plate.material.E, _modulus, moduli),
-        Cause("plate.loss_factor", "", lambda r: r.plate.loss_factor, _loss, _LOSSES),
-        Cause("eras.stiffness", "N/m", _mean_stiffness, _stiffnesses, _STIFFNESSES),
-        Cause("eras.bolt_mass", "kg", _mean_bolt, _bolts, _MASSES),
-        *(_loose_era(era.name, number) for number, era in enumerate(rig.eras)),
     ]
 
 
@@ -99,7 +130,7 @@ def explain(
 ) -> list[Explanation]:
     """Find what explains values (f, e, s) best, most likely first; see `match_plate`."""
 
-    rig = plate.parameters.rig
+    rig = plate.rig
 
     def solved(cause: Cause, factor: float) -> SensedPlate | None:
         try:
@@ -192,10 +223,6 @@ def _misfit(values: ComplexArray, model: ComplexArray) -> float:
     return float(np.nanmean(1 - mac) + 0.5 * np.nanmean(deviation))
 
 
-def _thickness(rig: Rig, factor: float) -> Rig:
-    return replace(rig, plate=rig.plate.scaled(thickness=factor))
-
-
 def _stretched(rig: Rig, along_x: float, along_y: float) -> Rig:
     """Plate of another size with everything attached in proportion."""
     plate = replace(rig.plate, length=rig.plate.length * along_x, width=rig.plate.width * along_y)
@@ -203,49 +230,3 @@ def _stretched(rig: Rig, along_x: float, along_y: float) -> Rig:
     masses = tuple(replace(mass, x=mass.x * along_x, y=mass.y * along_y) for mass in rig.masses)
     mesh = stretched(rig.mesh, plate)
     return replace(rig, plate=plate, eras=eras, masses=masses, mesh=mesh)
-
-
-def _modulus(rig: Rig, factor: float) -> Rig:
-    return replace(rig, plate=rig.plate.scaled(modulus=factor))
-
-
-def _loss(rig: Rig, factor: float) -> Rig:
-    loss = min(rig.plate.loss_factor * factor, 0.9)
-    return replace(rig, plate=replace(rig.plate, loss_factor=loss))
-
-
-def _stiffnesses(rig: Rig, factor: float) -> Rig:
-    return replace(
-        rig, eras=tuple(replace(era, stiffness=era.stiffness * factor) for era in rig.eras)
-    )
-
-
-def _loose_era(name: str, number: int) -> Cause:
-    """Stiffness of one ERA; a loose one damps less, too."""
-
-    def scaled(rig: Rig, factor: float) -> Rig:
-        eras = list(rig.eras)
-        era = eras[number]
-        eras[number] = replace(
-            era, stiffness=era.stiffness * factor, damping=era.damping * min(factor, 1.0)
-        )
-        return replace(rig, eras=tuple(eras))
-
-    return Cause(
-        f"eras.{name}.stiffness", "N/m", lambda r: r.eras[number].stiffness, scaled, _STIFFNESSES
-    )
-
-
-def _bolts(rig: Rig, factor: float) -> Rig:
-    more = factor * rig.plate.mass
-    return replace(
-        rig, eras=tuple(replace(era, bolt_mass=era.bolt_mass + more) for era in rig.eras)
-    )
-
-
-def _mean_stiffness(rig: Rig) -> float:
-    return float(np.mean([era.stiffness for era in rig.eras]))
-
-
-def _mean_bolt(rig: Rig) -> float:
-    return float(np.mean([era.bolt_mass for era in rig.eras]))

@@ -96,8 +96,7 @@ def check_consistency(rig: Rig, responses: Responses) -> Verdict:
 
 def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, observation: Responses) -> None:
     """Raise InputError where gains of all channels are those of another quantity or unit."""
-    x = plate.parameters.moved(*shapes.start)
-    model = plate.responses(x)[:, list(shapes.nearest)]
+    model = plate.responses(plate.moved(*shapes.start))[:, list(shapes.nearest)]
     weight = np.isfinite(observation.values) / row_rms(observation.values)[:, :, None]
     gains, _ = project_gains(model, observation.values, weight)
     size = np.log(row_rms(observation.values) / row_rms(model))

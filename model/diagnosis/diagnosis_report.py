@@ -86,7 +86,7 @@ def _plate_rows(verdict: Verdict) -> list[str]:
         why = f"{percent(match.error)} unexplained at best"
     else:
         at = best_of(abs(match.z))
-        parameter = match.parameters.rows[at].name
+        parameter = match.plate.rows[at].name
         why = f"{parameter} would be off by {abs(match.z[at]):.1f} standard deviations"
     rows = [f"PLATE: the rig does not match the plate: {why}"]
     good = [each for each in verdict.explanations if explains(each) and each.share >= _MIN_SHARE]
@@ -166,11 +166,11 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
                 {
                     "parameter": parameter.name,
                     "unit": parameter.unit,
-                    "expected": parameter.of(match.parameters.rig),
+                    "expected": parameter.of(match.plate.rig),
                     "found": parameter.of(match.rig),
                     "standard_deviations": float(z),
                 }
-                for parameter, z in zip(match.parameters.rows, match.z, strict=True)
+                for parameter, z in zip(match.plate.rows, match.z, strict=True)
             ],
             "explanations": [
                 {

@@ -39,7 +39,7 @@ def plate_difference(rig: Rig, rig_responses: ComplexArray, match: Match) -> Pla
     for kind in kinds:
         found = [
             row.of(match.rig) / row.of(rig) - 1
-            for row in match.parameters.rows
+            for row in match.plate.rows
             if row.kind == kind and row.of(rig)
         ]
         if found:

@@ -16,13 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.sensed_plate import Parameters, SensedPlate
-from model.calibration.variable_projection import project_gains, projection_slopes, row_rms
+from model.calibration.sensed_plate import SensedPlate
+from model.calibration.variable_projection import fit_with_gains, project_gains, row_rms
 from model.choice import best_by
-from model.identification.least_squares import search
 from model.rig.rig import Rig
 
-_GAIN_STD = 1.0  # of the logarithm of a channel's gain
 _GAIN_TOLERANCE = 0.08  # standard deviation over frequency, of itself
 MAX_FIT_ERROR = 0.2  # largest relative rms error of an acceptable plate
 MODEL_ERROR = 0.05  # of a row's rms: scales and positions of sensors, and what is not modelled
@@ -33,15 +31,15 @@ _ROBUST = 2.0  # standard deviations
 class Match:
     """The best fit of a plate.
 
-    z (n,): deviation of each parameter from the rig's value in standard deviations of its prior;
-    gains (e,): magnitude of each channel, NaN if not used; cost: half the sum of squares of robust
-    residuals and of z; error, median_error: rms and median of residuals relative to the rms of
-    their row; responses (f, e, s) of the ERAs; predicted (f, e, s): of those that the channels
+    plate: of the rig; z (n,): deviation of each of its fitted values in standard deviations of its
+    prior; gains (e,): magnitude of each channel, NaN if not used; cost: half the sum of squares of
+    robust residuals and of z; error, median_error: rms and median of residuals relative to the rms
+    of their row; responses (f, e, s) of the ERAs; predicted (f, e, s): of those that the channels
     drive, with gains.
     """
 
     rig: Rig
-    parameters: Parameters
+    plate: SensedPlate
     z: FloatArray
     gains: FloatArray
     cost: float
@@ -66,73 +64,48 @@ def match_plate(
 ) -> Match:
     """Fit a rig's plate at sensors to values (f, e, s) of channels.
 
-    drives (e,): index of the ERA that each
-    channel drives; model_error: relative to a row's rms; starts: logarithms of factors on the
-    modulus and on all stiffnesses from which to search.
+    drives (e,): number of the ERA that each channel drives; model_error: relative to a row's rms;
+    starts: logarithms of factors on the modulus and on all stiffnesses from which to search.
     """
-    parameters = plate.parameters
-    rows: NDArray[np.bool_] = np.asarray(np.isfinite(values).any(axis=2))
-    used = np.flatnonzero(rows.any(axis=0))
-    size = row_rms(values)
-    weight = np.isfinite(values) / (model_error * size[:, :, None])
-    count = len(parameters.rows)
-    inside, driven = weight > 0, list(drives)
-
-    def linearised(z: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        model, by_x = plate.slopes(z[:count])
-        model = model[:, driven]
-        slopes = np.zeros((len(z), *model.shape), dtype=complex)
-        slopes[:count] = by_x[:, :, driven]
-        gains, by_gains = np.ones(values.shape[1]), np.zeros((len(z), values.shape[1]))
-        gains[used] = np.exp(_GAIN_STD * z[count:])
-        by_gains[count:, used] = np.diag(_GAIN_STD * gains[used])
-        projected, left = project_gains(
-            model, values, weight, expected=gains, tolerance=_GAIN_TOLERANCE
-        )
-        by_gain, by_left = projection_slopes(
-            model,
-            slopes,
-            values,
-            weight,
-            expected=gains,
-            expected_slopes=by_gains,
-            tolerance=_GAIN_TOLERANCE,
-        )
-        size = np.abs(projected)
-        by_size = (projected.conj() * by_gain).real / size
-        wander = ((size / gains - 1) / _GAIN_TOLERANCE)[rows]
-        by_wander = (by_size - size * by_gains[:, None] / gains) / gains / _GAIN_TOLERANCE
-        return (
-            np.concatenate([left[inside], wander]),
-            np.hstack([by_left[:, inside], by_wander[:, rows]]).T,
-        )
-
-    bounds = np.hstack([parameters.bounds, np.tile([[-8.0], [8.0]], len(used))])
-    found = []
+    model, driven, size = plate.model, np.array(drives), row_rms(values)
+    inside = np.isfinite(values)
+    weight = inside / (model_error * size[:, :, None])
+    rows: NDArray[np.bool_] = np.asarray(inside.any(axis=2))
+    used: NDArray[np.bool_] = np.asarray(rows.any(axis=0))
+    gains_of = np.arange(model.space.size)[model.space.groups["gain"]][driven]
+    searched = model.space.uncertain & ~model.space.of("gain")
+    searched[gains_of[used]] = True
+    tried = []
     for start in starts:
-        moved = parameters.moved(*start)
-        model = plate.responses(moved)[:, driven]
-        ratio = np.log(np.maximum(size / row_rms(np.where(rows[:, :, None], model, np.nan)), 1e-6))
-        levels = [np.median(ratio[rows[:, e], e]) for e in used]
-        found.append(search(linearised, np.concatenate([moved, levels]), bounds, robust=_ROBUST))
-    best = best_by(found, lambda each: -each.cost)
-    z = best.y[:count]
-    gains = np.full(values.shape[1], np.nan)
-    gains[used] = np.exp(_GAIN_STD * best.y[count:])
-    responses = plate.responses(z)
-    model = responses[:, driven]
-    _, residual = project_gains(
-        model, values, weight, expected=np.nan_to_num(gains, nan=1.0), tolerance=_GAIN_TOLERANCE
-    )
+        at = plate.moved(*start)
+        found = row_rms(np.where(rows[:, :, None], plate.responses(at)[:, driven], np.nan))
+        ratio = np.where(rows, np.log(np.maximum(size / found, 1e-6)), np.nan)
+        at[gains_of[used]] = np.nanmedian(ratio[:, used], axis=0)
+        tried.append(
+            fit_with_gains(
+                model,
+                values,
+                weight,
+                at,
+                searched,
+                robust=_ROBUST,
+                drives=drives,
+                tolerance=_GAIN_TOLERANCE,
+            )
+        )
+    z, best = best_by(tried, lambda each: -each[1].cost)
+    predicted = plate.responses(z)[:, driven]
+    _, residual = project_gains(predicted, values, weight, tolerance=_GAIN_TOLERANCE)
     share = (model_error * np.abs(residual))[inside]
+    gains = np.where(used, np.exp(z[gains_of]), np.nan)
     return Match(
-        parameters.rig_at(z),
-        parameters,
-        z,
+        plate.rig_at(z),
+        plate,
+        z[plate.numbers],
         gains,
         best.cost,
         math.sqrt(float((share**2).mean())) if len(share) else math.inf,
         float(np.median(share)) if len(share) else math.inf,
-        responses,
-        np.asarray(model * gains[:, None]),
+        plate.responses(np.where(plate.model.space.of("gain"), 0.0, z)),
+        np.where(used[:, None], predicted, np.nan),
     )

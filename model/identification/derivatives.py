@@ -19,12 +19,16 @@ from model.structure.plate import LOSS_FREQUENCY
 AnyArray: TypeAlias = NDArray[np.floating[Any]] | NDArray[np.complexfloating[Any, Any]]
 
 
-def jacobian(plate: PlateAt) -> ComplexArray:
-    """Derivatives of the responses of a plate by x, (f, s, n, p)."""
+def jacobian(plate: PlateAt, searched: NDArray[np.bool_] | None = None) -> ComplexArray:
+    """Derivatives of the responses of a plate by x, (f, s, n, p).
+
+    searched (p,): those of interest; of kinds without any they may be zero. By default all.
+    """
     space = plate.model.space
     found = np.zeros((*plate.responses.shape, space.size), dtype=complex)
     for group, kinds in _GROUPS.items():
-        if not space.of(*kinds).any():
+        wanted = space.of(*kinds)
+        if not (wanted if searched is None else wanted & searched).any():
             continue
         for kind, columns in group(plate).items():
             found[..., space.groups[kind]] = columns * space.std[space.groups[kind]]

@@ -1,9 +1,10 @@
 """The vector of parameters x, in prior standard deviations, and the values that it stands for."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,6 +91,9 @@ FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson")
 
 _AT_EDGE = 1e-6  # m
 
+Number: TypeAlias = float | FloatArray
+"""Of all parameters of a kind, or of each."""
+
 
 @dataclass(frozen=True, eq=False)
 class Space:
@@ -125,6 +129,18 @@ class Space:
     def without(self, *kinds: str) -> "Space":
         """The same where all of these kinds is known."""
         return replace(self, std=np.where(self.of(*kinds), 0.0, self.std))
+
+    def knowing_all_but(self, kinds: Mapping[str, tuple[Number, Number, Number]]) -> "Space":
+        """The same where only some kinds are uncertain.
+
+        kinds: standard deviation, lower and upper bound of each, in units of `Values`.
+        """
+        columns = np.repeat([[0.0], [-np.inf], [np.inf]], self.size, axis=1)
+        for kind, (std, lower, upper) in kinds.items():
+            columns[:, self.groups[kind]] = np.array(
+                np.broadcast_arrays(std, np.divide(lower, std), np.divide(upper, std))
+            ).reshape(3, -1)
+        return replace(self, std=columns[0], lower=columns[1], upper=columns[2])
 
     @cached_property
     def as_built(self) -> "Space":

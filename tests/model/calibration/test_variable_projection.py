@@ -37,9 +37,8 @@ def fit_a_rig(*, has_form: bool) -> None:
     free_scales = np.ones(len(POINTS), dtype=bool)
     free_scales[1:] = not has_form
     plate = sensed_plate(RIG, POINTS, FREQUENCIES, has_form=True)
-    count = len(plate.parameters.rows)
-    problem = fit.Problem(plate, measured(RIG), np.ones(count, dtype=bool), free_scales)
-    found = fit.first_fit(problem, np.zeros(count))
+    problem = replace(fit.Problem.of(plate, measured(RIG)), free_scales=free_scales)
+    found = fit.first_fit(problem, np.zeros(plate.model.space.size))
     if has_form:
         fit.solve(problem, replace(found, z=problem.at_scales(found.z, np.ones(len(POINTS)))))
 

@@ -30,7 +30,7 @@ from benchmarks.setting import RIG, random_contacts, use_one_thread
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.identification.forward import RestingFinger, Sensor
 from model.identification.identify import identify
-from model.identification.in_service import LivePlate, Report
+from model.identification.in_service import Known, LivePlate, Report
 from model.identification.measurement import Measurement
 from model.identification.settled import SettledPattern
 from model.rig.file import load_rig
@@ -122,7 +122,7 @@ def hour(seed: int, *, is_quiet: bool) -> Hour:
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
     values = hidden.measured(FREQUENCIES, np.random.default_rng([seed, 1]))
     identified = identify(rig, Measurement.of(sensors, FREQUENCIES, values), seed=seed)
-    live, mounted = LivePlate(identified), hidden.mounted
+    live, mounted = LivePlate(Known.of(identified)), hidden.mounted
     loaded = table_of(identified.rig, FREQUENCIES, loaded=True)
     weightless = table_of(identified.rig, FREQUENCIES, loaded=False)
     table, first, rng = loaded, mounted.plate, np.random.default_rng([seed, 2])
@@ -152,12 +152,12 @@ def hour(seed: int, *, is_quiet: bool) -> Hour:
         report = live.take(SettledPattern(60 * minute, frequency, bases, measured, fingers))
         found.take(seed, minute, report)
         if number % _FOLLOWED_EVERY == 0:
-            table = table_following(loaded, live.rig)
+            table = table_following(loaded, live.known.rig)
         if judged and minute >= judged[0] - 1e-6:
             at = judged.pop(0)
             tables = {
                 "frozen": weightless,
-                "live": table_following(weightless, replace(live.rig, fingertip=None)),
+                "live": table_following(weightless, replace(live.known.rig, fingertip=None)),
             }
             for way, contrasts in _judged(tables, mounted, seed).items():
                 found.contrasts[at, way] = contrasts

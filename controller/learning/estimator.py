@@ -62,7 +62,8 @@ class Estimator:
             self._learned = LearnedTable.resumed(start.table, known, file=start.file)
             if self._learned.current is not start.table:
                 age = max(time.time() - start.file.stat().st_mtime, 0.0)
-                self._learned.live.known_since(now() - age)
+                live = self._learned.live
+                live.known = replace(live.known, time=now() - age)
         except InputError as error:
             self.note = f"{error}; {_set_aside(start.file)}"
             self._learned = LearnedTable(start.table, known, file=start.file)
@@ -81,7 +82,6 @@ class Estimator:
             self.only_alarms,
             self._prepared(learned.current, whole=True) if is_resumed else None,
             self._robust(),
-            learned.has_changed,
             learned.change,
         )
 
@@ -92,7 +92,7 @@ class Estimator:
             found = learned.take(pattern)
         except ValueError as error:  # InputError and LinAlgError are such
             note = Note(f"a pattern is not used: {error}")
-            return [note, Estimate(pattern.time, False, False, "", learned.has_changed, None)]
+            return [note, Estimate(pattern.time, False, False, "", learned.change, None)]
         report, table = found.report, found.table
         if table is not None:
             self._is_saved = self._is_refreshed = False
@@ -101,7 +101,7 @@ class Estimator:
             report.alarm,
             report.is_held,
             "" if report.explanation is None else str(report.explanation),
-            learned.has_changed,
+            learned.change,
             None if table is None else self._prepared(table, whole=False),
         )
         return [estimate]

@@ -43,7 +43,6 @@ _CHANGED_REMEDY = (
     "look for a loose mount, a crack or something on the plate; then identify it (era rig identify)"
     ", or discard what was learned (era forget)"
 )
-_CHANGED_BEFORE = "the plate has changed, as found before, and is not yet again as it was"
 _UNUSUAL = (LearningState.CHANGED, LearningState.EXPLAINING, LearningState.FAILED)
 _FAILED_REMEDY = "see the log above; era forget starts anew"
 
@@ -201,13 +200,13 @@ class Learning:
         self._robust, self._is_held = ready.robust, False
         self._only_alarms = ready.only_alarms
         if ready.answers is not None:
-            self._correct(ready.answers, are_robust=ready.has_changed)
+            self._correct(ready.answers, are_robust=bool(ready.change))
         elif self.status.are_robust:
             self._reset()
         if "readings" not in self._tasks:
             self._spawn("readings", self._read(ready.settling))
-        if ready.has_changed:
-            self._say(LearningState.CHANGED, ready.change or _CHANGED_BEFORE, _CHANGED_REMEDY)
+        if ready.change:
+            self._say(LearningState.CHANGED, ready.change, _CHANGED_REMEDY)
         else:
             known = "what was learned before" if ready.answers else "the rig as built"
             self._say_followed(f"the plate is followed from {known} on")
@@ -236,12 +235,11 @@ class Learning:
         if estimate.alarm:
             self._count(alarms=1)
         if estimate.answers is not None:
-            self._correct(estimate.answers, are_robust=estimate.has_changed)
+            self._correct(estimate.answers, are_robust=bool(estimate.change))
             self._estimated(clock.now() - estimate.time)
-        if estimate.has_changed:
+        if estimate.change:
             if estimate.explanation or self.status.state is not LearningState.CHANGED:
-                cause = estimate.explanation or _CHANGED_BEFORE
-                self._say(LearningState.CHANGED, cause, _CHANGED_REMEDY)
+                self._say(LearningState.CHANGED, estimate.change, _CHANGED_REMEDY)
         elif estimate.explanation:
             self._say(LearningState.FOLLOWING, f"the plate has changed: {estimate.explanation}")
         elif estimate.is_held:

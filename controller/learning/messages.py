@@ -53,9 +53,8 @@ class Ready:
 
     settling [s]: until the plate has settled; note: why it starts anew although there is a file, or
     nothing; only_alarms: why it does not correct answers, or nothing; answers: those of the plate
-    as learned before, None for the table as built; robust: for when the plate is not known;
-    has_changed: whether it had changed in a way that nothing known explains; change: how, as found
-    then, or nothing.
+    as learned before, None for the table as built; robust: for when the plate is not known; change:
+    how it had changed in a way that nothing known explains, as found then, or nothing.
     """
 
     settling: float
@@ -63,8 +62,7 @@ class Ready:
     only_alarms: str
     answers: Answers | None
     robust: Answers
-    has_changed: bool
-    change: str = ""
+    change: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,15 +70,16 @@ class Estimate:
     """What a pattern has shown.
 
     time [s]: of the pattern; alarm: whether the plate is not as known; is_held: whether answers
-    wait for an explanation; explanation: what has changed, where that was found now; has_changed:
-    whether the plate has changed in a way that nothing known explains; answers: None for the same.
+    wait for an explanation; explanation: what has changed, where that was found now; change: how
+    the plate has changed in a way that nothing known explains, or nothing; answers: None for the
+    same.
     """
 
     time: float
     alarm: bool
     is_held: bool
     explanation: str
-    has_changed: bool
+    change: str
     answers: Answers | None
 
 

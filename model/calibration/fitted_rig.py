@@ -27,7 +27,7 @@ _HELD, _HALF_WIDTH = 0.9, 1.645  # share that an interval holds, in standard err
 # viscous instead of hysteretic damping changes it by 0.15 %, and what form errors leave unexplained
 # widens resonances by 0.4 % (root mean square over plates without noise).
 _MODEL_ERROR, _LOSS_ERROR = 2e-3, 4e-3
-_FOREIGN_MASS = KINDS["foreign_mass"].std * math.sqrt(math.prod(MASS_CELLS))  # of the plate's
+_FOREIGN_MASS = KINDS["foreign_mass"].std * math.sqrt(MASS_CELLS.cell_count)  # of the plate's
 
 
 def rig_of_fit(problem: Problem, fit: Fit) -> Rig:

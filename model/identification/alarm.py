@@ -16,6 +16,7 @@ from scipy.special import chdtrc
 
 from model.arrays import FloatArray
 from model.choice import best_of
+from model.finger.grid import Grid
 from model.identification.derivatives import by_mass_at
 from model.identification.settled import Touched
 from model.identification.settled_update import State, Updated
@@ -25,7 +26,9 @@ _UNLIKELY_TOGETHER, _UNLIKELY_ALONE, _UNLIKELY_REST = 1e-7, 1e-6, 1e-2
 _ALONG_REST = 8.0  # without the pattern that deviates most
 _ALONG = 22.0  # squared standard deviations, of a hundred directions in some thousand patterns
 _REFERENCE = 0.4  # of nis / count: a change adds more, without one there is less most of the time
-_PLACES = (9, 7)  # along length and width
+PLACES: Final = Grid(9, 7)
+"""Cells in whose middles masses are looked for."""
+
 _KINDS = ("stiffness", "gain", "phase", "thickness")
 
 
@@ -133,11 +136,3 @@ def _squares(slopes: FloatArray, curvatures: FloatArray, masses: int) -> FloatAr
     first = slopes.shape[-1] - masses
     up[..., first:] = np.maximum(up[..., first:], 0.0)
     return np.divide(up**2, curvatures, out=np.zeros_like(up), where=curvatures > 1e-12)
-
-
-def places_on(length: float, width: float) -> FloatArray:
-    """Places (m, 2) [m] all over a plate, at which masses are looked for."""
-    axes = [
-        side * (np.arange(n) + 0.5) / n for side, n in zip((length, width), _PLACES, strict=True)
-    ]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -42,14 +42,12 @@ _LEAST = -6.0  # of logarithms
 class Alteration(ABC):
     """A kind of what may have come; parameters (e,) are x, y in thirds of the sides, then its own.
 
-    own: names of its own parameters, logarithms; reference (e - 2,): those of an alteration
-    as large as the unit of the one that is looked for, which is the number lead of them;
-    is_of_modes: whether truncated modes are left out.
+    own: names of its own parameters, logarithms of parts of its stiffness over usual ones, of which
+    the number lead is looked for; is_of_modes: whether truncated modes are left out.
     """
 
     name: ClassVar[str]
     own: ClassVar[tuple[str, ...]]
-    reference: ClassVar[FloatArray]
     lead: ClassVar[int]
     is_of_modes: ClassVar[bool] = False
 
@@ -63,20 +61,21 @@ class Alteration(ABC):
         """Points (m, 2) [m] about a place [m], and its coordinates by their deflections (c, m)."""
 
     @abstractmethod
-    def stiffness(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
-        """Z (c,) at omega [rad/s] for its own parameters (e - 2,)."""
+    def parts(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
+        """Parts of its dynamic stiffness at omega [rad/s] for its own parameters, (c, e - 2).
 
-    @abstractmethod
-    def slopes(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
-        """Derivatives of Z (c,) by its own parameters, (c, e - 2)."""
-
-    @abstractmethod
-    def start(self, size: float) -> FloatArray:
-        """Its own parameters (e - 2,) for a size in units."""
+        They are its derivatives, too.
+        """
 
     @abstractmethod
     def described(self, theta: FloatArray) -> str:
         """What its own parameters say."""
+
+    def start(self, size: float) -> FloatArray:
+        """Its own parameters (e - 2,) for a size of the leading one, all else as usual."""
+        theta = np.zeros(len(self.own))
+        theta[self.lead] = np.log(max(size, _MIN_SIZE))
+        return theta
 
 
 class Hand(Alteration):
@@ -89,25 +88,16 @@ class Hand(Alteration):
     name = "a hand"
     own = ("mass", "damping", "stiffness")
     lead = 1
-    reference = np.zeros(3)
     units: ClassVar[FloatArray] = np.array([1e-3, 5.0, 1000.0])  # kg, N s/m, N/m
 
     def stencil(self, plate: Plate, place: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The place itself."""
         return place[None], np.ones((1, 1))
 
-    def stiffness(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
-        """k + i omega c - omega² m."""
-        return np.asarray(self.slopes(plate, theta, omega).sum(axis=1))
-
-    def slopes(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
-        """Of logarithms: the parts themselves."""
+    def parts(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
+        """-omega² m, i omega c and k."""
         mass, damping, spring = self.units * np.exp(theta)
         return np.array([[-(omega**2) * mass, 1j * omega * damping, spring]])
-
-    def start(self, size: float) -> FloatArray:
-        """Damping of that size, all else as usual."""
-        return np.array([0.0, np.log(max(size, _MIN_SIZE)), 0.0])
 
     def described(self, theta: FloatArray) -> str:
         """Its damping."""
@@ -120,7 +110,6 @@ class Crack(Alteration):
     name = "a crack"
     own = ("area",)
     lead, is_of_modes = 0, True
-    reference = np.zeros(1)
     unit: ClassVar[float] = 3e-4  # m²
 
     def stencil(self, plate: Plate, place: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -135,24 +124,11 @@ class Crack(Alteration):
         coordinates = [(xx + yy) / np.sqrt(2), (xx - yy) / np.sqrt(2), np.sqrt(2) * xy]
         return middle + h * steps, np.array([each.ravel() for each in coordinates])
 
-    def stiffness(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
-        """Less than none."""
-        return np.asarray(self.slopes(plate, theta, omega)[:, 0])
-
-    def slopes(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
-        """Of each of the three coordinates."""
+    def parts(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
+        """Less than none, of each of the three coordinates."""
         nu = plate.material.nu
-        lost = (
-            self.unit
-            * np.exp(theta[0])
-            * plate.flexural_rigidity
-            * np.array([1 + nu, 1 - nu, 1 - nu])
-        )
-        return np.asarray(-lost[:, None], dtype=complex)
-
-    def start(self, size: float) -> FloatArray:
-        """That area."""
-        return np.array([np.log(max(size, _MIN_SIZE))])
+        lost = self.unit * np.exp(theta) * plate.flexural_rigidity
+        return np.asarray(np.outer([1 + nu, 1 - nu, 1 - nu], -lost), dtype=complex)
 
     def described(self, theta: FloatArray) -> str:
         """The area."""
@@ -219,7 +195,7 @@ class Altered:
             step[axis] = -_STEP if place[axis] > self._sides[axis] / 2 else _STEP
             moved = AlteredPlate(plate, self.alteration, place + step, own).responses @ bases
             by_place.append((moved - values) / step[axis] * self._sides[axis] / 3)
-        by_own = np.einsum("sne,n->se", here.by_own(own), bases)
+        by_own = np.einsum("sne,n->se", here.by_own, bases)
         J = np.einsum("snp,n->sp", jacobian(plate)[0], bases)
         columns = np.column_stack([J[:, :p], *by_place, by_own, J[:, p:]])
         return self.touched.as_numbers(values, columns)
@@ -235,7 +211,7 @@ def scores(
     reach = reach.reshape(len(reach), len(places), -1)
     coordinates = np.array([each for _, each in stencils])
     columns = np.einsum("amk,mck->amc", reach, coordinates)
-    slopes = alteration.slopes(plate.model.rig.plate, alteration.reference, plate.model.omega[0])
+    slopes = alteration.parts(plate.model.rig.plate, alteration.start(1.0), plate.model.omega[0])
     n, observed, bases = plate.base.shape[1], plate.model.observed, touched.pattern.bases
     left, right = columns[observed] * slopes[:, alteration.lead], columns[:n]
     changes = -np.einsum("smc,nmc,sn,n->sm", left, right, plate.scale[0], bases)
@@ -245,32 +221,27 @@ def scores(
 class AlteredPlate:
     """A plate at one frequency that is altered at a place [m], by own parameters of its alteration.
 
-    responses: acceleration at each sensor per base displacement of each ERA (s, n) [1/s²].
+    responses: acceleration at each sensor per base displacement of each ERA (s, n) [1/s²]; by_own:
+    their derivatives by the alteration's own parameters, (s, n, e - 2).
     """
 
     def __init__(
         self, plate: PlateAt, alteration: Alteration, place: FloatArray, own: FloatArray
     ) -> None:
-        self._plate, self._alteration = plate, alteration
         theory = plate.model.rig.plate
         points, coordinates = alteration.stencil(theory, place)
-        Z = alteration.stiffness(theory, own, plate.model.omega[0])
+        parts = alteration.parts(theory, own, plate.model.omega[0])
+        Z = parts.sum(axis=1)
         A = _receptance(plate, alteration, plate.located.footprints, points) @ coordinates.T
         within = coordinates @ _receptance(plate, alteration, points, points) @ coordinates.T
         T = plate.left[0] @ A
         within = within - A.T @ (plate.stiffness[0][:, None] * T)
-        self._columns = T @ coupled_forces(within, Z, np.eye(len(Z), dtype=complex))
-        n, observed = plate.base.shape[1], plate.model.observed
-        change = (self._columns[observed] * Z) @ T[:n].T
+        columns = T @ coupled_forces(within, Z, np.eye(len(Z), dtype=complex))
+        n, seen = plate.base.shape[1], plate.model.observed
+        by_parts = np.einsum("sc,ce,nc->sne", columns[seen], parts, columns[:n])
+        self.by_own: ComplexArray = np.asarray(-plate.scale[0][..., None] * by_parts)
+        change = (columns[seen] * Z) @ T[:n].T
         self.responses: ComplexArray = plate.responses[0] - plate.scale[0] * change
-
-    def by_own(self, own: FloatArray) -> ComplexArray:
-        """Derivatives of the responses by the alteration's own parameters, (s, n, e - 2)."""
-        plate, model = self._plate, self._plate.model
-        slopes = self._alteration.slopes(model.rig.plate, own, model.omega[0])
-        left, right = self._columns[model.observed], self._columns[: plate.base.shape[1]]
-        found = np.einsum("sc,ce,nc->sne", left, slopes, right)
-        return np.asarray(-plate.scale[0][..., None] * found)
 
 
 def _receptance(

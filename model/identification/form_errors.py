@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import FloatArray, lattice
+from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.fem.plate import element_slopes
+from model.finger.grid import Grid
 from model.reduction.free_plate import FreePlate
 from model.reduction.receptance import TERMS
 from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate
@@ -21,7 +22,7 @@ from model.spectral.shape_stiffness import stiffness_slopes
 from model.structure.attachments import footprints_of
 from model.structure.modal_elasticity import Dispersion
 
-MASS_CELLS = (8, 6)
+MASS_CELLS = Grid(8, 6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +65,7 @@ def reduced_modes(rig: Rig, free: FreePlate) -> ReducedModes:
     """Reduce a rig's free plate to coordinates in which it may have form errors."""
     plate = rig.plate
     reduced = reduce_free_plate(free, footprints_of(rig.eras, rig.masses))
-    cells = lattice(
-        *(
-            (np.arange(n) + 0.5) / n * side
-            for n, side in zip(MASS_CELLS, (plate.length, plate.width), strict=True)
-        )
-    )
+    cells = MASS_CELLS.centres(plate)
     unknowns = reduced.unknowns()
     if isinstance(free.mesh, Mesh):
         stiffening = element_slopes(plate, free.mesh, unknowns[0])

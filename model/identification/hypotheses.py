@@ -15,10 +15,11 @@ from scipy import linalg
 from scipy.special import chdtrc
 
 from model.arrays import FloatArray
-from model.choice import best_first, ranked_by
-from model.identification.alarm import places_on
+from model.choice import ranked_by
+from model.identification.alarm import PLACES
 from model.identification.alterations import Alteration, Altered, Crack, Hand, scores
 from model.identification.derivatives import by_mass_at
+from model.identification.least_squares import single_changes
 from model.identification.parameters import Space
 from model.identification.settled import Touched, finger_covariance
 from model.identification.settled_update import State, Updated, update
@@ -196,7 +197,7 @@ def _scan(
 
     None: a mass [kg]; std: of sizes.
     """
-    points = places_on(*_sides(patterns))
+    points = PLACES.centres(patterns[0].touched.rig.plate)
     slope, curvature = np.zeros(len(points)), np.zeros(len(points))
     for each in patterns:
         fingers = np.zeros(each.touched.space.size - len(before.x))
@@ -213,11 +214,7 @@ def _scan(
         weighted = linalg.solve(S, column, assume_a="pos")
         slope += (each.pattern.numbers - predicted) @ weighted
         curvature += (column * weighted).sum(axis=0)
-    curvature += 1 / std**2
-    sizes = slope / curvature
-    gains = np.where(sizes > 0, sizes * slope, 0.0)
-    best = best_first(gains)
-    return [(float(sizes[n]), points[n]) for n in best if gains[n] > 0]
+    return [(size, points[n]) for n, size in single_changes(slope, curvature, std)]
 
 
 def _sides(patterns: Sequence[Touched]) -> FloatArray:

@@ -10,20 +10,20 @@ plate as it was.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Self
 
 import numpy as np
 
 from model.arrays import FloatArray
-from model.identification.alarm import Alarm, Taken, places_on
+from model.identification.alarm import PLACES, Alarm, Taken
 from model.identification.forward import ForwardModel, Sensor
 from model.identification.hypotheses import Explanation, explain
 from model.identification.identified_rig import rig_with
 from model.identification.identify import Identification, solved_for
 from model.identification.noise import NoiseLevel
-from model.identification.parameters import FINGER_PARTS, KINDS, MODE_SHIFTS, Space, space_of
+from model.identification.parameters import FINGER_PARTS, KINDS, MODE_SHIFTS, space_of
 from model.identification.posterior import THEORY
 from model.identification.settled import SettledPattern, Touched
 from model.identification.settled_update import State, update
@@ -65,10 +65,13 @@ class Report:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is known of a plate when its service begins.
+    """What is known of a plate in service.
 
     before: the rig that parameters count from; uncertainty: of the rig as known; model: with a
-    spare mass; is_explained: whether it may be updated.
+    spare mass; is_explained: whether an identification explains it, so that it may be updated, or
+    there are only alarms; time [s]: of the state, from which it has drifted since, None before the
+    first pattern; change: how it has changed in a way that its parameters do not follow, "" where
+    it has not.
     """
 
     before: Rig
@@ -76,6 +79,14 @@ class Known:
     model: ForwardModel
     state: State
     is_explained: bool = True
+    time: float | None = None
+    change: str = ""
+
+    @property
+    def rig(self) -> Rig:
+        """The rig as it is known now."""
+        values = Values.of(self.before, self.model.space, self.state.x)
+        return rig_with(self.before, values, self.uncertainty)
 
     @classmethod
     def of(cls, found: Identification) -> Self:
@@ -110,69 +121,37 @@ class Known:
 
 
 class LivePlate:
-    """The state of an identified plate in service."""
+    """An identified plate in service; known: what is known of it now."""
 
-    def __init__(self, known: Known | Identification) -> None:
-        if isinstance(known, Identification):
-            known = Known.of(known)
-        self._before, self._uncertainty = known.before, known.uncertainty
-        self.can_update = known.is_explained
-        """Whether its identification explains the plate; otherwise there are only alarms."""
-        self._model = known.model
-        self._state = known.state
-        self._time: float | None = None
+    def __init__(self, known: Known) -> None:
+        self.known = known
         self._alarm = Alarm()
-        self._places = places_on(known.before.plate.length, known.before.plate.width)
+        self._places = PLACES.centres(known.before.plate)
         self._noise = NoiseLevel()
         self._held: list[Touched] = []
         self._since_alarm = 0
-        self.has_changed = False
+
+    @property
+    def has_changed(self) -> bool:
         """Whether the plate has changed in a way that its parameters do not follow."""
-
-    @property
-    def state(self) -> State:
-        """Parameters and covariance now."""
-        return self._state
-
-    @property
-    def space(self) -> Space:
-        """The parameters, a spare mass among them."""
-        return self._model.space
-
-    @property
-    def rig(self) -> Rig:
-        """The rig as it is known now."""
-        values = Values.of(self._before, self.space, self._state.x)
-        return rig_with(self._before, values, self._uncertainty)
-
-    @property
-    def before(self) -> Rig:
-        """The rig that parameters count from."""
-        return self._before
-
-    @property
-    def known_at(self) -> float | None:
-        """Time [s] of the state; None before the first pattern."""
-        return self._time
-
-    def known_since(self, time: float | None) -> None:
-        """Note that the state is that of a time [s], from which it has drifted since."""
-        self._time = time
+        return bool(self.known.change)
 
     def take(self, pattern: SettledPattern) -> Report:
         """Take a settled pattern: update the state, or hold it and explain what happened."""
-        touched = Touched.of(self._model, pattern, _FINGER, noise=self._noise.relative)
-        drifted = self._drifted(pattern.time)
+        touched = Touched.of(self.known.model, pattern, _FINGER, noise=self._noise.relative)
+        if self.known.time is None:
+            self.known = replace(self.known, time=pattern.time)
+        known, drifted = self.known, self._drifted(pattern.time)
         if self._held:
             self._held.append(touched)
             self._since_alarm += 1
             return self._explained(pattern.time)
         after = update(drifted, [touched], evaluations=_EVALUATIONS, theory=self._theory)
-        taken = Taken.of(touched, self._state, self._time, after, self._places)
+        taken = Taken.of(touched, known.state, known.time, after, self._places)
         suspect = self._alarm.take(taken)
         if suspect is not None:
             explanation, is_new = None, not self.has_changed
-            if self.can_update and is_new:
+            if known.is_explained and is_new:
                 self._go_back(suspect)
                 explanation = self._explained(pattern.time).explanation
             self._alarm.clear()
@@ -180,16 +159,16 @@ class LivePlate:
                 after.nis, after.count, is_new, bool(self._held), explanation, np.zeros((0, 4))
             )
         if self.has_changed and self._alarm.is_full:
-            self.has_changed = False
-        if self.can_update and not self.has_changed and not self._alarm.is_odd:
-            self._state, self._time = after.state, pattern.time
+            self.known = replace(self.known, change="")
+        if known.is_explained and not self.has_changed and not self._alarm.is_odd:
+            self.known = replace(self.known, state=after.state, time=pattern.time)
             self._noise.take(after)
         fingers = np.exp(_FINGER * after.fingers.reshape(-1, len(FINGER_PARTS)))
         return Report(after.nis, after.count, False, False, None, fingers)
 
     def _go_back(self, suspect: list[Taken]) -> None:
         """Return to the state before the first suspect pattern, and hold them."""
-        self._state, self._time = suspect[0].before, suspect[0].time
+        self.known = replace(self.known, state=suspect[0].before, time=suspect[0].time)
         self._held, self._since_alarm = [each.touched for each in suspect], 0
 
     def _explained(self, time: float) -> Report:
@@ -205,15 +184,16 @@ class LivePlate:
             return Report(np.nan, 0, False, True, None, np.zeros((0, 4)))
         self._held = []
         if found.can_be_followed:
-            self._state, self._time = found.state, time
+            self.known = replace(self.known, state=found.state, time=time)
         else:
-            self.has_changed = True
+            self.known = replace(self.known, change=str(found))
         return Report(np.nan, 0, False, False, found, np.zeros((0, 4)))
 
     @cached_property
     def _theory(self) -> FloatArray:
         """Variances (p,) of what the theory gets wrong, which patterns at other tones show anew."""
-        space, variance = self.space, np.zeros(self.space.size)
+        space = self.known.model.space
+        variance = np.zeros(space.size)
         for kind, std in (
             ("stiffness", THEORY["stiffness"]),
             ("damping_each", THEORY["damping"]),
@@ -228,18 +208,16 @@ class LivePlate:
 
     def _drifted(self, time: float) -> State:
         """The state at a time [s], less certain by what drifted since it was updated."""
-        hours = 0.0 if self._time is None else max(time - self._time, 0.0) / 3600
-        if self._time is None:
-            self._time = time
-        space, variance = self.space, np.zeros(self.space.size)
-        before = np.diag(self._state.covariance)
+        state, since, space = self.known.state, self.known.time, self.known.model.space
+        hours = 0.0 if since is None else max(time - since, 0.0) / 3600
+        before, variance = np.diag(state.covariance), np.zeros(space.size)
         for name, kind in KINDS.items():
             group = space.groups[name]
             known = space.std[group]
             scale = np.divide(1.0, known, out=np.zeros_like(known), where=known > 0)
             room = np.maximum((kind.widest * scale) ** 2 - before[group], 0.0)
             variance[group] = np.minimum((kind.drift * scale) ** 2 * hours, room)
-        return State(self._state.x, self._state.covariance + np.diag(variance))
+        return State(state.x, state.covariance + np.diag(variance))
 
 
 def widest(uncertainty: Uncertainty) -> Uncertainty:

@@ -26,15 +26,13 @@ class OtherPlate(InputError):
 class LearnedPlate:
     """A state of parameters by name, counted from a rig; table, base: fingerprints of both.
 
-    has_changed: whether the plate has changed since in a way that its parameters do not follow;
-    change: how, as found then, or nothing.
+    change: how the plate has changed since in a way that its parameters do not follow, or nothing.
     """
 
     table: str
     base: str
     names: tuple[str, ...]
     state: State
-    has_changed: bool = False
     change: str = ""
 
 
@@ -45,7 +43,6 @@ def save_learned(learned: LearnedPlate, file: Path) -> None:
         "table": learned.table,
         "base": learned.base,
         "names": learned.names,
-        "has_changed": learned.has_changed,
         "change": learned.change,
     }
     text = json.dumps(header)
@@ -78,7 +75,6 @@ def load_learned(file: Path, *, table: str | None = None) -> LearnedPlate:
             header["base"],
             names,
             State(x, covariance),
-            bool(header["has_changed"]),
             str(header["change"]),
         )
     except (*UNREADABLE, KeyError, TypeError) as error:

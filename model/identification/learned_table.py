@@ -37,12 +37,10 @@ class LearnedTable:
     """
 
     def __init__(self, table: LocalizationTable, known: Known, *, file: Path | None = None) -> None:
-        self._table, self._known, self._file = table, known, file
+        self._table, self._file = table, file
         self.live = LivePlate(known)
         self.current = table
         """The table as corrected so far."""
-        self.change = ""
-        """How the plate has changed in a way that its parameters do not follow, as found then."""
 
     @classmethod
     def resumed(cls, table: LocalizationTable, known: Known, *, file: Path) -> Self:
@@ -60,15 +58,15 @@ class LearnedTable:
                 f"{file}: parameters must be those of this rig and its sensors; remove the file to "
                 "learn anew"
             )
-        resumed = cls(table, replace(known, state=learned.state), file=file)
-        resumed.live.has_changed, resumed.change = learned.has_changed, learned.change
+        known = replace(known, state=learned.state, time=None, change=learned.change)
+        resumed = cls(table, known, file=file)
         resumed.current = resumed._followed()
         return resumed
 
     @property
-    def has_changed(self) -> bool:
-        """Whether the plate has changed in a way that its parameters do not follow."""
-        return self.live.has_changed
+    def change(self) -> str:
+        """How the plate has changed in a way that its parameters do not follow, or nothing."""
+        return self.live.known.change
 
     def take(self, pattern: SettledPattern) -> Learned:
         """Take a settled pattern, and correct the table by it.
@@ -78,50 +76,42 @@ class LearnedTable:
         """
         if not np.isfinite(pattern.values).all() or not np.any(pattern.values):
             raise InputError("readings must be finite and not all 0, got others")
-        before, since, had_changed = self.live.state, self.live.known_at, self.has_changed
-        change = self.change
+        before = self.live.known
         try:
             report = self.live.take(pattern)
-            after = self.live.state
-            if not np.isfinite(after.x).all() or not np.isfinite(after.covariance).all():
+            state, change = self.live.known.state, self.live.known.change
+            if not np.isfinite(state.x).all() or not np.isfinite(state.covariance).all():
                 raise InputError("parameters must be finite after a pattern, got others")
-            if not self.has_changed:
-                self.change = ""
-            elif report.explanation is not None:
-                self.change = str(report.explanation)
-            if after is before and self.has_changed == had_changed:
+            if state is before.state and bool(change) == bool(before.change):
                 return Learned(report, None)
             self.current = self._followed()
         except Exception:
-            self.live = LivePlate(replace(self._known, state=before))
-            self.live.known_since(since)
-            self.live.has_changed, self.change = had_changed, change
+            self.live = LivePlate(before)
             raise
         return Learned(report, self.current)
 
     def _followed(self) -> LocalizationTable:
         """The table for the plate as it is known now."""
         return table_following(
-            self._table, self.cautious_rig if self.has_changed else self.live.rig
+            self._table, self.cautious_rig if self.change else self.live.known.rig
         )
 
     def save(self) -> None:
         """Write what was learned, atomically, and whether the plate has changed since."""
         if self._file is None:
             return
-        base = self.live.before.fingerprint
+        known = self.live.known
         learned = LearnedPlate(
             self._table.fingerprint,
-            base,
-            self.live.space.names,
-            self.live.state,
-            self.has_changed,
-            self.change,
+            known.before.fingerprint,
+            known.model.space.names,
+            known.state,
+            known.change,
         )
         save_learned(learned, self._file)
 
     @property
     def cautious_rig(self) -> Rig:
         """The rig as last known, with the errors of a plate that was not measured."""
-        rig = self.live.rig
+        rig = self.live.known.rig
         return replace(rig, uncertainty=widest(rig.uncertainty))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
+from model.choice import best_first
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +82,20 @@ def search(
     )
     plain = both(found.x) if robust is None else real(found.x, None)
     return Found(found.x, float(found.cost), *plain)
+
+
+def single_changes(
+    slopes: FloatArray, curvatures: FloatArray, std: float
+) -> list[tuple[int, float]]:
+    """Which of m changes explain most, each alone, the most telling first, with its size above 0.
+
+    slopes, curvatures (m,): of half the sum of squares by each where all else has followed, the
+    slopes downwards; std: of the sizes beforehand.
+    """
+    curvatures = curvatures + std**-2
+    sizes = slopes / curvatures
+    gains = np.where(sizes > 0, sizes * slopes, 0.0)
+    return [(int(n), float(sizes[n])) for n in best_first(gains) if gains[n] > 0]
 
 
 def _softened(

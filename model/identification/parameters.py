@@ -80,7 +80,7 @@ KINDS = {
     # Form errors: a ruler's, a cutter's, and 1 % of the plate's mass over all cells, as its shares.
     "sensor_scale": Kind(0.01),
     "sensor_place": Kind(0.5e-3, *_LENGTH),
-    "foreign_mass": Kind(0.01 / math.sqrt(math.prod(MASS_CELLS))),
+    "foreign_mass": Kind(0.01 / math.sqrt(MASS_CELLS.cell_count)),
     "side": Kind(0.5e-3, *_LENGTH),
     "poisson": Kind(0.015, "", "", 1.0),
 }
@@ -241,7 +241,7 @@ def space_of(
     has_form = form_of is not None
     add("sensor_scale", [f"scale of sensor {name}" for name in sensors if has_form])
     add("sensor_place", [f"{axis} of sensor {n}" for n in range(form_of or 0) for axis in "xy"])
-    add("foreign_mass", [f"mass {n}" for n in range(math.prod(MASS_CELLS)) if has_form])
+    add("foreign_mass", [f"mass {n}" for n in range(MASS_CELLS.cell_count) if has_form])
     add("side", ["length", "width"] if has_form else [])
     add("poisson", ["Poisson's ratio"] if has_form else [])
     return builder.space()

@@ -12,11 +12,13 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import FloatArray
-from model.choice import NEARLY, best_by, best_first, ranked_by
+from model.choice import NEARLY, best_by, ranked_by
+from model.finger.grid import Grid
 from model.identification.derivatives import by_mass_at
 from model.identification.fit import Linearised, Problem, solve
 from model.identification.forward import ForwardModel, Sensor
 from model.identification.identified_rig import plate_with
+from model.identification.least_squares import single_changes
 from model.identification.measurement import Measurement
 from model.identification.parameters import MODE_SHIFTS, Space, inwards, space_of
 from model.reduction.free_plate import FreePlate, solve_free_plate
@@ -29,7 +31,7 @@ _THICKNESSES = (0.0, 1.5, -1.5)  # standard deviations
 _MARGIN = 1.02  # of frequency, since layers do not stiffen all modes alike
 _GOOD = 0.5  # chi² under the raised noise that needs no further start
 _INWARDS = 0.6  # standard deviations
-_SCANNED = (8, 6)
+_SCANNED = Grid(8, 6)
 _KEPT = 4
 _MORE_MASS_BEYOND = 1.5  # chi²
 _MASS_GAINS = 25.0  # of the cost: five standard deviations
@@ -173,21 +175,16 @@ def _scan(problem: Problem, x: FloatArray, own: int) -> list[tuple[FloatArray, f
     ]
     others = np.flatnonzero(space.of(*kinds))
     J = now.jacobian[:, others]
-    sides = np.array([model.rig.plate.length, model.rig.plate.width])
-    axes = [side * (np.arange(n) + 0.5) / n for side, n in zip(sides, _SCANNED, strict=True)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    plate, points = model.rig.plate, _SCANNED.centres(model.rig.plate)
     by_mass = by_mass_at(model.at(x), points)[m.rows, m.at, m.eras] / problem.std[:, None]
     columns = np.concatenate([by_mass.real, by_mass.imag]) * space.std[own]
     H = linalg.cho_factor(now.information[np.ix_(others, others)])
     # Of the residuals that the other parameters leave after one step of theirs.
     left = now.residuals - J @ linalg.cho_solve(H, now.gradient[others])
     beside = columns - J @ linalg.cho_solve(H, J.T @ columns)
-    curvature = (columns * beside).sum(axis=0) + 1
-    sizes = -(left @ columns) / curvature
-    gains = np.where(sizes > 0, sizes**2 * curvature, 0.0)
-    best = best_first(gains)[:_KEPT]
-    reach = space.std[own + 1 : own + 3]
-    return [((points[n] - sides / 2) / reach, float(sizes[n])) for n in best if gains[n] > 0]
+    heaviest = single_changes(-(left @ columns), (columns * beside).sum(axis=0), 1.0)
+    off = (points - [plate.length / 2, plate.width / 2]) / space.std[own + 1 : own + 3]
+    return [(off[number], size) for number, size in heaviest[:_KEPT]]
 
 
 def _in_full(problem: Problem, starts: list[Linearised]) -> Fitted:

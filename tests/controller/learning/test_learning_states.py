@@ -98,12 +98,12 @@ def answers() -> Answers:
     return Answers(table.fingerprint, replace(table), is_complete=False)
 
 
-QUIET = Estimate(0.0, alarm=False, is_held=False, explanation="", has_changed=False, answers=None)
+QUIET = Estimate(0.0, alarm=False, is_held=False, explanation="", change="", answers=None)
 
 
 def ready() -> Ready:
     """Of an estimator that knows the plate."""
-    return Ready(0.2, "", "", None, answers(), has_changed=False)
+    return Ready(0.2, "", "", None, answers(), change="")
 
 
 async def opened(folder: Path) -> tuple[Learning, Taking]:
@@ -127,10 +127,10 @@ async def test_plate_that_had_changed_stays_so_over_a_restart(
 ) -> None:
     """Ready with the flag: changed and robust, until an estimate says that it is as it was."""
     learning, _ = await opened(tmp_path)
-    estimators.reply(replace(ready(), answers=answers(), has_changed=True))
+    estimators.reply(replace(ready(), answers=answers(), change="a crack"))
     assert learning.status.state is LearningState.CHANGED
     assert learning.status.are_robust
-    estimators.reply(replace(QUIET, has_changed=True))
+    estimators.reply(replace(QUIET, change="a crack"))
     assert learning.status.state is LearningState.CHANGED
     estimators.reply(replace(QUIET, answers=answers()))
     assert learning.status.state is LearningState.FOLLOWING
@@ -151,7 +151,7 @@ async def test_refreshed_answers_are_taken_again_after_a_change(
     estimators.reply(replace(QUIET, alarm=True, is_held=True))
     estimators.reply(refreshed)
     assert taking.taken == []
-    estimators.reply(replace(QUIET, explanation="a crack", has_changed=True, answers=answers()))
+    estimators.reply(replace(QUIET, explanation="a crack", change="a crack", answers=answers()))
     estimators.reply(refreshed)
     assert len(taking.taken) == 1
     estimators.reply(replace(QUIET, answers=answers()))

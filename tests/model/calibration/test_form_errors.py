@@ -65,10 +65,10 @@ def _of_another_ratio(rig: Rig) -> Rig:
 
 def _heavier_in_one_cell(rig: Rig) -> Rig:
     """The rig with 0.5 % of its plate's mass taken from all of it, and put on a cell."""
-    plate, (n, m) = rig.plate, MASS_CELLS
+    plate = rig.plate
     material = replace(plate.material, rho=0.995 * plate.material.rho)
-    x, y = (CELL % n + 0.5) / n * plate.length, (CELL // n + 0.5) / m * plate.width
-    load = PointLoad(x, y, mass=0.005 * plate.mass)
+    x, y = MASS_CELLS.centres(plate)[CELL]
+    load = PointLoad(float(x), float(y), mass=0.005 * plate.mass)
     return replace(rig, plate=replace(plate, material=material), masses=(*rig.masses, load))
 
 

@@ -11,7 +11,7 @@ from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
 from extrapolated import extrapolated_slopes
 from model.identification.alterations import Alteration, Altered, AlteredPlate, Crack, Hand
 from model.identification.identify import Identification
-from model.identification.in_service import LivePlate, Report
+from model.identification.in_service import Known, LivePlate, Report
 from model.identification.settled import Touched
 from settled_patterns import settled_patterns
 
@@ -59,7 +59,7 @@ def test_hand_that_stays_is_no_sticker_and_leaves_again(
     hidden: Hidden, found: Identification
 ) -> None:
     """It is named where it rests, answers are cautious until it is gone; then service goes on."""
-    live = LivePlate(found)
+    live = LivePlate(Known.of(found))
     own = {each.name: getattr(hidden.mounted, each.name) for each in fields(Mounted)}
     rested = Rested(**own)
     reports = play(live, hidden, rested, count=6)
@@ -77,7 +77,7 @@ def test_heavy_sticker_is_no_hand(hidden: Hidden, found: Identification) -> None
     """10 g where the hand was are a mass."""
     sticker = np.array([*HAND, 10e-3])
     plate = replace(hidden.mounted, masses=np.vstack([hidden.mounted.masses, sticker]))
-    live = LivePlate(found)
+    live = LivePlate(Known.of(found))
     reports = map(live.take, settled_patterns(hidden, plate, count=6, start=0))
     assert said(reports) == "a mass"
 
@@ -85,7 +85,7 @@ def test_heavy_sticker_is_no_hand(hidden: Hidden, found: Identification) -> None
 @pytest.mark.long
 def test_crack_is_named(hidden: Hidden, found: Identification) -> None:
     """A patch of 2.3 by 6.9 cm at an edge that has lost half of its stiffness is a crack."""
-    live = LivePlate(found)
+    live = LivePlate(Known.of(found))
     reports = play(live, hidden, softened(hidden.mounted, EDGE), count=6)
     assert said(reports) == "a crack"
     assert live.has_changed

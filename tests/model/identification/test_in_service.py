@@ -8,7 +8,7 @@ import pytest
 from benchmarks.identification.hidden import Hidden
 from benchmarks.identification.thin_plate import Mounted
 from model.identification.identify import Identification
-from model.identification.in_service import LivePlate, Report
+from model.identification.in_service import Known, LivePlate, Report
 from settled_patterns import settled_patterns
 
 NE = 2  # number of that ERA
@@ -24,7 +24,7 @@ def play(
 
 def test_loosened_mount_is_named_and_followed(hidden: Hidden, found: Identification) -> None:
     """Quiet patterns raise no alarm; a mount 20 % softer does within 8, and is named NE."""
-    live = LivePlate(found)
+    live = LivePlate(Known.of(found))
     quiet = play(live, hidden, hidden.mounted, count=10, start=0)
     assert not any(report.alarm for report in quiet)
     assert np.mean([report.nis / report.count for report in quiet]) < 1.5
@@ -35,7 +35,7 @@ def test_loosened_mount_is_named_and_followed(hidden: Hidden, found: Identificat
     (explanation,) = (each.explanation for each in after if each.explanation)
     assert explanation.name == "stiffness NE"
     assert explanation.change == pytest.approx(np.log(0.8), abs=0.03)
-    assert live.rig.eras[NE].stiffness == pytest.approx(loose.stiffness[NE], rel=0.02)
+    assert live.known.rig.eras[NE].stiffness == pytest.approx(loose.stiffness[NE], rel=0.02)
     assert not live.has_changed
 
 
@@ -43,9 +43,8 @@ def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
     found: Identification,
 ) -> None:
     """Thickness by 1 % more after an hour; after two weeks by 2 %, stiffness by 10 %."""
-    live = LivePlate(found)
-    live.known_since(0.0)
-    space = live.space
+    live = LivePlate(replace(Known.of(found), time=0.0))
+    space = live.known.model.space
 
     def known(kind: str, hours: float) -> float:
         after = np.sqrt(np.diag(live._drifted(3600.0 * hours).covariance))
@@ -61,54 +60,54 @@ def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
 @pytest.mark.long
 def test_sticker_is_named_in_its_place(hidden: Hidden, found: Identification) -> None:
     """3 g are named a mass within ten patterns, to 0.6 g and 1.5 cm."""
-    live = LivePlate(found)
+    live = LivePlate(Known.of(found))
     play(live, hidden, hidden.mounted, count=10, start=0)
     sticker = np.array([0.11, 0.16, 3e-3])
     changed = replace(hidden.mounted, masses=np.vstack([hidden.mounted.masses, sticker]))
     after = play(live, hidden, changed, count=10, start=10)
     (explanation,) = (each.explanation for each in after if each.explanation)
     assert explanation.name == "a mass"
-    added = live.rig.masses[-1]
+    added = live.known.rig.masses[-1]
     assert added.mass == pytest.approx(3e-3, abs=0.6e-3)
     assert (added.x, added.y) == pytest.approx((0.11, 0.16), abs=0.015)
 
 
 def test_heavy_finger_is_no_change(hidden: Hidden, found: Identification) -> None:
     """Fingers of six times the usual load, beyond three standard deviations, raise no alarm."""
-    live = LivePlate(found)
+    live = LivePlate(Known.of(found))
     heavy = settled_patterns(hidden, hidden.mounted, count=12, start=0, heaviest=6.0)
     assert not any(live.take(each).alarm for each in heavy)
 
 
 def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, found: Identification) -> None:
     """After an identification with chi² above 2 patterns leave the state as it was."""
-    live = LivePlate(replace(found, chi2=2.5))
-    before = live.state
+    live = LivePlate(Known.of(replace(found, chi2=2.5)))
+    before = live.known.state
     play(live, hidden, hidden.mounted, count=2, start=0)
-    assert live.state is before
+    assert live.known.state is before
 
 
 @pytest.mark.long
 def test_change_that_nothing_explains_is_said(hidden: Hidden, found: Identification) -> None:
     """Two mounts and a gain at once are no known change: the state stays and says so."""
-    live = LivePlate(found)
+    live = LivePlate(Known.of(found))
     mounted = hidden.mounted
     odd = replace(
         mounted,
         stiffness=mounted.stiffness * [0.5, 1.0, 2.0, 1.0],
         gain=mounted.gain * [1.0, 0.5j, 1.0, 1.0],
     )
-    before = live.state
+    before = live.known.state
     reports = play(live, hidden, odd, count=6, start=0)
     assert reports[1].alarm
     assert reports[-1].explanation is not None
     assert reports[-1].explanation.name == ""
     assert live.has_changed
-    assert live.state is before
+    assert live.known.state is before
 
 
 def test_fingers_of_a_touch_are_refined(hidden: Hidden, found: Identification) -> None:
     """Factors of the parts of every finger come with the report, above zero."""
-    (report,) = play(LivePlate(found), hidden, hidden.mounted, count=1, start=3)
+    (report,) = play(LivePlate(Known.of(found)), hidden, hidden.mounted, count=1, start=3)
     assert report.fingers.shape[1] == 4
     assert (report.fingers > 0).all()

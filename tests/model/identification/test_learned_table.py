@@ -66,7 +66,7 @@ def test_answers_follow_a_loosened_mount(
     stale = learned.current
     for pattern in settled_patterns(hidden, loose, count=14, start=12):
         learned.take(pattern)
-    assert not learned.has_changed
+    assert not learned.change
     assert error(stale, loose) > 0.1
     assert error(learned.current, loose) < error(stale, loose) / 3
 
@@ -107,13 +107,11 @@ def test_unexplained_change_widens_the_errors_of_answers(
     last = [learned.take(each) for each in settled_patterns(hidden, odd, count=6, start=12)][-1]
     assert last.report.explanation is not None
     assert last.report.explanation.resembles
-    assert learned.has_changed
     assert last.table is learned.current
     wide, built = learned.current.uncertainty, Uncertainty()
     assert (wide.gain, wide.thickness, wide.damping) == (built.gain, built.thickness, built.damping)
     learned.save()
     resumed = LearnedTable.resumed(table, Known.of_rig(rig, sensors_of(rig)), file=file)
-    assert resumed.has_changed
     assert resumed.change == learned.change != ""
     assert resumed.current.uncertainty == wide
 
@@ -125,7 +123,7 @@ def test_pattern_that_no_table_follows_leaves_the_state(
     learned = LearnedTable(table, Known.of_rig(rig, sensors_of(rig)))
     first, second, third = settled_patterns(hidden, hidden.mounted, count=3, start=0)
     learned.take(first)
-    state, current, since = learned.live.state, learned.current, learned.live.known_at
+    known, current = learned.live.known, learned.current
 
     def refused(table: LocalizationTable, rig: Rig) -> LocalizationTable:
         raise InputError("thickness must be within 10 %, got 20 %")
@@ -134,8 +132,7 @@ def test_pattern_that_no_table_follows_leaves_the_state(
         patch.setattr(learned_table, "table_following", refused)
         with pytest.raises(InputError, match="thickness"):
             learned.take(second)
-    assert learned.live.state is state
-    assert learned.live.known_at == since
+    assert learned.live.known is known
     assert learned.current is current
     assert learned.take(third).table is not None
 
@@ -149,16 +146,18 @@ def test_what_was_learned_is_resumed_for_its_table_only(
     learned = LearnedTable.resumed(table, known, file=file)
     for pattern in settled_patterns(hidden, hidden.mounted, count=3, start=0):
         learned.take(pattern)
-    learned.live.has_changed = True
+    learned.live.known = replace(learned.live.known, change="a crack")
     learned.save()
     robust = LearnedTable.resumed(table, known, file=file)
-    assert robust.has_changed
+    assert robust.change == "a crack"
     assert robust.current.uncertainty.thickness == Uncertainty().thickness
-    learned.live.has_changed = False
+    learned.live.known = replace(learned.live.known, change="")
     learned.save()
     again = LearnedTable.resumed(table, known, file=file)
-    assert not again.has_changed
-    np.testing.assert_array_equal(again.live.state.covariance, learned.live.state.covariance)
+    assert not again.change
+    np.testing.assert_array_equal(
+        again.live.known.state.covariance, learned.live.known.state.covariance
+    )
     np.testing.assert_array_equal(
         again.current.unit_fields(POINTS), learned.current.unit_fields(POINTS)
     )

@@ -42,7 +42,7 @@ def state_after(known: Known, pattern: SettledPattern) -> FloatArray:
     """Parameters after the pattern."""
     live = LivePlate(known)
     live.take(pattern)
-    return live.state.x
+    return live.known.state.x
 
 
 def test_update_does_not_depend_on_a_phase_that_is_unknown(

@@ -1,7 +1,10 @@
 """Effects at a finger, regions, and priorities among several fingers."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
+from types import EllipsisType
 
 import pytest
 from hypothesis import given
@@ -30,55 +33,246 @@ LEFT = Rectangle(0.0, 0.0, 0.1, 0.2)
 RIGHT = Rectangle(0.1001, 0.0, 0.1, 0.2)
 
 
-def wanted(
-    player: EffectPlayer, contacts: Sequence[Contact], now: float
-) -> dict[int, float | None]:
-    """Intended levels by the id of the finger; their pulses start at once."""
-    intent = player.intent(contacts, now)
-    for target in intent.targets:
-        if target.pulse is not None and target.pulse.started_at is None:
-            target.pulse.started_at = now
-    return {target.key.id: target.level_db_sl for target in intent.targets}
+@dataclass(frozen=True)
+class At:
+    """What fingers feel at a time [s]: levels [dB SL] by their ids.
+
+    played: an effect that is requested by name before, and its finger; level: the requested one.
+    until: when the intent expires, None for never, if it is looked at. starts: whether what is
+    short starts to play. layouts: how often the layout is replaced by itself before. says: what
+    is found in the reason for what is not felt.
+    """
+
+    now: float
+    felt: Mapping[int, float | None]
+    fingers: Sequence[Contact]
+    played: tuple[str, Contact] | None = None
+    level: float | None = None
+    until: float | EllipsisType | None = ...
+    starts: bool = True
+    layouts: int = 0
+    says: str = ""
 
 
-def test_click_ends_after_its_duration() -> None:
-    """A click lasts for 40 ms from its start; the intent expires then, or after 0.1 s without."""
-    player = EffectPlayer(SurfaceLayout(effects={"click": Click(level=18.0)}, elsewhere="click"))
-    here = [finger(1)]
-    intent = player.intent(here, 10.0)
-    assert [target.level_db_sl for target in intent.targets] == [18.0]
-    assert intent.until == pytest.approx(10.1)
-    assert wanted(player, here, 10.05) == {1: 18.0}
-    assert player.intent(here, 10.06).until == pytest.approx(10.09)
-    assert wanted(player, here, 10.089) == {1: 18.0}
-    assert wanted(player, here, 10.0901) == {}
-    after = player.intent(here, 10.1)
-    assert after.until is None
-    assert "click" in after.reason  # which was played, and is over
-    assert "click" not in player.intent([finger(2)], 10.2).reason
+def left(**effects: str) -> Region:
+    """The left half of the plate."""
+    return Region("left", LEFT, **effects)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("is_requested", [False, True])
-def test_a_finger_that_came_down_again_feels_its_press_again(is_requested: bool) -> None:
-    """Also with the same id, and no intent between: it is known by when it came down."""
-    layout = SurfaceLayout(effects={"click": Click(), "hum": Buzz(level=9.0)}, elsewhere="click")
+def right(on_press: str, *, priority: int = 0) -> Region:
+    """The right half of the plate."""
+    return Region("right", RIGHT, on_press=on_press, priority=priority)
+
+
+ONE, TWO, THREE = finger(1, 0.05), finger(2, 0.15), finger(3, 0.16)
+AGAIN = finger(1, since=1.98)
+CLICK = {"click": Click(duration=0.04)}
+ALERT: dict[str, Effect] = {"buzz": Buzz(), "alert": Click(duration=0.1)}
+PRESSED = SurfaceLayout(effects={"click": Click(), "hum": Buzz(level=9.0)}, elsewhere="click")
+DOTS: dict[str, Effect] = {"buzz": Buzz(level=10.0), "click": Click(), "dots": Detents()}
+CLICKS_AND_DOTS = SurfaceLayout((left(on_press="click", on_move="dots"),), DOTS)
+
+
+def new_layout(times: int) -> list[At]:
+    """Fingers that are down when the layout is replaced, and some that come later."""
+    return [
+        At(0.0, {1: 20.0, 2: 10.0}, [ONE, TWO]),
+        At(1.0, {2: 10.0}, [ONE, TWO], layouts=times),
+        At(1.1, {1: 20.0, 2: 10.0}, [finger(1, 0.056), TWO]),
+        At(2.0, {}, []),
+        At(3.0, {1: 20.0}, [ONE]),
+        At(4.0, {1: 20.0}, [finger(1, 0.05, since=3.5)], layouts=1),  # not asked between
+    ]
+
+
+SCENARIOS: Mapping[str, tuple[SurfaceLayout, Sequence[At]]] = {
+    # 40 ms from its start; the intent expires then, or after 0.1 s without a start.
+    "a click ends after its duration": (
+        SurfaceLayout(effects={"click": Click(level=18.0)}, elsewhere="click"),
+        [
+            At(10.0, {1: 18.0}, [ONE], until=10.1, starts=False),
+            At(10.05, {1: 18.0}, [ONE]),
+            At(10.06, {1: 18.0}, [ONE], until=10.09),
+            At(10.089, {1: 18.0}, [ONE]),
+            At(10.0901, {}, [ONE]),
+            At(10.1, {}, [ONE], until=None, says="click"),
+            At(10.2, {2: 18.0}, [finger(2)], says="^(?!.*click)"),
+        ],
+    ),
+    # With the same id, and no intent between: it is known by when it came down.
+    "a finger that came down again feels its press again": (
+        PRESSED,
+        [
+            At(0.0, {1: 20.0}, [finger(1)]),
+            At(1.0, {}, [finger(1)]),
+            At(2.0, {1: 20.0}, [AGAIN]),
+            At(3.0, {}, [AGAIN]),
+        ],
+    ),
+    "a finger that came down again feels what is requested": (
+        PRESSED,
+        [
+            At(0.0, {1: 20.0}, [finger(1)]),
+            At(1.0, {}, [finger(1)]),
+            At(2.0, {1: 9.0}, [AGAIN], ("hum", AGAIN)),
+            At(3.0, {1: 9.0}, [AGAIN]),
+        ],
+    ),
+    # Without a duration it goes on; a new finger starts it again.
+    "a buzz lasts while the finger stays": (
+        SurfaceLayout(),
+        [
+            At(0.0, {1: 20.0}, [ONE]),
+            At(100.0, {1: 20.0}, [ONE], until=None),
+            At(101.0, {}, []),
+            At(102.0, {1: 20.0}, [ONE]),
+        ],
+    ),
+    # Half a millimetre across it is noise and no crossing; a millimetre of way is.
+    "a finger on an edge keeps its region": (
+        SurfaceLayout(
+            (left(on_press="tick"), right("tock")),
+            {"tick": Click(level=10.0), "tock": Click(level=15.0)},
+            elsewhere=None,
+        ),
+        [
+            At(0.0, {1: 10.0}, [finger(1, 0.0999)]),
+            *(At(0.1 * n, {}, [finger(1, 0.0999 + 0.0005 * (n % 2))]) for n in range(1, 20)),
+            At(2.0, {1: 15.0}, [finger(1, 0.1009)]),
+            *(At(2 + 0.1 * n, {}, [finger(1, 0.1009 - 0.0009 * (n % 2))]) for n in range(1, 20)),
+        ],
+    ),
+    # It presses where it comes in, is released where it goes out, and lifts without a feeling.
+    "a finger slides through regions": (
+        SurfaceLayout(
+            (left(on_press="soft", on_release="hard"), right("buzz")),
+            {"soft": Click(level=10.0), "hard": Click(level=24.0), "buzz": Buzz(level=16.0)},
+            elsewhere=None,
+        ),
+        [
+            At(0.0, {1: 10.0}, [finger(1, 0.05)]),
+            At(0.1, {}, [finger(1, 0.06)]),
+            At(0.2, {1: 24.0}, [finger(1, 0.15)]),  # left's release, on right
+            At(0.3, {1: 16.0}, [finger(1, 0.15)]),  # then right's own goes on
+            At(0.4, {}, [finger(1, 0.25)]),
+            At(0.5, {}, []),
+        ],
+    ),
+    # Then the one before, also beside a finger that feels the effect of a region.
+    "outside of all regions only the newest finger feels": (
+        SurfaceLayout((right("click", priority=1),), {"buzz": Buzz(), "click": Click(level=12.0)}),
+        [
+            At(0.0, {1: 20.0}, [finger(1, 0.02)]),
+            At(0.1, {2: 20.0}, [finger(1, 0.02), finger(2, 0.08)]),
+            At(0.2, {2: 20.0, 3: 12.0}, [finger(1, 0.02), finger(2, 0.08), THREE]),
+            At(0.25, {2: 20.0}, [finger(1, 0.02), finger(2, 0.08), THREE]),
+            At(0.3, {1: 20.0}, [finger(1, 0.02), THREE]),
+        ],
+    ),
+    # Of a detent of 30 ms, then the turn and the end of a click of 40 ms at another finger.
+    "an intent expires at the first end": (
+        SurfaceLayout(
+            (left(on_move="dots"),), {"dots": Detents(duration=0.03), **CLICK}, elsewhere="click"
+        ),
+        [
+            At(0.0, {}, [ONE]),
+            At(1.0, {1: 20.0}, [finger(1, 0.056), TWO]),
+            At(1.001, {1: 20.0}, [finger(1, 0.056), TWO], until=1.03),
+            At(1.03, {}, [finger(1, 0.056), TWO], until=1.06),
+            At(1.0601, {2: 20.0}, [finger(1, 0.056), TWO]),
+            At(1.07, {2: 20.0}, [finger(1, 0.056), TWO], until=1.1001),
+            At(1.1002, {}, [finger(1, 0.056), TWO], until=None),
+        ],
+    ),
+    # The second and the third wait, and play for their whole duration.
+    "clicks of two fingers are 60 ms apart": (
+        SurfaceLayout((left(on_press="click"), right("click")), CLICK, elsewhere=None),
+        [
+            At(1.0, {1: 20.0}, [ONE, TWO, THREE]),
+            At(1.01, {1: 20.0}, [ONE, TWO, THREE], until=1.04),
+            At(1.059, {}, [ONE, TWO, THREE]),
+            At(1.0601, {2: 20.0}, [ONE, TWO, THREE]),
+            At(1.0999, {2: 20.0}, [ONE, TWO, THREE]),
+            At(1.1201, {3: 20.0}, [ONE, TWO, THREE]),
+            At(1.1602, {}, [ONE, TWO, THREE]),
+        ],
+    ),
+    # The first at 0 ms, the second at 10 and again at 15: once, at 60; the first waits again, but
+    # lifts: the third is next.
+    "a waiting click is replaced in its place": (
+        SurfaceLayout(effects=CLICK, elsewhere=None),
+        [
+            At(0.0, {1: 20.0}, [ONE, TWO, THREE], ("click", ONE)),
+            At(0.010, {1: 20.0}, [ONE, TWO, THREE], ("click", TWO)),
+            At(0.015, {1: 20.0}, [ONE, TWO, THREE], ("click", TWO)),
+            At(0.0601, {2: 20.0}, [ONE, TWO, THREE]),
+            At(0.070, {2: 20.0}, [ONE, TWO, THREE], ("click", ONE)),
+            At(0.080, {2: 20.0}, [TWO, THREE], ("click", THREE)),
+            At(0.1201, {3: 20.0}, [TWO, THREE]),
+        ],
+    ),
+    # A finger between detents of a region feels nothing, and leaves the others what they feel.
+    "plays without a sensation count for nothing": (
+        SurfaceLayout((left(on_move="dots"),), {"dots": Detents(), "buzz": Buzz()}),
+        [
+            At(0.0, {1: 20.0}, [finger(1, 0.15), finger(2, 0.05)]),
+            At(0.1, {1: 20.0, 2: 20.0}, [finger(1, 0.15), finger(2, 0.056)]),
+            At(0.2, {1: 20.0}, [finger(1, 0.15), finger(2, 0.056)]),
+        ],
+    ),
+    # At its level, until it ends.
+    "what is requested comes before all regions": (
+        SurfaceLayout(effects=ALERT),
+        [
+            At(0.0, {2: 20.0}, [finger(1), finger(2)]),
+            At(0.05, {1: 24.0, 2: 20.0}, [finger(1), finger(2)], ("alert", finger(1)), 24.0),
+            At(0.16, {2: 20.0}, [finger(1), finger(2)]),
+        ],
+    ),
+    # What its place has for it begins all the same, and goes on when the other is over.
+    "what is requested plays for a finger that is new": (
+        SurfaceLayout(effects=ALERT),
+        [At(0.0, {1: 12.0}, [ONE], ("alert", ONE), 12.0), At(0.2, {1: 20.0}, [ONE])],
+    ),
+    # It goes on through other regions, unlike what a region has for it.
+    "what is requested ends with its finger": (
+        SurfaceLayout(
+            (left(on_press="hum"), Region("right", RIGHT)),
+            {"hum": Buzz(level=9.0), "alert": Buzz(level=18.0)},
+            elsewhere=None,
+        ),
+        [
+            At(0.0, {1: 9.0}, [finger(1, 0.05)]),
+            At(0.2, {1: 18.0}, [finger(1, 0.15)], ("alert", finger(1, 0.05))),
+            At(3.0, {}, []),
+            At(4.0, {1: 9.0}, [finger(1, 0.05, since=4.0)]),
+        ],
+    ),
+    # A finger that is down feels what lasts and what moves by it, but no second click. One that
+    # comes later feels all, also under the name of one that has lifted, be it unnoticed.
+    "a new layout repeats no press": (CLICKS_AND_DOTS, new_layout(1)),
+    "a layout that is replaced twice repeats no press": (CLICKS_AND_DOTS, new_layout(2)),
+}
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_fingers_feel_their_effects(name: str) -> None:
+    """At every time of a scenario, in whose name it is said."""
+    layout, steps = SCENARIOS[name]
     player = EffectPlayer(layout)
-    assert wanted(player, [finger(1)], 0.0) == {1: 20.0}
-    assert wanted(player, [finger(1)], 1.0) == {}
-    if is_requested:
-        player.play("hum", finger(1, since=1.98), 1.99, level_db_sl=None)
-    again = [finger(1, since=1.98)]
-    assert wanted(player, again, 2.0) == {1: 9.0 if is_requested else 20.0}
-    assert wanted(player, again, 3.0) == ({1: 9.0} if is_requested else {})
-
-
-def test_buzz_lasts_while_the_finger_stays() -> None:
-    """A buzz without a duration goes on; a new finger starts it again."""
-    player = EffectPlayer(SurfaceLayout())
-    assert wanted(player, [finger(1)], 0.0) == {1: 20.0}
-    assert player.intent([finger(1)], 100.0).until is None
-    assert wanted(player, [], 101.0) == {}
-    assert wanted(player, [finger(1)], 102.0) == {1: 20.0}
+    for step in steps:
+        for _ in range(step.layouts):
+            player.replace(layout)
+        if step.played is not None:
+            player.play(*step.played, step.now, level_db_sl=step.level)
+        intent = player.intent(step.fingers, step.now)
+        assert {each.key.id: each.level_db_sl for each in intent.targets} == step.felt, step
+        if step.until is not ...:
+            assert intent.until == pytest.approx(step.until), step
+        assert re.search(step.says, intent.reason), step
+        for target in intent.targets if step.starts else ():
+            if target.pulse is not None and target.pulse.started_at is None:
+                target.pulse.started_at = step.now
 
 
 @pytest.mark.parametrize(
@@ -153,19 +347,6 @@ def test_texture_level_has_hysteresis() -> None:
     assert len(levels) == 1
 
 
-def test_player_keeps_the_region_of_a_finger_on_an_edge() -> None:
-    """Noise of half a millimetre across an edge is no crossing; a millimetre of way is."""
-    regions = (Region("left", LEFT, on_press="tick"), Region("right", RIGHT, on_press="tock"))
-    effects: dict[str, Effect] = {"tick": Click(level=10.0), "tock": Click(level=15.0)}
-    player = EffectPlayer(SurfaceLayout(regions, effects, elsewhere=None))
-    assert wanted(player, [finger(1, 0.0999)], 0.0) == {1: 10.0}
-    for step in range(1, 20):
-        assert wanted(player, [finger(1, 0.0999 + 0.0005 * (step % 2))], 0.1 * step) == {}
-    assert wanted(player, [finger(1, 0.1009)], 2.0) == {1: 15.0}
-    for step in range(1, 20):
-        assert wanted(player, [finger(1, 0.1009 - 0.0009 * (step % 2))], 2 + 0.1 * step) == {}
-
-
 def test_layout_max_level() -> None:
     """The first level of a ramp counts too, also where a region lowers its last."""
     falling = Ramp(start_level=40.0, level=12.0)
@@ -194,53 +375,6 @@ def test_detents_click_once_per_detent() -> None:
     assert clicks == [5.6, 15.6, 30.6, 24]
 
 
-def test_player_follows_a_sliding_finger_through_regions() -> None:
-    """It presses where it comes in, is released where it goes out, and lifts without a feeling."""
-    regions = (
-        Region("left", LEFT, on_press="soft", on_release="hard"),
-        Region("right", RIGHT, on_press="buzz"),
-    )
-    effects: dict[str, Effect] = {
-        "soft": Click(level=10.0),
-        "hard": Click(level=24.0),
-        "buzz": Buzz(level=16.0),
-    }
-    player = EffectPlayer(SurfaceLayout(regions, effects, elsewhere=None))
-    assert wanted(player, [finger(1, 0.05)], 0.0) == {1: 10.0}
-    assert wanted(player, [finger(1, 0.06)], 0.1) == {}
-    assert wanted(player, [finger(1, 0.15)], 0.2) == {1: 24.0}  # left's release, on right
-    assert wanted(player, [finger(1, 0.15)], 0.3) == {1: 16.0}  # then right's own goes on
-    assert wanted(player, [finger(1, 0.25)], 0.4) == {}
-    assert wanted(player, [], 0.5) == {}
-
-
-def test_outside_of_all_regions_only_the_newest_finger_feels() -> None:
-    """Then the one before, also beside a finger that feels the effect of a region."""
-    region = Region("right", RIGHT, on_press="click", priority=1)
-    player = EffectPlayer(SurfaceLayout((region,), {"buzz": Buzz(), "click": Click(level=12.0)}))
-    first, second, urgent = finger(1, 0.02), finger(2, 0.08), finger(3, 0.15)
-    assert wanted(player, [first], 0.0) == {1: 20.0}
-    assert wanted(player, [first, second], 0.1) == {2: 20.0}
-    assert wanted(player, [first, second, urgent], 0.2) == {2: 20.0, 3: 12.0}
-    assert wanted(player, [first, second, urgent], 0.25) == {2: 20.0}
-    assert wanted(player, [first, urgent], 0.3) == {1: 20.0}
-
-
-def test_intent_expires_at_the_first_end() -> None:
-    """Of a detent of 30 ms, then the turn and the end of a click of 40 ms at another finger."""
-    slider = Region("slider", LEFT, on_move="dots")
-    effects: dict[str, Effect] = {"dots": Detents(duration=0.03), "click": Click(duration=0.04)}
-    player = EffectPlayer(SurfaceLayout((slider,), effects, elsewhere="click"))
-    player.intent([finger(1, 0.05)], 0.0)
-    fingers = [finger(1, 0.056), finger(2, 0.15)]
-    assert wanted(player, fingers, 1.0) == {1: 20.0}
-    assert player.intent(fingers, 1.001).until == pytest.approx(1.03)
-    assert player.intent(fingers, 1.03).until == pytest.approx(1.06)
-    assert wanted(player, fingers, 1.0601) == {2: 20.0}
-    assert player.intent(fingers, 1.07).until == pytest.approx(1.1001)
-    assert player.intent(fingers, 1.1002).until is None
-
-
 def test_every_finger_in_a_region_feels_its_own() -> None:
     """And outside of all regions the newest alone; each with its level, priority and content."""
     region = Region("left", LEFT, on_press="soft", on_move=None, priority=3)
@@ -252,20 +386,6 @@ def test_every_finger_in_a_region_feels_its_own() -> None:
         (3, 20.0, 0, "buzz"),
         (4, 9.0, 3, "soft"),
     ]
-
-
-def test_clicks_of_two_fingers_are_60_ms_apart() -> None:
-    """The second and the third wait, and play for their whole duration."""
-    pads = (Region("left", LEFT, on_press="click"), Region("right", RIGHT, on_press="click"))
-    player = EffectPlayer(SurfaceLayout(pads, {"click": Click(duration=0.04)}, elsewhere=None))
-    fingers = [finger(1, 0.05), finger(2, 0.15), finger(3, 0.16)]
-    assert wanted(player, fingers, 1.0).keys() == {1}
-    assert player.intent(fingers, 1.01).until == pytest.approx(1.04)
-    assert wanted(player, fingers, 1.059).keys() == set()
-    assert wanted(player, fingers, 1.0601).keys() == {2}
-    assert wanted(player, fingers, 1.0999).keys() == {2}
-    assert wanted(player, fingers, 1.1201).keys() == {3}
-    assert wanted(player, fingers, 1.1602).keys() == set()
 
 
 def test_clicks_requested_faster_than_they_play_wait_for_two_turns_at_most() -> None:
@@ -289,59 +409,8 @@ def test_clicks_requested_faster_than_they_play_wait_for_two_turns_at_most() -> 
     assert len(starts) >= 28  # 2 s by 70 ms
 
 
-def test_a_waiting_click_is_replaced_in_its_place() -> None:
-    """A at 0 ms, B at 10 and again at 15: B once, at 60; A waits again, but lifts: C is next."""
-    player = EffectPlayer(SurfaceLayout(effects={"click": Click(duration=0.04)}, elsewhere=None))
-    fingers = [finger(1, 0.05), finger(2, 0.15), finger(3, 0.16)]
-    for one, now in zip(fingers[:2], (0.0, 0.010), strict=True):
-        player.play("click", one, now, level_db_sl=None)
-        assert wanted(player, fingers, now).keys() == {1}
-    player.play("click", fingers[1], 0.015, level_db_sl=None)
-    assert wanted(player, fingers, 0.015).keys() == {1}
-    assert wanted(player, fingers, 0.0601).keys() == {2}
-    player.play("click", fingers[0], 0.070, level_db_sl=None)
-    assert wanted(player, fingers, 0.070).keys() == {2}
-    player.play("click", fingers[2], 0.080, level_db_sl=None)
-    assert wanted(player, fingers[1:], 0.080).keys() == {2}
-    assert wanted(player, fingers[1:], 0.1201).keys() == {3}
-
-
-def test_player_ignores_plays_without_sensation() -> None:
-    """A finger between detents of a region feels nothing, and leaves the others what they feel."""
-    slider = Region("slider", LEFT, on_move="detents", priority=9)
-    player = EffectPlayer(SurfaceLayout((slider,), {"detents": Detents(), "buzz": Buzz()}))
-    other = finger(1, 0.15)
-    assert wanted(player, [other, finger(2, 0.05)], 0.0) == {1: 20.0}
-    assert wanted(player, [other, finger(2, 0.056)], 0.1) == {1: 20.0, 2: 20.0}
-    assert wanted(player, [other, finger(2, 0.056)], 0.2) == {1: 20.0}
-
-
-def test_player_plays_an_effect_by_name() -> None:
-    """A requested effect has priority over all regions, at its level, until it ends."""
-    player = EffectPlayer(SurfaceLayout(effects={"buzz": Buzz(), "alert": Click(duration=0.1)}))
-    here, other = finger(1), finger(2)
-    assert wanted(player, [here, other], 0.0) == {2: 20.0}
-    player.play("alert", here, 0.05, level_db_sl=24.0)
-    assert wanted(player, [here, other], 0.05) == {1: 24.0, 2: 20.0}
-    assert player.effect_of(here.key) == "alert"
-    assert wanted(player, [here, other], 0.16) == {2: 20.0}
-    with pytest.raises(KeyError):
-        player.play("nothing", here, 0.2, level_db_sl=None)
-
-
-def test_requested_effect_ends_with_its_finger() -> None:
-    """It goes on through other regions, unlike what a region has for it."""
-    regions = (Region("left", LEFT, on_press="hum"), Region("right", RIGHT))
-    effects: dict[str, Effect] = {"hum": Buzz(level=9.0), "alert": Buzz(level=18.0)}
-    player = EffectPlayer(SurfaceLayout(regions, effects, elsewhere=None))
-    assert wanted(player, [finger(1, 0.05)], 0.0) == {1: 9.0}
-    player.play("alert", finger(1, 0.05), 0.1, level_db_sl=None)
-    assert wanted(player, [finger(1, 0.15)], 0.2) == {1: 18.0}
-    assert player.effect_of(finger(1).key) == "alert"
-
-
 def test_requested_effect_restarts_when_requested_again() -> None:
-    """An effect without an end, requested a thousand times, runs once; it ends with its finger."""
+    """An effect without an end, requested a thousand times, runs once."""
     felt = 0
 
     class Felt(EffectRun):
@@ -361,40 +430,8 @@ def test_requested_effect_restarts_when_requested_again() -> None:
     player = EffectPlayer(SurfaceLayout(effects={"hum": Endless()}, elsewhere=None))
     for number in range(1000):
         player.play("hum", finger(1), 0.001 * number, level_db_sl=None)
-    assert wanted(player, [finger(1)], 2.0) == {1: 20.0}
+    player.intent([finger(1)], 2.0)
     assert felt == 1
-    assert wanted(player, [], 3.0) == {}
-    assert wanted(player, [finger(1)], 4.0) == {}
-
-
-def test_requested_effect_plays_for_an_unknown_finger() -> None:
-    """What its place has for it begins all the same, and goes on when the other is over."""
-    player = EffectPlayer(SurfaceLayout(effects={"buzz": Buzz(), "alert": Click(duration=0.1)}))
-    player.play("alert", finger(1), 0.0, level_db_sl=12.0)
-    assert wanted(player, [finger(1)], 0.0) == {1: 12.0}
-    assert wanted(player, [finger(1)], 0.2) == {1: 20.0}
-
-
-@pytest.mark.parametrize("times", [1, 2])
-def test_new_layout_repeats_no_press(times: int) -> None:
-    """A finger that is down feels what lasts and what moves by the new one, but no second click.
-
-    One that comes later feels all, also under the name of one that has lifted, be it unnoticed. It
-    may be exchanged twice before it is asked.
-    """
-    effects: dict[str, Effect] = {"buzz": Buzz(level=10.0), "click": Click(), "dots": Detents()}
-    clicks = Region("left", LEFT, on_press="click", on_move="dots")
-    player = EffectPlayer(SurfaceLayout((clicks,), effects))
-    fingers = [finger(1, 0.05), finger(2, 0.15)]
-    assert wanted(player, fingers, 0.0) == {1: 20.0, 2: 10.0}
-    for _ in range(times):
-        player.replace(SurfaceLayout((clicks,), effects))
-    assert wanted(player, fingers, 1.0) == {2: 10.0}
-    assert wanted(player, [finger(1, 0.056), finger(2, 0.15)], 1.1) == {1: 20.0, 2: 10.0}
-    assert wanted(player, [], 2.0) == {}
-    assert wanted(player, [finger(1, 0.05)], 3.0) == {1: 20.0}
-    player.replace(SurfaceLayout((clicks,), effects))
-    assert wanted(player, [finger(1, 0.05, since=3.5)], 4.0) == {1: 20.0}  # not asked between
 
 
 @given(

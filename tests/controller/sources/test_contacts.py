@@ -2,6 +2,8 @@
 
 import math
 from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import pytest
@@ -27,11 +29,6 @@ def frame(
     return TouchFrame(source, time, tuple(Touch(*touch) for touch in touches), timeout, origin)
 
 
-def ids(tracker: ContactTracker) -> list[int]:
-    """Ids of the contacts in order of arrival."""
-    return [contact.key.id for contact in tracker.contacts]
-
-
 @pytest.mark.parametrize(
     ("touch", "place"),
     [
@@ -50,136 +47,207 @@ def test_tracker_maps_touches_to_the_plate(
     assert (contact.x, contact.y) == pytest.approx(place)
 
 
-def test_tracker_reports_down_moved_up() -> None:
-    """Each change is reported once; a contact keeps the time since when it is down."""
-    tracker = ContactTracker(PLATE)
-    change = tracker.update(frame(1.0, (7, 0.5, 0.5)))
-    assert [contact.key for contact in change.down] == [ContactKey("a", 7)]
-    assert not tracker.update(frame(1.01, (7, 0.5, 0.5)))
-    change = tracker.update(frame(1.02, (7, 0.6, 0.5)))
-    assert [(contact.x, contact.since) for contact in change.moved] == [(pytest.approx(0.18), 1.0)]
-    change = tracker.update(frame(1.03))
-    assert [contact.x for contact in change.up] == [pytest.approx(0.18)]
-    assert tracker.contacts == ()
-
-
-def test_tracker_keeps_the_order_of_arrival() -> None:
-    """The newest contact is the last, in whatever order frames list them."""
-    tracker = ContactTracker(PLATE)
-    tracker.update(frame(0.0, (5, 0.1, 0.1)))
-    tracker.update(frame(0.0, (1, 0.5, 0.5), source="b"))
-    tracker.update(frame(0.1, (9, 0.2, 0.1), (5, 0.2, 0.2)))
-    assert ids(tracker) == [5, 1, 9]
-    tracker.update(frame(0.2, (9, 0.2, 0.1)))
-    tracker.update(frame(0.3, (9, 0.2, 0.1), (5, 0.2, 0.2)))
-    assert ids(tracker) == [1, 9, 5]
-
-
-@pytest.mark.parametrize(
-    ("x", "y", "reason"),
-    [
-        (math.nan, 0.5, "not_finite"),
-        (0.5, math.inf, "not_finite"),
-        (-0.001, 0.5, "off_plate"),
-        (0.5, 1.001, "off_plate"),
-    ],
-)
-def test_tracker_rejects_invalid_touches(x: float, y: float, reason: str) -> None:
-    """An invalid position makes no contact, lifts its previous one, and is reported."""
-    tracker = ContactTracker(PLATE)
-    tracker.update(frame(0.0, (1, 0.5, 0.5), (2, 0.5, 0.5)))
-    change = tracker.update(frame(0.01, (1, x, y), (2, 0.5, 0.5), (3, x, y)))
-    assert [contact.key.id for contact in change.up] == [1]
-    assert change.rejected == (reason, reason)
-    assert ids(tracker) == [2]
-
-
-def test_tracker_rejects_duplicates() -> None:
-    """Of two touches with one id in a frame the last counts; it is reported."""
-    tracker = ContactTracker(PLATE)
-    change = tracker.update(frame(0.0, (1, 0.1, 0.5), (1, 0.9, 0.5)))
-    assert [contact.x for contact in change.down] == [pytest.approx(0.27)]
-    assert change.rejected == ("twice",)
-
-
-def test_tracker_accepts_twenty_contacts() -> None:
-    """The 21st contact is refused, the twenty that came first stay, and it gets a place later."""
-    tracker = ContactTracker(PLATE)
-    many = [(id, 0.5, 0.5) for id in range(21)]
-    change = tracker.update(frame(0.0, *many))
-    assert change.rejected == ("too_many",)
-    tracker.update(frame(0.01, *reversed(many)))
-    assert ids(tracker) == list(range(20))
-    tracker.update(frame(0.02, *many[1:]))
-    assert ids(tracker) == list(range(1, 21))
-
-
-def fingers(count: int) -> list[tuple[int, float, float]]:
+def fingers(count: int, *, first: int = 0) -> list[tuple[int, float, float]]:
     """So many touches."""
-    return [(id, 0.5, 0.5) for id in range(count)]
+    return [(id, 0.5, 0.5) for id in range(first, first + count)]
 
 
-def shares(tracker: ContactTracker) -> dict[str, int]:
-    """Number of contacts by source."""
-    return dict(Counter(contact.key.source for contact in tracker.contacts))
+@dataclass(frozen=True)
+class Then:
+    """A frame, or a time [s] at which is looked for what is over, and what is so thereafter.
 
-
-def test_origin_that_has_all_contacts_gives_way_to_another() -> None:
-    """Its newest contacts are lifted, one for each of the other's, until both have ten.
-
-    No frame of either takes any back; what one lifts the other may have.
+    What is None is not looked at. contacts: in order of arrival, as source and id; down, moved, up,
+    rejected: of the change; shares: number of contacts by source; expiry [s]: when the next ends.
     """
-    tracker = ContactTracker(PLATE)
-    greedy = frame(0.0, *fingers(22), source="tuio:a", origin="x")
-    tracker.update(greedy)
-    change = tracker.update(frame(0.0, *fingers(1), source="tuio:b"))
-    assert [contact.key for contact in change.up] == [("tuio:a", 19)]
-    for _ in range(3):
-        tracker.update(frame(0.0, *fingers(19), source="tuio:b"))
-        tracker.update(greedy)
-        assert shares(tracker) == {"tuio:a": 10, "tuio:b": 10}
-    tracker.update(frame(0.0, *fingers(2), source="tuio:b"))
-    tracker.update(greedy)
-    assert shares(tracker) == {"tuio:a": 18, "tuio:b": 2}
+
+    event: TouchFrame | float
+    contacts: Sequence[tuple[str, int]] | None = None
+    down: Sequence[tuple[str, int]] | None = None
+    moved: Sequence[tuple[float, float]] | None = None
+    up: Sequence[tuple[str, int]] | None = None
+    rejected: tuple[str, ...] | None = None
+    shares: Mapping[str, int] | None = None
+    expiry: float | None = None
+    keeps_taps: bool = False
 
 
-def test_sources_of_one_origin_have_equal_shares() -> None:
-    """Two browsers behind one gateway: the one with twenty fingers leaves ten to the other."""
-    tracker = ContactTracker(PLATE)
-    tracker.update(frame(0.0, *fingers(20), source="api:1:a", origin="api:1"))
-    tracker.update(frame(0.0, *fingers(19), source="api:1:b", origin="api:1"))
-    assert shares(tracker) == {"api:1:a": 10, "api:1:b": 10}
+def invalid(x: float, y: float, reason: str) -> list[Then]:
+    """An invalid position makes no contact, lifts its previous one, and is reported."""
+    touches = (1, x, y), (2, 0.5, 0.5), (3, x, y)
+    return [
+        Then(frame(0.0, *fingers(2, first=1))),
+        Then(frame(0.01, *touches), [("a", 2)], up=[("a", 1)], rejected=(reason,) * 2),
+    ]
 
 
-def test_origin_gains_nothing_by_many_sources() -> None:
-    """Twenty names of one origin, or origins of one input, do not keep a panel out."""
-    for origin in ("one", None):
-        tracker = ContactTracker(PLATE)
-        for number in range(20):
-            tracker.update(frame(0.0, *fingers(1), source=f"tuio:{number}", origin=origin))
-        tracker.update(frame(0.0, *fingers(10), source="panel:evdev"))
-        assert shares(tracker)["panel:evdev"] == 10
-        tracker.update(frame(0.0, *fingers(19), source="tuio:other"))
-        expected = 5 if origin else 0  # all origins of the input have one contact each
-        assert shares(tracker).get("tuio:other", 0) == expected
-        assert shares(tracker)["panel:evdev"] == 10
-        assert len(tracker.contacts) == MAX_CONTACTS
-
-
-@pytest.mark.parametrize(
-    ("stated", "timeout"),
-    [(3.0, 3.0), (None, 0.15), (math.nan, 0.15), (math.inf, 0.15), (-1.0, 0.15), (61.0, 0.15)],
-)
-def test_tracker_waits_as_long_as_the_frame_states(stated: float | None, timeout: float) -> None:
+def waiting(stated: float | None, timeout: float) -> list[Then]:
     """A timeout of up to a minute counts; the next frame of the source may state another."""
+    return [
+        Then(frame(10.0, (1, 0.5, 0.5), timeout=stated), expiry=10.0 + timeout),
+        Then(10.0 + timeout - 0.001, [("a", 1)]),
+        Then(10.0 + timeout + 0.001, []),
+        Then(frame(20.0, (1, 0.5, 0.5), timeout=stated), [("a", 1)]),
+        Then(frame(20.1, (1, 0.5, 0.5), timeout=1.0), expiry=21.1),
+    ]
+
+
+def many(origin: str | None, others: Mapping[str, int]) -> list[Then]:
+    """Twenty names of one origin, or origins of one input, do not keep a panel out."""
+    return [
+        *(Then(frame(0.0, *fingers(1), source=f"tuio:{n}", origin=origin)) for n in range(20)),
+        Then(frame(0.0, *fingers(10), source="panel:evdev"), shares={"panel:evdev": 10}),
+        Then(frame(0.0, *fingers(19), source="tuio:other"), shares={"panel:evdev": 10, **others}),
+    ]
+
+
+def no_time(time: float) -> list[Then]:
+    """Touches that could not time out make no contact."""
+    return [
+        Then(frame(0.0, (1, 0.5, 0.5))),
+        Then(frame(time, (1, 0.5, 0.5)), [], rejected=("no_time",)),
+    ]
+
+
+TAP = ("a", 1)
+GREEDY = frame(0.0, *fingers(22), source="tuio:a", origin="x")
+HALVES = {"tuio:a": 10, "tuio:b": 10}
+
+SCENARIOS: Mapping[str, Sequence[Then]] = {
+    # Each change is reported once; a contact keeps the time since when it is down.
+    "down, moved and up": [
+        Then(frame(1.0, (7, 0.5, 0.5)), down=[("a", 7)], moved=[], up=[], rejected=()),
+        Then(frame(1.01, (7, 0.5, 0.5)), down=[], moved=[], up=[]),
+        Then(frame(1.02, (7, 0.6, 0.5)), moved=[(pytest.approx(0.18), 1.0)], down=[]),
+        Then(frame(1.03), [], up=[("a", 7)]),
+    ],
+    # The newest contact is the last, in whatever order frames list them.
+    "order of arrival": [
+        Then(frame(0.0, (5, 0.1, 0.1))),
+        Then(frame(0.0, (1, 0.5, 0.5), source="b")),
+        Then(frame(0.1, (9, 0.2, 0.1), (5, 0.2, 0.2)), [("a", 5), ("b", 1), ("a", 9)]),
+        Then(frame(0.2, (9, 0.2, 0.1))),
+        Then(frame(0.3, (9, 0.2, 0.1), (5, 0.2, 0.2)), [("b", 1), ("a", 9), ("a", 5)]),
+    ],
+    "not a number": invalid(math.nan, 0.5, "not_finite"),
+    "infinite": invalid(0.5, math.inf, "not_finite"),
+    "west of the plate": invalid(-0.001, 0.5, "off_plate"),
+    "south of the plate": invalid(0.5, 1.001, "off_plate"),
+    # Of two touches with one id in a frame the last counts; it is reported.
+    "one id twice": [
+        Then(
+            frame(0.0, (1, 0.1, 0.5), (1, 0.9, 0.5)),
+            [("a", 1)],
+            down=[("a", 1)],
+            rejected=("twice",),
+        ),
+        Then(frame(0.1, (1, 0.9, 0.5)), moved=[]),
+    ],
+    # The 21st contact is refused, the twenty that came first stay, and it gets a place later.
+    "twenty contacts": [
+        Then(frame(0.0, *fingers(21)), rejected=("too_many",)),
+        Then(frame(0.01, *reversed(fingers(21))), [("a", id) for id in range(20)]),
+        Then(frame(0.02, *fingers(20, first=1)), [("a", id) for id in range(1, 21)]),
+    ],
+    # The newest contacts of one that has all are lifted, one for each of the other's, until both
+    # have ten. No frame of either takes any back; what one lifts the other may have.
+    "an origin that has all contacts gives way to another": [
+        Then(GREEDY),
+        Then(frame(0.0, *fingers(1), source="tuio:b"), up=[("tuio:a", 19)]),
+        *(
+            Then(frame(0.0, *fingers(19), source="tuio:b")),
+            Then(GREEDY, shares=HALVES),
+        )
+        * 3,
+        Then(frame(0.0, *fingers(2), source="tuio:b")),
+        Then(GREEDY, shares={"tuio:a": 18, "tuio:b": 2}),
+    ],
+    # Two browsers behind one gateway: the one with twenty fingers leaves ten to the other.
+    "sources of one origin have equal shares": [
+        Then(frame(0.0, *fingers(20), source="tuio:a", origin="api:1")),
+        Then(frame(0.0, *fingers(19), source="tuio:b", origin="api:1"), shares=HALVES),
+    ],
+    "many sources of one origin": many("one", {"tuio:other": 5}),
+    # All origins of the input have one contact each.
+    "many origins": many(None, {"tuio:other": 0}),
+    # A source without news for 150 ms has all its contacts lifted, others keep theirs.
+    "contact timeout": [
+        Then(frame(10.0, *fingers(2, first=1))),
+        Then(frame(10.1, (1, 0.5, 0.5), source="b"), expiry=10.15),
+        Then(10.149, up=[]),
+        Then(10.151, [("b", 1)], up=[("a", 1), ("a", 2)]),
+        Then(frame(10.2, (1, 0.5, 0.5), source="b")),
+        Then(10.3, [("b", 1)]),
+        Then(10.36, [], expiry=math.inf),
+    ],
+    "no timeout stated": waiting(None, 0.15),
+    "3 s stated": waiting(3.0, 3.0),
+    "no number stated": waiting(math.nan, 0.15),
+    "endless stated": waiting(math.inf, 0.15),
+    "less than nothing stated": waiting(-1.0, 0.15),
+    "more than a minute stated": waiting(61.0, 0.15),
+    "a time that is no number": no_time(math.nan),
+    "a time that never comes": no_time(math.inf),
+    # It counts from when it is first processed.
+    "a frame from the future": [
+        Then(frame(1e6, (1, 0.5, 0.5))),
+        Then(10.0, [TAP]),
+        Then(10.0 + CONTACT_TIMEOUT, []),
+    ],
+    # For 60 ms from its down, once, and only where taps are kept; another finger there is new.
+    "a tap whose frames come together": [
+        Then(frame(1.0, (1, 0.5, 0.5))),
+        Then(frame(1.001), [], up=[TAP]),
+        Then(frame(1.0, (1, 0.5, 0.5))),
+        Then(frame(1.001), [TAP], up=[], expiry=1.060, keeps_taps=True),
+        Then(frame(1.030), down=[], moved=[], up=[], keeps_taps=True),
+        Then(1.059, [TAP]),
+        Then(1.0601, [], up=[TAP], expiry=math.inf),
+        Then(frame(2.0, (1, 0.5, 0.5))),
+        Then(frame(2.0), [TAP], keeps_taps=True),
+        Then(frame(2.01, (1, 0.1, 0.5)), down=[TAP], up=[TAP], keeps_taps=True),
+        Then(frame(2.02), [], up=[TAP], keeps_taps=True),  # 10 ms are no glimpse
+    ],
+    # A touch off the plate, one too many, and a source that times out lift at once.
+    "no tap": [
+        Then(frame(1.0, (1, 0.5, 0.5))),
+        Then(frame(1.0, (1, 1.5, 0.5)), [], keeps_taps=True),
+        Then(frame(2.0, (1, 0.5, 0.5))),
+        Then(frame(2.0, timeout=0.02), keeps_taps=True),
+        Then(2.021, []),
+        Then(frame(3.0, *fingers(MAX_CONTACTS))),
+        Then(frame(3.0), shares={"a": MAX_CONTACTS}, keeps_taps=True),
+        Then(
+            frame(3.0, (1, 0.5, 0.5), source="b"),
+            shares={"a": MAX_CONTACTS - 1, "b": 1},
+            keeps_taps=True,
+        ),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_frames_become_contacts(name: str) -> None:
+    """After every frame of a scenario, and at every time at which something may be over."""
     tracker = ContactTracker(PLATE)
-    tracker.update(frame(10.0, (1, 0.5, 0.5), timeout=stated))
-    assert tracker.next_expiry == pytest.approx(10.0 + timeout)
-    assert not tracker.expire(10.0 + timeout - 0.001)
-    assert tracker.expire(10.0 + timeout + 0.001)
-    tracker.update(frame(20.0, (1, 0.5, 0.5), timeout=stated))
-    tracker.update(frame(20.1, (1, 0.5, 0.5), timeout=1.0))
-    assert tracker.next_expiry == pytest.approx(21.1)
+    for then in SCENARIOS[name]:
+        if isinstance(then.event, TouchFrame):
+            change = tracker.update(then.event, keeps_taps=then.keeps_taps)
+        else:
+            change = tracker.expire(then.event)
+        shares = Counter(contact.key.source for contact in tracker.contacts)
+        found = {
+            "contacts": [each.key for each in tracker.contacts],
+            "down": [each.key for each in change.down],
+            "moved": [(each.x, each.since) for each in change.moved],
+            "up": [each.key for each in change.up],
+            "rejected": change.rejected,
+            "shares": {source: shares[source] for source in then.shares or ()},
+            "expiry": pytest.approx(tracker.next_expiry),
+        }
+        wanted = {what: getattr(then, what) for what in found}
+        wanted = {what: each for what, each in wanted.items() if each is not None}
+        assert {what: found[what] for what in wanted} == wanted, then
+        assert len(tracker.contacts) <= MAX_CONTACTS
 
 
 def test_tracker_follows_loads_in_steps_once_a_finger_has_landed() -> None:
@@ -214,39 +282,6 @@ def test_tracker_bounds_whatever_is_reported(reported: list[float]) -> None:
     assert all(0.4 <= load <= 2.5 for load in loads)
     ratios = [max(a / b, b / a) for a, b in pairwise(loads)]
     assert all(ratio == 1 or ratio >= 1.5 for ratio in ratios)
-
-
-def test_tracker_lifts_contacts_after_the_timeout() -> None:
-    """A source without news for 150 ms has all its contacts lifted, others keep theirs."""
-    tracker = ContactTracker(PLATE)
-    tracker.update(frame(10.0, (1, 0.5, 0.5), (2, 0.5, 0.5)))
-    tracker.update(frame(10.1, (1, 0.5, 0.5), source="b"))
-    assert tracker.next_expiry == pytest.approx(10.15)
-    assert not tracker.expire(10.149)
-    assert [contact.key for contact in tracker.expire(10.151).up] == [("a", 1), ("a", 2)]
-    assert [contact.key for contact in tracker.contacts] == [("b", 1)]
-    tracker.update(frame(10.2, (1, 0.5, 0.5), source="b"))
-    assert not tracker.expire(10.3)
-    assert tracker.expire(10.36)
-    assert tracker.next_expiry == math.inf
-
-
-@pytest.mark.parametrize("time", [math.nan, math.inf])
-def test_tracker_rejects_frames_without_a_time(time: float) -> None:
-    """Touches that could not time out make no contact."""
-    tracker = ContactTracker(PLATE)
-    tracker.update(frame(0.0, (1, 0.5, 0.5)))
-    change = tracker.update(frame(time, (1, 0.5, 0.5)))
-    assert change.rejected == ("no_time",)
-    assert tracker.contacts == ()
-
-
-def test_tracker_times_out_frames_from_the_future() -> None:
-    """A frame from the future counts from when it is first processed."""
-    tracker = ContactTracker(PLATE)
-    tracker.update(frame(1e6, (1, 0.5, 0.5)))
-    assert not tracker.expire(10.0)
-    assert tracker.expire(10.0 + CONTACT_TIMEOUT)
 
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True) | st.floats(0, 1)
@@ -288,40 +323,3 @@ def test_tracker_invariants_for_any_sequence(events: list[TouchFrame | float]) -
     tracker.expire(latest)
     tracker.expire(latest + 1.0)
     assert tracker.contacts == ()
-
-
-def test_tracker_keeps_a_tap_whose_frames_come_together() -> None:
-    """For 60 ms from its down, once, and only where taps are kept; another finger there is new."""
-    tracker = ContactTracker(PLATE)
-    for keeps_taps, left in ((False, []), (True, [1])):
-        tracker.update(frame(1.0, (1, 0.5, 0.5)))
-        change = tracker.update(frame(1.001), keeps_taps=keeps_taps)
-        assert (ids(tracker), len(change.up)) == (left, 1 - len(left))
-    key = ContactKey("a", 1)
-    assert tracker.next_expiry == tracker.expiry_of(key) == pytest.approx(1.060)
-    assert not tracker.update(frame(1.030), keeps_taps=True)
-    assert not tracker.expire(1.059)
-    assert [each.key for each in tracker.expire(1.0601).up] == [key]
-    assert tracker.next_expiry == math.inf
-
-    tracker.update(frame(2.0, (1, 0.5, 0.5)))
-    tracker.update(frame(2.0), keeps_taps=True)
-    change = tracker.update(frame(2.01, (1, 0.1, 0.5)), keeps_taps=True)
-    assert ([each.x for each in change.up], [each.since for each in change.down]) == (
-        [0.15],
-        [2.01],
-    )
-    assert tracker.update(frame(2.02), keeps_taps=True).up  # 10 ms are no glimpse
-
-
-def test_tracker_keeps_no_tap_that_is_rejected_evicted_or_out_of_time() -> None:
-    """A touch off the plate, one too many, and a source that times out lift at once."""
-    tracker = ContactTracker(PLATE)
-    tracker.update(frame(1.0, (1, 0.5, 0.5)))
-    assert tracker.update(frame(1.0, (1, 1.5, 0.5)), keeps_taps=True).up
-    tracker.update(frame(2.0, (1, 0.5, 0.5)))
-    tracker.update(frame(2.0, timeout=0.02), keeps_taps=True)
-    assert tracker.expire(2.021).up
-    tracker.update(frame(3.0, *((number, 0.5, 0.5) for number in range(MAX_CONTACTS))))
-    tracker.update(frame(3.0), keeps_taps=True)
-    assert len(tracker.update(frame(3.0, (1, 0.5, 0.5), source="b"), keeps_taps=True).up) == 1

@@ -6,10 +6,8 @@ from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
-from model.arrays import FloatArray
 from model.files.array_file import whole_or_nothing
 from model.files.replacing import check_picture_name
 from model.rig.rig import Rig
@@ -35,41 +33,12 @@ def raster(plate: Plate) -> tuple[int, int]:
     return max(2, round(plate.length / step) + 1), max(2, round(plate.width / step) + 1)
 
 
-def draw_field(
-    axes: Axes, x: FloatArray, y: FloatArray, peak: FloatArray, *, maximum: float | None = None
-) -> ScalarMappable:
-    """Draw peak acceleration (len(y), len(x)) [m/s²] over the plate in g; axes in centimetres.
-
-    maximum: upper end of the colour scale [g].
-    """
-    image = axes.pcolormesh(
-        100 * x, 100 * y, peak / G, cmap=COLORS, shading="gouraud", vmin=0, vmax=maximum
-    )
-    label_plate(axes)
-    return image
-
-
-def draw_shape(axes: Axes, x: FloatArray, y: FloatArray, shape: FloatArray) -> ScalarMappable:
-    """Draw a mode shape (len(y), len(x)) scaled to 1, white at nodes; axes in cm."""
-    image = axes.pcolormesh(
-        100 * x, 100 * y, shape, cmap="RdBu_r", shading="gouraud", vmin=-1, vmax=1
-    )
-    label_plate(axes)
-    return image
-
-
-def draw_eras(axes: Axes, eras: Sequence[Era], *, active: Collection[str]) -> None:
-    """Mark ERAs, red if driven and green if not."""
+def draw_eras(axes: Axes, eras: Sequence[Era], *, active: Collection[str], size: float = 9) -> None:
+    """Mark ERAs, red if driven and green if not; axes in centimetres, size in points."""
     for era in eras:
         color = ACTIVE_COLOR if era.name in active else RESTING_COLOR
-        axes.plot(
-            100 * era.x, 100 * era.y, "o", ms=9, color=color, mec="white", mew=1.5, clip_on=False
-        )
-
-
-def draw_nulls(axes: Axes, nulls: FloatArray) -> None:
-    """Mark nulls [m] (n, 2) by red crosses, as the paper does."""
-    axes.plot(*(100 * nulls.T), "x", color="red", ms=5, mew=1.2, clip_on=False)
+        place = (100 * era.x, 100 * era.y)
+        axes.plot(*place, "o", ms=size, color=color, mec="white", mew=1.5, clip_on=False)
 
 
 @dataclass(frozen=True)
@@ -94,8 +63,10 @@ def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None
     maximum = max(float(panel.plate_map.peak.max()) for panel in panels) / G
     for axes, panel in zip(grid.flat, panels, strict=True):
         solved = panel.plate_map
-        image = draw_field(axes, solved.x, solved.y, solved.peak, maximum=maximum)
-        draw_nulls(axes, solved.nulls)
+        colours = {"cmap": COLORS, "shading": "gouraud", "vmin": 0, "vmax": maximum}
+        image = axes.pcolormesh(100 * solved.x, 100 * solved.y, solved.peak / G, **colours)
+        label_plate(axes)
+        axes.plot(*(100 * solved.nulls.T), "x", color="red", ms=5, mew=1.2, clip_on=False)
         draw_eras(axes, panel.eras, active=panel.active)
         axes.set_title(panel.title)
         axes.label_outer()

@@ -7,29 +7,21 @@ with what it prints.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from model.arrays import FloatArray, lattice
 from model.choice import best_by, best_of
 from model.errors import InputError
-from model.figures.drawing import (
-    ACTIVE_COLOR,
-    RESTING_COLOR,
-    MapPanel,
-    draw_eras,
-    draw_shape,
-    maps_figure,
-    raster,
-)
+from model.figures.drawing import MapPanel, draw_eras, label_plate, maps_figure, raster
 from model.files.csv_file import Columns
 from model.finger.grid import Grid
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.rig.layouts import FOUR_ERA_LAYOUTS, EraLayout, alike, diagonal_pair, edge_pair
+from model.rig.layouts import FOUR_ERA_LAYOUTS, alike, diagonal_pair, edge_pair
 from model.rig.rig import Rig
 from model.structure.attachments import Era
 from model.structure.plate import Plate
@@ -57,7 +49,6 @@ STATISTICS = ("minimum", "lower_quartile", "median", "upper_quartile", "maximum"
 """Of the cumulative peak acceleration over the plate [m/s²]."""
 
 _MODES = (1, 5)
-_MEDIAN = STATISTICS.index("median")
 
 
 @dataclass(frozen=True)
@@ -83,7 +74,7 @@ def paper_figures(rig: Rig, number: str) -> Iterator[PaperFigure]:
             yield from (figure(rig, free) for figure in figures)
 
 
-def _modes(rig: Rig, name: str, support: str, caption: str) -> PaperFigure:
+def _modes(rig: Rig, free: FreePlate, *, name: str, support: str) -> PaperFigure:
     """Mode shapes 1 and 5, and natural frequencies."""
     solved = natural_modes(rig, max(_MODES), support=support)
     columns, rows = raster(rig.plate)
@@ -95,13 +86,15 @@ def _modes(rig: Rig, name: str, support: str, caption: str) -> PaperFigure:
     figure = Figure(figsize=(9, 4.2), layout="constrained")
     grid = figure.subplots(1, len(shapes), sharey=True)
     for axes, mode, shape in zip(grid, _MODES, shapes, strict=True):
-        image = draw_shape(axes, x, y, shape.reshape(rows, columns))
+        colours = {"cmap": "RdBu_r", "shading": "gouraud", "vmin": -1, "vmax": 1}
+        image = axes.pcolormesh(100 * x, 100 * y, shape.reshape(rows, columns), **colours)
+        label_plate(axes)
         if support == "eras":
             draw_eras(axes, rig.eras, active=())
         axes.set_title(f"mode {mode}: {solved.frequencies[mode - 1]:.2f} Hz")
         axes.label_outer()
     figure.colorbar(image, ax=grid, label="deflection, largest = 1")
-    figure.suptitle(caption)
+    figure.suptitle(f"On {len(rig.eras)} ERAs" if support == "eras" else "Simply supported")
     of_shapes = {f"mode_{mode}": shape for mode, shape in zip(_MODES, shapes, strict=True)}
     tables: dict[str, Columns] = {
         "": {"mode": range(1, max(_MODES) + 1), "model_hz": solved.frequencies},
@@ -110,66 +103,59 @@ def _modes(rig: Rig, name: str, support: str, caption: str) -> PaperFigure:
     return PaperFigure(name, figure, tables)
 
 
-def _simply_supported(rig: Rig, free: FreePlate) -> PaperFigure:
-    return _modes(rig, "figure_6", "simply-supported", "Simply supported")
-
-
-def _on_eras(rig: Rig, free: FreePlate) -> PaperFigure:
-    return _modes(rig, "figure_7", "eras", f"On {len(rig.eras)} ERAs")
-
-
-@dataclass(frozen=True)
-class _Drive:
-    """A layout with the ERAs that are driven, and STATISTICS (5,) of what that gives."""
-
-    layout: EraLayout
-    active: tuple[int, ...]
-    statistics: FloatArray
-
-    @property
-    def rounded_median(self) -> float:
-        """Of drives that are equal by symmetry all have the same."""
-        return float(f"{self.statistics[_MEDIAN]:.6g}")
-
-
-def _box_plots(rig: Rig, free: FreePlate, name: str, active_count: int, title: str) -> PaperFigure:
+def _box_plots(rig: Rig, free: FreePlate, *, name: str, active_count: int) -> PaperFigure:
     """Peak acceleration summed over the sweep, of the layouts with a number of driven ERAs.
 
     ERAs are like the rig's first, at full stroke and in phase; each box is that of the highest
     median of its layout.
     """
-    plate = rig.plate
-    points, drives = equal_area_points(plate), []
-    for layout in FOUR_ERA_LAYOUTS:
-        eras = alike(rig.eras[0], layout.positions(plate))
+    points = equal_area_points(rig.plate)
+    figure = Figure(figsize=(max(6, 1.4 * len(FOUR_ERA_LAYOUTS)), 6), layout="constrained")
+    upper, lower = figure.subfigures(2, 1, height_ratios=(1, 4), squeeze=False)[:, 0]
+    rows, boxes = [], []
+    for axes, layout in zip(
+        upper.subplots(1, len(FOUR_ERA_LAYOUTS)), FOUR_ERA_LAYOUTS, strict=True
+    ):
+        eras = alike(rig.eras[0], layout.positions(rig.plate))
         acceleration = free.acceleration(eras, SWEEP, points, loads=rig.masses)
+        places = " ".join(f"({x:.4g};{y:.4g})" for x, y in layout.places)
+        drives = []
         for active in combinations(range(len(eras)), active_count):
             total = np.abs(acceleration[:, active].sum(axis=1)).sum(axis=0)
-            drives.append(_Drive(layout, active, np.percentile(total, [0, 25, 50, 75, 100])))
-    best = [
-        best_by(
-            [each for each in drives if each.layout is layout], lambda each: each.rounded_median
+            drives.append((active, np.percentile(total, [0, 25, 50, 75, 100])))
+            names = "+".join(str(era + 1) for era in active)
+            rows.append((layout.name, names, places, *drives[-1][1]))
+        # Drives that are equal by symmetry have the same median to six digits.
+        best, statistics = best_by(drives, lambda drive: float(f"{drive[1][2]:.6g}"))
+        of_box = zip(("whislo", "q1", "med", "q3", "whishi"), statistics / G, strict=True)
+        boxes.append({"label": layout.name.replace(" ", "\n"), "fliers": [], **dict(of_box)})
+        axes.add_patch(
+            Rectangle((0, 0), 100 * rig.plate.length, 100 * rig.plate.width, fc="0.93", ec="0.4")
         )
-        for layout in FOUR_ERA_LAYOUTS
-    ]
-    statistics = np.array([each.statistics for each in drives])
-    columns: Columns = {
-        "layout": [each.layout.name for each in drives],
-        "active_eras": ["+".join(str(era + 1) for era in each.active) for each in drives],
-        "era_fractions": [
-            " ".join(f"({x:.4g};{y:.4g})" for x, y in each.layout.places) for each in drives
-        ],
-        **{f"{key}_m_s2": statistics[:, column] for column, key in enumerate(STATISTICS)},
-    }
-    return PaperFigure(name, _draw_boxes(plate, best, title=title), {"": columns})
-
-
-def _one_era(rig: Rig, free: FreePlate) -> PaperFigure:
-    return _box_plots(rig, free, "figure_10", 1, "One active ERA (red)")
-
-
-def _two_eras(rig: Rig, free: FreePlate) -> PaperFigure:
-    return _box_plots(rig, free, "figure_11_boxplots", 2, "Two active ERAs (red)")
+        draw_eras(axes, eras, active=[eras[number].name for number in best], size=7)
+        axes.set_aspect("equal")
+        axes.axis("off")
+    axes = lower.subplots()
+    axes.bxp(
+        boxes,
+        widths=0.6,
+        patch_artist=True,
+        showfliers=False,
+        boxprops={"facecolor": "#9ecae1"},
+        medianprops={"color": "black", "linewidth": 1.5},
+    )
+    axes.grid(axis="y", color="0.9")
+    axes.set_axisbelow(True)
+    axes.set_ylabel("cumulative peak acceleration / g")
+    axes.set_ylim(bottom=0)
+    axes.set_title("boxes: quartiles over the plate; whiskers: minimum and maximum", fontsize=10)
+    figure.suptitle(
+        f"{'One active ERA' if active_count == 1 else 'Two active ERAs'} (red): peak accelerations "
+        f"added up over {len(SWEEP)} frequencies"
+    )
+    headers = ("layout", "active_eras", "era_fractions", *(f"{key}_m_s2" for key in STATISTICS))
+    table: Columns = dict(zip(headers, zip(*rows, strict=True), strict=True))
+    return PaperFigure(name, figure, {"": table})
 
 
 def equal_area_points(plate: Plate) -> FloatArray:
@@ -186,55 +172,12 @@ def equal_area_points(plate: Plate) -> FloatArray:
     return grid.centres(plate)
 
 
-def _draw_boxes(plate: Plate, drives: Sequence[_Drive], *, title: str) -> Figure:
-    """Boxes side by side, each with its layout above it, whiskers to minimum and maximum."""
-    figure = Figure(figsize=(max(6, 1.4 * len(drives)), 6), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=(1, 4), squeeze=False)[:, 0]
-    for axes, drive in zip(upper.subplots(1, len(drives), squeeze=False)[0], drives, strict=True):
-        _draw_layout(axes, plate, drive)
-    axes = lower.subplots()
-    keys = ("whislo", "q1", "med", "q3", "whishi")
-    boxes = [
-        {"label": drive.layout.name.replace(" ", "\n"), "fliers": []}
-        | dict(zip(keys, drive.statistics / G, strict=True))
-        for drive in drives
-    ]
-    axes.bxp(
-        boxes,
-        widths=0.6,
-        patch_artist=True,
-        showfliers=False,
-        boxprops={"facecolor": "#9ecae1"},
-        medianprops={"color": "black", "linewidth": 1.5},
-    )
-    axes.grid(axis="y", color="0.9")
-    axes.set_axisbelow(True)
-    axes.set_ylabel("cumulative peak acceleration / g")
-    axes.set_ylim(bottom=0)
-    axes.set_title("boxes: quartiles over the plate; whiskers: minimum and maximum", fontsize=10)
-    figure.suptitle(f"{title}: peak accelerations added up over {len(SWEEP)} frequencies")
-    return figure
-
-
-def _draw_layout(axes: Axes, plate: Plate, drive: _Drive) -> None:
-    """Draw a small plate with its ERAs."""
-    axes.add_patch(Rectangle((0, 0), plate.length, plate.width, fc="0.93", ec="0.4"))
-    for era, (x, y) in enumerate(drive.layout.positions(plate)):
-        color = ACTIVE_COLOR if era in drive.active else RESTING_COLOR
-        axes.plot(x, y, "o", ms=7, color=color, mec="white", mew=1, clip_on=False)
-    axes.set_aspect("equal")
-    axes.set_xlim(-0.05 * plate.length, 1.05 * plate.length)
-    axes.set_ylim(-0.05 * plate.width, 1.05 * plate.width)
-    axes.axis("off")
-
-
 def _same_frequency(rig: Rig, free: FreePlate) -> PaperFigure:
     """Two ERAs on an edge and two on a diagonal, both at 110 Hz."""
+    both = (110.0, 110.0)
     panels = {
-        "edge": pair_map(rig, free, edge_pair(rig.eras), (110.0, 110.0), "(a) same edge: {names}"),
-        "diagonal": pair_map(
-            rig, free, diagonal_pair(rig.eras), (110.0, 110.0), "(b) diagonal: {names}"
-        ),
+        "edge": pair_map(rig, free, edge_pair(rig.eras), both, "(a) same edge: {names}"),
+        "diagonal": pair_map(rig, free, diagonal_pair(rig.eras), both, "(b) diagonal: {names}"),
     }
     return _maps("figure_11_maps", panels, columns=2, caption="Two ERAs at 110 Hz")
 
@@ -283,10 +226,9 @@ def pair_map(
     title: str,
 ) -> MapPanel:
     """The map of a pair of ERAs at full stroke; the title may contain {names} and {tones}."""
-    driven = [rig.eras[number] for number in pair]
     excitation = {
-        era.name: Tone(frequency, era.stroke)
-        for era, frequency in zip(driven, frequencies, strict=True)
+        rig.eras[number].name: Tone(frequency, rig.eras[number].stroke)
+        for number, frequency in zip(pair, frequencies, strict=True)
     }
     tones = ", ".join(f"{name} {tone.frequency:g} Hz" for name, tone in excitation.items())
     solved = plate_map(rig, excitation, raster=raster(rig.plate), free=free)
@@ -303,10 +245,13 @@ def _maps(name: str, panels: dict[str, MapPanel], *, columns: int, caption: str)
 
 
 _FIGURES: dict[str, tuple[Callable[[Rig, FreePlate], PaperFigure], ...]] = {
-    "6": (_simply_supported,),
-    "7": (_on_eras,),
-    "10": (_one_era,),
-    "11": (_two_eras, _same_frequency),  # the paper gives this number twice
+    "6": (partial(_modes, name="figure_6", support="simply-supported"),),
+    "7": (partial(_modes, name="figure_7", support="eras"),),
+    "10": (partial(_box_plots, name="figure_10", active_count=1),),
+    "11": (  # the paper gives this number twice
+        partial(_box_plots, name="figure_11_boxplots", active_count=2),
+        _same_frequency,
+    ),
     "12": (_switched,),
     "13": (_stiffnesses,),
 }

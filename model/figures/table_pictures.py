@@ -1,6 +1,6 @@
 """Pictures of a table: weak cells, levels, contrast, and a pattern with its fingertips."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,6 +25,8 @@ from model.table.table import LocalizationTable
 from model.table.weak_cells import WANTED_CONTRAST_DB, WeakCells
 from model.vibration.excitation import Excitation
 
+_CONTRAST = "promised felt contrast / dB"
+
 # Fingers of the example, in shares of the plate.
 _EXAMPLE = ((0.3, 0.35), (0.8, 0.6), (0.45, 0.85))
 
@@ -39,20 +41,13 @@ def table_figures(table: LocalizationTable, overview: Overview) -> Iterator[tupl
 
 def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
     """Draw contrast from each cell to the median other finger and to one in ten."""
-    figure = Figure(figsize=(11, 4.6), layout="compressed")
-    panels = (
-        ("median other finger", weak.median_db, ~weak.feasible),
-        ("one other finger in ten (tenth percentile)", weak.tenth_db, weak.weak),
+    panels = {
+        "median other finger": weak.median_db,
+        "one other finger in ten (tenth percentile)": weak.tenth_db,
+    }
+    figure = _cells_figure(
+        table, weak.grid, panels, label=_CONTRAST, crossed=(~weak.feasible, weak.weak)
     )
-    known = np.concatenate([values[np.isfinite(values)] for _, values, _ in panels])
-    limits = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
-    grid = figure.subplots(1, 2, sharey=True)
-    for axes, (title, values, below) in zip(grid, panels, strict=True):
-        image = _draw_cells(axes, table, weak.grid, values, limits=limits)
-        _cross_out(axes, table, weak.grid, below)
-        axes.set_title(title)
-        axes.label_outer()
-    figure.colorbar(image, ax=grid, label="promised felt contrast / dB")
     figure.suptitle(
         f"Mode {table.drive_mode}: felt contrast from each cell to one other finger\n"
         f"(crosses: below {WANTED_CONTRAST_DB:g} dB; dots: ERAs)"
@@ -62,18 +57,13 @@ def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
 
 def levels_figure(table: LocalizationTable) -> Figure:
     """Draw the highest level of any pattern of one or two ERAs at each cell."""
-    figure = Figure(figsize=(7, 5), layout="compressed")
-    axes = figure.subplots()
     levels = table.available_level_db_sl
-    limits = (float(levels.min()), float(levels.max()))
-    image = _draw_cells(axes, table, table.grid, levels, limits=limits)
-    _cross_out(axes, table, table.grid, levels < FELT_DB_SL)
-    figure.colorbar(image, ax=axes, label="level / dB SL")
-    axes.set_title(
+    title = (
         f"Highest level of one or two ERAs at full stroke\n(crosses: dead, below {FELT_DB_SL:g} "
         "dB SL)"
     )
-    return figure
+    dead = levels < FELT_DB_SL
+    return _cells_figure(table, table.grid, {title: levels}, label="level / dB SL", crossed=(dead,))
 
 
 def contrast_figure(table: LocalizationTable, overview: Overview) -> Figure:
@@ -90,7 +80,7 @@ def contrast_figure(table: LocalizationTable, overview: Overview) -> Figure:
     axes.axvline(WANTED_CONTRAST_DB, color="0.5", ls=":", lw=1)
     axes.set_xlim(left=0)
     axes.set_ylim(0, 100)
-    axes.set_xlabel("promised felt contrast / dB")
+    axes.set_xlabel(_CONTRAST)
     axes.set_ylabel("contact sets with at least this contrast / %")
     axes.grid(color="0.9")
     figure.legend(loc="outside lower center", ncols=3, fontsize=9, frameon=False)
@@ -100,19 +90,45 @@ def contrast_figure(table: LocalizationTable, overview: Overview) -> Figure:
 
 def contrast_map_figure(table: LocalizationTable, found: ContrastMap) -> Figure:
     """Draw promised contrast of every place to quiet fingers, drive modes side by side."""
-    count = len(found.promised_db)
-    figure = Figure(figsize=(5.5 * count + 1.5, 4.8), layout="compressed")
-    known = np.concatenate([of[np.isfinite(of)] for of in found.promised_db.values()])
-    limits = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
-    panels = figure.subplots(1, count, sharey=True, squeeze=False)[0]
     grid = Grid(len(found.x), len(found.y))
-    for axes, (mode, promised) in zip(panels, found.promised_db.items(), strict=True):
-        image = _draw_cells(axes, table, grid, promised, limits=limits)
+    figure = _cells_figure(table, grid, found.promised_db, label=_CONTRAST)
+    for axes in figure.axes[: len(found.promised_db)]:
         for finger in found.quiet:
             draw_fingertip(axes, finger, felt=False)
-        axes.set_title(mode)
+    return figure
+
+
+def _cells_figure(
+    table: LocalizationTable,
+    grid: Grid,
+    panels: Mapping[str, FloatArray],
+    *,
+    label: str,
+    crossed: Sequence[NDArray[np.bool_]] = (),
+) -> Figure:
+    """Draw values of cells, panels side by side on one scale; white without a value, and ERAs.
+
+    crossed: of each panel the cells with crosses.
+    """
+    count = len(panels)
+    figure = Figure(figsize=(5.2 * count + 1.5, 4.8), layout="compressed")
+    known = np.concatenate([values[np.isfinite(values)] for values in panels.values()])
+    limits = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    x = np.linspace(0, 100 * table.plate.length, grid.nx + 1)
+    y = np.linspace(0, 100 * table.plate.width, grid.ny + 1)
+    drawn = figure.subplots(1, count, sharey=True, squeeze=False)[0]
+    for axes, (title, values) in zip(drawn, panels.items(), strict=True):
+        shown = np.ma.masked_invalid(values.reshape(grid.ny, grid.nx))
+        image = axes.pcolormesh(x, y, shown, cmap=COLORS, vmin=limits[0], vmax=limits[1])
+        axes.add_patch(Rectangle((0, 0), x[-1], y[-1], fill=False, ec="0.4", clip_on=False))
+        draw_eras(axes, table.eras, active=[era.name for era in table.eras])
+        label_plate(axes)
+        axes.set_title(title)
         axes.label_outer()
-    figure.colorbar(image, ax=list(panels), label="promised felt contrast / dB")
+    for axes, cells in zip(drawn, crossed, strict=False):
+        marked = 100 * grid.centres(table.plate)[cells]
+        axes.plot(*marked.T, "x", color="white", ms=6, mew=1.5)
+    figure.colorbar(image, ax=list(drawn), label=label)
     return figure
 
 
@@ -152,31 +168,6 @@ def _in_words(table: LocalizationTable, pattern: Pattern) -> str:
         for name, tone in table.drive_of(pattern.excitation).items()
     ]
     return "\n".join("; ".join(tones[start : start + 2]) for start in range(0, 12, 2)).strip()
-
-
-def _draw_cells(
-    axes: Axes,
-    table: LocalizationTable,
-    grid: Grid,
-    values: FloatArray,
-    *,
-    limits: tuple[float, float],
-) -> ScalarMappable:
-    """Draw cells in colour, white without a value, and ERAs."""
-    x = np.linspace(0, 100 * table.plate.length, grid.nx + 1)
-    y = np.linspace(0, 100 * table.plate.width, grid.ny + 1)
-    shown = np.ma.masked_invalid(values.reshape(grid.ny, grid.nx))
-    image = axes.pcolormesh(x, y, shown, cmap=COLORS, vmin=limits[0], vmax=limits[1])
-    axes.add_patch(Rectangle((0, 0), x[-1], y[-1], fill=False, ec="0.4", clip_on=False))
-    draw_eras(axes, table.eras, active=[era.name for era in table.eras])
-    label_plate(axes)
-    return image
-
-
-def _cross_out(axes: Axes, table: LocalizationTable, grid: Grid, cells: NDArray[np.bool_]) -> None:
-    """Draw crosses on some cells."""
-    marked = 100 * grid.centres(table.plate)[cells]
-    axes.plot(*marked.T, "x", color="white", ms=6, mew=1.5)
 
 
 _COLORS = "magma"

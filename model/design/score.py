@@ -27,18 +27,14 @@ import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.choice import best_rows
+from model.ensemble.attached_plate import mounts_of
+from model.ensemble.touched_plate import gram, power_of
 from model.finger.fingertip import FIVE_POINTS, fingertips_on
 from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL, detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
-from model.structure.attachments import (
-    Era,
-    attached_stiffness,
-    coupled_forces,
-    drive_forces,
-    full_strokes,
-)
+from model.structure.attachments import Era, coupled_forces
 
 LEVEL_RESERVE = 1.2
 """Factor on the wanted level for what nine of ten plates need beyond the nominal plate."""
@@ -68,24 +64,11 @@ class Places:
     to_plate: Complex64Array
 
 
-@dataclass(frozen=True, eq=False)
-class Mounts:
-    """ERAs at frequencies (f,): dynamic stiffness, force and base at full stroke, (f, n) each.
-
-    by_stiffness, by_damping: change of the stiffness by one standard deviation.
-    """
-
-    stiffness: Complex64Array
-    force: Complex64Array
-    stroke: Complex64Array
-    by_stiffness: Complex64Array
-    by_damping: Complex64Array
-
-
 class Scorer:
     """Scores layouts on a rig's plate, solved once, with contact sets on it.
 
-    frequencies (f,) [Hz]; sets: contacts (fingers, 2) [m] of each, those with contents first.
+    frequencies (f,) [Hz]; sets: contacts (fingers, 2) [m] of each, those with contents first;
+    eras: those of every layout, wherever they stand there, further ones like the last.
     """
 
     def __init__(
@@ -94,6 +77,7 @@ class Scorer:
         frequencies: FloatArray,
         sets: Sequence[FloatArray],
         *,
+        eras: Sequence[Era],
         contents: int = 1,
     ) -> None:
         self._rig = rig
@@ -101,7 +85,7 @@ class Scorer:
         uncertainty = rig.uncertainty
         std = uncertainty.thickness
         self._thicknesses = np.array([1.0, 1 + std, 1 - std] if std > 0 else [1.0])
-        self._minus_omega2 = -(self._omega**2).astype(np.float32)[:, None, None]
+        self._mounts = mounts_of(eras, (), self._omega, uncertainty)
         tip = rig.fingertip
         finger = np.zeros(len(frequencies)) if tip is None else tip.dynamic_stiffness(self._omega)
         self._finger = finger.astype(np.complex64)[:, None]
@@ -144,23 +128,9 @@ class Scorer:
         over_plate = np.asarray(to_plate.swapaxes(1, 2), dtype=np.complex64)
         return Places(footprints[:, :2], between.astype(np.complex64), to_tips, over_plate)
 
-    def mounts(self, eras: Sequence[Era]) -> Mounts:
-        """What the score needs of ERAs, whose places do not matter."""
-        omega, uncertainty = self._omega, self._rig.uncertainty
-        stiffness = np.array([era.stiffness for era in eras])
-        damping = np.array([era.damping for era in eras])
-        each = (
-            attached_stiffness(eras, (), omega),
-            drive_forces(eras, omega),
-            full_strokes(eras, omega),
-            np.broadcast_to(uncertainty.stiffness * stiffness, (len(omega), len(eras))),
-            math.log(uncertainty.damping) * 1j * omega[:, None] * damping,
-        )
-        return Mounts(*(values.astype(np.complex64) for values in each))
-
-    def mean(self, places: Places, chosen: IntArray, mounts: Mounts) -> float:
+    def mean(self, places: Places, chosen: IntArray) -> float:
         """Mean score [dB] of ERAs at chosen places (n,), each number of fingers counting alike."""
-        target, power = self._forms(places, chosen, mounts)
+        target, power = self._forms(places, chosen)
         scores = [self._of_sets(target, power, fingers).mean() for fingers in self._groups]
         return float(np.mean(scores))
 
@@ -174,14 +144,23 @@ class Scorer:
         ]
         return np.asarray(np.min(each, axis=0))
 
-    def _forms(
-        self, places: Places, chosen: IntArray, mounts: Mounts
-    ) -> tuple[Complex64Array, Complex64Array]:
+    def _forms(self, places: Places, chosen: IntArray) -> tuple[Complex64Array, Complex64Array]:
         """Mean fields (f, m, n) [m/s²] at the fingertips, and expected power there (f, m, n, n)."""
         uncertainty, weights, D = self._rig.uncertainty, self._weights, self._finger
-        minus_omega2, Z = self._minus_omega2, mounts.stiffness
         m, p = weights.shape
-        n = len(chosen)
+        n, mounts = len(chosen), self._mounts
+        which = np.minimum(np.arange(n), mounts.stiffness.shape[1] - 1)
+        Z, force, stroke, by_stiffness, by_damping = (
+            each[:, which]
+            for each in (
+                mounts.stiffness,
+                mounts.forces,
+                mounts.strokes,
+                mounts.by_stiffness,
+                mounts.by_damping,
+            )
+        )
+        minus_omega2 = mounts.minus_omega2[:, None, None]
         # The plates on the ERAs, without fingers; those of other thickness come first.
         A = places.between[:, :, chosen[:, None], chosen]
         E = places.to_tips[:, :, :, chosen]
@@ -196,26 +175,26 @@ class Scorer:
         released = 1 / (1 + D * L[..., 0])  # (v, f, m)
         reaction = L * (D * released)[..., None]
         t = G.reshape(v, f, m, p, n) - reaction[..., None] * G_f[:, :, :, None]
-        scale = minus_omega2 * mounts.force[:, None]
+        scale = minus_omega2 * force[:, None]
         fields = t * scale[:, None]
         h = fields[0]
 
         # Changes of the nominal plate.
-        motion = -(A[0] @ (K[0] * mounts.force[:, None]))
-        motion.reshape(f, -1)[:, :: n + 1] += mounts.stroke
+        motion = -(A[0] @ (K[0] * force[:, None]))
+        motion.reshape(f, -1)[:, :: n + 1] += stroke
         t, L, released, G_f = t[0], L[0], released[0], G_f[0]
-        damping = t.reshape(f, -1, n) @ (minus_omega2 * mounts.by_damping[:, :, None] * motion)
+        damping = t.reshape(f, -1, n) @ (minus_omega2 * by_damping[:, :, None] * motion)
         root = np.sqrt(weights)[..., None]
         parts = [h, damping.reshape(h.shape), *((fields[1:] - h) * np.float32(math.sqrt(0.5)))]
         rows = [each * root for each in parts]
         reach = np.sqrt(_mean_power(t, weights)) * -minus_omega2
-        rows.append(reach[..., None] * (mounts.by_stiffness[:, :, None] * motion)[:, None])
+        rows.append(reach[..., None] * (by_stiffness[:, :, None] * motion)[:, None])
         if uncertainty.fingertip > 0:
             by_load = np.sqrt(_mean_power(L[..., None], weights)) * np.abs(released)[..., None]
             load = by_load * np.float32(uncertainty.fingertip) * (D * released)[..., None]
             rows.append((load * G_f * scale)[:, :, None])
         every = np.concatenate(rows, axis=2)
-        power = every.conj().swapaxes(2, 3) @ every
+        power = gram(every)
         diagonal = power.reshape(f, m, -1)[..., :: n + 1]
         ridge = _RIDGE / n * diagonal.real.sum(axis=2, keepdims=True)
         gains = np.float32(uncertainty.gain_variance) * _mean_power(h, weights)
@@ -272,7 +251,7 @@ class Scorer:
 
 def _mean_power(values: Complex64Array, weights: Float32Array) -> Float32Array:
     """Mean of |values|² (f, m, p, n) over fingertips of weights (m, p), (f, m, n)."""
-    return np.asarray((weights[:, None] @ (values.real**2 + values.imag**2))[:, :, 0])
+    return np.asarray((weights[:, None] @ power_of(values))[:, :, 0])
 
 
 def _grouped(sizes: Sequence[int], numbers: IntArray) -> tuple[IntArray, ...]:

@@ -32,17 +32,44 @@ LEAST_THICKNESS = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class AttachedPlate:
-    """The plate with b fixed attachments, n ERAs first and then masses, at frequencies (f,).
-
-    All in single precision: accelerations are within 1e-5 of their largest.
+class Mounts:
+    """b fixed attachments of a plate, n ERAs first and then masses, at frequencies (f,).
 
     - minus_omega2: (f,) [rad²/s²]
-    - receptance: (f, r) g; by_loss: (f, r) its change by one standard deviation of the loss factor
-    - shapes: (b, r) of the attachments; stiffness: (f, b) their dynamic stiffness [N/m]
+    - stiffness: (f, b) dynamic stiffness of the attachments [N/m]
     - forces: (f, n) of each ERA at full stroke [N]; strokes: (f, n) of its base [m]
     - by_stiffness: (f, n), by_damping: (f, n) change of the ERAs' dynamic stiffness by one standard
       deviation [N/m]
+    """
+
+    minus_omega2: Float32Array
+    stiffness: Complex64Array
+    forces: Complex64Array
+    strokes: Complex64Array
+    by_stiffness: Complex64Array
+    by_damping: Complex64Array
+
+
+def mounts_of(
+    eras: Sequence[Era], masses: Sequence[PointLoad], w: FloatArray, uncertainty: Uncertainty
+) -> Mounts:
+    """ERAs and masses at w (f,) [rad/s], wherever they are."""
+    k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))
+    by_damping = math.log(uncertainty.damping) * 1j * w[:, None] * c
+    by_stiffness = np.broadcast_to(uncertainty.stiffness * k, by_damping.shape)
+    each = attached_stiffness(eras, masses, w), drive_forces(eras, w), full_strokes(eras, w)
+    single = (part.astype(np.complex64) for part in (*each, by_stiffness, by_damping))
+    return Mounts(-(w**2).astype(np.float32), *single)
+
+
+@dataclass(frozen=True, eq=False)
+class AttachedPlate(Mounts):
+    """The plate with its attachments.
+
+    All in single precision: accelerations are within 1e-5 of their largest.
+
+    - receptance: (f, r) g; by_loss: (f, r) its change by one standard deviation of the loss factor
+    - shapes: (b, r) of the attachments
     - fingertip: of the rig, None for weightless ones; finger: (f,) its dynamic stiffness [N/m];
       omega: (f,) [rad/s]; load_std: standard deviation of the logarithm of its load
     - gain, phase: standard deviations of an ERA's amplitude and of its phase [rad]; gain_variance:
@@ -50,15 +77,9 @@ class AttachedPlate:
     - thickness: its standard deviation, relative
     """
 
-    minus_omega2: Float32Array
     receptance: Complex64Array
     by_loss: Complex64Array
     shapes: Float32Array
-    stiffness: Complex64Array
-    forces: Complex64Array
-    strokes: Complex64Array
-    by_stiffness: Complex64Array
-    by_damping: Complex64Array
     omega: FloatArray
     finger: ComplexArray
     fingertip: Fingertip | None
@@ -137,24 +158,15 @@ def attach(
     frequencies (f,) [Hz]; dispersion: how omega² changes with them.
     """
     w = 2 * np.pi * frequencies
-    w2 = (w**2)[:, None]
     elasticity = ModalElasticity.of(plate, omega**2, losses, dispersion)
     stiffness = elasticity.stiffness(w)
     g = modal_receptance(stiffness, w)
     by_loss = -1j * stiffness.imag * g**2
-    k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))
-    log_damping = math.log(uncertainty.damping)
-    single = np.complex64
     return AttachedPlate(
-        minus_omega2=-w2[:, 0].astype(np.float32),
-        receptance=g.astype(single),
-        by_loss=(log_damping * by_loss).astype(single),
+        **vars(mounts_of(eras, masses, w, uncertainty)),
+        receptance=g.astype(np.complex64),
+        by_loss=(math.log(uncertainty.damping) * by_loss).astype(np.complex64),
         shapes=shapes.astype(np.float32),
-        stiffness=attached_stiffness(eras, masses, w).astype(single),
-        forces=drive_forces(eras, w).astype(single),
-        strokes=full_strokes(eras, w).astype(single),
-        by_stiffness=np.broadcast_to(uncertainty.stiffness * k, (len(w), len(k))).astype(single),
-        by_damping=(log_damping * 1j * w[:, None] * c).astype(single),
         finger=fingertip.dynamic_stiffness(w) if fingertip else np.zeros(len(w), dtype=complex),
         omega=w,
         fingertip=fingertip,

@@ -125,15 +125,18 @@ def test_search_finds_the_best_of_all_layouts_on_a_coarse_raster(monkeypatch) ->
         places = candidates[list(triple)]
         if search.problem.shortfall(places) == 0:
             dense[triple] = dense_score(loud, places, pairs, ends)
-            assert search.value(triple) == pytest.approx(dense[triple], abs=0.05)
+            (scored,) = search.scored([places])
+            assert scored.score_db == pytest.approx(dense[triple], abs=0.05)
     rng = np.random.default_rng(0)
-    starts = [
-        search.add(search.add(search.add(()))),
-        *(tuple(sorted(rng.choice(8, 3, replace=False).tolist())) for _ in range(8)),
-    ]
-    found = max(map(search.exchange, starts), key=search.value)
+    found = np.empty((0, 2))
+    for _ in range(3):
+        found = search.add(found).positions
+    starts = [found, *(candidates[rng.choice(8, 3, replace=False)] for _ in range(8))]
+    ends = search.scored([search.exchange(each) for each in starts])
+    best = max(ends, key=lambda each: each.score_db)
     assert len(dense) >= 20
-    assert dense[tuple(sorted(found))] == pytest.approx(max(dense.values()), abs=0.05)
+    numbers = np.flatnonzero((candidates[:, None] == best.positions).all(axis=-1).any(axis=1))
+    assert dense[tuple(numbers.tolist())] == pytest.approx(max(dense.values()), abs=0.05)
 
 
 def problem(**changes) -> DesignProblem:
@@ -151,14 +154,14 @@ def test_further_eras_never_score_less(monkeypatch) -> None:
     """The best layout of ever more ERAs has ever more contrast, and moved places no less."""
     monkeypatch.setitem(problem_module.CANDIDATES, True, 16)
     search = LayoutSearch(problem())
-    layout: tuple[int, ...] = ()
-    values = []
+    positions, values = np.empty((0, 2)), []
     for _ in range(4):
-        layout = search.add(layout)
-        values.append(search.value(layout))
+        added = search.add(positions)
+        positions = added.positions
+        values.append(added.score_db)
     assert values == sorted(values)
-    found = search.refine(layout)
-    assert found.score_db >= search.value(layout) - 1e-3
+    found = search.refine(positions)
+    assert found.score_db >= added.score_db - 1e-3
     (again,) = search.scored([found.positions])
     assert again.score_db == pytest.approx(found.score_db, abs=0.02)
 
@@ -259,9 +262,9 @@ def test_scores_fall_with_the_error_of_fields_as_answers_do() -> None:
     for field in (0.02, 0.05):
         known = Uncertainty(0.005, 0.5, 0.002, 0.01, 1.1, 0.5, field=field)
         some = replace(rig(), uncertainty=known)
-        scorer = Scorer(some, np.arange(60.0, 320.0, 10.0), pairs)
+        scorer = Scorer(some, np.arange(60.0, 320.0, 10.0), pairs, eras=some.eras)
         places = scorer.places(np.array([[era.x, era.y] for era in some.eras]))
-        scores.append(scorer.mean(places, np.arange(4), scorer.mounts(some.eras)))
+        scores.append(scorer.mean(places, np.arange(4)))
         answers.append(judge(some, pairs).mean_db)
     assert answers[0] - answers[1] > 4
     assert scores[0] - scores[1] == pytest.approx(answers[0] - answers[1], abs=2)

@@ -9,11 +9,11 @@ Integrals are by Gauss's rule on pieces that shrink towards the edges.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from itertools import product
 
 import numpy as np
-from numpy.polynomial.legendre import leggauss
+from numpy.polynomial.legendre import leggauss, legvander
 from scipy import linalg
 
 from model.arrays import FloatArray
@@ -111,7 +111,10 @@ class EdgedFunctions:
         n = np.arange(self.degree + 1)
         scale = np.sqrt((2 * n + 1) / self.length)
         t = 2 * x / self.length - 1
-        values, slopes = _legendre(t, self.degree)
+        values: FloatArray = np.asarray(legvander(t, self.degree), dtype=float)
+        slopes = np.zeros_like(values)
+        for each in n[1:]:
+            slopes[:, each] = each * values[:, each - 1] + t * slopes[:, each - 1]
         values, slopes = values * scale, slopes * scale * (2 / self.length)
         root = np.sqrt(weights)[:, None]
         found: tuple[dict[int, FloatArray], dict[int, FloatArray]] = ({}, {})
@@ -168,27 +171,9 @@ def _deflections(
 
 
 def _polynomials(x: FloatArray, length: float, degree: int) -> FloatArray:
-    """Values [1/sqrt(m)] of all polynomials, by degree, at x [m] (p,), (p, degree + 1)."""
-    angle = np.arccos(np.clip(1 - 2 * x / length, -1, 1))
-    cosines = np.cos(np.multiply.outer(angle, np.arange(degree + 1)))
-    return np.asarray(cosines @ _polynomials_in_cosines(degree) / np.sqrt(length))
-
-
-@lru_cache(maxsize=64)
-def _polynomials_in_cosines(degree: int) -> FloatArray:
-    """Coefficients (degree + 1, degree + 1) of orthonormal polynomials at -cos(angle).
-
-    Rows are cos(n angle), columns polynomials on a unit length: P_n(cos a) is the sum of
-    c_k c_(n-k) cos((n - 2 k) a), c_k = (2 k - 1)!! / (2 k)!!, all positive, so nothing cancels.
-    """
-    k = np.arange(1, degree + 1)
-    c = np.concatenate([[1.0], np.cumprod((2 * k - 1) / (2 * k))])
-    n = np.arange(degree + 1)
-    below = n - n[:, None]  # n - m for the coefficient of cos(m angle)
-    some = (below >= 0) & (below % 2 == 0)
-    fewer, more = np.where(some, below // 2, 0), np.where(some, below // 2 + n[:, None], 0)
-    coefficients = some * c[fewer] * c[more] * np.where(n == 0, 1, 2)[:, None]
-    return np.asarray(coefficients * (-1.0) ** n * np.sqrt(2 * n + 1))
+    """Values [1/sqrt(m)] of all orthonormal polynomials, by degree, at x [m], (p, degree + 1)."""
+    scale = np.sqrt((2 * np.arange(degree + 1) + 1) / length)
+    return np.asarray(legvander(2 * x / length - 1, degree) * scale)
 
 
 def edge_decays(section: Section) -> tuple[float, ...]:
@@ -204,12 +189,3 @@ def edge_decays(section: Section) -> tuple[float, ...]:
         if k > 0 and (not decays or k > _ALIKE * decays[-1]):
             decays.append(float(k))
     return tuple(decays[:_MAX_LAYERS])
-
-
-def _legendre(t: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
-    """Legendre polynomials at t (q,) and their derivatives, (q, degree + 1)."""
-    values: FloatArray = np.asarray(np.polynomial.legendre.legvander(t, degree), dtype=float)
-    slopes: FloatArray = np.zeros(values.shape)
-    for n in range(1, degree + 1):
-        slopes[:, n] = n * values[:, n - 1] + t * slopes[:, n - 1]
-    return values, slopes

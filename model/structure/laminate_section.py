@@ -19,10 +19,14 @@ _MAX_STEPS = 200  # of the iteration for a wavenumber, which takes some twenty
 
 @dataclass(frozen=True)
 class Bending:
-    """Bending properties of a thin plate: flexural rigidity D [N m] and Poisson's ratio."""
+    """Bending properties of a thin plate: flexural rigidity D [N m] and Poisson's ratio.
+
+    bonded: how far layers do not slide on each other, 0 to 1.
+    """
 
     rigidity: float
     nu: float
+    bonded: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +121,8 @@ def shear_corrections(layers: Sequence[Layer]) -> FloatArray:
     layers without slip: exact wherever shear matters, in soft layers between stiff ones.
     """
     factors = np.empty(len(layers))
-    plane = np.array([layer.material.E / (1 - layer.material.nu**2) for layer in layers])
-    thickness = np.array([layer.thickness for layer in layers])
-    centres = _centres(layers)
+    E, nu, thickness, centres = _columns(layers)
+    plane = E / (1 - nu**2)
     neutral = plane * thickness @ centres / (plane @ thickness)
     bottoms = centres - thickness / 2 - neutral
     stress = 0.0  # tau at the bottom of the layer; tau' = -E (z - neutral)
@@ -140,19 +143,13 @@ def perfectly_bonded(layers: Sequence[Layer]) -> Bending:
     Mater. 3 (1969) 189. For isotropic layers A, B and D share their eigenvectors, so the matrices
     fall apart into equal bending both ways, modulus E / (1 - nu), and opposite, E / (1 + nu).
     """
-    centres = _centres(layers)
+    E, nu, h, z = _columns(layers)
 
-    def reduced(moduli: Sequence[float]) -> float:
-        A = B = D = 0.0
-        for layer, z, modulus in zip(layers, centres, moduli, strict=True):
-            h = layer.thickness
-            A += modulus * h
-            B += modulus * h * z
-            D += modulus * (h**3 / 12 + h * z**2)
+    def reduced(moduli: FloatArray) -> float:
+        A, B, D = np.array([np.ones(len(z)), z, h**2 / 12 + z**2]) @ (moduli * h)
         return float(D - B**2 / A)
 
-    equal = reduced([layer.material.E / (1 - layer.material.nu) for layer in layers])
-    opposite = reduced([layer.material.E / (1 + layer.material.nu) for layer in layers])
+    equal, opposite = reduced(E / (1 - nu)), reduced(E / (1 + nu))
     return Bending((equal + opposite) / 2, (equal - opposite) / (equal + opposite))
 
 
@@ -160,7 +157,7 @@ def freely_sliding(layers: Sequence[Layer]) -> Bending:
     """Layers that share only their deflection: the sum of their rigidities."""
     rigidity = sum(layer.flexural_rigidity for layer in layers)
     coupling = sum(layer.material.nu * layer.flexural_rigidity for layer in layers)
-    return Bending(rigidity, coupling / rigidity)
+    return Bending(rigidity, coupling / rigidity, bonded=0.0)
 
 
 def wave_rigidity(laminate: Laminate, wavenumber: complex, frequency: float) -> complex:
@@ -194,10 +191,11 @@ def wavenumber_of(laminate: Laminate, frequency: float) -> complex:
     return better
 
 
-def _centres(layers: Sequence[Layer]) -> FloatArray:
-    """Heights of the layers' middles above the first face [m]."""
-    thickness = np.array([layer.thickness for layer in layers])
-    return np.asarray(np.cumsum(thickness) - thickness / 2)
+def _columns(layers: Sequence[Layer]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Moduli [Pa], Poisson's ratios, thicknesses, and heights of the middles above the face [m]."""
+    rows = [(each.material.E, each.material.nu, each.thickness) for each in layers]
+    moduli, nu, thickness = np.array(rows).T
+    return moduli, nu, thickness, np.cumsum(thickness) - thickness / 2
 
 
 def bending(laminate: Laminate, frequency: float) -> Bending:
@@ -241,7 +239,7 @@ def _bending_at(laminate: Laminate, wavenumber: float, frequency: float) -> Bend
     share = (rigidity - sliding.rigidity) / gain if gain > 1e-9 * rigidity else 0.0
     share = min(max(share, 0.0), 1.0)
     coupling = share * bonded.nu * bonded.rigidity + (1 - share) * sliding.nu * sliding.rigidity
-    return Bending(rigidity, coupling / (share * gain + sliding.rigidity))
+    return Bending(rigidity, coupling / (share * gain + sliding.rigidity), share)
 
 
 def _homogeneous(
@@ -269,18 +267,11 @@ def _rotary_inertia(laminate: Laminate, bent: Bending) -> float:
 
     The share of the latter is that of perfect bonding.
     """
-    layers = laminate.layers
-    bonded, sliding = perfectly_bonded(layers).rigidity, freely_sliding(layers).rigidity
-    gain = bonded - sliding
-    share = (bent.rigidity - sliding) / gain if gain > 1e-9 * bonded else 0.0
-    densities = np.array([layer.surface_density for layer in layers])
-    thickness = np.array([layer.thickness for layer in layers])
-    stiffness = np.array(
-        [layer.material.E * layer.thickness / (1 - layer.material.nu**2) for layer in layers]
-    )
-    centres = np.cumsum(thickness) - thickness / 2
-    off_neutral = min(max(share, 0.0), 1.0) * (centres - stiffness @ centres / stiffness.sum())
-    return float(densities @ (thickness**2 / 12 + off_neutral**2))
+    E, nu, h, z = _columns(laminate.layers)
+    stiffness = E * h / (1 - nu**2)
+    off_neutral = bent.bonded * (z - stiffness @ z / stiffness.sum())
+    densities = np.array([layer.surface_density for layer in laminate.layers])
+    return float(densities @ (h**2 / 12 + off_neutral**2))
 
 
 def _rounded(value: float) -> float:

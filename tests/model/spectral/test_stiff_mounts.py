@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy import special
 from scipy.integrate import trapezoid
-from scipy.special import eval_legendre
 
 from model.fem.mesh import Mesh, element_of
 from model.reduction.free_plate import solve_free_plate
-from model.spectral.functions import EVEN, EdgedFunctions, _polynomials
+from model.spectral.functions import EVEN, EdgedFunctions
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import Era
 from paper_plate import make_paper_rig
@@ -83,13 +82,3 @@ def test_a_layer_that_polynomials_resolve_is_left_out():
     """On a plate as thick as long, degree 24 has the layer's function already."""
     assert EdgedFunctions(LENGTH, 24, (3 / LENGTH,)).count(EVEN) == 13
     assert EdgedFunctions(LENGTH, 24, (DECAY,)).count(EVEN) == 14
-
-
-def test_polynomials_are_normalised_legendre_polynomials_at_high_degree():
-    """SciPy's, by recurrence, times sqrt((2 n + 1) / L), ends included."""
-    x = np.concatenate([[0.0, 1e-9, LENGTH], np.random.default_rng(5).uniform(0, LENGTH, 100)])
-    degrees = np.arange(61)
-    expected = eval_legendre(degrees, 2 * x[:, None] / LENGTH - 1)
-    expected *= np.sqrt((2 * degrees + 1) / LENGTH)
-    found = _polynomials(x, LENGTH, 60)
-    np.testing.assert_allclose(found, expected, atol=1e-11)

@@ -35,7 +35,7 @@ from drivers.conformance.client import (
     expect_within,
     read_as,
 )
-from drivers.conformance.expected import NAMES, OFF
+from drivers.conformance.expected import NAMES
 from drivers.conformance.material import layer
 from drivers.conformance.subject import Subject
 from drivers.protocol.records import Values
@@ -225,12 +225,12 @@ async def numbers(subject: Subject) -> None:
                 raise Late("frames were too far apart")
 
     for number, order in ((200, -1), (220, 1)):
-        token, words = subject.words_of(layer(0, subject.tone(0, 0.5)))
+        part, words = subject.words_of(layer(0, subject.tone(0, 0.5)))
         await asyncio.sleep(_FORGOTTEN)
         sent = clock.now()
         frames = segments(number, _SET, words)[::order]
         await expect_replies(1, "frames in another order", *frames)
-        subject.shown.commit(token, When(sent, clock.now()))
+        subject.played(part, When(sent, clock.now()))
         client.number = number
         await subject.ping()
     await asyncio.sleep(_FORGOTTEN)
@@ -257,7 +257,7 @@ async def network_management(subject: Subject) -> None:
     async def stopped_by(command: str) -> None:
         sent = clock.now()
         await client.command(command)
-        subject.shown.carried_out("Stop", {"ramp": 0}, When(sent, clock.now()))
+        subject.shown.carry_out("Stop", {"ramp": 0}, {}, When(sent, clock.now()))
         data = client.packed(segments(client.next_number(), _STATUS, []))
         await client.expect_silence(data, f"GetStatus after {command}")
         await client.command("start")
@@ -279,7 +279,7 @@ async def network_management(subject: Subject) -> None:
     reply = await client.exchange(_STATUS, ())
     status = MESSAGES["GetStatus"].reply.unpack(reply.words, is_strict=False)
     seen = NAMES.get(status["state"]), any(status["levels"]), status["token"]
-    expect_equal(seen, (OFF, False, 0), "state, levels, token after reset_node")
+    expect_equal(seen, ("SWITCH_ON_DISABLED", False, 0), "state, levels, token after reset_node")
 
 
 @driving("can.md#network-management", "can")

@@ -17,12 +17,14 @@ from drivers.conformance.client import (
     expect_one_of,
     expect_within,
 )
-from drivers.conformance.expected import ENABLED, NAMES, flag
+from drivers.conformance.expected import NAMES
 from drivers.conformance.material import Rows, layer, send, stage
 from drivers.conformance.serial_frames import SerialClient
 from drivers.conformance.subject import Subject
+from drivers.expected.amplifier import flag
 from drivers.protocol.records import Values
 from drivers.protocol.table import (
+    ENABLED,
     EVENT,
     EVENT_RECORD,
     FEATURES,
@@ -81,7 +83,7 @@ async def capabilities(subject: Subject) -> None:
 async def starts_disarmed(subject: Subject) -> None:
     """It is disarmed and silent unless it was armed, and shows what it has only."""
     status = (await subject.request("GetStatus")).values
-    disarmed = [number for number, name in NAMES.items() if name != ENABLED]
+    disarmed = [number for number, name in NAMES.items() if number != ENABLED]
     expect_one_of(status["state"], disarmed, "state before Arm")
     for name in ("watchdog_left", "levels", "tokens"):
         shown = status[name]
@@ -217,7 +219,7 @@ async def events(subject: Subject) -> None:
             *(send("Stop", ramp=0), subject.clear, 0.02),
         ]
     )
-    second = subject.shown.latch
+    second = subject.latch
     first = second - 1
     required = [
         *(("OPERATION_ENABLED", 0, first - 1), ("FAULT_REACTION_ACTIVE", 1, first)),
@@ -246,7 +248,8 @@ async def broadcasts(subject: Subject) -> None:
         data = subject.client.request(message.number, words, to=0)
         await subject.client.expect_silence(data, f"a {name} for all")
         if is_obeyed:
-            subject.shown.carried_out(name, values, When(sent, clock.now()))
+            own = {"session": subject.session, **values}
+            subject.shown.granted(name, own, {}, When(sent, clock.now()))
         await subject.request("GetStatus")
 
     await send_to_all("Arm", watchdog=subject.can["watchdog_max"])
@@ -255,7 +258,7 @@ async def broadcasts(subject: Subject) -> None:
     for name, values in (
         ("Set", subject.parts(half, token=2)[0]),
         *(("Silence", {"ramp": 0}), ("Ping", {}), ("Disarm", {"ramp": 0})),
-        ("Clear", {"latch": subject.shown.latch}),
+        ("Clear", {"latch": subject.latch}),
         ("Commit", {"session": 77, "token": 2}),
     ):
         await subject.run([subject.one(), subject.ping])

@@ -13,9 +13,9 @@ from drivers.conformance.client import (
     expect_within,
     read_as,
 )
-from drivers.conformance.expected import SLACK
 from drivers.conformance.material import layer, send
 from drivers.conformance.subject import Subject
+from drivers.expected.amplifier import ROUNDED
 from drivers.protocol.records import Record, Values
 from drivers.protocol.table import NO_CHANNEL, QUANTITIES, READING_STATES, sensor_reading
 
@@ -89,8 +89,8 @@ async def _start(subject: Subject, request: Values) -> Answer:
     required = request["reading"], _RUNNING, subject.shown.token
     expect_equal(seen, required, "number, state, token of a reading that begins")
     start = QUANTITIES["window_start"].from_wire(began["window_start"])
-    low = began.when.earliest - subject.shown.began.latest - 2 * SLACK
-    high = began.when.latest - subject.shown.began.earliest + SLACK
+    low = began.when.earliest - subject.shown.outputs.began[1] - 2 * ROUNDED
+    high = began.when.latest - subject.shown.outputs.began[0] + ROUNDED
     expect_within(start, low, high, "window_start since the commit")
     return began
 
@@ -102,8 +102,8 @@ async def _complete(subject: Subject, began: Answer, state: str = "COMPLETE") ->
         await asyncio.sleep(_POLL)
         shown = await subject.request("GetReading", first=0)
         left, is_running = shown["window_left"] / 1000, shown["state"] == _RUNNING
-        low = max(window - (shown.when.latest - began.when.earliest) - SLACK, 0.0)
-        high = max(window - (shown.when.earliest - began.when.latest) + SLACK, 0.0)
+        low = max(window - (shown.when.latest - began.when.earliest) - ROUNDED, 0.0)
+        high = max(window - (shown.when.earliest - began.when.latest) + ROUNDED, 0.0)
         expect_within(left, low, high, "window_left")
         expect(
             high > 0 or not is_running, "state after the window", expected="over", seen="running"

@@ -166,10 +166,10 @@ async def doubled_frames(subject: Subject) -> None:
     sets = [layer(0, subject.tone(0, each), valid_for=500) for each in (0.5, 1.0)]
     made = [subject.words_of(each) for each in sets]
     frames = [subject.client.request(_SET, words) for _, words in made]
-    for (token, _), data in zip(made, frames, strict=True):
+    for (part, _), data in zip(made, frames, strict=True):
         began = clock.now()
         await subject.client.send(data)
-        subject.shown.commit(token, When(began, clock.now()))
+        subject.played(part, When(began, clock.now()))
     for at, pause in ((0, 0.0), (1, 0.5), (1, 0.0)):
         await subject.client.send(frames[at])
         await subject.run([subject.ping, pause])

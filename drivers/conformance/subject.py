@@ -15,16 +15,18 @@ from drivers.conformance.client import (
     Client,
     Late,
     Optional,
+    When,
     expect,
     expect_equal,
     expect_one_of,
     read_as,
 )
-from drivers.conformance.expected import ENABLED, NAMES, OFF, Expected
+from drivers.conformance.expected import NAMES, Judge
 from drivers.conformance.material import FULL, Material, Rows, Send, layer, play, send
+from drivers.expected.amplifier import OFF
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, pack_layers, parts
-from drivers.protocol.table import MESSAGES, QUANTITIES, REACTION, STATES
+from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES, REACTION, STATES
 
 LEVEL = 0.2
 """Level of driven channels unless another is given: perceptible, and far from any limit."""
@@ -53,7 +55,7 @@ class Subject(Material):
         super().__init__(can, level)
         self.client, self.identity = client, identity
         self.session, self.token = 1, 0
-        self.expected: Expected | None = None
+        self.expected: Judge | None = None
         self.is_starving = True
         self._exchange_time = self._read_time = math.inf
         client.quiet = REPLY_TIMEOUT
@@ -65,7 +67,7 @@ class Subject(Material):
         client.reply_words = {MESSAGES[name].number: words for name, words in rows.items()}
 
     @property
-    def shown(self) -> Expected:
+    def shown(self) -> Judge:
         """What it must show."""
         assert self.expected is not None  # noqa: S101
         return self.expected
@@ -138,31 +140,30 @@ class Subject(Material):
             for each in ("channels", "layers"):
                 expect_equal(shown[each], self.can[each], f"number of {each} in Status")
         if self.expected is not None:
-            if name in ("Set", "Commit"):
-                await self._learn_achieved(values["token"], shown)
             if name == "Set":
-                self.expected.taken(values, shown, answer.when)
                 self.token = values["token"]
-            self.expected.carried_out(name, values, answer.when)
+                if self.token != self.expected.token:
+                    self.expected.sets.sent(values, answer.when.earliest)
+            if name == "Commit" or shown.get("played"):
+                is_exact = shown.get("exact", self.expected.sets.is_exact)
+                await self._learn_achieved(values["token"], is_exact=bool(is_exact))
+            self.expected.granted(name, values, shown, answer.when)
             self.is_starving = self.is_starving or name in ("Stop", "Disarm")
-            if "levels" in shown:
-                self.expected.check(shown, answer.when)
         return replace(answer, values=shown)
 
-    async def _learn_achieved(self, token: int, shown: Values) -> None:
-        """Read what is played of a set that is not played to the word; shown: of its reply."""
-        known = self.shown
-        if shown.get("staged") or shown.get("played"):
-            known.is_exactly[token] = bool(shown["exact"])
-        if not shown.get("played", True) or known.is_exactly.get(token, True):
+    async def _learn_achieved(self, token: int, *, is_exact: bool) -> None:
+        """Read what is played of a set that is not played to the word."""
+        judge, played = self.shown, []
+        layers = judge.sets.whole(token) if token != judge.token else None
+        if layers is None or is_exact:
             return
-        if token != known.token:
-            played = []
-            for one in known.sets[token]:
-                plays = await self.request("GetAchieved", layer=one.layer)
-                is_shown = plays["token"] == token and not one.renew
-                played.append(known.achieved(one, plays.values) if is_shown else one)
-            known.sets[token] = tuple(played)
+        for one in layers:
+            answer = await self.answer("GetAchieved", layer=one.layer)
+            unpack = MESSAGES["GetAchieved"].reply.unpack
+            shown = read_as("reply to GetAchieved", unpack, answer.words, is_strict=False)
+            is_shown = shown["token"] == token and not one.renew
+            played.append(judge.achieved(one, shown) if is_shown else one)
+        judge.sets.replace(token, tuple(played))
 
     async def status(self) -> Answer:
         """Read the status; feeds the watchdog where that is due."""
@@ -192,7 +193,12 @@ class Subject(Material):
 
     async def clear(self) -> Answer:
         """Acknowledge the last stop or fault."""
-        return await self.request("Clear", latch=self.shown.latch)
+        return await self.request("Clear", latch=self.latch)
+
+    @property
+    def latch(self) -> int:
+        """The number of the last stop or fault."""
+        return self.shown.latch or 0
 
     def _check_fed(self) -> None:
         """Raise Late where this machine may have starved the watchdog."""
@@ -204,7 +210,7 @@ class Subject(Material):
         """Share of the watchdog time that has passed."""
         if self.is_starving or self.expected is None or self.expected.state != ENABLED:
             return 0.0
-        return (clock.now() - self.expected.fed.earliest) / self.expected.watchdog
+        return (clock.now() - self.expected.fed[0]) / self.expected.watchdog
 
     @property
     def _is_hungry(self) -> bool:
@@ -221,8 +227,8 @@ class Subject(Material):
         stopped = await self.settle()
         await self.request("Clear", latch=stopped["latch"])
         status = await self.request("GetStatus")
-        expect_equal(NAMES.get(status["state"]), OFF, "state after Clear")
-        self.expected = Expected(self.can, status.values, status.when)
+        expect_equal(NAMES.get(status["state"]), NAMES[OFF], "state after Clear")
+        self.expected = Judge(self.can, status.values, status.when)
 
     def parts(
         self, *layers: LayerSet, token: int = 0, now: int = 1, count: int = 1
@@ -232,15 +238,19 @@ class Subject(Material):
             token = self.token = self.token % 0xFFFF + 1
         ramp_max = self.can["ramp_max"]
         layers = tuple([replace(one, ramp=min(one.ramp, ramp_max)) for one in layers])
-        self.shown.sets[token] = layers
         stream = pack_layers(layers)
         made = parts(stream, session=1, token=token, now=bool(now), max_words=len(stream) // count)
         return [{name: each[name] for name in each if name != "session"} for each in made]
 
-    def words_of(self, *layers: LayerSet) -> tuple[int, list[int]]:
-        """Return the token and the words of a set of one part that plays at once."""
+    def words_of(self, *layers: LayerSet) -> tuple[Values, list[int]]:
+        """Return a set of one part that plays at once, and its words."""
         (part,) = self.parts(*layers)
-        return self.token, MESSAGES["Set"].request.pack({"session": self.session, **part})
+        return part, MESSAGES["Set"].request.pack({"session": self.session, **part})
+
+    def played(self, part: Values, when: When) -> None:
+        """Note that a set of one part was carried out."""
+        self.shown.sets.sent(part, when.earliest)
+        self.shown.carry_out("Set", part, {}, when)
 
     async def play(self, *layers: LayerSet) -> Answer:
         """Play a set at once."""
@@ -314,7 +324,7 @@ class Subject(Material):
         due = clock.now() + _SETTLED
         while True:
             reply = await self.status()
-            if not any(reply["levels"]) and reply["state"] not in (*_MOVING, STATES[ENABLED]):
+            if not any(reply["levels"]) and reply["state"] not in (*_MOVING, ENABLED):
                 return reply
             seen = f"{NAMES.get(reply['state'])}, levels {reply['levels']}"
             expect(clock.now() < due, "silence", expected=f"within {_SETTLED:g} s", seen=seen)
@@ -325,15 +335,15 @@ class Subject(Material):
 
         Raises Late where this machine was too slow to see what happens.
         """
-        began = self.shown.began
-        end = self.shown.settled_at(clock.now()) + _SETTLING
-        end = end if duration is None else began.earliest + duration
+        began = self.shown.outputs.began
+        end = self.shown.outputs.settled_at(clock.now()) + _SETTLING
+        end = end if duration is None else began[0] + duration
         end = max(end, clock.now() + 3 * min(self.exchange_time, 1.0))  # of a slow line: a few
         time, seen = end - self.heard_at, 0
         pause = max(time / (2 * _SAMPLES) - min(self.exchange_time, 1.0), 0.0)
         while clock.now() < end:
             reply = await self.status()
-            width = reply.when.latest - reply.when.earliest + began.latest - began.earliest
+            width = reply.when.latest - reply.when.earliest + began[1] - began[0]
             is_narrow = width <= _NARROW + 2 * max(self.exchange_time, self.client.transit)
             seen += is_narrow
             await asyncio.sleep(pause * is_narrow)
@@ -359,7 +369,7 @@ class Subject(Material):
         await self.play(*map(layer, range(2)))
         if level > 0.75 * self.level * FULL:  # phases may be rounded
             raise Optional("its levels do not show that tones of one frequency interfere")
-        self.shown.is_exact = True
+        self.shown.outputs.interferes = True
 
 
 def _brief(values: Mapping[str, object]) -> dict[str, object]:

@@ -9,16 +9,17 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TypeAlias
 
+from drivers.expected.outputs import silent
 from drivers.playback import Playback
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, is_newer_token
 from drivers.protocol.table import QUANTITIES
 from sim.witness.capture import ReportViolation
 from sim.witness.config import AmplifierConfig
-from sim.witness.expected_amplifier import ExpectedAmplifier
-from sim.witness.expected_outputs import silent
+from sim.witness.watched_amplifier import WatchedAmplifier
 
 _TOKENS_KEPT = 16  # of commits
 
@@ -35,7 +36,7 @@ class AmplifierSession:
 
     name: str
     config: AmplifierConfig
-    amplifier: ExpectedAmplifier
+    amplifier: WatchedAmplifier
     report_always: ReportViolation
     report: ReportViolation
     is_disturbed: Callable[[float], bool]
@@ -72,7 +73,7 @@ class AmplifierSession:
 
     def forget_amplifier(self) -> None:
         """Take it for another one from now on, or for one that has started."""
-        self.amplifier.forget_state()
+        self.amplifier.forget()
         self.constants.clear()
         self.played = silent()
 
@@ -138,6 +139,7 @@ class Deadlines:
 
 
 _STEP = 0.6  # of a step of the wire; tolerance of rounding
+_FRACTIONS = 16  # of a transition at which sums are looked at
 _ABOVE = 1.01  # of a sum; what it may exceed a limit by, for moments that are not known
 _FREQUENCY, _LEVEL, _PHASE = (QUANTITIES[name] for name in ("frequency", "level", "phase"))
 
@@ -158,7 +160,7 @@ def check_set(
         session.report_always(
             "token", time, f"set {token} sent to {session.name} after set {last[0]}{other}"
         )
-    count = session.amplifier.capabilities.get("layers", math.inf)
+    count = session.amplifier.can.get("layers", math.inf)
     for one in layers:
         if one.layer >= count:
             session.report_always(
@@ -188,7 +190,7 @@ def _problem_of(session: AmplifierSession, command: Command) -> str:
 
 def check_sums(session: AmplifierSession, time: float) -> None:
     """Check what an amplifier plays from a time on, over all layers."""
-    levels, power, rises = session.amplifier.outputs.sums(time)
+    levels, power, rises = _sums(session.amplifier.outputs.playback, time)
     checked = [("power", power, session.config.power)]
     for channel, limits in session.config.channels.items():
         name = f"channel {channel}, sum of all layers"
@@ -199,6 +201,32 @@ def check_sums(session: AmplifierSession, time: float) -> None:
             session.report_always(
                 "limits", time, f"{session.name}: {what} must be at most {limit:g}, got {value:.4g}"
             )
+
+
+def _sums(
+    playback: Playback, time: float
+) -> tuple[Mapping[int, float], float, Mapping[int, float]]:
+    """Return what follows from a time on: largest levels, power, and steepest rises.
+
+    Levels and rises by channel, in full levels and full levels/s; looked at along the transitions
+    under way.
+    """
+    times = {time}
+    playing = {each: one for each, one in enumerate(playback.all_voices) if one}
+    for way in [voice.transition for voices in playing.values() for voice in voices]:
+        count = max(_FRACTIONS, len(way.knots) + 1)
+        steps = range(count + 1)
+        times.update(way.start + (way.end - way.start) * part / count for part in steps)
+    moments = sorted({round(at, 6) for at in times if at >= time})  # no sums of floats
+    levels, rises = dict[int, list[float]](), dict[int, float]()
+    for channel, voices in playing.items():
+        row = [sum(abs(each.transition.at(at)) for each in voices) for at in moments]
+        steeps = zip(pairwise(row), pairwise(moments), strict=True)
+        levels[channel] = row
+        rises[channel] = max(((b - a) / (t - s) for (a, b), (s, t) in steeps), default=0.0)
+    moment_by_moment = zip(*levels.values(), strict=True)
+    power = max((sum(v * v for v in each) for each in moment_by_moment), default=0.0)
+    return {channel: max(row) for channel, row in levels.items()}, power, rises
 
 
 def check_expected(

@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from drivers.codec.serial_line.frame import NEUTRAL, FrameReader, unpack_identity, unpack_words
+from drivers.expected.amplifier import FEEDING as FEEDING
 from drivers.protocol.records import Record, Refusal, Values
 from drivers.protocol.table import (
     BY_NUMBER,
+    ENABLED,
     EVENT,
     EVENT_RECORD,
     FAULTS,
@@ -26,7 +28,6 @@ from drivers.protocol.table import HELLO as HELLO_NUMBER
 from sim.witness.capture import Direction
 
 HELLO = "Hello"
-ENABLED = STATES["OPERATION_ENABLED"]
 A_READ = "a read"
 """Name of a read that is no message, and changes nothing."""
 STATUS_RECORD = MESSAGES["GetStatus"].reply
@@ -36,8 +37,6 @@ NAMES = {HELLO_NUMBER: HELLO, **{number: message.name for number, message in BY_
 """Names of requests by number."""
 BROADCAST = frozenset(name for name, message in MESSAGES.items() if message.is_broadcast)
 """Requests that may be for all amplifiers of a line."""
-FEEDING = frozenset(name for name, message in MESSAGES.items() if message.feeds)
-"""Requests that feed the watchdog unless they are refused."""
 _WITH_STATE = (STATUS_RECORD, EVENT_RECORD)
 
 

@@ -82,7 +82,7 @@ class WatchedWire:
         """Note that the host has closed or lost it."""
         for sent in self._pending.values():
             if sent.request.name in CHANGING:  # it may be executed unheard
-                self.sessions[sent.request.address].amplifier.forget_state()
+                self.sessions[sent.request.address].amplifier.forget()
         self._forget_pending(time)
         for session in self.sessions.values():
             session.is_open = False
@@ -120,7 +120,7 @@ class WatchedWire:
         self._faults_until = math.inf if is_on else time
         self._disturbed_until = self._faults_until + _RECOVERY
         for session in () if is_on else self.sessions.values():
-            session.amplifier.forget_state()  # what it did meanwhile may be unseen
+            session.amplifier.forget()  # what it did meanwhile may be unseen
 
     # frames
 
@@ -199,7 +199,10 @@ class WatchedWire:
 
     def _check_request(self, session: AmplifierSession, time: float, sent: Sent) -> None:
         request = sent.request
-        if problem := request.problem or session.amplifier.sets.sent(request, time):
+        problem = request.problem
+        if request.name == "Set" and not problem:
+            problem = session.amplifier.sets.sent(request.values, time)
+        if problem:
             session.report_always("garbage", time, f"host sent {request.name}: {problem}")
         if request.problem:
             return
@@ -229,7 +232,7 @@ class WatchedWire:
             session.amplifier.event_reported(notice.values, time)
         elif notice.what == "other host" and session is not None and notice.text in FEEDING:
             session.heard_other_host = time
-            session.amplifier.forget_state()
+            session.amplifier.forget()
 
     def _received(self, time: float, message: Message) -> None:
         """Process a frame of an amplifier."""
@@ -262,7 +265,7 @@ class WatchedWire:
             if request.problem:
                 what = f"{session.name} accepted {request.name}: {request.problem}"
                 session.report_always("garbage", time, what)
-            amplifier.forget_state()
+            amplifier.forget()
         elif reply.values is not None:  # else not all of it was read
             self._granted(session, time, sent, reply)
 
@@ -274,10 +277,10 @@ class WatchedWire:
             amplifier.identified(values)
         self._host.request_granted(session, time, request)
         if self.is_disturbed(time) and request.name == "Arm":
-            amplifier.forget_state()
+            amplifier.forget()
         self._host.status_heard(session, values)
         token = amplifier.token
-        amplifier.granted(sent, values, time if sent.end is None else sent.end)
+        amplifier.replied(sent, values, time if sent.end is None else sent.end)
         if amplifier.token != token and not self.is_disturbed(time):
             check_sums(session, sent.begin)
         self._move(session, request)

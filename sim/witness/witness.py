@@ -7,8 +7,8 @@ from typing import Any, Literal
 from sim.witness.amplifier_session import AmplifierSession, Delays, ExpectedSets
 from sim.witness.capture import Direction, Report, Violation, capture_line
 from sim.witness.config import WitnessConfig, parse_config
-from sim.witness.expected_amplifier import ExpectedAmplifier
 from sim.witness.host_rules import HostRules
+from sim.witness.watched_amplifier import WatchedAmplifier
 from sim.witness.watched_wire import WatchedWire
 
 OperatorCommand = Literal["arm", "disarm", "stop", "clear"]
@@ -67,7 +67,7 @@ class Witness:
                 report_always(invariant, time, sentence)
 
         slack = self._config.times_s.slack
-        amplifier = ExpectedAmplifier(name, slack=slack, report=report, report_always=report_always)
+        amplifier = WatchedAmplifier(name, slack=slack, report=report, report_always=report_always)
         return AmplifierSession(name, config, amplifier, report_always, report, is_disturbed)
 
     @property

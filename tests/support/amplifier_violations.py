@@ -67,7 +67,13 @@ BROKEN: Broken = {
     ),
     "high_voltage_in_a_fault": (
         "high_voltage",
-        lambda: Talk().armed().says(hand.FAULT, fault=hand.ARC, latch=1, high_voltage=True),
+        lambda: (
+            Talk()
+            .armed()
+            .says(hand.FAULT, fault=hand.ARC, latch=1)
+            .rest(0.03)
+            .says(hand.FAULT, fault=hand.ARC, latch=1, high_voltage=True)
+        ),
     ),
     "staged_before_all_parts": (
         "commit",

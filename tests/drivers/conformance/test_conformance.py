@@ -18,12 +18,12 @@ from drivers.codec.serial_line.frame import FrameReader
 from drivers.conformance import CHECKS, Result, judge, of_kind
 from drivers.conformance.check import Check, CheckResult, Report, run_checks
 from drivers.conformance.client import Violation, When
-from drivers.conformance.expected import Expected
+from drivers.conformance.expected import Judge
 from drivers.conformance.material import layer
 from drivers.conformance.subject import Subject
 from drivers.errors import CommandError
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, LayerSet
+from drivers.protocol.sets import Command, LayerSet, pack_layers
 from drivers.protocol.table import MESSAGES
 from drivers.trace import tracing
 from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
@@ -357,21 +357,24 @@ RISE = LayerSet(0, 100, 0, (Command(0, 2200, 5000, 0),))
 """To half of full level along 100 ms."""
 
 
+PART = {"token": 1, "now": 1, "index": 0, "parts": 1, "missing": 0, "exact": 1}
+
+
 def expected_by(moment: float, level: float) -> None:
     """Compare a status that is read a time [s] after such a set was played with what is expected.
 
     Raises Violation.
     """
     start, when = When(0.0, 0.0), When(moment, moment)
-    expected = Expected(capabilities(4), {"latch": 7, "token": 0}, start)
-    expected.carried_out("Arm", {"session": 1, "watchdog": 1000}, start)
-    expected.sets[1] = (RISE,)
-    part = {"token": 1, "now": 1, "index": 0, "parts": 1}
-    expected.taken(part, {"token": 1, "staged": 0, "played": 1, "missing": 0}, start)
-    status = {"state": 4, "fault": 0, "flags": 1, "latch": 7, "token": 1}
-    left = {"watchdog_left": round(1000 - 1000 * moment)}
+    off = {"state": 1, "fault": 0, "flags": 0, "latch": 7, "temperature": 250, "token": 0}
+    off |= {"watchdog_left": 0, "levels": [0] * 4, "tokens": [0] * 8}
+    judge = Judge(capabilities(4), off, start)
+    judge.granted("Arm", {"session": 1, "watchdog": 1000}, {}, start)
+    judge.sets.sent({**PART, "stream": pack_layers([RISE])}, 0.0)
+    judge.granted("Set", {**PART, "session": 1}, {**PART, "staged": 0, "played": 1}, start)
+    left = {"watchdog_left": round(1000 - 1000 * moment), "token": 1}
     played = {"levels": [round(10_000 * level), 0, 0, 0], "tokens": [1, *[0] * 7]}
-    expected.check({**status, **left, **played}, when)
+    judge.check({**off, "state": 4, "flags": 1, **left, **played}, when)
 
 
 # A raised cosine has risen by (1 - cos 45 degrees)/2 after a quarter, by half after half.

@@ -14,6 +14,7 @@ from sim.witness.capture import read_capture
 from sim.witness.witness import Witness
 
 BROKEN = {**host_violations.BROKEN, **amplifier_violations.BROKEN}
+FADING: dict[str, Any] = {**HALF, "tokens": (0, 0, 0, 0)}
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "witness.md"
 
 
@@ -127,7 +128,7 @@ def test_disarm_after_the_last_lift_releases_only_what_plays() -> None:
 def test_arm_may_be_withdrawn_before_its_reply() -> None:
     """It was carried out, so that the set committed last is none."""
     talk = Talk().armed().playing()
-    talk.exchange(hand.DISARM, (5,), hand.status(hand.SWITCHED_ON, **HALF)).rest(0.01)
+    talk.exchange(hand.DISARM, (5,), hand.status(hand.SWITCHED_ON, **FADING)).rest(0.01)
     talk.sends(hand.ARM, (8, 250))
     talk.exchange(hand.DISARM, (5,), hand.status(hand.SWITCHED_ON, token=0))
     assert "token" not in talk.found

@@ -1,21 +1,12 @@
-"""What the layers of an amplifier are to play, in physical units: tones, their shapes, layers.
+"""What the layers of an amplifier are to play: tones in physical units, and layers of them.
 
 The ledger of an amplifier (`drivers.host.ledger`) checks them and makes the integers of the wire.
+Envelopes are in these from the start: all knots of a set are made at once.
 """
 
 from dataclasses import dataclass
 
-
-@dataclass(frozen=True, slots=True)
-class Shape:
-    """How a level begins or ends: complex levels in full levels, a step [s] apart.
-
-    Straight lines lead through them from the present amplitude to the final one, which comes one
-    step after the last.
-    """
-
-    step: float
-    knots: tuple[complex, ...]
+from drivers.protocol.sets import Envelope
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +23,8 @@ class Tone:
     phase: float = 0.0
     keep_phase: bool = False
     skip_ending: bool = False
-    onset: Shape | None = None
-    ending: Shape | None = None
+    onset: Envelope | None = None
+    ending: Envelope | None = None
 
 
 @dataclass(frozen=True, slots=True)

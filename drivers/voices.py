@@ -35,7 +35,7 @@ def amplitudes_of(envelope: Envelope | None) -> tuple[complex, ...]:
     return () if envelope is None else _amplitudes_at(envelope.knots)
 
 
-def _amplitudes_at(knots: Sequence[tuple[int, int]]) -> tuple[complex, ...]:
+def _amplitudes_at(knots: Sequence[tuple[int, ...]]) -> tuple[complex, ...]:
     amplitudes = []
     for level, phase in knots:
         amplitudes.append(cmath.rect(level / _PER_FULL, math.radians(phase / _PER_DEGREE)))

@@ -190,7 +190,10 @@ class Decider:
 
     def _without_shapes(self, decision: Decision) -> Decision:
         """Return the last decision along its plain ramps."""
-        sets = {number: each.plain or each for number, each in decision.sets.items()}
+        sets = {
+            number: self._builder.plain(each) if each.is_shaped else each
+            for number, each in decision.sets.items()
+        }
         decision = self._decided = replace(decision, sets=sets)
         for number in decision.started:
             pattern = replace(self.playing.contents[number].pattern, onset=None, ending=None)
@@ -202,7 +205,7 @@ class Decider:
 
         Without its newest content where it has no other shapes, and silence where none is left.
         """
-        if any(each.plain for each in decision.sets.values()):
+        if any(each.is_shaped for each in decision.sets.values()):
             _logger.info("loop: plain ramps instead of envelopes: %s", error)
             return self._without_shapes(decision)
         self._retry_at = math.inf if error.until is None else error.until

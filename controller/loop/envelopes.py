@@ -1,4 +1,4 @@
-"""How many knots of an onset the wires carry in time, and envelopes as shapes of amplifiers.
+"""How many knots of an onset the wires carry in time, and envelopes in integers of the wire.
 
 A set takes its onset and its ending with it, so a touch waits for them. The knots that fit are
 arithmetic from the wires, done once when the amplifiers are open. An onset of fewer knots follows
@@ -15,9 +15,9 @@ from itertools import islice
 
 import numpy as np
 
-from drivers.contents import Shape
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
+from drivers.protocol.sets import Envelope
 from drivers.protocol.table import MAX_WORDS, QUANTITIES
 from model.rig.rig import Rig
 from model.transients.base_motion import KNOT_STEP, BaseEnvelope, Envelopes
@@ -28,8 +28,8 @@ MAX_SET_TIME = 0.010
 
 _LAYER_WORDS, _COMMAND_WORDS, _ENVELOPE_WORDS, _KNOT_WORDS = 3, 4, 2, 2
 _PART_WORDS = 3  # of a message: session, token, part
-_STEP = QUANTITIES["envelope_step"]
-_DIGITS = 9  # of a level
+_STEP, _LEVEL, _PHASE = (QUANTITIES[name] for name in ("envelope_step", "level", "phase"))
+_DIGITS = 6  # of a step of the wire
 _LEAST_ONSET = 5  # knots that an ending must leave
 
 
@@ -89,32 +89,39 @@ def _knots_in(words: int, channels: list[int]) -> int:
 
 
 def thinned(envelopes: Envelopes, *, knots: int) -> Envelopes:
-    """Return envelopes by ERA with at most so many knots beside the last value."""
-    return {name: _thinned(envelope, knots + 1) for name, envelope in envelopes.items()}
+    """Return envelopes by ERA with at most so many knots beside the last value.
 
-
-def shapes_of(envelopes: Envelopes | None, rig: Rig) -> dict[str, Shape]:
-    """Return envelopes as shapes, by ERA, with levels of full stroke; none without any."""
-    envelopes = envelopes or {}
-    strokes = {era.name: era.stroke for era in rig.eras}
-    each = [
-        knot / strokes[name] for name, envelope in envelopes.items() for knot in envelope.knots[:-1]
-    ]
-    # Without the rounding errors of the knot search, by which it may exceed 1; all at once.
-    levels = np.round(np.abs(each), _DIGITS) * np.exp(1j * np.angle(each))
-    knots = iter(levels.tolist())
+    Over the same time, in whole steps of the wire; all have as many knots and the same step.
+    """
+    first = next(iter(envelopes.values()))
+    count, steps = len(first.knots), knots + 1
+    if count <= steps:
+        return envelopes
+    step = math.ceil(round(first.duration * _STEP.per_unit) / steps) / _STEP.per_unit
+    at = np.minimum(step * np.arange(1, steps + 1), first.duration) / first.step
+    since = np.minimum(at.astype(int), count - 1)
+    values = np.array([(each.start, *each.knots) for each in envelopes.values()])
+    between = values[:, since] + (values[:, since + 1] - values[:, since]) * (at - since)
     return {
-        name: Shape(envelope.step, tuple(islice(knots, len(envelope.knots) - 1)))
-        for name, envelope in envelopes.items()
+        name: BaseEnvelope(each.frequency, each.start, tuple(row), step)
+        for (name, each), row in zip(envelopes.items(), between.tolist(), strict=True)
     }
 
 
-def _thinned(envelope: BaseEnvelope, steps: int) -> BaseEnvelope:
-    """Return an envelope over the same time in at most so many steps, of whole wire steps."""
-    count = len(envelope.knots)
-    if count <= steps:
-        return envelope
-    step = math.ceil(round(envelope.duration * _STEP.per_unit) / steps) / _STEP.per_unit
-    times = np.minimum(step * np.arange(1, steps + 1), envelope.duration)
-    knots = tuple(complex(value) for value in envelope.amplitude(times))
-    return BaseEnvelope(envelope.frequency, envelope.start, knots, step)
+def on_wire(envelopes: Envelopes | None, strokes: Mapping[str, float]) -> dict[str, Envelope]:
+    """Return envelopes in integers of the wire; strokes [m]: by ERA, as envelopes are."""
+    if not envelopes:
+        return {}
+    rows = [[knot / strokes[name] for knot in one.knots[:-1]] for name, one in envelopes.items()]
+    counts = [*map(len, rows)]
+    each = np.array([knot for row in rows for knot in row], dtype=complex)
+    levels = np.rint(np.abs(each) * _LEVEL.per_unit).astype(int)
+    phases = np.rint(np.degrees(np.angle(each)) * _PHASE.per_unit).astype(int)
+    phases[phases > _PHASE.maximum] = _PHASE.minimum  # half a turn
+    knots = zip(levels.tolist(), phases.tolist(), strict=True)
+    return {
+        name: Envelope(
+            math.ceil(round(one.step * _STEP.per_unit, _DIGITS)), tuple(islice(knots, count))
+        )
+        for (name, one), count in zip(envelopes.items(), counts, strict=True)
+    }

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from controller.loop.envelopes import EnvelopeSupport, thinned
-from controller.loop.routing import Drive, route, shaped
+from controller.loop.routing import Drive, restarted_by, route
 from drivers.contents import Layer
 from model.rig.rig import Rig
 from model.table.pattern import Pattern
@@ -23,14 +23,13 @@ class PlateSet:
     """What one layer plays on every amplifier, by name.
 
     settled_after [s]: from the commit until the last fade or onset has ended; has_endings: whether
-    it ends along shaped endings. plain: the same along its ramp, where an amplifier's ledger
-    refuses its onset or ending; None without either.
+    it ends along shaped endings; is_shaped: whether it has any envelope, or leads along one.
     """
 
     layers: Mapping[str, Layer]
     settled_after: float
     has_endings: bool = False
-    plain: "PlateSet | None" = None
+    is_shaped: bool = False
 
 
 @dataclass(frozen=True)
@@ -91,30 +90,41 @@ class SetBuilder:
         onset and an ending, which it has only if its first pulse lasts [s] until the onset is over.
         among: layers that change at once, which share the time on the wires.
         """
+        tones, ramp = pattern.excitation, min(pattern.ramp, self.ramp_max)
+        onset = ending = None
+        if is_shaped:
+            restarted = restarted_by(tones, {} if restarts else playing)
+            is_continued = not restarted.issuperset([tone.frequency for tone in tones.values()])
+            is_ended = lasts > KNOT_STEP * ONSET_KNOTS
+            pattern = self.shape(question, pattern, is_continued, is_ended=is_ended)
+            onset, ending = pattern.onset, pattern.ending
+            if onset:
+                onset = thinned(onset, knots=max(1, self.support.onset_knots // among))
         layers = route(
-            pattern.excitation,
+            tones,
             self.rig,
-            ramp=min(pattern.ramp, self.ramp_max),
+            ramp=ramp,
             number=number,
             playing=playing,
             restarts=restarts,
             valid_for=valid_for,
+            onset=onset,
+            ending=ending,
         )
-        ramp = max(layer.ramp for layer in layers.values())
-        pattern = replace(pattern, ramp=ramp)
-        plain = PlateSet(layers, ramp)
-        if is_shaped:
-            is_continued = any(tone.keep_phase for layer in layers.values() for tone in layer.tones)
-            is_ended = lasts > KNOT_STEP * ONSET_KNOTS
-            pattern = self.shape(question, pattern, is_continued, is_ended=is_ended)
-        if not (pattern.onset or pattern.ending):
-            return plain, pattern
-        if pattern.onset:
-            onset = thinned(pattern.onset, knots=max(1, self.support.onset_knots // among))
-            pattern = replace(pattern, onset=onset)
-            ramp = max(ramp, *[each.duration for each in onset.values()])
-        layers = shaped(layers, self.rig, onset=pattern.onset, ending=pattern.ending)
-        return PlateSet(layers, ramp, bool(pattern.ending), plain), pattern
+        ramp = next(iter(layers.values())).ramp
+        pattern = replace(pattern, ramp=ramp, onset=onset, ending=ending)
+        settled = max([ramp, *[each.duration for each in (onset or {}).values()]])
+        return PlateSet(layers, settled, bool(ending), bool(onset or ending)), pattern
+
+    def plain(self, shaped: PlateSet) -> PlateSet:
+        """Build a set along its ramp, where an amplifier's ledger refuses its envelopes."""
+        layers: dict[str, Layer] = {}
+        for name, layer in shaped.layers.items():
+            if not layer.tones:
+                return self.build_end(layer.number, has_endings=False)
+            tones = [replace(tone, onset=None, ending=None) for tone in layer.tones]
+            layers[name] = replace(layer, tones=tuple(tones))
+        return PlateSet(layers, layer.ramp)
 
     def build_renewal(self, playing: PlateSet, *, valid_for: float) -> PlateSet:
         """Build the set that prolongs another for a time [s]."""
@@ -127,8 +137,7 @@ class SetBuilder:
     def build_end(self, number: int, *, has_endings: bool) -> PlateSet:
         """Build the set that ends a layer along its endings, or along a ramp."""
         ramp = min(FADE_RAMP, self.ramp_max)
-        plain = PlateSet(route({}, self.rig, ramp=ramp, number=number), ramp)
         if not has_endings:
-            return plain
+            return PlateSet(route({}, self.rig, ramp=ramp, number=number), ramp)
         layers = {name: Layer(number, ramp=ramp) for name in self.rig.amplifiers}
-        return PlateSet(layers, ramp, plain=plain)
+        return PlateSet(layers, ramp, is_shaped=True)

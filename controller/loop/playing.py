@@ -12,7 +12,7 @@ from typing import Any
 from controller.loop.content import Content
 from controller.loop.intent import Pulse, Target
 from controller.loop.plate_set import PlateSet
-from controller.loop.routing import Drive, continues_all_tones, tones_by_era
+from controller.loop.routing import Drive, restarted_by, tones_by_era
 from controller.sources.contacts import MAX_CONTACT_TIMEOUT, Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.ledger import is_vibrating
@@ -197,7 +197,7 @@ class Playing:
         for number, content in numbers.items() if voiced else ():
             before = self.contents.get(number)
             drive = {} if before is None else before.drive
-            is_continued = continues_all_tones(content.pattern.excitation, drive)
+            is_continued = not restarted_by(content.pattern.excitation, drive)
             if content.key[0] in voiced and number not in unchanged and not is_continued:
                 found.add(content.key[0])
         return found

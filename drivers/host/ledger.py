@@ -215,7 +215,7 @@ class Ledger:
     def _check_sums(self, layers: Sequence[LayerSet], now: float, delay: float) -> None:
         late, until = now - self.lag, now + delay + self.lag  # ends are as late as they can be
         self.playback.advance(late)
-        if self.limits.slew == math.inf and self._is_plain_and_within(layers, late, until):
+        if self.limits.slew == math.inf and self._is_within_at_most(layers, late, until):
             return
         refusal = self._refusal_of_sums(layers, late, until)
         if refusal is None:
@@ -252,43 +252,37 @@ class Ledger:
             )
         return None
 
-    def _is_plain_and_within(self, layers: Sequence[LayerSet], late: float, until: float) -> bool:
-        """Whether a cross-fade along one ramp is within the limits: nearly every set.
+    def _is_within_at_most(self, layers: Sequence[LayerSet], late: float, until: float) -> bool:
+        """Whether the limits hold with all that may play at its largest at once: nearly always.
 
-        Between its two ends levels are convex, and so are sums of their squares, so that the worst
-        is at one of them. False where envelopes, several ramps or ends of layers need more.
+        Of one layer, a tone that rises along the ramp and the one that falls along it meanwhile are
+        together at most the larger of both.
         """
-        playback, ramp, highest = self.playback, layers[0].ramp, self.limits.level
-        may_end = playback.next_due <= until
-        if playback.next_due < math.inf and playback.waiting:
-            return False
-        named: list[int] = []
-        after = [0.0] * playback.channels
-        for one in layers:
-            if one.ramp != ramp or one.after or (may_end and playback.end_of(one.layer) <= until):
-                return False
-            if not one.renew:
-                named.append(one.layer)
+        playback, full = self.playback, _LEVEL.per_unit
+        levels, rising = [0.0] * playback.channels, dict[tuple[int, int], float]()
+        for one in (*layers, *playback.waiting):
+            is_at_once = not one.after and playback.end_of(one.layer) > until
             for command in one.commands:
-                if command.onset is not None or command.ending is not None:
-                    return False
-                after[command.channel] += command.level / _LEVEL.per_unit
-        before = [0.0] * playback.channels
+                peak = command.level
+                for shape in (command.onset, command.ending):
+                    if shape is not None:
+                        peak = max(peak, shape.peak)
+                levels[command.channel] += peak / full
+                if is_at_once and command.onset is None:
+                    rising[one.layer, command.channel] = command.level / full
         for channel, voices in enumerate(playback.all_voices):
             for voice in voices:
-                transition = voice.transition
-                if transition.knots or voice.ending is not None:
-                    return False
-                peak = abs(transition.last)
-                if transition.first and late < transition.end:
-                    peak = max(peak, abs(transition.first))
-                before[channel] += peak
-                if voice.has_ended or voice.layer not in named:
-                    after[channel] += peak
-        if max(*before, *after) > highest / _LEVEL.per_unit * TOLERANCE:
-            return False
-        power = max(math.hypot(*before), math.hypot(*after)) ** 2
-        return power <= self.limits.power * TOLERANCE
+                way, ending = voice.transition, voice.ending
+                largest = abs(way.last)
+                if late < way.end:
+                    largest = max(largest, abs(way.first), *map(abs, way.knots))
+                if ending is not None:
+                    largest = max(largest, ending.peak / full)
+                if not voice.has_ended and way.last:
+                    largest = max(largest - rising.pop((voice.layer, channel), 0.0), 0.0)
+                levels[channel] += largest
+        is_within = max(levels) <= self.limits.level / full * TOLERANCE
+        return is_within and math.hypot(*levels) ** 2 <= self.limits.power * TOLERANCE
 
     def _within_budget(
         self, layers: tuple[LayerSet, ...], now: float, delay: float

@@ -1,8 +1,8 @@
 """What a set may contain: limits in force, layers as the wire rounds them, and limits over time.
 
 Limits are the least of rig, amplifier, channels and ceilings. Levels, frequencies and phases are
-rounded to the nearest step, ramps and steps upward, and `valid_for` never to 0, which means without
-end; what the wire cannot have, or limits forbid, is refused.
+rounded to the nearest step, ramps upward, and `valid_for` never to 0, which means without end; what
+the wire cannot have, or limits forbid, is refused. Envelopes come in integers of the wire.
 """
 
 import math
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from operator import index
 from typing import TypeAlias
 
-from drivers.contents import Layer, Shape, Tone
+from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused
 from drivers.protocol.records import Values, WireQuantity
 from drivers.protocol.sets import Command, Envelope, LayerSet
@@ -95,9 +95,8 @@ TOLERANCE = 1 + 1e-9
 """Factor by which a sum of floats may exceed a limit."""
 _LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
-_STEP, _FREQUENCY = QUANTITIES["envelope_step"], QUANTITIES["frequency"]
+_FREQUENCY = QUANTITIES["frequency"]
 _VALID_FOR_MAX = _VALID_FOR.high
-_ENDS = ("min", "max")
 
 
 class Rounding:
@@ -109,7 +108,6 @@ class Rounding:
         self._layers: int = capabilities["layers"]
         self._ramp_max = _RAMP.from_wire(capabilities["ramp_max"])
         self._level_max = limits.level / _LEVEL.per_unit
-        self._steps = [_STEP.from_wire(capabilities[f"envelope_step_{end}"]) for end in _ENDS]
 
     def layers(self, layers: Sequence[Layer]) -> tuple[LayerSet, ...]:
         """Return layers in integers of the wire; raises CommandRefused with channel and reason."""
@@ -180,33 +178,25 @@ class Rounding:
             phase,
             bool(tone.keep_phase),
             bool(tone.skip_ending),
-            None if onset is None else self._envelope(onset, channel),
-            None if tone.ending is None else self._envelope(tone.ending, channel),
+            onset and self._envelope(onset, channel),
+            tone.ending and self._envelope(tone.ending, channel),
         )
 
     def _level_refused(self, channel: int, name: str, level: float) -> CommandRefused:
         return _refused(channel, f"{name} must be 0 to {self._level_max:g}, got {level!r}")
 
-    def _envelope(self, shape: Shape, channel: int) -> Envelope:
-        can, limits = self._can, self._limits
-        low, high = self._steps
-        if not low <= shape.step <= high:
-            text = f"step of an envelope must be {low:g} to {high:g} s, got {shape.step!r} s"
+    def _envelope(self, envelope: Envelope, channel: int) -> Envelope:
+        """Return an envelope, which has the integers of the wire; raises unless it is allowed."""
+        low, high = self._can["envelope_step_min"], self._can["envelope_step_max"]
+        if not low <= envelope.step <= high:
+            text = f"step of an envelope must be {low} to {high} (0.1 ms), got {envelope.step!r}"
             raise _refused(channel, text)
-        if len(shape.knots) > can["knots"]:
-            text = f"knots of an envelope must be at most {can['knots']}, got {len(shape.knots)}"
+        if len(envelope.knots) > (limit := self._can["knots"]):
+            text = f"knots of an envelope must be at most {limit}, got {len(envelope.knots)}"
             raise _refused(channel, text)
-        knots: list[tuple[int, int]] = []
-        for knot in shape.knots:
-            level = abs(knot)
-            if not 0 <= level <= self._level_max * TOLERANCE:
-                raise self._level_refused(channel, "level of a knot", level)
-            degrees = math.degrees(math.atan2(knot.imag, knot.real))
-            phase = round(degrees * _PHASE.per_unit)
-            if not _PHASE.minimum <= phase <= _PHASE.maximum:
-                phase = _PHASE.to_wire(degrees)
-            knots.append((min(round(level * _LEVEL.per_unit), limits.level), phase))
-        return Envelope(math.ceil(shape.step * _STEP.per_unit - _SLACK), tuple(knots))
+        if not 0 <= (peak := envelope.peak) <= self._limits.level:
+            raise self._level_refused(channel, "level of a knot", peak / _LEVEL.per_unit)
+        return envelope
 
 
 def _refused(channel: int, text: str) -> CommandRefused:

@@ -40,7 +40,12 @@ class Envelope:
     """A transition: knots (level, phase), a step apart; the last step leads to the final level."""
 
     step: int
-    knots: tuple[tuple[int, int], ...]
+    knots: tuple[tuple[int, ...], ...]
+
+    @property
+    def peak(self) -> int:
+        """The highest level of a knot."""
+        return max(self.knots)[0] if self.knots else 0
 
     def scaled(self, factor: float) -> "Envelope":
         """Return it with the levels of all knots times a factor."""
@@ -112,8 +117,7 @@ def pack_layers(layers: Iterable[LayerSet]) -> list[int]:
                 if shape is None:
                     continue
                 ENVELOPE.append(words, {"knots": len(shape.knots), "step": shape.step})
-                rows = [{"level": level, "phase": phase} for level, phase in shape.knots]
-                KNOT.append(words, *rows)
+                KNOT.append_rows(words, shape.knots)
     return words
 
 
@@ -151,11 +155,8 @@ def _command(words: Sequence[int], at: int) -> tuple[Command, int]:
 
 def _envelope(words: Sequence[int], at: int) -> tuple[Envelope, int]:
     head, at = ENVELOPE.read(words, at)
-    knots = []
-    for _ in range(head["knots"]):
-        knot, at = KNOT.read(words, at)
-        knots.append((knot["level"], knot["phase"]))
-    return Envelope(head["step"], tuple(knots)), at
+    knots, at = KNOT.read_rows(words, at, head["knots"])
+    return Envelope(head["step"], knots), at
 
 
 def parts(

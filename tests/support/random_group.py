@@ -6,11 +6,12 @@ import random
 from collections.abc import Sequence
 from typing import Any
 
-from drivers.contents import Layer, Shape, Tone
+from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, LinkError, Preempted
 from drivers.host.group import Group
 from drivers.host.jobs import Priority
 from drivers.host.members import GroupState
+from drivers.protocol.sets import Envelope
 from drivers.protocol.table import STATES
 from words_line import unaltered
 
@@ -141,10 +142,10 @@ class RandomGroup:
             ending=shapes[1],
         )
 
-    def _shape(self) -> Shape:
+    def _shape(self) -> Envelope:
         count = self.rng.choice((0, 1, 4))
-        step = self.rng.choice((0.001, 0.004, 0.02))
-        return Shape(step, tuple(0.2 * self.rng.random() + 0j for _ in range(count)))
+        step = self.rng.choice((10, 40, 200))
+        return Envelope(step, tuple((self.rng.randrange(2000), 0) for _ in range(count)))
 
     async def keep_beating(self) -> None:
         """Beat as a control loop does while it is armed."""

@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 
 from controller.loop.capabilities import playback_capabilities
-from controller.loop.envelopes import EnvelopeSupport, envelope_support, shapes_of, thinned
+from controller.loop.envelopes import EnvelopeSupport, envelope_support, on_wire, thinned
 from controller.loop.routing import route, tones_by_era
 from drivers.contents import Layer
 from drivers.contents import Tone as Played
 from drivers.host.ledger import Ledger
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, LayerSet
+from drivers.protocol.sets import Command, Envelope, LayerSet
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.rig.rig import Channel, Rig
@@ -160,25 +160,31 @@ def test_envelopes_need_capabilities(changed: dict[str, int], expected: tuple[in
     assert found == EnvelopeSupport(*expected)
 
 
-def test_shapes_by_hand() -> None:
-    """Levels in strokes, without the last knot."""
-    found = shapes_of(
+STROKES = {"A": 1e-4, "B": 2e-4, "C": 1e-4}
+
+
+def test_envelopes_on_the_wire_by_hand() -> None:
+    """Levels in strokes of 1e-4, phases in 0.01 degrees and steps of 0.1 ms, without the last knot.
+
+    Half a turn is the lowest phase that the wire has.
+    """
+    found = on_wire(
         {
-            "B": BaseEnvelope(110.0, 0, (1e-4j, -2e-4, 0)),
+            "B": BaseEnvelope(110.0, 0, (1e-4j, -2e-4, 0), 0.01),
             "A": BaseEnvelope(110.0, 0, (2e-5, 5e-5)),
+            "C": BaseEnvelope(110.0, 0, (5e-5,)),
         },
-        rig(),
+        STROKES,
     )
-    assert found["A"].knots == (pytest.approx(0.2),)
-    assert found["B"].step == 0.005
-    assert found["B"].knots == (pytest.approx(0.5j), pytest.approx(-1.0))
+    assert found["A"] == Envelope(50, ((2000, 0),))
+    assert found["B"] == Envelope(100, ((5000, 9000), (10000, -18000)))
+    assert found["C"] == Envelope(50, ())
 
 
-def test_shapes_round_full_stroke_to_one() -> None:
+def test_envelopes_round_full_stroke_to_one() -> None:
     """A rounding error above it would be refused by the ledger."""
     full = cmath.rect(1e-4 * (1 + 1e-12), 1.0)
-    (knot,) = shapes_of({"A": BaseEnvelope(110.0, 0, (full, 0))}, rig())["A"].knots
-    assert abs(knot) <= 1.0 + math.ulp(1.0)
+    assert on_wire({"A": BaseEnvelope(110.0, 0, (full, 0))}, STROKES)["A"].peak == 10000
 
 
 def test_thinned_envelope_follows_the_same_lines() -> None:

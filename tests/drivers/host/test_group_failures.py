@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from drivers.contents import Shape
 from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkError
 from drivers.host.group import Group
 from drivers.host.jobs import JointStart
 from drivers.host.sensors import read_measured
 from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import Envelope
 from sim.amplifier.contract import Amplifier as FarEnd
 from virtual_loop import in_virtual_time
 from words_line import MemoryLine, grouped, layer, losing, tone, with_group
@@ -233,7 +233,7 @@ async def test_reading_that_gives_way_to_a_set_is_no_silence(
     end.outward = lambda name, data: [(0.008 if name == "GetMeasured" else 0.0002, data)]
     reading = asyncio.ensure_future(read_measured(group.amplifiers["a"]))
     await asyncio.sleep(0.001)
-    onset = Shape(0.002, (0.01,) * 12)
+    onset = Envelope(20, ((100, 0),) * 12)
     await group.apply({"a": [layer(number, tone(level=0.05, onset=onset)) for number in range(4)]})
     assert not group.degraded
     await reading

@@ -1,16 +1,16 @@
 """The ledger: what it admits stays within the limits whenever it is played, and what it refuses."""
 
-import cmath
 import math
 import random
 from dataclasses import replace
 
 import pytest
 
-from drivers.contents import Layer, Shape, Tone
+from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused
 from drivers.host.ledger import Ledger
 from drivers.playback import Playback
+from drivers.protocol.sets import Envelope
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
 
@@ -45,9 +45,9 @@ BAD = {
     "level negative": tone(1, level=-0.1),
     "phase": replace(tone(1), phase=math.inf),
     "channel": tone(3),
-    "knot": tone(1, onset=Shape(0.01, (1.1j,))),
-    "step": tone(1, ending=Shape(0.0001, (0.1,))),
-    "knots": tone(1, onset=Shape(0.01, (0.1,) * 33)),
+    "knot": tone(1, onset=Envelope(100, ((10001, 9000),))),
+    "step": tone(1, ending=Envelope(1, ((1000, 0),))),
+    "knots": tone(1, onset=Envelope(100, ((1000, 0),) * 33)),
 }
 
 
@@ -160,7 +160,7 @@ def test_other_capabilities_leave_what_was_spent() -> None:
 def test_set_that_waits_counts_with_its_ending() -> None:
     """Level 0.1 with an ending through 0.8 waits: 0.3 beside it is refused, 0.15 is not."""
     ledger = Ledger(WIDE, CAN)
-    onset, ending = Shape(0.05, (0.05,)), Shape(0.01, (0.8,))
+    onset, ending = Envelope(500, ((500, 0),)), Envelope(100, ((8000, 0),))
     play(ledger, 1, 0.0, Layer(0, (tone(level=0.05, onset=onset),)))
     play(ledger, 2, 0.01, Layer(0, (tone(level=0.1, ending=ending),), after=True))
     refusal(ledger, Layer(1, (tone(level=0.3, frequency=200),)), at=0.02)
@@ -189,7 +189,7 @@ def test_rise_is_bounded() -> None:
     assert Ledger(replace(WIDE, slew=7.86), CAN).admit([ramp], 0.0)
     ledger = Ledger(replace(WIDE, slew=7.85), CAN)
     assert refusal(ledger, ramp).channel == 0
-    shaped = Layer(0, (tone(level=0.2, onset=Shape(0.01, (0.1, 0.2))),))
+    shaped = Layer(0, (tone(level=0.2, onset=Envelope(100, ((1000, 0), (2000, 0)))),))
     assert refusal(ledger, shaped).channel == 0
     ledger = Ledger(replace(WIDE, slew=10.01), CAN)
     assert ledger.admit([shaped], 0.0)
@@ -250,11 +250,11 @@ def test_rate_is_limited_with_the_time_from_which_it_is_allowed() -> None:
 def random_layer(random_: random.Random, number: int) -> Layer:
     """A layer of up to three tones of three frequencies, with shapes, fades and ends."""
 
-    def shape() -> Shape | None:
+    def shape() -> Envelope | None:
         if random_.random() < 0.6:
             return None
-        knots = [cmath.rect(random_.random() * 0.5, random_.uniform(-3, 3)) for _ in range(3)]
-        return Shape(random_.choice((0.002, 0.01)), tuple(knots[: random_.randrange(4)]))
+        knots = [(random_.randrange(5000), random_.randrange(-18000, 18000)) for _ in range(3)]
+        return Envelope(random_.choice((20, 100)), tuple(knots[: random_.randrange(4)]))
 
     tones = tuple(
         Tone(

@@ -5,13 +5,14 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.contents import Layer, Shape
+from drivers.contents import Layer
 from drivers.errors import DriverError, LinkTimeout
 from drivers.host.dialogue import SILENCING
 from drivers.host.group import Group
 from drivers.host.modbus_wire import ModbusWire
 from drivers.host.serial_wire import SerialWire
 from drivers.host.wire import Wire
+from drivers.protocol.sets import Envelope
 from virtual_loop import in_virtual_time
 from words_line import MemoryLine, grouped, layer, tone, with_group
 
@@ -82,7 +83,7 @@ async def armed(name: str, *amplifiers: str) -> tuple[Group, MemoryLine, Paced]:
 async def test_replies_that_begin_as_late_as_they_may_are_awaited(name: str) -> None:
     """9.9 ms after each request, on Modbus after write and read: nothing is repeated."""
     group, end, _ = await armed(name, "a")
-    onset = Shape(0.002, (0.01,) * 8)
+    onset = Envelope(20, ((100, 0),) * 8)
     await group.apply({"a": [layer(0, tone(onset=onset), tone(1))]})
     await group.beat()
     assert end.retries == 0
@@ -118,7 +119,7 @@ async def test_amplifier_may_play_until_what_is_under_way_has_arrived() -> None:
     group, end, _ = await armed("serial at 9600", "a")
     await group.apply({"a": [layer(0, tone())]})
     end.outward = lambda name, data: []
-    onset = Shape(0.002, (0.01,) * 30)
+    onset = Envelope(20, ((100, 0),) * 30)
     with pytest.raises(LinkTimeout):
         await group.apply({"a": [layer(number, tone(level=0.1, onset=onset)) for number in (1, 2)]})
     await asyncio.sleep(group.amplifiers["a"].feeding.may_play_until - end.loop.time() - 0.1)

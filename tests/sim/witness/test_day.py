@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from drivers.contents import Layer, Shape, Tone
+from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, Preempted
 from drivers.host.group import Group
 from drivers.host.jobs import Priority
+from drivers.protocol.sets import Envelope
 from listened_line import ListenedLine, witness_of
 from long_form import in_turn, shortly
 from random_group import RandomGroup
@@ -21,8 +22,8 @@ from virtual_loop import run_virtual
 from witnessed_chain import SCENARIOS, WITNESSED, play
 from words_line import KINDS
 
-SWELL = Shape(0.01, (0.1 + 0j, 0.3 + 0j, 0.1 + 0j))
-SLOW = Shape(0.04, (0.05 + 0j,))
+SWELL = Envelope(100, ((1000, 0), (3000, 0), (1000, 0)))
+SLOW = Envelope(400, ((500, 0),))
 
 
 class Day:

@@ -356,8 +356,9 @@ def _log_transition(before: Operation, after: Operation) -> None:
         return
     _logger.log(
         _LOG_LEVELS.get(after.state, logging.INFO),
-        "%s -> %s",
+        "%s -> %s: %s",
         before.state,
         after.state,
+        after.cause,
         extra={"topic": "state", "cause": after.cause, "remedy": after.remedy},
     )

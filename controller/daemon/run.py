@@ -16,6 +16,7 @@ from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogThread, open_log_file, start_log
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
+from controller.gateway.installed import require_gateway
 from drivers.errors import DriverError
 from drivers.trace import tracing
 from model.compiled.kernels import kernels
@@ -46,7 +47,7 @@ def check_daemon(path: Path) -> str:
         frequencies = counted(len(loaded.frequencies), "frequency", plural="frequencies")
         table = f"table with {frequencies}"
     eras, amplifiers = counted(len(config.rig.eras), "ERA"), counted(len(config.urls), "amplifier")
-    return f"{path}: valid: {eras}, {amplifiers}; {table}"
+    return f"{path}: good: {eras}, {amplifiers}; {table}"
 
 
 def run_daemon(path: Path, *, dashboard: str | None, trace: Path | None = None) -> None:
@@ -70,7 +71,18 @@ def run_daemon(path: Path, *, dashboard: str | None, trace: Path | None = None) 
         stack.callback(lock.release)
         log = start_log(config.log_file, level=config.section.log.level)
         stack.callback(log.close)
-        _run(config, lock, log=log, dashboard=address or config.section.dashboard)
+        _run(config, lock, log=log, dashboard=address or _page_of_file(config))
+
+
+def _page_of_file(config: DaemonConfig) -> str | None:
+    """Where the file wants the page; None, and a warning, where its libraries are missing."""
+    try:
+        if config.section.dashboard is not None:
+            require_gateway()
+    except InputError as error:
+        _logger.warning("dashboard: %s; going on without the page", error)
+        return None
+    return config.section.dashboard
 
 
 def _check_limits() -> None:

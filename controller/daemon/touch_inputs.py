@@ -3,6 +3,7 @@
 import asyncio
 import logging
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 
@@ -43,15 +44,19 @@ class TouchInputs:
         ]
 
     async def close(self) -> None:
-        """Stop all sources, without waiting for one of a plug-in that does not end."""
+        """Stop all sources; one of a plug-in that goes on is ended where it waits."""
         for task in self._running:
             task.cancel()
         if not self._running:
             return
         _, late = await asyncio.wait(self._running, timeout=_CLOSE_TIMEOUT)
-        for task in late:
-            _logger.warning("%s: does not end, continuing without it", task.get_name())
-            asyncio.tasks._unregister_task(task)  # else the end of the program would wait for it
+        for task in late:  # else the end of the program would wait for it
+            _logger.warning("%s: does not end when cancelled", task.get_name())
+            with suppress(RuntimeError):  # it ignores this as well
+                task.get_coro().close()
+            task.cancel()
+        ends = asyncio.gather(*late, return_exceptions=True)
+        await asyncio.wait([ends], timeout=_CLOSE_TIMEOUT)
 
     async def _run(self, touch_input: TouchInput) -> None:
         def deliver(frame: TouchFrame) -> None:

@@ -173,7 +173,13 @@ class HostRules:
             session.is_stopped = False
 
     def status_heard(self, session: AmplifierSession, values: Values) -> None:
-        """Note a status: whether it confirms a stop, or the end of a disarm."""
+        """Note a status: whether it confirms a stop, or the end of a disarm.
+
+        One that has latched nothing since it was switched on shows that it has restarted after a
+        stop that was confirmed, of which there is nothing left to clear.
+        """
+        if session.first_stop is None and values.get("latch") == 0:
+            session.is_stopped = session.is_stopped and values["state"] in LATCHED
         if "levels" in values and not any(values["levels"]):
             session.is_disarming = False
             if values["state"] in LATCHED:

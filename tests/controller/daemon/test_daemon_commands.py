@@ -17,6 +17,7 @@ from controller.cli.commands import app
 from controller.cli.daemon import touch
 from controller.cli.main import run
 from controller.cli.shown import show_event
+from controller.daemon.log import LogThread
 from controller.daemon.run import run_daemon
 from daemon_bench import ready_daemon, write_daemon
 from drivers.errors import CommandError
@@ -87,6 +88,24 @@ def test_dashboard_is_refused_before_anything_starts_when_not_installed(
     assert isinstance(result.exception, InputError)
     assert "pip install -e '.[gateway]'" in str(result.exception)
     assert not result.stdout
+
+
+def test_daemon_goes_on_without_the_page_of_its_file_when_not_installed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It says once what to install, and starts no gateway that could only end."""
+    pages: list[str | None] = []
+    monkeypatch.setattr("controller.gateway.installed.find_spec", lambda name: None)
+    monkeypatch.setattr(
+        "controller.daemon.run._run",
+        lambda config, lock, *, log, dashboard: pages.append(dashboard),
+    )
+    monkeypatch.setattr("controller.daemon.run.start_log", lambda file, *, level: LogThread(file))
+    more = 'dashboard: "127.0.0.1:0"\n'
+    run_daemon(write_daemon(tmp_path, {"main": "sim://"}, more), dashboard=None)
+    assert pages == [None]
+    (line,) = caplog.messages
+    assert "pip install -e '.[gateway]'" in line
 
 
 def test_daemon_does_not_start_when_log_not_writable(tmp_path: Path) -> None:

@@ -149,6 +149,16 @@ def test_stop_of_what_a_stop_has_silenced_needs_no_second_confirmation() -> None
     assert talk.rest(0.3).found == []
 
 
+@pytest.mark.parametrize(("latch", "broken"), [(0, False), (1, True)])
+def test_stop_is_over_where_the_amplifier_has_restarted(latch: int, broken: bool) -> None:
+    """It has latched nothing since, and is armed; one that merely unlatched by itself is not."""
+    talk = Talk().armed()
+    talk.exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
+    talk.says(hand.SWITCHED_OFF, kind=hand.GET_STATUS, latch=latch)
+    talk.exchange(hand.ARM, (10, 250), hand.status(latch=latch))
+    assert ("stop" in talk.found) is broken
+
+
 @pytest.mark.parametrize(("before", "broken"), [(0.06, ["answer"]), (0.0, ["credit"])])
 def test_status_of_an_amplifier_that_is_mute_gives_way(before: float, broken: list[str]) -> None:
     """What is mute has left a request without a reply; of another one the reply is awaited."""

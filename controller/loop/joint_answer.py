@@ -22,9 +22,9 @@ from model.choice import NEARLY
 from model.finger.perception import FELT_DB_SL, decibels
 from model.table import request
 from model.table.answer import answer
-from model.table.contents_numpy import share_stroke
 from model.table.modulation import frequency_of, with_gains, with_modulation
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, ONSET_RAMP, Pattern
+from model.table.promised import share_stroke
 from model.table.question import MIN_LEVEL_DB_SL, Question
 from model.table.request import OWN_CONTRAST_DB, Answer, Finger, Layer, Request
 from model.table.table import LocalizationTable

@@ -15,7 +15,7 @@ from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, decibels
 from model.table.effect_level import DriveLimits, EffectLevels
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, Pattern
-from model.table.pattern_choice import UnreachableLevel
+from model.table.pattern_query import UnreachableLevel
 from model.table.pulse_gains import OverEffect
 from model.table.question import MAX_LEVEL_DB_SL, Question
 from model.table.table import LocalizationTable

@@ -236,11 +236,11 @@ static int answer_from(answered *to, const plates *on, const rules *by, const qu
     candidates from = {0, integers(memory, most), integers(memory, most), integers(memory, most), floats(memory, most),
                        floats(memory, 2 * most * n)};
     int is_limited = find_candidates(&from, on, by, of, rows, count, memory);
-    if (count < of->rows && (!from.count || (is_limited && !of->is_strict)) && of->is_ranked) {
+    if (count < of->rows && (!from.count || is_limited) && of->is_ranked) {
         from.count = 0; /* among all frequencies */
         is_limited = find_candidates(&from, on, by, of, of->row, of->rows, memory);
     }
-    if (!from.count || (of->is_strict && is_limited)) return NOT_REACHED;
+    if (!from.count) return NOT_REACHED;
     const float *columns = columns_of(of->fine_points, k * of->fine, on->r, memory);
     const size_t draws = of->judging->count;
     float *own = floats(memory, from.count * draws + LANES);
@@ -289,7 +289,7 @@ static int guarded(results *found, const plates *table, const raster *read, cons
     plates on = *table;
     on.k = given->fingers, on.centres = at.centres, on.stiffness = given->stiffness;
     question of = {.contents = given->contents, .bands = given->bands, .quiet_count = given->quiet_count,
-                   .is_strict = given->is_strict, .with_onset = given->with_onset, .apart = given->apart,
+                   .with_onset = given->with_onset, .apart = given->apart,
                    .level = given->level, .background = given->background, .judging = given->judging,
                    .promise = given->promise, .few = read->few, .fine = read->fine, .few_points = at.few,
                    .fine_points = at.fine, .few_weights = at.few_weights, .fine_weights = at.fine_weights};
@@ -305,7 +305,7 @@ static int guarded(results *found, const plates *table, const raster *read, cons
     return status;
 }
 
-/* FOUND, NOT_REACHED where tones of one frequency do not do, NEEDS_ONSETS, or NO_MEMORY. */
+/* FOUND, NOT_REACHED where nothing is felt at all, NEEDS_ONSETS, or NO_MEMORY. */
 int answer(results *to, const plates *on, const raster *read, const rules *by, const asked *of) {
     arena memory = {NULL, NULL, NULL};
     const int status = guarded(to, on, read, by, of, &memory);

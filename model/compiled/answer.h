@@ -27,7 +27,7 @@ typedef struct {
 /* Fingers (k) and contents, as given. */
 typedef struct {
     int contents, bands, fingers, quiet_count;
-    int is_strict, with_onset;  /* strict: give up where the level is hard to reach */
+    int with_onset;             /* whether onsets along a plain ramp count */
     float apart;                /* of frequencies [Hz] */
     const int *numbers;         /* (contents + 1) starts of targets; these and quiet ones, by finger; (contents)
                                  * priorities; (contents, bands, 2) first row of a band and one past the last */
@@ -40,7 +40,7 @@ typedef struct {
 
 /* The same with what is found first. */
 typedef struct {
-    int contents, bands, quiet_count, is_strict, with_onset, is_ranked; /* see `ranked_rows` */
+    int contents, bands, quiet_count, with_onset, is_ranked; /* see `ranked_rows` */
     float apart;
     const int *starts, *targets, *quiet, *priority;
     const float *level, *background;

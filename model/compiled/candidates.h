@@ -260,7 +260,7 @@ SHARED int find_candidates(candidates *to, const plates *on, const rules *by, co
             const int ways = others > 0 && others <= by->max_by_point ? 2 : 1;
             const arena mark = *memory;
             for (int way = 0; way < ways && (!way || to->count > start); way++) {
-                for (;;) {
+                for (int tries = 0;; tries++) { /* without the margin where that must be, or else near the highest level */
                     int some[LANES];
                     for (int block = first / LANES; block * LANES < end; block++) {
                         rows_at(some, rows, block * LANES, count);
@@ -268,11 +268,12 @@ SHARED int find_candidates(candidates *to, const plates *on, const rules *by, co
                     }
                     int is_hard = search_rows(&at, forms, by, first, end, memory);
                     limited |= is_hard && !way;
-                    if (way || margin == 0 || of->is_strict || highest_score(at.score, first, end) > 0) break;
+                    if (way || tries == 2 || highest_score(at.score, first, end) > 0) break;
+                    margin = 0, limited = 1;
+                    if (!tries) continue;
                     for (int block = first / LANES; block * LANES < end; block++)
                         forms[block].wanted = ZERO.re, forms[block].margin = 0;
-                    level = by->highest * highest_level(forms, by, rows, count, first, end, memory), margin = 0;
-                    limited = 1;
+                    level = by->highest * highest_level(forms, by, rows, count, first, end, memory);
                 }
                 keep_apart(to, &at, by, of, content, band, rows, first, end, n, memory);
             }

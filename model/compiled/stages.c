@@ -1,14 +1,5 @@
-/* Stages of an answer for arrays of numpy: forms, a search, and what is felt of tones. */
+/* Stages of an answer for arrays of numpy: forms, and what is felt of tones. */
 #include "answer.h"
-
-typedef struct {
-    int n, targets, q, few, fine; /* ERAs; targets; quiet fingertips; points of each, 0 for none */
-    float wanted, margin;
-    phases phases;
-    const float *of_targets, *target_power; /* (f, targets, n), (f, targets, n, n) */
-    const float *quiet, *threshold;         /* (f, q, n, n), (f) */
-    const float *few_fields, *fine_fields;  /* (f, q, points, n) */
-} given_forms;
 
 typedef struct {
     float *fields, *fine, *power, *uncertain; /* as `formed`, by frequency */
@@ -39,36 +30,6 @@ static void run_forms(const job *each, arena *memory) {
         if (of->fine) store(to->fine + 2 * (size_t)first * of->fine * n, found.fine, of->fine * n, some);
         store(to->power + 2 * (size_t)first * of->groups * n * n, found.power, of->groups * n * n, some);
         store(to->uncertain + 2 * (size_t)first * of->groups * n * n, found.uncertain, of->groups * n * n, some);
-    }
-}
-
-static void run_search(const job *each, arena *memory) {
-    const given_forms *from = each->on;
-    const method *by = each->by;
-    const size_t n = from->n, q = from->q, few = from->few, fine = from->fine, targets = from->targets;
-    float *weights = each->to[0], *scores = each->to[1], *missed = each->to[2], *bounds = each->to[3];
-    value *target = values(memory, targets * n), *P = values(memory, targets * n * n), *Q = values(memory, q * n * n);
-    value *fields = values(memory, q * few * n), *points = values(memory, q * fine * n);
-    const value **forms = take(memory, q * sizeof(value *));
-    best found = {values(memory, n), ZERO.re, ZERO.re, ZERO.re};
-    for (size_t i = 0; i < q; i++) forms[i] = Q + i * n * n;
-    for (int first = 0; first < each->count; first += LANES) {
-        int rows[LANES], some = each->count - first < LANES ? each->count - first : LANES;
-        lanes wanted;
-        for (int l = 0; l < LANES; l++) rows[l] = each->rows[first + (l < some ? l : some - 1)];
-        load_real(&wanted, from->threshold, 1, rows);
-        load(target, from->of_targets, targets * n, rows);
-        load(P, from->target_power, targets * n * n, rows);
-        load(Q, from->quiet, q * n * n, rows);
-        if (few) load(fields, from->few_fields, q * few * n, rows);
-        if (few) load(points, from->fine_fields, q * fine * n, rows);
-        const searched on = {n, targets, q, 0, few, fine, from->phases, from->margin, wanted * from->wanted, target, P, forms,
-                             NULL, fields, points};
-        search(&found, &on, by, memory);
-        store(weights + 2 * first * n, found.weights, n, some);
-        store_real(scores + first, &found.score, 1, some);
-        store_real(missed + first, &found.missed, 1, some);
-        store_real(bounds + first, &found.bound, 1, some);
     }
 }
 
@@ -117,12 +78,6 @@ static int done(void (*run)(const job *, arena *), job each) {
 /* Forms at rows (count). */
 int forms_stage(const plates *on, const grouped *of, const int *rows, int count, found_forms *to) {
     return done(run_forms, (job){on, of, NULL, rows, count, {to}});
-}
-
-/* At rows (count): weights (count, n), scores, scores of what misses the level, and bounds. */
-int search_stage(const given_forms *on, const method *by, const int *rows, int count, float *weights, float *scores,
-                 float *missed, float *bounds) {
-    return done(run_search, (job){on, by, NULL, rows, count, {weights, scores, missed, bounds}});
 }
 
 /* Tones at rows (count) of weights (count, n). */

@@ -79,15 +79,6 @@ class Method(Structure):
     _fields_ = _fields(i="steps limited", f="variance gain reserve growth most")
 
 
-class GivenForms(Structure):
-    """`given_forms`: forms to search."""
-
-    _fields_ = [
-        *_fields(i="n targets q few fine", f="wanted margin", integers="starts iterations"),
-        *_fields(p="of_targets target_power quiet threshold few_fields fine_fields"),
-    ]
-
-
 class Rules(Structure):
     """`rules`: how tones are chosen."""
 
@@ -117,7 +108,7 @@ class GivenQuestion(Structure):
     """`question`: fingers, and what each is to feel; what is found first is not named."""
 
     _fields_ = [
-        *_fields(i="contents bands fingers quiet_count is_strict with_onset", f="apart"),
+        *_fields(i="contents bands fingers quiet_count with_onset", f="apart"),
         *_fields(p="numbers level places stiffness background judging promise"),
     ]
 

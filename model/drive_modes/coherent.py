@@ -1,4 +1,7 @@
-"""All ERAs at one frequency: robust weights that reach the targets with little at the quiet ones.
+"""The drive mode `phased`: all ERAs at one frequency, with any amplitudes and phases.
+
+Robust weights reach the targets with little at the quiet fingers; a spring or damper at an ERA adds
+a force where the drive acts anyway: without errors the best contrast does not depend on it.
 
 At each frequency the expected power at the quiet fingertips, a weighted mean over them, is the
 quadratic form w^H R w of the weights w, and the weights that reach the targets with the least of it
@@ -7,6 +10,8 @@ over the quiet fingertips counts, their weights mu_q are multiplied by the root 
 power and the system is solved again (Lawson's algorithm for minimax approximation; few steps, since
 the minimax of expected powers is not the best percentile). A mean is at most the maximum, so that
 |c^H w| / sqrt(w^H R w) bounds the score at a frequency.
+
+`model/compiled/search.h` is the same in C.
 """
 
 from dataclasses import dataclass, replace
@@ -22,9 +27,9 @@ from model.drive_modes.forms import Forms
 LAWSON_STEPS = 3
 """Iterations; twelve lose 0.1 to 0.3 dB of the tenth percentile."""
 
-PRUNE_MARGIN = 0.84
-"""Patterns of `switched` below this times the best score are left out: 1.5 dB, since the percentile
-decides among the best."""
+TARGET_STARTS, ALIGNMENTS = 5, 8
+"""Starting phases of every target but the first, and iterations from each start that align the
+phases with those reached."""
 
 LIMITED_STEPS = 30
 """Iterations towards weights that reach the level within full stroke; ten lose up to 1.4 dB where
@@ -32,6 +37,9 @@ drives are known to 5 %."""
 
 MAX_GROWTH, MAX_MULTIPLIER = 100.0, 1e12
 """Factor on a multiplier in one iteration, and in all."""
+
+NEARLY_HIGHEST = 0.99
+"""Of the highest level there is, what is searched where the level cannot be reached."""
 
 LEVEL_RESERVE = 1.02
 """Level aimed at, since the iterations come near to full stroke from above."""
@@ -65,95 +73,6 @@ which the quiet points count less against each ERA's own power."""
 _TINY, _LEAST = 1e-7, np.float32(1e-30)
 
 
-@dataclass(frozen=True)
-class Coherent:
-    """Search for weights of all ERAs.
-
-    phases: number of starting phases of the first target, and of every further one; iterations:
-    number from each start that align the phases with those reached.
-    """
-
-    phases: tuple[int, int]
-    iterations: int
-
-    def search(self, forms: Forms) -> "CoherentResult":
-        """Find the best weights at each frequency, brought within full stroke where they must."""
-        found = self.search_all(forms)
-        for method in WITHIN_STROKE:
-            open_ = found.level_limited
-            if len(open_) == 0:
-                break
-            more = self.tried(forms.at(open_), method)
-            found.score[open_], found.weights[open_] = more.score, more.weights
-            found.missed[open_] = np.maximum(found.missed[open_], more.missed)
-        return found
-
-    def search_all(self, forms: Forms) -> "CoherentResult":
-        """Find the best weights at every frequency, none raised to the level."""
-        return self.tried(forms, SEVERAL if forms.quiet.shape[1] > 1 else ONE_FINGER)
-
-    def max_sensation(self, forms: Forms) -> float:
-        """Return the highest amplitude to threshold found at the weakest target."""
-        any_level = replace(forms, wanted=0.0, level_margin=0.0)
-        peak = forms.amplitude(self.tried(any_level, WITHIN_STROKE[-1]).weights)
-        return float((peak / forms.threshold).max())
-
-    def tried(self, forms: Forms, method: Method) -> "CoherentResult":
-        """Find the best of the weights of a method at every frequency.
-
-        Within full stroke the optimum has R + diag(d) in place of R, with multipliers d that are
-        zero but for ERAs at full stroke; they are multiplied by the squared magnitudes of the
-        weights until they fit.
-        """
-        f, q, n, _ = forms.quiet.shape
-        shares = np.full((f, q), 1 / q, dtype=np.float32)
-        multipliers = limit = np.zeros((f, 1), dtype=np.float32)
-        bound = np.full(f, np.inf, dtype=np.float32)
-        tried, powers = [], []
-        for step in range(method.steps):
-            R = _weighted(forms, shares)
-            diagonal = R.reshape(f, -1)[:, :: n + 1]
-            diagonal *= 1 + np.float32(method.variance)
-            diagonal += multipliers
-            weights, highest = self._weights(forms, R)
-            bound = np.minimum(bound, highest)
-            if method.is_limited:
-                gain = LEVEL_RESERVE * forms.gain_to_level(weights)
-                weights = (weights * gain[:, None]).astype(np.complex64)
-            fitting = weights
-            if method.gain:
-                saturated = weights / np.maximum(np.abs(weights), np.float32(1 / method.gain))
-                fitting = np.asarray(saturated, dtype=np.complex64)
-            expected = forms.quiet_power(fitting)
-            tried.append(fitting)
-            powers.append(np.maximum.reduce(expected, axis=1))
-            shares = _moved(shares, expected)
-            if not method.is_limited:
-                continue
-            power = np.abs(weights) ** 2
-            if step == 0:
-                own = np.maximum.reduce(forms.quiet_power(weights), axis=1)
-                multipliers = (own / np.maximum(np.add.reduce(power, axis=1), _LEAST))[:, None]
-                limit = np.float32(MAX_MULTIPLIER) * multipliers
-            # Beyond any level that can be reached they would grow without end.
-            multipliers = np.minimum(multipliers * np.minimum(power, MAX_GROWTH), limit)
-        every = np.array(tried)
-        peak, reaches = forms.reached(every)
-        each = peak / np.sqrt(np.maximum(powers, _LEAST) + _TINY * (peak * peak))
-        score = np.where(reaches, each, 0)
-        best = (best_along(score, axis=0), np.arange(f))
-        best_weights = np.where(score[best][:, None] > 0, every[best], 0).astype(np.complex64)
-        missed = np.maximum.reduce(np.where(reaches, 0, each), axis=0)
-        return CoherentResult(score[best], best_weights, bound, missed)
-
-    def _weights(self, forms: Forms, R: Complex64Array) -> tuple[Complex64Array, Float32Array]:
-        """Weights (n, eras), and their bound |c^H w| / sqrt(w^H R w), (n,)."""
-        targets = forms.targets
-        starts = _starts(len(targets), self.phases)
-        iterations = self.iterations if len(starts) > 1 else 1
-        return _optimise_target_phases(R, targets, starts=starts, iterations=iterations)
-
-
 @dataclass(frozen=True, eq=False)
 class CoherentResult:
     """The best weights (f, eras) at each frequency, and their robust score (f,).
@@ -179,6 +98,95 @@ class CoherentResult:
         return len(self.level_limited) > 0
 
 
+def search(forms: Forms) -> CoherentResult:
+    """Find the best weights at each frequency, brought within full stroke where they must."""
+    found = search_all(forms)
+    for method in WITHIN_STROKE:
+        open_ = found.level_limited
+        if len(open_) == 0:
+            break
+        more = tried(forms.at(open_), method)
+        found.score[open_], found.weights[open_] = more.score, more.weights
+        found.missed[open_] = np.maximum(found.missed[open_], more.missed)
+    return found
+
+
+def search_to_level(forms: Forms) -> tuple[CoherentResult, Forms]:
+    """Search for weights of a level, without its margin where they must, or else near the highest.
+
+    Also return the forms with the level that was sought.
+    """
+    found = search(forms)
+    for is_highest in (False, True):
+        if found.score.any():
+            break
+        level = NEARLY_HIGHEST * max_sensation(forms) if is_highest else forms.wanted
+        forms = replace(forms, wanted=float(np.float32(level)), level_margin=0.0)
+        found = search(forms)
+    return found, forms
+
+
+def search_all(forms: Forms) -> CoherentResult:
+    """Find the best weights at every frequency, none raised to the level."""
+    return tried(forms, SEVERAL if forms.quiet.shape[1] > 1 else ONE_FINGER)
+
+
+def max_sensation(forms: Forms) -> float:
+    """Return the highest amplitude to threshold found at the weakest target."""
+    any_level = replace(forms, wanted=0.0, level_margin=0.0)
+    peak = forms.amplitude(tried(any_level, WITHIN_STROKE[-1]).weights)
+    return float((peak / forms.threshold).max())
+
+
+def tried(forms: Forms, method: Method) -> CoherentResult:
+    """Find the best of the weights of a method at every frequency.
+
+    Within full stroke the optimum has R + diag(d) in place of R, with multipliers d that are
+    zero but for ERAs at full stroke; they are multiplied by the squared magnitudes of the
+    weights until they fit.
+    """
+    f, q, n, _ = forms.quiet.shape
+    shares = np.full((f, q), 1 / q, dtype=np.float32)
+    multipliers = limit = np.zeros((f, 1), dtype=np.float32)
+    bound = np.full(f, np.inf, dtype=np.float32)
+    every_weights, powers = [], []
+    for step in range(method.steps):
+        R = _weighted(forms, shares)
+        diagonal = R.reshape(f, -1)[:, :: n + 1]
+        diagonal *= 1 + np.float32(method.variance)
+        diagonal += multipliers
+        weights, highest = _optimise_target_phases(R, forms.targets)
+        bound = np.minimum(bound, highest)
+        if method.is_limited:
+            gain = LEVEL_RESERVE * forms.gain_to_level(weights)
+            weights = (weights * gain[:, None]).astype(np.complex64)
+        fitting = weights
+        if method.gain:
+            saturated = weights / np.maximum(np.abs(weights), np.float32(1 / method.gain))
+            fitting = np.asarray(saturated, dtype=np.complex64)
+        expected = forms.quiet_power(fitting)
+        every_weights.append(fitting)
+        powers.append(np.maximum.reduce(expected, axis=1))
+        shares = _moved(shares, expected)
+        if not method.is_limited:
+            continue
+        power = np.abs(weights) ** 2
+        if step == 0:
+            own = np.maximum.reduce(forms.quiet_power(weights), axis=1)
+            multipliers = (own / np.maximum(np.add.reduce(power, axis=1), _LEAST))[:, None]
+            limit = np.float32(MAX_MULTIPLIER) * multipliers
+        # Beyond any level that can be reached they would grow without end.
+        multipliers = np.minimum(multipliers * np.minimum(power, MAX_GROWTH), limit)
+    every = np.array(every_weights)
+    peak, reaches = forms.reached(every)
+    each = peak / np.sqrt(np.maximum(powers, _LEAST) + _TINY * (peak * peak))
+    score = np.where(reaches, each, 0)
+    best = (best_along(score, axis=0), np.arange(f))
+    best_weights = np.where(score[best][:, None] > 0, every[best], 0).astype(np.complex64)
+    missed = np.maximum.reduce(np.where(reaches, 0, each), axis=0)
+    return CoherentResult(score[best], best_weights, bound, missed)
+
+
 def _moved(shares: Float32Array, expected: Float32Array) -> Float32Array:
     """Shares of the quiet fingertips (f, q) after a step of Lawson's, by their expected powers.
 
@@ -197,21 +205,14 @@ def _weighted(forms: Forms, shares: Float32Array) -> Complex64Array:
 
 
 @lru_cache(maxsize=16)
-def _starts(targets: int, phases: tuple[int, int]) -> Complex64Array:
+def _starts(targets: int) -> Complex64Array:
     """Phase factors of the targets to start from, (s, targets)."""
-    circles = [
-        np.exp(2j * np.pi * np.arange(count) / count)
-        for count in (phases[0], *[phases[1]] * (targets - 1))
-    ]
-    return np.array(list(product(*circles)), dtype=np.complex64)
+    circle = np.exp(2j * np.pi * np.arange(TARGET_STARTS) / TARGET_STARTS)
+    return np.array(list(product([1.0], *[circle] * (targets - 1))), dtype=np.complex64)
 
 
 def _optimise_target_phases(
-    R: Complex64Array,
-    targets: Complex64Array,
-    *,
-    starts: Complex64Array,
-    iterations: int,
+    R: Complex64Array, targets: Complex64Array
 ) -> tuple[Complex64Array, Float32Array]:
     """Weights (n, eras), largest magnitude 1, for targets (t, n, eras), and their bound (n,).
 
@@ -219,8 +220,9 @@ def _optimise_target_phases(
     which cannot lower the bound, and gives more weight to a weaker target.
     """
     _, n, eras = targets.shape
-    conjugate = targets.conj()
+    conjugate, starts = targets.conj(), _starts(len(targets))
     s = len(starts)
+    iterations = ALIGNMENTS if s > 1 else 1
     target_factors = np.repeat(starts[:, :, None], n, axis=2)
     forms = np.broadcast_to(R, (s, *R.shape)).reshape(-1, eras, eras)
     tried, magnitudes = [], []

@@ -10,14 +10,15 @@ detection thresholds, and so are a score's powers: each in units of its threshol
 """
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, Float32Array, IntArray
 
-SILENT = -1
-"""Frequency index of an ERA that is not driven."""
+Drive: TypeAlias = list[tuple[int, Complex64Array]]
+"""Tones: a frequency, by index, and the weights (eras,) at it, in full strokes."""
 
 LEVEL_MARGIN = 1.0
 """Standard deviations of a target's amplitude that a drive must have in reserve.
@@ -26,34 +27,6 @@ About what nine of ten plates need; the answer's own draws decide.
 """
 
 _LEAST = np.float32(1e-20)
-
-
-@dataclass(frozen=True, eq=False)
-class Weights:
-    """Complex weight of each ERA in full strokes, values (eras,), and its frequency.
-
-    frequencies (eras,): by index, or SILENT where the weight is zero.
-    """
-
-    frequencies: NDArray[np.int64]
-    values: Complex64Array
-
-    @classmethod
-    def at(cls, frequency: int, values: Complex64Array) -> "Weights":
-        """Drive all ERAs at one frequency."""
-        frequencies = np.full(len(values), frequency)
-        frequencies[values == 0] = SILENT
-        return cls(frequencies, values)
-
-    def tones(self) -> list[tuple[int, Complex64Array]]:
-        """Index of each distinct frequency, and the weights (eras,) at it."""
-        frequencies = sorted({*self.frequencies.tolist()} - {SILENT})
-        if len(frequencies) == 1:
-            return [(frequencies[0], self.values)]
-        return [
-            (index, np.where(self.frequencies == index, self.values, 0).astype(np.complex64))
-            for index in frequencies
-        ]
 
 
 @dataclass(frozen=True, eq=False)

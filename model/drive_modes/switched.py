@@ -22,7 +22,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 from model.choice import NEARLY, best_few
-from model.drive_modes.forms import SILENT, Forms, Weights
+from model.drive_modes.forms import Drive, Forms
 
 BATCH = 256
 """Patterns evaluated together."""
@@ -69,10 +69,10 @@ def group_powers(forms: Complex64Array, members: Float32Array) -> Float32Array:
     return np.asarray(real.reshape(q, f, -1).transpose(0, 2, 1))
 
 
-def find_switched(forms: Forms, min_score: float) -> list[tuple[float, Weights]]:
+def find_switched(forms: Forms) -> list[tuple[float, Drive]]:
     """Find the patterns of the best robust scores that reach the level, best first.
 
-    Empty if none is above min_score. The first one is exact: patterns are excluded by bounds only.
+    Empty if none does. The first one is exact: patterns are excluded by bounds only.
     """
     eras, f = forms.era_count, forms.frequency_count
     powers = source_powers(forms, members_of(eras))
@@ -94,8 +94,7 @@ def find_switched(forms: Forms, min_score: float) -> list[tuple[float, Weights]]
     found: list[tuple[float, tuple[int, ...]]] = [
         (float(alone[s]), (s,)) for s in kept.tolist() if alone[s] > 0
     ]
-    least = min_score**2
-    best = max(least, found[0][0] if found else 0.0)
+    best = found[0][0] if found else 0.0
     loudest = np.bincount((quiet / mean_target).argmax(axis=0), minlength=len(quiet))
     share = (loudest / loudest.sum()).astype(np.float32)
     mean_quiet = share @ quiet
@@ -118,7 +117,6 @@ def find_switched(forms: Forms, min_score: float) -> list[tuple[float, Weights]]
         best = max(best, float(values.max()))
         left = BATCH + np.flatnonzero(bound[BATCH:] > (1 - NEARLY) * best)
         one, other, bound = one[left], other[left], bound[left]
-    found = [each for each in found if each[0] > least]
     found.sort(key=lambda each: each[1])
     order = best_few([value for value, _ in found], ALTERNATIVES).tolist()
     return [
@@ -181,10 +179,7 @@ def members_of(eras: int) -> Float32Array:
     return members
 
 
-def _drive(sources: tuple[int, ...], eras: int, count: int) -> Weights:
+def _drive(sources: tuple[int, ...], eras: int, count: int) -> Drive:
     """All ERAs of one or two sources at full stroke."""
-    index = np.full(eras, SILENT)
-    for source in sources:
-        group, frequency = divmod(source, count)
-        index[members_of(eras)[group] > 0] = frequency
-    return Weights(index, (index != SILENT).astype(np.complex64))
+    tones = sorted(divmod(source, count)[::-1] for source in sources)
+    return [(row, members_of(eras)[group].astype(np.complex64)) for row, group in tones]

@@ -215,8 +215,7 @@ class _Answering:
         found = choose_tones(self.table, contents) if contents.streams else None
         layers: list[Layer | None] = [None] * len(self.requests)
         for number, stream in enumerate(contents.streams):
-            if found is None:
-                raise AssertionError("contents must have tones")
+            assert found is not None  # noqa: S101  there are contents
             weights = [(found.rows[number], found.weights[number])]
             excitation = excitation_of(
                 weights, self.table.eras, self.table.frequencies, gain=found.gains[number]

@@ -47,9 +47,6 @@ MIN_CANDIDATES = 4
 MAX_COMBINATIONS, PRUNING_STEP = 200, 4
 """Combinations of candidates that are kept for the next content and the choice, by some draws."""
 
-NEARLY_HIGHEST = 0.99
-"""Of the highest level there is, what is searched where the level cannot be reached."""
-
 # Among tones of nearly the same robust contrast the onset decides, too: a decibel of contrast
 # counts as much as three in the first 100 ms (docs/decisions, on ramps).
 ONSET_WEIGHT = 1 / 3
@@ -79,8 +76,7 @@ class Contents:
 
     places: of the fingers [m]; loads: of each relative to the rig's fingertip, empty for 1; quiet:
     by index; apart_hz: distance of the contents' frequencies where bands allow it; background: form
-    of the rest of the plate at all of the table's frequencies, for no other finger; is_strict:
-    whether nothing is to be found where tones of one frequency hardly reach the level; with_onset:
+    of the rest of the plate at all of the table's frequencies, for no other finger; with_onset:
     whether onsets along a plain ramp count.
     """
 
@@ -90,7 +86,6 @@ class Contents:
     quiet: tuple[int, ...]
     apart_hz: float = 0.0
     background: Complex64Array | None = None
-    is_strict: bool = False
     with_onset: bool = True
 
     @property
@@ -104,6 +99,11 @@ class Contents:
         """Rows of the table's frequencies that any band holds, ascending, (f,)."""
         bands = [np.arange(*band) for stream in self.streams for band in stream.bands]
         return np.unique(np.concatenate(bands))
+
+    def others(self, number: int) -> list[int]:
+        """Fingers that a content, by its number, is kept from."""
+        every = {*self.quiet}.union(*(stream.targets for stream in self.streams))
+        return sorted(every - {*self.streams[number].targets})
 
     @property
     def levels(self) -> Float32Array:

@@ -17,9 +17,8 @@ from model.compiled.structures import (
     Plates,
     Rules,
 )
-from model.drive_modes.coherent import ONE_FINGER, SEVERAL, WITHIN_STROKE
+from model.drive_modes import coherent
 from model.drive_modes.forms import LEVEL_MARGIN
-from model.drive_modes.phased import MAX_TARGETS, PHASED, as_structure
 from model.ensemble.measures import PERCENTILE
 from model.ensemble.touched_by_kernel import draws_structure, plates_structure
 from model.ensemble.touched_plate import RIDGE
@@ -36,7 +35,6 @@ from model.table.contents import (
     MAX_COMBINATIONS,
     MIN_CANDIDATES,
     MISSING,
-    NEARLY_HIGHEST,
     ONSET_MARGIN_DB,
     ONSET_WEIGHT,
     PROMISED_DRAWS,
@@ -53,11 +51,14 @@ from model.transients.onset import TIME_COUNT
 if TYPE_CHECKING:
     from model.table.table import LocalizationTable
 
+MAX_TARGETS = 4
+"""Of a content that the kernel serves: the room of its search grows by five for each."""
+
 _NEEDS_ONSETS = 2
 
 
-def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones | None:
-    """Choose a tone for each content; None where one frequency hardly reaches a strict level."""
+def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones:
+    """Choose a tone for each content, and find what it promises."""
     streams, places, quiet, by = contents.streams, contents.places, contents.quiet, kernels()
     starts, targets, bands, priorities, levels = [0], list[int](), list[int](), [], array("f")
     for stream in streams:
@@ -82,7 +83,7 @@ def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones | None
     at = array("d", [coordinate for place in places for coordinate in place])
     background = contents.background
     given = GivenQuestion(
-        *(count, len(streams[0].bands), k, len(quiet), contents.is_strict, contents.with_onset),
+        *(count, len(streams[0].bands), k, len(quiet), contents.with_onset),
         *(contents.apart_hz, numbers.buffer_info()[0], levels.buffer_info()[0]),
         *(at.buffer_info()[0], stiffness.ctypes.data),
         None if background is None else background.ctypes.data,
@@ -98,7 +99,7 @@ def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones | None
         given.with_onset = table.onsets is not None
         status = run(by.library.answer, to, plates, raster, rules, given)
     if status != FOUND:
-        return None
+        raise AssertionError("contents must have tones")
     found = figures.tolist()
     weights = map(complex, found[:size:2], found[1:size:2])
     contrast = size + count
@@ -149,10 +150,11 @@ def _kept_of(table: "LocalizationTable") -> _Kept:
     rules = Rules(
         *(KEPT, MISSING, MAX_FINGERS_BY_POINT, MIN_CANDIDATES, MAX_COMBINATIONS, PRUNING_STEP),
         *(len(CENTRE_AND_RIM), plate.gain_variance < MAX_VARIANCE_FINE, plate.thickness > 0),
-        *(TIME_COUNT, plate.gain_variance, RIDGE, LEVEL_MARGIN, NEARLY_HIGHEST, REACHED),
+        *(TIME_COUNT, plate.gain_variance, RIDGE, LEVEL_MARGIN, coherent.NEARLY_HIGHEST, REACHED),
         *(10 ** (-ONSET_MARGIN_DB / 20), ONSET_WEIGHT, PERCENTILE, PROMISED_PERCENTILE),
-        *(PHASED.phases[1], PHASED.iterations, as_structure(ONE_FINGER), as_structure(SEVERAL)),
-        (Method * 3)(*map(as_structure, WITHIN_STROKE)),
+        *(coherent.TARGET_STARTS, coherent.ALIGNMENTS),
+        *(_method(coherent.ONE_FINGER), _method(coherent.SEVERAL)),
+        (Method * 3)(*map(_method, coherent.WITHIN_STROKE)),
     )
     rules.point(
         rim=CENTRE_AND_RIM,
@@ -161,3 +163,10 @@ def _kept_of(table: "LocalizationTable") -> _Kept:
         frequencies=table.frequencies,
     )
     return plates_structure(table.on_eras), read, rules, {}
+
+
+def _method(of: coherent.Method) -> Method:
+    return Method(
+        *(of.steps, of.is_limited, of.variance, of.gain),
+        *(coherent.LEVEL_RESERVE, coherent.MAX_GROWTH, coherent.MAX_MULTIPLIER),
+    )

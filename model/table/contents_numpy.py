@@ -1,21 +1,16 @@
 """Tones of contents in numpy: where there is no compiler, and what the kernel in C must find."""
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import groupby
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
-from model.choice import NEARLY, best_few, best_first, best_of
-from model.drive_modes.coherent import Coherent
+from model.choice import best_few, best_first, best_of
+from model.drive_modes.coherent import search, search_all, search_to_level
 from model.drive_modes.forms import Forms
-from model.drive_modes.phased import PHASED
-from model.ensemble.draws import Drawing
 from model.ensemble.measures import percentile
-from model.ensemble.touched_plate import Sensed, TouchedPlate
 from model.finger.perception import decibels
 from model.table.contents import (
     JUDGING_DRAWS,
@@ -23,11 +18,8 @@ from model.table.contents import (
     MAX_COMBINATIONS,
     MIN_CANDIDATES,
     MISSING,
-    NEARLY_HIGHEST,
     ONSET_MARGIN_DB,
     ONSET_WEIGHT,
-    PROMISED_DRAWS,
-    PROMISED_PERCENTILE,
     PRUNING_STEP,
     REACHED,
     Contents,
@@ -35,13 +27,15 @@ from model.table.contents import (
     Tones,
 )
 from model.table.fingers_on_plate import MAX_FINGERS_BY_POINT, FingersOnPlate
-from model.table.raster import FingertipShapes
+from model.table.promised import promised
 
 if TYPE_CHECKING:
     from model.table.table import LocalizationTable
 
-_SEARCH = Coherent(PHASED.phases, PHASED.iterations)
 _TINY, _SAME_FREQUENCY = 1e-20, 1e-3  # -, Hz
+
+OnsetContrast: TypeAlias = Callable[[IntArray], FloatArray | None]
+"""Contrast of ramped onsets of candidates, by index (n,); None where that cannot be solved."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,56 +49,34 @@ class Candidates:
     weights: Complex64Array
 
 
-@dataclass(frozen=True, eq=False)
-class Asked:
-    """Contents on a table, and their fingers on its plate."""
-
-    table: "LocalizationTable"
-    contents: Contents
-    tips: FingertipShapes
-    touched: TouchedPlate
-
-    @classmethod
-    def of(cls, table: "LocalizationTable", contents: Contents) -> "Asked":
-        """Put the fingers of contents on a table's plate."""
-        tips = table.read_fingertips(contents.places)
-        stiffness = table.attached.finger_stiffness(len(tips.few), contents.loads)
-        touched = TouchedPlate(table.on_eras, tips.few[:, 0], stiffness)
-        return cls(table, contents, tips, touched)
-
-    def drawn(
-        self, by: Drawing, rows: IntArray, weights: Complex64Array, *, with_powers: bool = False
-    ) -> Sensed:
-        """What tones at rows (m,) of weights (m, n) do at all fine points on drawn plates."""
-        points, table = self.tips.fine.reshape(-1, self.tips.fine.shape[2]), self.table
-        given = points, self.tips.fine_weights, table.error_power, table.thresholds
-        return self.touched.drawn(by, rows, weights, *given, with_powers=with_powers)
-
-
-def choose_by_numpy(table: "LocalizationTable", contents: Contents) -> Tones | None:
-    """Choose a tone for each content; None where one frequency hardly reaches a strict level."""
-    asked, rows = Asked.of(table, contents), contents.rows
-    kept = ranked(asked) if contents.is_ranked else rows
-    found, is_limited = _candidates(asked, kept)
-    if len(kept) < len(rows) and (not len(found.rows) or (is_limited and not contents.is_strict)):
-        found, is_limited = _candidates(asked, rows)
-    if not len(found.rows) or (is_limited and contents.is_strict):
-        return None
+def choose_by_numpy(table: "LocalizationTable", contents: Contents) -> Tones:
+    """Choose a tone for each content, and find what it promises."""
+    fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=False)
+    rows = contents.rows
+    kept = ranked(fingers, contents) if contents.is_ranked else rows
+    found, is_limited = _candidates(fingers, contents, kept)
+    if len(kept) < len(rows) and (not len(found.rows) or is_limited):
+        found, is_limited = _candidates(fingers, contents, rows)
+    own, loudest = _judged(fingers, contents, found)
     best, is_apart = np.zeros(1, dtype=int), True
-    if len(found.rows) > 1:
-        own, loudest = _judged(asked, found)
-        if len(contents.streams) == 1:
-            best[0] = _best_tone(asked, found, own, loudest)
-        else:
-            best, is_apart = best_combination(table, contents, found, own, loudest)
-    return _promised(asked, found.rows[best], found.weights[best], is_apart)
+    if len(contents.streams) > 1:
+        best, is_apart = best_combination(table, contents, found, own, loudest)
+    elif len(found.rows) > 1:
+
+        def onset(near: IntArray) -> FloatArray | None:
+            return onset_contrast(fingers, contents, found.rows[near], found.weights[near])
+
+        quiet = loudest[:, [*contents.quiet]]
+        level = float(contents.levels[0])
+        best[0] = best_tone(level, found.scores, own, quiet, onset if contents.with_onset else None)
+    rows, weights = found.rows[best], found.weights[best]
+    return promised(fingers, contents, rows, weights, np.arange(len(rows)), is_apart=is_apart)
 
 
-def ranked(asked: Asked) -> IntArray:
+def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
     """The rows most worth a search for one target, ascending; by one form of all other fingers."""
-    table, contents, tips, touched = asked.table, asked.contents, asked.tips, asked.touched
-    rows, target = contents.rows, contents.streams[0].targets[0]
-    others = _others(contents, 0)
+    table, tips, touched = fingers.table, fingers.tips, fingers.touched
+    rows, target, others = contents.rows, contents.streams[0].targets[0], contents.others(0)
     points, weights = tips.few, tips.few_weights
     if len(others) > MAX_FINGERS_BY_POINT:
         points, weights = touched.centres[:, None], np.ones_like(weights[:, :1])
@@ -116,7 +88,7 @@ def ranked(asked: Asked) -> IntArray:
     mean = (weights[target] @ fields[:, target])[None]
     level, threshold = float(contents.levels[0]), table.thresholds.take(rows)
     power = found.power.swapaxes(0, 1)
-    searched = _SEARCH.search_all(Forms(mean, power, found.power, threshold, level, 0.0))
+    searched = search_all(Forms(mean, power, found.power, threshold, level, 0.0))
     order = best_first(searched.bound)
     reaches = searched.score[order] > 0
     # Those that would be better than the best, were they loud enough.
@@ -126,48 +98,32 @@ def ranked(asked: Asked) -> IntArray:
     return np.asarray(rows[np.sort(np.concatenate([reaching, missing]))])
 
 
-def _others(contents: Contents, number: int) -> list[int]:
-    """Fingers that a content is kept from."""
-    every = {*contents.quiet}.union(*(stream.targets for stream in contents.streams))
-    return sorted(every - {*contents.streams[number].targets})
-
-
-def _candidates(asked: Asked, rows: IntArray) -> tuple[Candidates, bool]:
+def _candidates(
+    fingers: FingersOnPlate, contents: Contents, rows: IntArray
+) -> tuple[Candidates, bool]:
     """The best tones of each content in each band, and whether a level was hard to reach."""
-    table, contents, tips, touched = asked.table, asked.contents, asked.tips, asked.touched
-    count = len(contents.streams)
-    formed = touched.forms(rows, tips.few, tips.few_weights, table.error_power, tips.fine)
-    fingers = FingersOnPlate(
-        *(touched, rows, tips, table.thresholds, table.error_power, formed),
-        *(np.arange(0), np.arange(0), 1.0),
-    )
+    count, hertz = len(contents.streams), fingers.table.frequencies
+    formed = fingers.forms(rows, with_fine=True)
     candidate_count = MIN_CANDIDATES + (count // 2 if count > 1 else 0)
+    apart_hz = contents.apart_hz if count > 1 else 0.0
     found: list[tuple[int, int, int, float, Complex64Array]] = []
     is_limited = False
     for number, stream in enumerate(contents.streams):
-        others = _others(contents, number)
-        level = stream.level_db_sl + 20 * math.log10(count)
-        view = fingers.for_targets(stream.targets, others, level_db_sl=level)
-        rest = None if contents.background is None or others else contents.background[rows]
+        others = contents.others(number)
+        level = stream.level_db_sl + float(decibels(count))
         for band, (low, end) in enumerate(stream.bands):
-            at = np.flatnonzero((rows >= low) & (rows < end))
-            forms = view.forms(rest).at(at)
-            searched = _SEARCH.search(forms)
-            is_limited |= searched.is_level_limited
-            if not searched.score.any() and not contents.is_strict:
-                highest = np.float32(NEARLY_HIGHEST * _SEARCH.max_sensation(forms))
-                forms = replace(forms, wanted=float(highest), level_margin=0.0)
-                searched, is_limited = _SEARCH.search(forms), True
+            here = formed.at(np.flatnonzero((rows >= low) & (rows < end)))
+            rest = None if contents.background is None or others else contents.background[here.rows]
+            asked = here.of(stream.targets, others, level, rest)
+            searched, forms = search_to_level(asked)
+            is_limited |= searched.is_level_limited or forms is not asked
             ways = [searched]
-            by_point = 1 <= len(others) <= MAX_FINGERS_BY_POINT
-            if by_point and searched.score.any():
-                ways.append(_SEARCH.search(view.by_point(forms, at)))
-            hertz = table.frequencies[rows[at]]
-            apart_hz = contents.apart_hz if count > 1 else 0.0
+            if 1 <= len(others) <= MAX_FINGERS_BY_POINT and searched.score.any():
+                ways.append(search(here.by_point(forms, others)))
             for way in ways:
-                for each in _apart(way.score, hertz, candidate_count, apart_hz):
+                for each in _apart(way.score, hertz[here.rows], candidate_count, apart_hz):
                     score, weights = float(way.score[each]), way.weights[each]
-                    found.append((number, band, int(rows[at[each]]), score, weights))
+                    found.append((number, band, int(here.rows[each]), score, weights))
     parts = zip(*found, strict=True) if found else ((),) * 5
     return Candidates(*(np.array(part) for part in parts)), is_limited
 
@@ -184,13 +140,14 @@ def _apart(score: Float32Array, frequencies: FloatArray, count: int, apart_hz: f
     return found
 
 
-def _judged(asked: Asked, found: Candidates) -> tuple[FloatArray, FloatArray]:
+def _judged(
+    fingers: FingersOnPlate, contents: Contents, found: Candidates
+) -> tuple[FloatArray, FloatArray]:
     """Amplitude (m, d) at the targets of each candidate, squared one (m, k, d) at loudest points.
 
     Those of several contents at the contents' levels.
     """
-    contents = asked.contents
-    judged = asked.drawn(JUDGING_DRAWS, found.rows, found.weights)
+    judged = fingers.drawn(JUDGING_DRAWS, found.rows, found.weights)
     loudest = judged.loudest[:, :, 1:].astype(float)
     own = np.empty((len(loudest), loudest.shape[2]))
     for number, stream in enumerate(contents.streams):
@@ -203,48 +160,48 @@ def _judged(asked: Asked, found: Candidates) -> tuple[FloatArray, FloatArray]:
     return own, loudest
 
 
-def _best_tone(asked: Asked, found: Candidates, own: FloatArray, loudest: FloatArray) -> int:
-    """The tone of an only content: level first, then contrast, of nearly the same the onset.
+def best_tone(
+    wanted: float,
+    scores: FloatArray,
+    own: FloatArray,
+    quiet: FloatArray,
+    onset: OnsetContrast | None,
+) -> int:
+    """The candidate of an only content: level first, then contrast, of nearly the same the onset.
 
     Without other fingers the score counts, and as much a level that is much the same on all plates.
+    wanted: amplitude to threshold; scores (m,); own (m, d), quiet (m, q, d) as of `_judged`.
     """
-    contents = asked.contents
-    quiet, least = [*contents.quiet], percentile(own)
-    reaches = least >= contents.levels[0] * REACHED
+    least = percentile(own)
+    reaches = least >= wanted * REACHED
     if not reaches.any():
         reaches[:] = True
-    if not quiet:
-        return best_of(reaches * found.scores * least / percentile(own, 50))
-    loud = np.sqrt(loudest[:, quiet].max(axis=1))
+    if not quiet.shape[1]:
+        return best_of(reaches * scores * least / percentile(own, 50))
+    loud = np.sqrt(quiet.max(axis=1))
     robust = np.where(reaches, percentile(own / np.maximum(loud, 1e-30)), 0.0)
     near = np.flatnonzero(robust >= 10 ** (-ONSET_MARGIN_DB / 20) * robust.max())
-    contrast = None
-    if contents.with_onset and len(near) > 1:
-        drives, targets = (found.rows[near], found.weights[near]), [*contents.streams[0].targets]
-        contrast = onset_contrast(asked.table, asked.tips, targets, quiet, *drives)
+    contrast = onset(near) if onset is not None and len(near) > 1 else None
     if contrast is None:
         return best_of(robust)
     return int(near[best_of(robust[near] * contrast**ONSET_WEIGHT)])
 
 
 def onset_contrast(
-    table: "LocalizationTable",
-    tips: FingertipShapes,
-    targets: list[int],
-    quiet: list[int],
-    rows: IntArray,
-    weights: Complex64Array,
+    fingers: FingersOnPlate, contents: Contents, rows: IntArray, weights: Complex64Array
 ) -> FloatArray | None:
     """Contrast (m,) along a plain ramp of tones at rows (m,), weights (m, n); None if unsolved."""
+    table, tips = fingers.table, fingers.tips
     if table.onsets is None:
         return None
     # An onset's target counts by the plain mean over its points.
+    targets = [*contents.streams[0].targets]
     scales = tips.fine.shape[1] * tips.fine_weights[targets]
     return table.onsets.contrast(
         rows,
         weights,
         targets=list(tips.fine[targets] * scales[:, :, None].astype(np.float32)),
-        quiet=tips.fine[quiet].reshape(-1, tips.fine.shape[2]),
+        quiet=tips.fine[[*contents.quiet]].reshape(-1, tips.fine.shape[2]),
     )
 
 
@@ -302,122 +259,3 @@ def worst_ratios(
     for finger in quiet:
         worst = np.minimum(worst, levels.min(axis=1) / np.maximum(total[:, finger], _TINY))
     return percentile(worst)
-
-
-def _promised(asked: Asked, rows: IntArray, weights: Complex64Array, is_apart: bool) -> Tones:
-    """What fingers feel of tones at rows (K,) of weights (K, n), brought to their levels."""
-    contents, shares = asked.contents, asked.tips.fine_weights
-    streams, levels, k = contents.streams, contents.levels, len(shares)
-    powers = asked.drawn(PROMISED_DRAWS, rows, weights, with_powers=True).powers
-    power = np.asarray(powers).reshape(len(rows), *shares.shape, -1)
-    alone = np.arange(len(rows))  # as if each had a frequency of its own
-    own = [
-        promise(felt_amplitudes(power, shares, alone, j, s.targets)) for j, s in enumerate(streams)
-    ]
-    gains = levels / np.maximum(own, 1e-30)
-    priorities = [stream.priority for stream in streams]
-    gains, factor = share_stroke(gains, weights, levels.astype(float), priorities)
-    power = power * np.square(gains, dtype=np.float32)[:, None, None, None]
-    contrast, level, foreign_amplitudes = (np.full(size, np.nan) for size in ((k, 3), (k, 2), k))
-    each_own = [felt_amplitudes(power, shares, rows, j, s.targets) for j, s in enumerate(streams)]
-    ratios: list[Float32Array] = []
-    loudest = np.zeros(power.shape[-1], dtype=np.float32)
-    for finger in (*(finger for stream in streams for finger in stream.targets), *contents.quiet):
-        felt, others = np.min(each_own, axis=0), np.ones(len(rows), dtype=bool)
-        for j, stream in enumerate(streams):
-            if finger in stream.targets:
-                felt, others[j] = felt_amplitudes(power, shares, rows, j, (finger,)), False
-                level[finger] = felt[0], promise(felt)
-        if not others.any():
-            continue
-        heard = np.sqrt(np.maximum(loudest_power(power[others], rows[others], finger), _TINY))
-        ratios.append(felt / heard)
-        foreign_amplitudes[finger] = promise(heard, 100 - PROMISED_PERCENTILE)
-        contrast[finger] = figures(ratios[-1])
-        if finger in contents.quiet:
-            loudest = np.maximum(loudest, heard)
-    worst = figures(np.min(ratios, axis=0)) if ratios else (np.nan,) * 3
-    if len(streams) == 1:
-        contrast[[*streams[0].targets]] = worst  # the one at the loudest quiet finger
-    of_all = worst[2], promise(loudest, 100 - PROMISED_PERCENTILE)
-    worst_db, loudest_db_sl = decibels(np.array(of_all)).tolist()
-    return Tones(
-        rows=rows.tolist(),
-        weights=weights.tolist(),
-        gains=gains.tolist(),
-        contrast_db=decibels(contrast).tolist(),
-        level_db_sl=decibels(level).tolist(),
-        foreign_db_sl=decibels(foreign_amplitudes).tolist(),
-        worst_db=worst_db,
-        loudest_db_sl=loudest_db_sl,
-        stroke_factor=factor,
-        is_apart=is_apart,
-    )
-
-
-def share_stroke(
-    gains: FloatArray, weights: Complex64Array, levels: FloatArray, priorities: Sequence[int]
-) -> tuple[FloatArray, float]:
-    """Gains (K,) to levels (K,) within the stroke, and the least factor on them.
-
-    Of each priority the louder contents are lowered first, to one level (max-min), until all fit
-    into what is left by the higher ones.
-    """
-    amplitudes = gains[:, None] * np.abs(weights)
-    factors, left = np.zeros(len(gains)), np.ones(amplitudes.shape[1])
-    for priority in sorted({*priorities}, reverse=True):
-        of = np.array(priorities) == priority
-        level, is_lowered = 0.0, of
-        while is_lowered.any():
-            kept = amplitudes[of & ~is_lowered].sum(axis=0)
-            per_level = (amplitudes[is_lowered] / levels[is_lowered, None]).sum(axis=0)
-            level = float((np.maximum(left - kept, 0) / np.maximum(per_level, 1e-30)).min())
-            if (levels[is_lowered] > level).all():
-                break
-            is_lowered = is_lowered & (levels > level)
-        factors[of] = np.where(is_lowered[of], level / levels[of], 1.0)
-        used = factors[of] @ amplitudes[of]
-        left = np.where(used >= left * (1 - NEARLY), 0.0, left - used)  # rounding leaves no stroke
-    return gains * factors, float(factors.min())
-
-
-def felt_amplitudes(
-    power: Float32Array,
-    weights: Float32Array,
-    rows: IntArray,
-    number: int,
-    targets: Sequence[int],
-) -> Float32Array:
-    """The least that a content's fingertips feel of it, (d,), of power (K, k, p, d).
-
-    weights (k, p): of the points in the mean. Tones of other contents at its frequency, by rows
-    (K,), may cancel part of it.
-    """
-    amplitude = np.sqrt(power[number])
-    for other in np.flatnonzero(rows == rows[number]).tolist():
-        if other != number:
-            amplitude = amplitude - np.sqrt(power[other])
-    return np.asarray(np.min([weights[t] @ np.maximum(amplitude[t], 0) for t in targets], axis=0))
-
-
-def loudest_power(power: Float32Array, rows: IntArray, finger: int) -> Float32Array:
-    """Power (d,) of contents at the loudest point of a finger, of power (j, k, p, d).
-
-    Of contents of one frequency, by rows (j,), the amplitudes add.
-    """
-    at = power[:, finger]
-    total = np.zeros(at.shape[1:], dtype=at.dtype)
-    order = np.argsort(rows, kind="stable").tolist()
-    for _, same in groupby(order, key=rows.__getitem__):
-        total += np.sqrt(at[list(same)]).sum(axis=0) ** 2
-    return np.asarray(total.max(axis=0))
-
-
-def promise(values: Float32Array, percent: float = PROMISED_PERCENTILE) -> float:
-    """Percentile of the drawn plates, without the first, the nominal one."""
-    return float(percentile(values[1:].astype(float), percent))
-
-
-def figures(ratio: Float32Array) -> tuple[float, float, float]:
-    """Of ratios (1 + d,): nominal, of half of the drawn plates, of nine of ten."""
-    return float(ratio[0]), promise(ratio, 50), promise(ratio)

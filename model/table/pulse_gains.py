@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.drive_modes.forms import Weights
+from model.drive_modes.forms import Drive
 from model.finger.perception import decibels
 from model.table.pattern import Pattern
 
@@ -69,10 +69,10 @@ class PulseResponses:
     count: int
     share: float
 
-    def gains(self, drive: Weights) -> PulseGains:
+    def gains(self, drive: Drive) -> PulseGains:
         """Gains of a drive at full level; its frequencies are rows of the table."""
         squares = np.zeros(self.values.shape[2:])
-        for row, weights in drive.tones():
+        for row, weights in drive:
             at = int(np.searchsorted(self.rows, row))
             field = np.tensordot(weights, self.values[at], axes=1)
             squares += (field.real**2 + field.imag**2) / self.threshold[at] ** 2

@@ -8,13 +8,12 @@ that any fingertips can be queried in any drive mode.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
-from model.drive_modes import UNRESTRICTED
 from model.drive_modes.forms import Forms
 from model.drive_modes.switched import amplitude_powers, members_of, sums_of_sources
 from model.ensemble.attached_plate import AttachedPlate, attach
@@ -30,12 +29,10 @@ from model.spectral.mesh import PlateMesh
 from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loads
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
-from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS, Contents, Stream
-from model.table.contents_kernel import choose_tones
-from model.table.contents_numpy import onset_contrast
+from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS
 from model.table.fingers_on_plate import FingersOnPlate
 from model.table.pattern import ONSET_RAMP, Pattern
-from model.table.pattern_choice import Candidates, choose_pattern, pattern_of
+from model.table.pattern_query import find_pattern
 from model.table.pulse_gains import OverEffect
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
 from model.table.raster import FingertipShapes, Raster
@@ -135,43 +132,7 @@ class LocalizationTable:
         decide with the steady measures; None where the steady vibration counts. Raises InputError
         for contacts off the plate and for a level that cannot be reached.
         """
-        question.check_on(self.plate)
-        drive_mode = question.drive_mode_on(self.drive_mode)
-        low, high = question.frequencies
-        playable = np.flatnonzero((self.frequencies >= low) & (self.frequencies <= high))
-        if len(playable) == 0:
-            raise InputError(
-                f"frequencies of the table must include some from {low:g} to {high:g} Hz, which "
-                f"these amplifiers play, got {self.frequencies[0]:g} to {self.frequencies[-1]:g} "
-                "Hz; build a table with others: era table build --frequencies"
-            )
-        background = None if question.quiet else self.background(question.targets)
-        if drive_mode == UNRESTRICTED and over_effect is None:
-            band = int(playable[0]), int(playable[-1]) + 1
-            found = self._tone(question, band, background)
-            if found is not None:
-                return found
-        tips = self.read_fingertips(question.contacts)
-        count = len(question.targets)
-        candidates = Candidates(
-            eras=self.eras,
-            frequencies=self.frequencies,
-            playable=playable,
-            fingers=self._fingers(question, tips),
-            background=background,
-            threshold=self.thresholds,
-            threshold_name=self.threshold,
-            onset_contrast=partial(
-                onset_contrast,
-                self,
-                tips,
-                [*range(count)],
-                [*range(count, len(tips.fine))],
-            ),
-            over_effect=over_effect,
-            ringing=self._ringing(over_effect.duration) if over_effect else None,
-        )
-        return choose_pattern(question, drive_mode, candidates)
+        return find_pattern(self, question, over_effect)
 
     def prepare(self, drive_mode: str | None = None, *, with_ringing: bool = True) -> None:
         """Compute ahead what the first query in a drive mode needs.
@@ -186,7 +147,7 @@ class LocalizationTable:
         if (drive_mode or self.drive_mode) != "switched":
             _ = self.onsets  # used only where several patterns are near the best
             for duration in EFFECT_DURATIONS if with_ringing else ():
-                self._ringing(duration)
+                self.ringing(duration)
 
     def inherit_ringing(self, other: "LocalizationTable") -> None:
         """Take what is prepared of ringing from a table of nearly the same plate."""
@@ -195,8 +156,11 @@ class LocalizationTable:
     def forms(self, question: Question) -> Forms:
         """Expected powers at the fingertips of a question, at all frequencies of the table."""
         background = None if question.quiet else self.background(question.targets)
-        tips = self.read_fingertips(question.contacts)
-        return self._fingers(question, tips).forms(background)
+        fingers = FingersOnPlate.of(self, question.contacts, question.loads)
+        every = range(len(question.contacts))
+        count = len(question.targets)
+        formed = fingers.forms(np.arange(len(self.frequencies)), with_fine=True)
+        return formed.of(every[:count], every[count:], question.level_db_sl, background)
 
     def unit_fields(
         self, points: FloatArray, *, contacts: Sequence[Point] = (), loads: Sequence[float] = ()
@@ -300,7 +264,7 @@ class LocalizationTable:
         except InputError:
             return None
 
-    def _ringing(self, duration: float) -> RampedRinging | None:
+    def ringing(self, duration: float) -> RampedRinging | None:
         """Ringing over an effect of about a duration [s]; None where too few ERAs support it."""
         nearest = min(EFFECT_DURATIONS, key=lambda each: abs(math.log(each / duration)))
         if nearest not in self._ringings:
@@ -384,41 +348,3 @@ class LocalizationTable:
         """Mean power of the plate beyond targets, without fingers on it, (f, eras, eras)."""
         rest = self._cell_fields[:, :, is_background(self.cell_centres, targets)]
         return np.asarray(rest.conj() @ rest.swapaxes(1, 2) / np.float32(rest.shape[2]))
-
-    def _fingers(self, question: Question, tips: FingertipShapes) -> FingersOnPlate:
-        """Fingers at all frequencies."""
-        return FingersOnPlate.of(
-            touch(self.on_eras, tips.few[:, 0], question.loads),
-            tips,
-            question,
-            np.arange(len(self.frequencies)),
-            threshold=self.thresholds,
-            error_power=self.error_power,
-        )
-
-    def _tone(
-        self, question: Question, band: tuple[int, int], background: Complex64Array | None
-    ) -> Pattern | None:
-        """The best pattern of one tone, None where that hardly reaches the level."""
-        count = len(question.targets)
-        contents = Contents(
-            question.contacts,
-            question.loads,
-            (Stream(tuple(range(count)), question.level_db_sl, (band,)),),
-            tuple(range(count, len(question.contacts))),
-            background=background,
-            is_strict=True,
-            with_onset=not question.envelopes,
-        )
-        found = choose_tones(self, contents)
-        if found is None:
-            return None
-        return pattern_of(
-            question,
-            found,
-            eras=self.eras,
-            frequencies=self.frequencies,
-            thresholds=self.thresholds,
-            threshold_name=self.threshold,
-            background=background,
-        )

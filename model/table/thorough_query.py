@@ -12,7 +12,7 @@ from dataclasses import replace
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.table.pattern import Pattern
-from model.table.pattern_choice import UnreachableLevel
+from model.table.pattern_query import UnreachableLevel
 from model.table.question import MAX_LEVEL_DB_SL, Question
 from model.table.table import LocalizationTable
 

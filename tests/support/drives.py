@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from model.drive_modes.forms import Forms, Weights
+from model.drive_modes.forms import Drive, Forms
 
 
-def by_hand(forms: Forms, drive: Weights) -> tuple[float, float]:
+def by_hand(forms: Forms, drive: Drive) -> tuple[float, float]:
     """Robust score, and amplitude to threshold at the weakest target: powers of tones add."""
     target = np.zeros(len(forms.targets))
     quiet = np.zeros(forms.quiet.shape[1])
-    for f in sorted({*drive.frequencies.tolist()} - {-1}):
-        w = np.where(drive.frequencies == f, drive.values, 0).astype(complex)
+    for f, weights in drive:
+        w = weights.astype(complex)
         threshold_power = float(forms.threshold[f]) ** 2
         for t, field in enumerate(forms.targets[:, f].astype(complex)):
             target[t] += abs(field @ w) ** 2 / threshold_power

@@ -18,7 +18,7 @@ from model.errors import InputError
 from model.rig.file import example_rig_path
 from model.table import overview
 from model.table.file import load_table, save_table
-from model.table.pattern_choice import UnreachableLevel
+from model.table.pattern_query import UnreachableLevel
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 

@@ -10,9 +10,9 @@ from model.cli import app
 from model.errors import InputError
 from model.finger.perception import detection_threshold
 from model.table.answer import answer
-from model.table.contents_numpy import felt_amplitudes, loudest_power
 from model.table.exact_plates import Plates, draw_plates, powers_on
 from model.table.file import save_table
+from model.table.promised import felt_amplitudes, loudest_power
 from model.table.query import answer_as_json
 from model.table.question import Question
 from model.table.request import Finger, Request
@@ -158,8 +158,13 @@ def test_a_tone_of_the_same_frequency_may_cancel_part_of_ones_own():
     """At two points of amplitude 5 and 2, beside 3 of another content: 2 and 0, 1 in the mean."""
     power = np.array([[5.0, 2.0], [3.0, 3.0], [4.0, 4.0]])[:, None, :, None] ** 2
     weights = np.full((1, 2), 0.5, dtype=np.float32)
-    assert felt_amplitudes(power, weights, np.array([7, 7, 8]), 0, (0,)) == pytest.approx(1.0)
-    assert felt_amplitudes(power, weights, np.array([7, 6, 8]), 0, (0,)) == pytest.approx(3.5)
+    first = np.array([True, False, False])
+    for rows, felt in (([7, 7, 8], 1.0), ([7, 6, 8], 3.5)):
+        found = felt_amplitudes(power, weights, np.array(rows), first, (0,))
+        assert found == pytest.approx(felt)
+    # Of two tones of one's own, the second beside none: at both points 5 and 2, with 4 each.
+    both = felt_amplitudes(power, weights, np.array([7, 6, 8]), np.array([True, False, True]), (0,))
+    assert both == pytest.approx((41**0.5 + 20**0.5) / 2)
 
 
 def test_two_fingers_that_share_and_no_other_are_served():

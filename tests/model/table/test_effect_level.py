@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.drive_modes.forms import Weights
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold
 from model.table.effect_level import DriveLimits, EffectLevels, pulse_ramp, shaped_gain_db
@@ -80,7 +79,7 @@ def test_responses_of_each_era_make_those_of_a_drive(frequency: float) -> None:
     row = table.frequencies.tolist().index(frequency)
     weights = [drive[era.name].phasor / STROKE if era.name in drive else 0.0 for era in table.eras]
     responses = levels.responses(np.array([row]), question=question, duration=0.04)
-    found = responses.gains(Weights.at(row, np.array(weights, dtype=np.complex64)))
+    found = responses.gains([(row, np.array(weights, dtype=np.complex64))])
     fine = levels.gains_db(drive, question, ramp=0.01, duration=0.04)
     assert found.targets == pytest.approx(fine.targets, abs=0.5)
     assert fine.quiet_db_sl is not None

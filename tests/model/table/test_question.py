@@ -10,7 +10,7 @@ from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold
 from model.table.pattern import Pattern
-from model.table.pattern_choice import UnreachableLevel
+from model.table.pattern_query import UnreachableLevel
 from model.table.question import Question
 from paper_table import FREQUENCIES, contact_sets, smooth_table
 

@@ -7,7 +7,7 @@ from model.arguments import expect_path
 from model.calibration.calibrate import calibrate as fit
 from model.calibration.calibration_result import Calibration
 from model.calibration.responses import responses_of
-from model.calibration.responses_file import read_functions
+from model.calibration.responses_file import read_measured
 from model.diagnosis.consistency import check_consistency
 from model.rig.rig import Rig
 
@@ -20,6 +20,6 @@ def calibrate(rig: Rig, measured: Path | str, *, all_scales: bool = False) -> Ca
     `is_good`. Raises InputError for responses that are not what they claim, by their cause.
     """
     expect_rig(rig)
-    responses = responses_of(read_functions(expect_path(measured, what="measured")), rig)
+    responses = responses_of(read_measured(expect_path(measured, what="measured")), rig)
     check_consistency(rig, responses)
     return fit(rig, responses, all_scales=all_scales)

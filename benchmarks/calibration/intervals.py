@@ -18,7 +18,7 @@ from benchmarks.setting import RIG
 from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
 from model.calibration.responses import Responses, responses_of
-from model.calibration.responses_file import read_functions
+from model.calibration.responses_file import read_measured
 from model.diagnosis.consistency import check_consistency
 from model.errors import InputError
 from model.rig.file import load_rig
@@ -64,7 +64,7 @@ def main(count: int, form: str) -> None:
             program = [sys.executable, "-m", "benchmarks.calibration.hidden_plates"]
             subprocess.run([*program, name, str(first), str(some), form], check=True)
             for seed in range(first, first + some):
-                measured = read_functions(Path(name) / f"{seed}.csv")
+                measured = read_measured(Path(name) / f"{seed}.csv")
                 truth = json.loads((Path(name) / f"{seed}.json").read_text())
                 try:
                     found = deviations(rig, responses_of(measured, rig), truth)

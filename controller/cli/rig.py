@@ -135,8 +135,8 @@ def _measured(
 def _read(measured: Path, rig_file: Path, *, mesh: str | None) -> "tuple[Rig, Responses]":
     """Read what was measured from a file."""
     from model.calibration.responses import responses_of
-    from model.calibration.responses_file import read_functions
+    from model.calibration.responses_file import read_measured
     from model.rig.file import load_rig
 
     rig = load_rig(rig_file, mesh=mesh)
-    return rig, responses_of(read_functions(measured), rig)
+    return rig, responses_of(read_measured(measured), rig)

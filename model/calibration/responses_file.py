@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from model.calibration.responses import MeasuredFunction, Responses
+from model.calibration.responses import MeasuredValue, Responses
 from model.errors import InputError
 from model.files.csv_file import write_columns
 from model.files.uff import (
@@ -38,7 +38,7 @@ _ACCELERATION_UNITS = ("", "m/s2", "m/sec2", "m/ss", "ms-2", "ms2")
 _DISPLACEMENT_UNITS = ("", "m", "meter", "metre")
 
 
-def read_functions(path: Path) -> list[MeasuredFunction]:
+def read_measured(path: Path) -> list[MeasuredValue]:
     """Read measured responses; raises InputError with file and line."""
     suffix = path.suffix.lower()
     if suffix == ".csv":
@@ -95,13 +95,13 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig) -> None:
     write_universal(path, Universal(nodes, functions))
 
 
-def _read_csv(path: Path) -> list[MeasuredFunction]:
+def _read_csv(path: Path) -> list[MeasuredValue]:
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: text must be UTF-8; save it as CSV in UTF-8") from error
     rows = csv.reader(io.StringIO(text), strict=True)
-    grouped: dict[tuple[str, str], list[tuple[tuple[float, ...], int]]] = {}
+    found = []
     try:
         header = [name.strip() for name in next(rows)]
         _check_header(path, header)
@@ -116,45 +116,25 @@ def _read_csv(path: Path) -> list[MeasuredFunction]:
                     f"got {len(row)}; the file is damaged"
                 )
             cell = dict(zip(header, row, strict=True))
-            numbers = tuple(_number(path, line, name, cell[name]) for name in numeric)
-            key = (cell["era"].strip(), cell["sensor"].strip())
-            if not all(key):
+            x, y, frequency, real, imaginary, *at_era = (
+                _number(path, line, name, cell[name]) for name in numeric
+            )
+            era, sensor = cell["era"].strip(), cell["sensor"].strip()
+            if not (era and sensor):
                 raise InputError(f"{path}:{line}: era and sensor must have names")
-            if numbers[2] <= 0:
-                raise InputError(
-                    f"{path}:{line}: frequency_hz must be positive, got {numbers[2]:g}"
-                )
-            grouped.setdefault(key, []).append((numbers, line))
+            if frequency <= 0:
+                raise InputError(f"{path}:{line}: frequency_hz must be positive, got {frequency:g}")
+            era_point = (at_era[0], at_era[1]) if at_era else None
+            value = complex(real, imaginary)
+            place = f"{path}:{line}"
+            found.append(MeasuredValue(era, sensor, (x, y), era_point, frequency, value, place))
     except csv.Error as error:
         raise InputError(
             f"{path}:{rows.line_num}: invalid CSV ({error}); check quotes and the end of the file"
         ) from error
-    if not grouped:
+    if not found:
         raise InputError(f"{path}:1: at least one line of values must follow, got none")
-    return [_csv_function(path, *key, found) for key, found in grouped.items()]
-
-
-def _csv_function(
-    path: Path, era: str, sensor: str, rows: Sequence[tuple[tuple[float, ...], int]]
-) -> MeasuredFunction:
-    table = np.array([numbers for numbers, _ in rows])
-    first = rows[0]
-    for numbers, line in rows:
-        if numbers[:2] != first[0][:2] or numbers[5:] != first[0][5:]:
-            raise InputError(
-                f"{path}:{line}: sensor {sensor} and ERA {era} must be at the positions of line "
-                f"{first[1]}; name others differently"
-            )
-    era_point = (float(table[0, 5]), float(table[0, 6])) if table.shape[1] > 5 else None
-    return MeasuredFunction(
-        era,
-        sensor,
-        (float(table[0, 0]), float(table[0, 1])),
-        era_point,
-        table[:, 2],
-        table[:, 3] + 1j * table[:, 4],
-        [f"{path}:{line}" for _, line in rows],
-    )
+    return found
 
 
 def _check_header(path: Path, header: Sequence[str]) -> None:
@@ -184,7 +164,7 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
     return value
 
 
-def _read_uff(path: Path) -> list[MeasuredFunction]:
+def _read_uff(path: Path) -> list[MeasuredValue]:
     content = read_universal(path)
     functions = [f for f in content.functions if f.function_type == FREQUENCY_RESPONSE]
     if not functions:
@@ -195,12 +175,12 @@ def _read_uff(path: Path) -> list[MeasuredFunction]:
     named: dict[str, set[int]] = {}
     for function in functions:
         named.setdefault(function.names[0], set()).add(function.response)
-    return [_uff_function(function, content, named) for function in functions]
+    return [value for function in functions for value in _uff_values(function, content, named)]
 
 
-def _uff_function(
+def _uff_values(
     function: Function, content: Universal, named: dict[str, set[int]]
-) -> MeasuredFunction:
+) -> list[MeasuredValue]:
     place = function.place
     if function.data_types[1] != ACCELERATION or function.data_types[2] != DISPLACEMENT:
         raise InputError(
@@ -236,12 +216,10 @@ def _uff_function(
         name = f"{name or 'node'}:{function.response}"
     sign = math.prod(-1 if direction < 0 else 1 for direction in function.directions)
     x, y, _ = content.nodes[function.response]
-    return MeasuredFunction(
-        function.names[1],
-        name,
-        (float(x), float(y)),
-        None if reference is None else (float(reference[0]), float(reference[1])),
-        function.x,
-        sign * function.data,
-        [place] * len(function.x),
-    )
+    era_point = None if reference is None else (float(reference[0]), float(reference[1]))
+    return [
+        MeasuredValue(
+            function.names[1], name, (float(x), float(y)), era_point, frequency, sign * value, place
+        )
+        for frequency, value in zip(function.x.tolist(), function.data.tolist(), strict=True)
+    ]

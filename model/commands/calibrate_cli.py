@@ -42,7 +42,7 @@ def calibrate(
     from model.calibration import calibration_report
     from model.calibration.calibrate import calibrate as fit
     from model.calibration.responses import responses_of
-    from model.calibration.responses_file import read_functions
+    from model.calibration.responses_file import read_measured
     from model.config.document import read_document
     from model.diagnosis.consistency import check_consistency
     from model.rig.file import rig_of
@@ -52,7 +52,7 @@ def calibrate(
         check_picture(picture)
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)
-    responses = responses_of(read_functions(measured_file), rig)
+    responses = responses_of(read_measured(measured_file), rig)
     started = time.perf_counter()
     check_consistency(rig, responses)
     calibration = fit(rig, responses, all_scales=all_scales)

@@ -16,7 +16,7 @@ from benchmarks.desk.session import PLATE, Desk, desk
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.truth import draw_truth
 from model.calibration.responses import responses_of
-from model.calibration.responses_file import read_functions
+from model.calibration.responses_file import read_measured
 from model.rig.file import load_rig
 
 pytestmark = [
@@ -50,7 +50,7 @@ def test_measured_plate_is_the_one_on_the_desk(plate: Desk, device: str, late: i
     )  # fmt: skip
     assert told["latency_s"] * 48_000 == pytest.approx(73 + 128 + late, abs=0.5)
     rig = load_rig(plate.folder / "rig.yaml")
-    found = responses_of(read_functions(plate.folder / "measured.csv"), rig)
+    found = responses_of(read_measured(plate.folder / "measured.csv"), rig)
     model = DeskModel(draw_truth(rig, seed=SEED, mesh=MESH), found.points).under()
     exact = model.response(found.frequencies).swapaxes(1, 2) / rig.eras[0].stroke
     loud = np.abs(exact) > 0.2 * np.abs(exact).max(axis=(1, 2), keepdims=True)

@@ -33,7 +33,7 @@ from controller.cli.main import run
 from distorted_responses import DISTORTIONS, every
 from gateway_bench import real_daemon, wait_for
 from model.calibration.responses import responses_of
-from model.calibration.responses_file import read_functions, write_responses_csv
+from model.calibration.responses_file import read_measured, write_responses_csv
 from model.rig.file import example_rig_path, load_rig
 
 ROOT = Path(__file__).parents[2]
@@ -225,7 +225,7 @@ _BEFORE: dict[str, Callable[[contextlib.ExitStack, io.StringIO], None]] = {
 def _write_distorted(shelf: Path) -> None:
     """Put measured responses on the shelf that are not what they claim, such as g.csv."""
     rig = load_rig(example_rig_path())
-    measured = responses_of(read_functions(ROOT / "examples" / "measured.csv"), rig)
+    measured = responses_of(read_measured(ROOT / "examples" / "measured.csv"), rig)
     few = every(measured, 2, up_to=300.0)
     for name in ("g", "conjugated", "swapped_channels", "swapped_sensors"):
         write_responses_csv(shelf / f"{name}.csv", DISTORTIONS[name](few), rig)

@@ -21,7 +21,7 @@ from controller.sources.capture import (
 )
 from drivers.errors import LinkError
 from examples.make_touches import write_capture
-from model.calibration.responses_file import read_functions
+from model.calibration.responses_file import read_measured
 from model.errors import InputError
 from model.rig.file import load_rig
 from model.table.file import load_table
@@ -139,8 +139,8 @@ READERS: dict[str, Callable[[Path], object]] = {
     "rig.yaml": load_rig,
     "layout.yaml": lambda path: load_layout(path, None),
     "taps.tuio": read_capture,
-    "measured.csv": read_functions,
-    "measured.uff": read_functions,
+    "measured.csv": read_measured,
+    "measured.uff": read_measured,
     "table.npz": load_table,
 }
 

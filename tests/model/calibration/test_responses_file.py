@@ -9,7 +9,7 @@ import pyuff
 
 from model.calibration.responses import Responses, responses_of
 from model.calibration.responses_file import (
-    read_functions,
+    read_measured,
     write_responses_csv,
     write_responses_uff,
 )
@@ -36,7 +36,7 @@ def test_responses_files_read_back_what_was_written(responses, coarse_rig, tmp_p
     """Sensors, places, frequencies and complex values, gaps among them."""
     path = tmp_path / f"measured.{ending}"
     WRITERS[ending](path, responses, coarse_rig)
-    back = responses_of(read_functions(path), coarse_rig)
+    back = responses_of(read_measured(path), coarse_rig)
     order = [back.sensors.index(name) for name in responses.sensors]
     np.testing.assert_allclose(back.points[order], responses.points, rtol=1e-12)
     np.testing.assert_array_equal(back.frequencies, responses.frequencies)
@@ -44,7 +44,7 @@ def test_responses_files_read_back_what_was_written(responses, coarse_rig, tmp_p
     assert back.count == 17
 
 
-def test_read_functions_reads_uff_of_another_program(coarse_rig: Rig, tmp_path: Path) -> None:
+def test_read_measured_reads_uff_of_another_program(coarse_rig: Rig, tmp_path: Path) -> None:
     """Written by pyuff alone: single precision, nodes as dataset 15, no names, sensor upside down.
 
     ERAs are known by their nodes' places.
@@ -79,7 +79,7 @@ def test_read_functions_reads_uff_of_another_program(coarse_rig: Rig, tmp_path: 
     path = tmp_path / "other.unv"
     file = pyuff.UFF(str(path))
     file.write_sets([nodes, record], "overwrite", force_double=False)
-    back = responses_of(read_functions(path), coarse_rig)
+    back = responses_of(read_measured(path), coarse_rig)
     assert back.sensors == ("node:7",)
     np.testing.assert_allclose(back.frequencies, [50, 60, 70])
     np.testing.assert_allclose(back.values[:, 1, 0], [-1 - 2j, -3 + 1j, 250 - 0.5j], rtol=1e-5)
@@ -90,7 +90,7 @@ def test_read_functions_reads_uff_of_another_program(coarse_rig: Rig, tmp_path: 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.parametrize("is_whole", [True, False])
-def test_read_functions_reads_binary_uff(
+def test_read_measured_reads_binary_uff(
     responses: Responses, coarse_rig: Rig, tmp_path: Path, *, is_whole: bool
 ) -> None:
     """Records as bytes (58b) are read to the last bit; one that lost some of them is refused."""
@@ -101,14 +101,14 @@ def test_read_functions_reads_binary_uff(
     path = tmp_path / "binary.uff"
     pyuff.UFF(str(path)).write_sets(sets, "overwrite")
     if is_whole:
-        back = responses_of(read_functions(path), coarse_rig)
+        back = responses_of(read_measured(path), coarse_rig)
         np.testing.assert_allclose(back.values, responses.values, rtol=1e-11)
         return
     content = path.read_bytes()
     cut = content.rindex(b"    -1")
     path.write_bytes(content[: cut - 24] + b"\n" + content[cut:])
     with pytest.raises(InputError, match=r"binary\.uff:?\d*: "):
-        read_functions(path)
+        read_measured(path)
 
 
 def damage(path: Path, before: str, after: str) -> None:
@@ -134,13 +134,13 @@ def damage(path: Path, before: str, after: str) -> None:
         ("\nSW,", '\n"SW,', r":\d+: "),
     ],
 )
-def test_read_functions_refuses_damaged_csv(responses, coarse_rig, tmp_path, before, after, named):
+def test_read_measured_refuses_damaged_csv(responses, coarse_rig, tmp_path, before, after, named):
     """Wrong units, unknown columns, bad values: file and line."""
     path = tmp_path / "measured.csv"
     write_responses_csv(path, responses, coarse_rig)
     damage(path, before, after)
     with pytest.raises(InputError, match=rf"measured\.csv.*{named}"):
-        read_functions(path)
+        responses_of(read_measured(path), coarse_rig)
 
 
 @pytest.mark.parametrize(
@@ -158,38 +158,38 @@ def test_read_functions_refuses_damaged_csv(responses, coarse_rig, tmp_path, bef
         ("\n    -1\n", "\n    -3\n", r":\d+: "),
     ],
 )
-def test_read_functions_refuses_damaged_uff(responses, coarse_rig, tmp_path, before, after, named):
+def test_read_measured_refuses_damaged_uff(responses, coarse_rig, tmp_path, before, after, named):
     """Wrong units and kinds, broken records: file and line; other functions are skipped."""
     path = tmp_path / "measured.uff"
     write_responses_uff(path, responses, coarse_rig)
     damage(path, before, after)
     if not named:
-        assert len(read_functions(path)) == 5
+        assert len(read_measured(path)) == 17 - 3
         return
     with pytest.raises(InputError, match=rf"measured\.uff{named}"):
-        read_functions(path)
+        read_measured(path)
 
 
 @pytest.mark.parametrize("ending", WRITERS)
-def test_read_functions_refuses_files_without_measurements(
+def test_read_measured_refuses_files_without_measurements(
     responses, coarse_rig, tmp_path, monkeypatch, ending
 ):
     """No file, an empty one, text, one cut off or too large, and an unknown ending."""
     path = tmp_path / f"measured.{ending}"
     with pytest.raises(InputError, match=path.name):
-        read_functions(path)
+        read_measured(path)
     WRITERS[ending](path, responses, coarse_rig)
     cut = path.read_bytes()[:-30]
     for content in (b" \n", b"Dear all, the measurement was a success.\n", cut):
         path.write_bytes(content)
         with pytest.raises(InputError, match=path.name):
-            read_functions(path)
+            read_measured(path)
     WRITERS[ending](path, responses, coarse_rig)
     monkeypatch.setattr("model.files.uff._MAX_BYTES", 100)
     with pytest.raises(InputError, match="MiB"):
-        read_functions(path)
+        read_measured(path)
     with pytest.raises(InputError, match=r"\.csv, \.uff"):
-        read_functions(path.with_suffix(".mat"))
+        read_measured(path.with_suffix(".mat"))
 
 
 @pytest.mark.parametrize("ending", WRITERS)
@@ -197,21 +197,21 @@ def test_responses_of_refuses_another_plate(responses, coarse_rig, tmp_path, end
     """Points off the plate, ERAs elsewhere or unknown, frequencies beyond limits, repetitions."""
     path = tmp_path / f"measured.{ending}"
     WRITERS[ending](path, responses, coarse_rig)
-    functions = read_functions(path)
+    measured = read_measured(path)
     plate, eras = coarse_rig.plate, coarse_rig.eras
     small = Plate(0.25, 0.2, plate.thickness, plate.material)
     inside = tuple(replace(era, x=min(era.x, 0.25), y=min(era.y, 0.2)) for era in eras)
     moved = tuple(replace(era, x=0.9 * era.x) for era in eras)
     others = tuple(replace(era, name=f"X{era.name}", x=0.1 + era.x / 3) for era in eras)
     limits = replace(coarse_rig.limits, frequency_max=300.0)
-    elsewhere = replace(functions[0], point=(0.2, 0.2), era="NE", era_point=None)
+    elsewhere = replace(measured[0], point=(0.2, 0.2), era="NE", era_point=None)
     for rig, given, named in (
-        (replace(coarse_rig, plate=small, eras=inside), functions, "sensor rim"),
-        (replace(coarse_rig, eras=moved), functions, "ERA SE"),
-        (replace(coarse_rig, eras=others), functions, "ERA.* SW"),
-        (replace(coarse_rig, limits=limits), functions, "320 Hz"),
-        (coarse_rig, [*functions, functions[0]], "50 Hz"),
-        (coarse_rig, [*functions, elsewhere], "sensor P1"),
+        (replace(coarse_rig, plate=small, eras=inside), measured, "sensor rim"),
+        (replace(coarse_rig, eras=moved), measured, "ERA SE"),
+        (replace(coarse_rig, eras=others), measured, "ERA.* SW"),
+        (replace(coarse_rig, limits=limits), measured, "320 Hz"),
+        (coarse_rig, [*measured, measured[0]], "50 Hz"),
+        (coarse_rig, [*measured, elsewhere], "sensor P1"),
     ):
         with pytest.raises(InputError, match=rf"{path.name}:\d+: .*{named}"):
             responses_of(given, rig)

@@ -2,29 +2,32 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from model.config.document import Document, parse_document
+from model.config.document import Document, KeyPath, parse_document
 from model.config.editing import edited_text
 from model.errors import InputError
 from model.rig.file import rig_of
 from model.rig.rig import Rig
-from model.structure.attachments import Gain
+from model.rig.uncertainty import Uncertainty
 from model.structure.plate import Material
+
+_Written: TypeAlias = "float | tuple[Any, ...] | Material | Uncertainty"
 
 _PER_LINE = 4
 _SAME = 1e-4  # relative; of phases and of what modes deviate, absolute
 _SAME_PLACE = 1e-6  # m
+_IN_ANY_CASE = ("loss_factor", "stiffness", "damping", "bolt_mass")
 
 # ruamel.yaml wraps long sequences anywhere, so rows replace placeholders in its text.
 _ROWS_OF = "rows-of-"
 _PLACEHOLDER = re.compile(
-    rf"^(?P<start>(?P<indent> *).*(gains|modes):\s+){_ROWS_OF}(?P<what>\d+|modes)", re.MULTILINE
+    rf"^(?P<start>(?P<indent> *).*(gains|modes):\s+){_ROWS_OF}(?P<number>\d+)", re.MULTILINE
 )
 
 
@@ -37,39 +40,30 @@ def rewritten_text(
     mesh: that replaces the file's. Raises ConfigError if a comment of the file would be lost,
     InputError where the text, read as a rig, has other values.
     """
+    rows: list[list[str]] = []
 
     def change(data: CommentedMap) -> None:
-        _change_plate(data["plate"], before, after)
-        for number, era in enumerate(after.eras):
-            _change_era(data["eras"][era.name], number, before, after)
-        own = len(before.masses)
-        if len(after.masses) > own:
+        own = _values(before)
+        for path, value in _values(after).items():
+            if value != own[path] or path[-1] in _IN_ANY_CASE:
+                _put(data, path, value, rows)
+        for mass in after.masses[len(before.masses) :]:
             masses = data.setdefault("masses", CommentedMap())
-            for mass in after.masses[own:]:
-                masses[_free_name(masses)] = _flow(
-                    {"at": _sequence([mass.x, mass.y]), "mass": _rounded(mass.mass)}
-                )
-        if after.uncertainty != before.uncertainty:
-            data["uncertainty"] = _flow(
-                {key: _rounded(value) for key, value in asdict(after.uncertainty).items()}
+            masses[_free_name(masses)] = _flow(
+                {"at": _sequence([mass.x, mass.y]), "mass": _rounded(mass.mass)}
             )
 
     def rows_text(match: re.Match[str]) -> str:
-        indent = match["indent"]
-        if match["what"] == "modes":
-            rows = [
-                f"[{math.exp(shift / 2):.7g}, {math.exp(loss):.5g}]"
-                for shift, loss in after.plate.mode_deviations
-            ]
-        else:
-            rows = _gain_rows(after.eras[int(match["what"])].gains)
-        return match["start"] + _rows_text(rows, indent=indent)
+        return match["start"] + _rows_text(rows[int(match["number"])], indent=match["indent"])
 
     lines = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
     text = f"{lines}\n{_PLACEHOLDER.sub(rows_text, edited_text(document, change))}"
     back = rig_of(parse_document(document.source, text), mesh=mesh)
-    read, expected = _numbers(back), _numbers(after)
-    if len(read) != len(expected) or not all(map(_is_same, read, expected)):
+    read, expected = ([*_numbers(each)] for each in (back, after))
+    if len(read) != len(expected) or not all(
+        math.isclose(one, other, rel_tol=_SAME, abs_tol=none)
+        for (one, _), (other, none) in zip(read, expected, strict=True)
+    ):
         raise InputError(
             f"{document.source}: values read back must be those written; write plate and ERAs as "
             "`era config init` does, and try again"
@@ -77,61 +71,76 @@ def rewritten_text(
     return text
 
 
-def _numbers(rig: Rig) -> list[tuple[float, float]]:
-    """Values of a rig that are written, each with what counts as none of its quantity."""
-    plate = rig.plate
-    layers = rig.laminate.layers if rig.laminate else ()
-    found = [(layer.material.E, 0.0) for layer in layers] or [(plate.material.E, 0.0)]
-    found += [(each, 0.0) for each in (plate.thickness, plate.loss_factor, plate.loss_exponent)]
-    found += [(part, _SAME) for pair in plate.mode_deviations for part in pair]
-    found += [(each, 0.0) for each in asdict(rig.uncertainty).values()]
+def _values(rig: Rig) -> dict[KeyPath, _Written]:
+    """Values of a rig that a fit may change, by where its file has them."""
+    plate, layers = rig.plate, rig.laminate.layers if rig.laminate else ()
+    found: dict[KeyPath, _Written] = {("uncertainty",): rig.uncertainty}
+    # New keys come first in their block.
+    for number, layer in enumerate(layers):
+        found["plate", "layers", number, "material"] = layer.material
+        found["plate", "layers", number, "thickness"] = layer.thickness
+    if not layers:
+        found["plate", "material"], found["plate", "thickness"] = plate.material, plate.thickness
+    found["plate", "loss_factor"] = plate.loss_factor
+    found["plate", "loss_exponent"] = plate.loss_exponent
+    found["plate", "modes"] = plate.mode_deviations
     for era in rig.eras:
-        found += [(era.x, _SAME_PLACE), (era.y, _SAME_PLACE)]
-        found += [(each, 0.0) for each in (era.stiffness, era.damping, era.bolt_mass)]
-        for _, size, phase in era.gains:
-            found += [(size, 0.0), (np.cos(phase), _SAME), (np.sin(phase), _SAME)]
-    for mass in rig.masses:
-        found += [(mass.x, _SAME_PLACE), (mass.y, _SAME_PLACE), (mass.mass, 0.0)]
+        found["eras", era.name, "at"] = (era.x, era.y)
+        for key in ("stiffness", "damping", "bolt_mass", "gains"):
+            found["eras", era.name, key] = getattr(era, key)
     return found
 
 
-def _is_same(read: tuple[float, float], expected: tuple[float, float]) -> bool:
-    """Whether a value was read back as it was written."""
-    return math.isclose(read[0], expected[0], rel_tol=_SAME, abs_tol=expected[1])
+def _numbers(rig: Rig) -> Iterator[tuple[float, float]]:
+    """Values of a rig that are written, each with what counts as none of its quantity."""
+    for path, value in _values(rig).items():
+        match value:
+            case Material():
+                yield value.E, 0.0
+            case Uncertainty():
+                yield from ((each, 0.0) for each in asdict(value).values())
+            case tuple() if path[-1] == "at":
+                yield from ((each, _SAME_PLACE) for each in value)
+            case tuple() if path[-1] == "modes":
+                yield from ((each, _SAME) for pair in value for each in pair)
+            case tuple():
+                for _, size, phase in value:
+                    yield from ((size, 0.0), (math.cos(phase), _SAME), (math.sin(phase), _SAME))
+            case _:
+                yield value, 0.0
+    for mass in rig.masses:
+        yield from ((mass.x, _SAME_PLACE), (mass.y, _SAME_PLACE), (mass.mass, 0.0))
 
 
-def _change_plate(data: CommentedMap, before: Rig, after: Rig) -> None:
-    plate, own = after.plate, before.plate
-    _set(data, {"loss_factor": _rounded(plate.loss_factor)})
-    if plate.loss_exponent != own.loss_exponent:
-        _set(data, {"loss_exponent": _rounded(plate.loss_exponent)})
-    if plate.mode_deviations != own.mode_deviations:
-        _set(data, {"modes": f"{_ROWS_OF}modes"})
-    if plate.thickness != own.thickness:
-        _set_thickness(data, before, plate.thickness)
-    _set_modulus(data, before, after)
+def _put(data: CommentedMap, path: KeyPath, value: _Written, rows: list[list[str]]) -> None:
+    """Set a value in the data of a file; rows of numbers are added to those given."""
+    entry, key = data, path[-1]
+    for part in path[:-1]:
+        entry = entry[part]
+    if key == "damping":
+        # With another stiffness a ratio would be another damping.
+        _rename(entry, "damping_ratio", "damping")
+    match value:
+        case Material():
+            _set_material(entry, value)
+        case Uncertainty():
+            entry[key] = _flow({name: _rounded(each) for name, each in asdict(value).items()})
+        case tuple() if key == "at":
+            _set(entry, key, _sequence(value))
+        case tuple():
+            text = _mode_rows if key == "modes" else _gain_rows
+            rows.append(text(value))
+            _set(entry, key, f"{_ROWS_OF}{len(rows) - 1}")
+        case _:
+            _set(entry, key, _rounded(value))
 
 
-def _change_era(entry: CommentedMap, number: int, before: Rig, after: Rig) -> None:
-    era = after.eras[number]
-    own = before.era(era.name)
-    # With another stiffness a ratio would be another damping.
-    _rename(entry, "damping_ratio", "damping")
-    if (era.x, era.y) != (own.x, own.y):
-        _set(entry, {"at": _sequence([era.x, era.y])})
-    _set(
-        entry,
-        {
-            "stiffness": _rounded(era.stiffness),
-            "damping": _rounded(era.damping),
-            "bolt_mass": _rounded(era.bolt_mass),
-        },
-    )
-    if era.gains and era != own:
-        _set(entry, {"gains": f"{_ROWS_OF}{number}"})
+def _mode_rows(deviations: Sequence[tuple[float, float]]) -> list[str]:
+    """Rows of natural frequency and loss factor, relative to the plate's theory."""
+    return [f"[{math.exp(shift / 2):.7g}, {math.exp(loss):.5g}]" for shift, loss in deviations]
 
 
-def _gain_rows(gains: tuple[Gain, ...]) -> list[str]:
+def _gain_rows(gains: Sequence[tuple[float, float, float]]) -> list[str]:
     """Rows of frequency [Hz], magnitude and phase [degrees]."""
     return [f"[{f:.9g}, {size:.5g}, {np.degrees(phase):.6g}]" for f, size, phase in gains]
 
@@ -144,28 +153,9 @@ def _rows_text(rows: Sequence[str], *, indent: str) -> str:
     return f"[\n{indent}    {joined}]"
 
 
-def _set_thickness(plate: CommentedMap, before: Rig, thickness: float) -> None:
-    """Set the thickness [m] of a plate, of a laminate those of all layers by one factor."""
-    if before.laminate is None:
-        plate["thickness"] = _rounded(thickness)
-        return
-    factor = thickness / before.plate.thickness
-    for entry, layer in zip(plate["layers"], before.laminate.layers, strict=True):
-        entry["thickness"] = _rounded(factor * layer.thickness)
-
-
-def _set_modulus(plate: CommentedMap, before: Rig, after: Rig) -> None:
-    if before.laminate is None:
-        _set_material(plate, before.plate.material, after.plate.material.E)
-        return
-    factor = after.plate.material.E / before.plate.material.E
-    for entry, layer in zip(plate["layers"], before.laminate.layers, strict=True):
-        _set_material(entry, layer.material, factor * layer.material.E)
-
-
-def _set_material(entry: CommentedMap, material: Material, modulus: float) -> None:
-    """Set the modulus [Pa] of a plate's or layer's material, writing out a named material."""
-    text = f"{modulus / 1e9:.7g} GPa"
+def _set_material(entry: CommentedMap, material: Material) -> None:
+    """Set the modulus of a plate's or layer's material, writing out a named material."""
+    text = f"{material.E / 1e9:.7g} GPa"
     if isinstance(entry["material"], CommentedMap):
         entry["material"]["E"] = text
         return
@@ -187,13 +177,12 @@ def _rename(mapping: CommentedMap, old: str, new: str) -> None:
         mapping.insert(position, new, mapping.pop(old))
 
 
-def _set(mapping: CommentedMap, values: Mapping[str, Any]) -> None:
-    """Set keys of a mapping; new ones come first in a block, where they separate no comment."""
-    for key, value in values.items():
-        if key in mapping or mapping.fa.flow_style():
-            mapping[key] = value
-        else:
-            mapping.insert(0, key, value)
+def _set(mapping: CommentedMap, key: str | int, value: object) -> None:
+    """Set a key of a mapping; a new one comes first in a block, where it separates no comment."""
+    if key in mapping or mapping.fa.flow_style():
+        mapping[key] = value
+    else:
+        mapping.insert(0, key, value)
 
 
 def _flow(values: Mapping[str, Any]) -> CommentedMap:

@@ -141,7 +141,7 @@ def test_text_that_reads_back_otherwise_is_refused(monkeypatch: pytest.MonkeyPat
     """A file whose plate cannot be changed is not taken for that of the other rig."""
     document = parse_document("rig.yaml", FLOW)
     rig = rig_of(document)
-    monkeypatch.setattr(rewritten, "_set_modulus", lambda *_: None)
+    monkeypatch.setattr(rewritten, "_set_material", lambda *_: None)
     with pytest.raises(InputError, match="read back"):
         rewritten_text(document, rig, other_values(rig), comment="")
 
@@ -151,6 +151,6 @@ def test_small_value_that_reads_back_otherwise_is_refused(monkeypatch: pytest.Mo
     document = parse_document("rig.yaml", FLOW)
     rig = rig_of(document)
     other = replace(rig, plate=replace(rig.plate, loss_factor=rig.plate.loss_factor + 5e-5))
-    monkeypatch.setattr(rewritten, "_change_plate", lambda *_: None)
+    monkeypatch.setattr(rewritten, "_set", lambda *_: None)
     with pytest.raises(InputError, match="read back"):
         rewritten_text(document, rig, other, comment="")

@@ -9,7 +9,8 @@ from benchmarks.identification.thin_plate import Reals
 from model.identification.derivatives import jacobian
 from model.identification.forward import Sensor
 from model.identification.identify import Identification
-from model.identification.posterior import THEORY, relevant
+from model.identification.parameters import KINDS
+from model.identification.posterior import relevant
 from model.identification.stages import Setting
 
 _WITHIN = 1.96
@@ -50,7 +51,7 @@ def parameters_held(found: Identification, truth: Truth) -> dict[str, Reals]:
         x, y, weight = truth.masses[0]
         at = space.groups["masses"].start
         own = found.values.masses[0] - [weight, x, y]
-        std = np.hypot(posterior.std[at : at + 3], [0.0, THEORY["place"], THEORY["place"]])
+        std = np.hypot(posterior.std[at : at + 3], [0.0, *[KINDS["place"].theory] * 2])
         errors["mass"] = own / std
     return errors
 

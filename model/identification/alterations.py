@@ -16,17 +16,15 @@ left.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.identification.derivatives import jacobian
 from model.identification.forward import PlateAt
-from model.identification.parameters import Space
-from model.identification.settled import SettledPattern, Touched
+from model.identification.settled import Touched
 from model.reduction.receptance import TERMS, combined
 from model.structure.attachments import coupled_forces
 from model.structure.plate import Plate
@@ -136,39 +134,29 @@ class Crack(Alteration):
 
 
 @dataclass(frozen=True, eq=False)
-class Altered:
-    """A pattern on a plate that is altered; its parameters come after those of the plate."""
+class Altered(Touched):
+    """A pattern on a plate that is altered; space: of the plate, then those of the alteration."""
 
-    touched: Touched
-    alteration: Alteration
+    alteration: Alteration = field(kw_only=True)
 
-    @property
-    def pattern(self) -> SettledPattern:
-        """What was measured."""
-        return self.touched.pattern
-
-    @property
-    def std(self) -> FloatArray:
-        """Error of each number of the pattern, (2 s,)."""
-        return self.touched.std
-
-    @cached_property
-    def space(self) -> Space:
-        """The parameters of the plate, then those of the alteration."""
-        space, own = self.touched.space, self.alteration
+    @classmethod
+    def by(cls, alteration: Alteration, touched: Touched) -> Self:
+        """A pattern whose plate was altered."""
+        space, own = touched.space, alteration
         edge, free = np.full(2, 1.5), np.full(own.size - 2, np.inf)
         names = tuple(f"{each} of {own.name}" for each in ("x", "y", *own.own))
-        return replace(
+        wider = replace(
             space,
             names=space.names + names,
             std=np.concatenate([space.std, np.ones(own.size)]),
             lower=np.concatenate([space.lower, -edge, np.full(own.size - 2, _LEAST)]),
             upper=np.concatenate([space.upper, edge, free]),
         )
+        return cls(touched.pattern, wider, touched.touched, touched.noise, alteration=alteration)
 
     @property
     def _sides(self) -> FloatArray:
-        plate = self.touched.touched.rig.plate
+        plate = self.touched.rig.plate
         return np.array([plate.length, plate.width])
 
     def place(self, theta: FloatArray) -> FloatArray:
@@ -184,8 +172,8 @@ class Altered:
 
         Derivatives by plate and fingers are those without the alteration.
         """
-        p = self.touched.space.size
-        plate = self.touched.touched.at(np.concatenate([x[:p], fingers]))
+        p = self.space.size - self.alteration.size
+        plate = self.touched.at(np.concatenate([x[:p], fingers]))
         place, own, bases = self.place(x[p:]), x[p + 2 :], self.pattern.bases
         here = AlteredPlate(plate, self.alteration, place, own)
         values = here.responses @ bases
@@ -198,7 +186,7 @@ class Altered:
         by_own = np.einsum("sne,n->se", here.by_own, bases)
         J = np.einsum("snp,n->sp", jacobian(plate)[0], bases)
         columns = np.column_stack([J[:, :p], *by_place, by_own, J[:, p:]])
-        return self.touched.as_numbers(values, columns)
+        return self.as_numbers(values, columns)
 
 
 def scores(

@@ -176,7 +176,7 @@ def _by_alteration(
     before: State, patterns: Sequence[Touched], alteration: Alteration
 ) -> list[_Tried]:
     """Batch estimates with a hand or a crack, from the places where it would explain most."""
-    altered = tuple(Altered(each, alteration) for each in patterns)
+    altered = tuple(Altered.by(alteration, each) for each in patterns)
     p, e = len(before.x), alteration.size
     x = np.concatenate([before.x, np.zeros(e)])
     wider = State(x, linalg.block_diag(before.covariance, np.eye(e)))

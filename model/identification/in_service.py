@@ -24,7 +24,6 @@ from model.identification.identified_rig import rig_with
 from model.identification.identify import Identification, solved_for
 from model.identification.noise import NoiseLevel
 from model.identification.parameters import FINGER_PARTS, KINDS, MODE_SHIFTS, space_of
-from model.identification.posterior import THEORY
 from model.identification.settled import SettledPattern, Touched
 from model.identification.settled_update import State, update
 from model.identification.stages import Setting
@@ -193,31 +192,18 @@ class LivePlate:
     def _theory(self) -> FloatArray:
         """Variances (p,) of what the theory gets wrong, which patterns at other tones show anew."""
         space = self.known.model.space
-        variance = np.zeros(space.size)
-        for kind, std in (
-            ("stiffness", THEORY["stiffness"]),
-            ("damping_each", THEORY["damping"]),
-            ("mode_shifts", 2 * THEORY["frequency"]),
-            ("place", THEORY["place"]),
-        ):
-            known = space.std[space.groups[kind]]
-            variance[space.groups[kind]] = (
-                np.divide(std, known, out=np.zeros_like(known), where=known > 0) ** 2
-            )
-        return variance
+        return (space.of_kinds(lambda kind: kind.theory) / space.scale) ** 2
 
     def _drifted(self, time: float) -> State:
         """The state at a time [s], less certain by what drifted since it was updated."""
         state, since, space = self.known.state, self.known.time, self.known.model.space
         hours = 0.0 if since is None else max(time - since, 0.0) / 3600
-        before, variance = np.diag(state.covariance), np.zeros(space.size)
-        for name, kind in KINDS.items():
-            group = space.groups[name]
-            known = space.std[group]
-            scale = np.divide(1.0, known, out=np.zeros_like(known), where=known > 0)
-            room = np.maximum((kind.widest * scale) ** 2 - before[group], 0.0)
-            variance[group] = np.minimum((kind.drift * scale) ** 2 * hours, room)
-        return State(state.x, state.covariance + np.diag(variance))
+        drift, widest = (
+            (space.of_kinds(of) / space.scale) ** 2
+            for of in (lambda kind: kind.drift, lambda kind: kind.widest)
+        )
+        room = np.maximum(widest - np.diag(state.covariance), 0.0)
+        return State(state.x, state.covariance + np.diag(np.minimum(drift * hours, room)))
 
 
 def widest(uncertainty: Uncertainty) -> Uncertainty:

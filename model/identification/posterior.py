@@ -15,15 +15,15 @@ from scipy import linalg
 
 from model.arrays import FloatArray
 from model.identification.fit import Linearised
-from model.identification.parameters import Space
+from model.identification.parameters import KINDS, Space
 from model.rig.uncertainty import Uncertainty
 
-THEORY = {"frequency": 1.5e-3, "stiffness": 3e-3, "damping": 0.01, "place": 1e-4}
-"""By kind, what another theory of the plate changes in values that are fitted to it.
-
-Relative, of places in metres: on plates of 1.5 mm without shear deformation, with viscous losses
-(docs/measured/identification.md). No measurement tells of it, and answers do not depend on it.
-"""
+_THEORY = {
+    "frequency": KINDS["mode_shifts"].theory / 2,
+    "stiffness": KINDS["stiffness"].theory,
+    "damping": KINDS["damping_each"].theory,
+    "place": KINDS["place"].theory,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ class Posterior:
         own = {kind: self.std_of(rows) for kind, rows in relevant(self.space).items()}
         own["place"] = self.std[self.space.groups["place"]]
         return {
-            kind: np.where(std > 0, np.hypot(std, THEORY.get(kind, 0.0)), 0.0)
+            kind: np.where(std > 0, np.hypot(std, _THEORY.get(kind, 0.0)), 0.0)
             for kind, std in own.items()
         }
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -60,25 +59,6 @@ def finger_covariance(patterns: Sequence[SettledPattern]) -> FloatArray:
     parts = len(FINGER_PARTS)
     own = _OWN**2 * np.eye(parts) + np.ones((parts, parts))
     return np.asarray(np.kron(np.eye(finger_count(patterns) // parts), own), dtype=float)
-
-
-class Measured(Protocol):
-    """A pattern with what predicts it."""
-
-    @property
-    def pattern(self) -> SettledPattern:
-        """What was measured."""
-
-    @property
-    def std(self) -> FloatArray:
-        """Error of each of its numbers, (2 s,)."""
-
-    @property
-    def space(self) -> Space:
-        """The parameters p, without those of its fingers."""
-
-    def predicted(self, x: FloatArray, fingers: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Numbers that it is expected to give (2 s,), and their derivatives (2 s, p + q)."""
 
 
 @dataclass(frozen=True, eq=False)

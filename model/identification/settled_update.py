@@ -8,7 +8,7 @@ from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray
 from model.identification.least_squares import search
-from model.identification.settled import Measured, finger_count, finger_covariance
+from model.identification.settled import Touched, finger_count, finger_covariance
 
 _LEAST = 1e-14  # of the largest variance
 _INSIDE = 0.1  # standard deviations
@@ -47,7 +47,7 @@ class Updated:
 
 def update(
     before: State,
-    patterns: Sequence[Measured],
+    patterns: Sequence[Touched],
     *,
     evaluations: int,
     start: FloatArray | None = None,
@@ -119,7 +119,7 @@ def update(
 
 
 def _linearised(
-    patterns: Sequence[Measured], at: FloatArray, p: int, q: int
+    patterns: Sequence[Touched], at: FloatArray, p: int, q: int
 ) -> tuple[FloatArray, FloatArray]:
     """Numbers of all patterns, and their derivatives by plate and fingers (m, p + q)."""
     predicted, rows, first = [], [], p

@@ -123,7 +123,7 @@ def test_numbers_change_with_place_and_values_of_an_alteration(
     """As extrapolated differences of the numbers, to 0.2 % of each column's largest."""
     model = found.fitted.problem.model
     (pattern,) = settled_patterns(hidden, hidden.mounted, count=1, start=0)
-    altered = Altered(Touched.of(model, pattern, 0.5), alteration)
+    altered = Altered.by(alteration, Touched.of(model, pattern, 0.5))
     p, fingers = model.space.size, np.zeros(4 * len(pattern.fingers))
     start = np.array([0.3, -0.4, *alteration.start(1.0)])
 

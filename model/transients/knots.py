@@ -26,7 +26,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas, lapack
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray
 from model.transients import base_motion
@@ -235,7 +234,7 @@ def ending_by_numpy(
 
 
 def while_ending(found: Felt, start: ComplexArray, gain_variance: float) -> tuple[Complex, Complex]:
-    """Form, its upper triangle, and right side of the mean square at quiet fingers in an ending.
+    """Form and right side of the mean square at quiet fingers in an ending.
 
     An ending from a start (eras,) is the steady tone, and at each knot a hat of what the knot is
     above the start.
@@ -248,7 +247,7 @@ def while_ending(found: Felt, start: ComplexArray, gain_variance: float) -> tupl
     by_knot = (hats.sum(axis=0).conj() * tones[:, None]).sum(axis=0)
     along = by_knot[::-1].cumsum(axis=0)[::-1].ravel() / count
     free = len(form) - len(start)
-    lowered = blas.chemv(1.0, form.T, np.tile(start.conj(), ENDING_KNOTS), lower=1).conj()
+    lowered = form @ np.tile(start, ENDING_KNOTS)
     return form[:free, :free], lowered[:free] - along[:free]
 
 
@@ -261,11 +260,12 @@ def _expected_power(responses: ComplexArray, gain_variance: float) -> float:
 def _summed(responses: Complex, gain_variance: float) -> Complex:
     """Expected form over knots and ERAs, summed over time, of the squares over samples and rows.
 
-    Its upper triangle. responses (samples, d, knots, eras) as in `Felt.hats`. In the step before
+    responses (samples, d, knots, eras) as in `Felt.hats`. In the step before
     the last, each hat is as that of the next knot in the last step, and so on.
     """
     knots, eras = responses.shape[2:]
-    form = blas.cherk(1.0, responses.reshape(-1, knots * eras).T, lower=1).T
+    flat = responses.reshape(-1, knots * eras)
+    form = flat.conj().T @ flat
     shift = eras
     while shift < len(form):  # sums of 2, 4, 8 ... steps
         form[:-shift, :-shift] += form[shift:, shift:]
@@ -348,42 +348,28 @@ ITERATIONS = 30
 def bounded_minimum(form: Complex, right: Complex, combinations: Complex64Array) -> ComplexArray:
     """Minimise x^H form x - 2 Re right^H x where no ERA exceeds its stroke; its knots (k, eras).
 
-    form: over knots and combinations, the upper triangle of a positive semidefinite one; right (k,
-    c); combinations (eras, c): orthonormal. The unbounded solution where it is within the bounds;
-    otherwise by alternating directions (ADMM: Boyd and others, 2011, section 5), whose result is so
-    exactly.
+    form: over knots and combinations, a positive semidefinite one; right (k, c); combinations
+    (eras, c): orthonormal. The unbounded solution where it is within the bounds; otherwise by
+    alternating directions (ADMM: Boyd and others, 2011, section 5), whose result is so exactly.
     """
-    single = form.astype(np.complex64)
-    size = float(single.diagonal().real.mean())
-    diagonal = np.einsum("ii->i", single)
-    diagonal += RIDGE * size
-    right = right.astype(np.complex64)
+    unit, size = np.eye(len(form)), float(form.diagonal().real.mean())
     to_knots, back = combinations.T, combinations.conj()
-    _, found, is_indefinite = lapack.cposv(single, right.ravel())  # by rounding
-    knots = (0 if is_indefinite else 1) * found.reshape(right.shape) @ to_knots
-    feasible = _within(knots)
-    if is_indefinite or feasible is not knots:
+
+    def solved(inverse: Complex, right: Complex) -> Complex:
+        return np.asarray((inverse @ right.ravel()).reshape(right.shape) @ to_knots)
+
+    found = solved(np.linalg.inv(form + RIDGE * size * unit), right)
+    feasible = _within(found)
+    if feasible is not found:
         penalty = PENALTY * size
-        diagonal += penalty
-        inverse = _inverse(single)
-        offset = (inverse @ right.ravel()).reshape(right.shape) @ to_knots
-        inverse *= penalty
-        dual = np.zeros_like(feasible)
+        inverse = np.linalg.inv(form + (RIDGE * size + penalty) * unit)
+        offset, dual = solved(inverse, right), np.zeros_like(feasible)
         for _ in range(ITERATIONS):
-            pulled = (feasible - dual) @ back
-            knots = offset + (inverse @ pulled.ravel()).reshape(right.shape) @ to_knots
+            knots = offset + penalty * solved(inverse, (feasible - dual) @ back)
             relaxed = RELAXATION * knots + (1 - RELAXATION) * feasible + dual
             feasible = _within(relaxed)
             dual = relaxed - feasible
-    found = _within(feasible.astype(complex))
-    return np.asarray(found * (1 - 1e-12), dtype=complex)  # whatever rounding does
-
-
-def _inverse(A: Complex64Array) -> Complex64Array:
-    """Of a Hermitian positive definite matrix."""
-    factor, _ = lapack.cpotrf(A)
-    upper, _ = lapack.cpotri(factor)
-    return np.asarray(np.triu(upper) + np.triu(upper, 1).conj().T)
+    return np.asarray(feasible * (1 - 1e-12), dtype=complex)  # whatever rounding does
 
 
 def _within(knots: Complex) -> Complex:

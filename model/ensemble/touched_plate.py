@@ -101,7 +101,7 @@ class TouchedPlate:
         fingers = resting[:, :, :n] * plate.forces[rows, None] / w2
         held = at.swapaxes(1, 2) @ (self.stiffness[rows, :, None] * fingers) / w2
         moved = np.concatenate([on.moved[rows, nodes] - held, fingers], axis=1)
-        return product(points, coordinates), moved
+        return points @ coordinates.swapaxes(1, 2), moved
 
     def fields(
         self, rows: IntArray, nodes: IntArray, weights: Complex64Array, points: Float32Array
@@ -111,14 +111,14 @@ class TouchedPlate:
         by_force = self.on.by_force[rows, nodes, : forces.shape[1]]
         driven = np.asarray(forces[:, None] @ by_force, dtype=np.complex64)
         _, G, P = self._fingers(rows, nodes)
-        found, _ = self._with_fingers(rows, driven, product(self.centres, driven), G, P)
-        return product(points, found)[:, :, 0]
+        found, _ = self._with_fingers(rows, driven, self.centres @ driven.swapaxes(1, 2), G, P)
+        return (points @ found.swapaxes(1, 2))[:, :, 0]
 
     def coordinates(self) -> Complex64Array:
         """Reduced coordinates by each ERA at full stroke at all frequencies, (f, n, r)."""
         driven, rows = self.on.fields, np.arange(len(self.stiffness))
         _, G, P = self._fingers(rows, np.full(len(rows), MODELLED))
-        found, _ = self._with_fingers(rows, driven, product(self.centres, driven), G, P)
+        found, _ = self._with_fingers(rows, driven, self.centres @ driven.swapaxes(1, 2), G, P)
         return found
 
     def forms(
@@ -192,9 +192,9 @@ class TouchedPlate:
         own[:, b:] = np.float32(plate.load_std) * self.stiffness[rows] * stretched[:, b:]
         held = np.asarray(drives - stiffness * moved, dtype=np.complex64)
         by_loss = self.on.by_loss[rows, nodes]
-        lost = np.asarray(by_loss * real_product(held, shapes), dtype=np.complex64)
-        at_points = plate.minus_omega2[rows, None] * real_product(lost, points.T)
-        loss = -stiffness * real_product(lost, shapes.T)
+        lost = np.asarray(by_loss * (held @ shapes), dtype=np.complex64)
+        at_points = plate.minus_omega2[rows, None] * (lost @ points.T)
+        loss = -stiffness * (lost @ shapes.T)
         return Changes(loss, damping, own, drives, at_points)
 
     def drawn(
@@ -252,10 +252,10 @@ class TouchedPlate:
     ) -> tuple[Complex64Array, Complex64Array, Complex64Array]:
         """T at the centres (c, k, b), G (c, k, r) and P (c, k, k)."""
         on, by_force = self.on, self.on.by_force[rows, nodes]
-        at = product(self.centres, by_force)
+        at = self.centres @ by_force.swapaxes(1, 2)
         free = on.receptance[rows, nodes][:, None] * self.centres
         G = np.asarray(free + (at @ on.coupling[rows, nodes]) @ by_force, dtype=np.complex64)
-        system = product(self.centres, G) * self.stiffness[rows, None]
+        system = (self.centres @ G.swapaxes(1, 2)) * self.stiffness[rows, None]
         k = len(self.centres)
         system.reshape(len(rows), -1)[:, :: k + 1] += 1
         return at, G, np.asarray(np.linalg.inv(system))
@@ -300,20 +300,6 @@ def drawn_on(
     )
     first_base = on.first.get(by.bases, MODELLED)
     return draws, nodes, (by.bases if first_base else 1, first_base), first
-
-
-def product(points: Float32Array, modal: Complex64Array) -> Complex64Array:
-    """Values (c, p, q) at points of shapes (p, r) of reduced coordinates (c, q, r)."""
-    c, q, r = modal.shape
-    parts = np.stack([modal.real, modal.imag], axis=2).reshape(c, 2 * q, r)
-    return np.ascontiguousarray(points @ parts.swapaxes(1, 2)).view(np.complex64)
-
-
-def real_product(values: Complex64Array, matrix: Float32Array) -> Complex64Array:
-    """Values (c, i) times a real matrix (i, j)."""
-    found = np.empty((len(values), matrix.shape[1]), dtype=np.complex64)
-    found.real, found.imag = values.real @ matrix, values.imag @ matrix
-    return found
 
 
 def gram(rows: Complex64Array) -> Complex64Array:

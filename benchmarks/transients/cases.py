@@ -46,7 +46,7 @@ class Case:
 
     def steady_db(self, weights: ComplexArray) -> float:
         target, quiet = np.abs(weights @ self.at_target), np.abs(weights @ self.at_quiet)
-        return float(contrast_db([target], quiet))
+        return float(contrast_db([target], quiet, [np.full(len(target), 1 / len(target))]))
 
     def excitation(
         self, rig: Rig, level: float = 1.0, errors: ComplexArray | None = None

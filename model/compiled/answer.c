@@ -40,44 +40,9 @@ SHARED void judge(float *own, float *loudest, const candidates *from, const plat
     }
 }
 
-/* Contrast of an onset along a plain ramp. */
-SHARED float onset_contrast(const plates *on, const rules *by, const question *of, const float *columns, int row,
-                            const float *weights, arena *memory) {
-    const size_t n = on->n, r = on->r, times = by->times, fine = of->fine, padded = padded_to(on->k * fine);
-    const arena mark = *memory;
-    float *moved = floats(memory, 2 * times * r), *found = floats(memory, 2 * times * padded);
-    memset(moved, 0, 2 * times * r * sizeof(float));
-    for (size_t e = 0; e < n; e++) {
-        const float *from = by->onsets + 2 * ((size_t)row * n + e) * times * r, re = weights[2 * e], im = weights[2 * e + 1];
-        for (size_t i = 0; i < times * r; i++) {
-            moved[2 * i] += re * from[2 * i] - im * from[2 * i + 1];
-            moved[2 * i + 1] += re * from[2 * i + 1] + im * from[2 * i];
-        }
-    }
-    at_points(found, moved, times, columns, padded, r);
-    float weakest = INFINITY, loudest = 0;
-    for (int each = 0; each < of->starts[1] + of->quiet_count; each++) {
-        const size_t finger = each < of->starts[1] ? of->targets[each] : of->quiet[each - of->starts[1]];
-        float mean = 0;
-        for (size_t i = finger * fine; i < (finger + 1) * fine; i++) {
-            float peak = 0;
-            for (size_t time = 0; time < times; time++) {
-                float a = found[2 * time * padded + i], b = found[(2 * time + 1) * padded + i];
-                peak = fmaxf(peak, a * a + b * b);
-            }
-            mean += of->fine_weights[i] * sqrtf(peak);
-            if (each >= of->starts[1]) loudest = fmaxf(loudest, sqrtf(peak));
-        }
-        if (each < of->starts[1]) weakest = fminf(weakest, mean);
-    }
-    release(memory, mark);
-    return weakest / loudest;
-}
-
-/* Index of the tone of an only content that drawn plates prefer: level first, then contrast, of nearly the same the
- * onset; -1 where that is missing. */
+/* Index of the tone of an only content that drawn plates prefer: level first, then contrast. */
 SHARED int best_tone(const candidates *from, const float *own, const float *loudest, const plates *on, const rules *by,
-                     const question *of, const float *columns, arena *memory) {
+                     const question *of, arena *memory) {
     const int count = from->count, draws = of->judging->count;
     const arena mark = *memory;
     float *least = floats(memory, count), *robust = floats(memory, count), *some = floats(memory, draws);
@@ -103,20 +68,7 @@ SHARED int best_tone(const candidates *from, const float *own, const float *loud
         }
         if (any && !reaches[i]) robust[i] = 0;
     }
-    int chosen_tone = best_of(robust, count), near = 0;
-    const float close = by->onset_margin * robust[chosen_tone];
-    for (int i = 0; i < count; i++) near += robust[i] >= close;
-    if (of->quiet_count && of->with_onset && near > 1) {
-        if (!by->onsets) return -1;
-        for (int i = 0; i < count; i++) {
-            if (robust[i] < close) robust[i] = 0;
-            else {
-                float onset = onset_contrast(on, by, of, columns, from->rows[i], from->weights + 2 * on->n * i, memory);
-                robust[i] *= powf(onset, by->onset_weight);
-            }
-        }
-        chosen_tone = best_of(robust, count);
-    }
+    const int chosen_tone = best_of(robust, count);
     release(memory, mark);
     return chosen_tone;
 }
@@ -247,8 +199,7 @@ static int answer_from(answered *to, const plates *on, const rules *by, const qu
     float *loudest = floats(memory, from.count * k * draws + LANES);
     best_tones[0] = 0, to->is_apart = 1;
     if (from.count > 1) judge(own, loudest, &from, on, by, of, columns, memory);
-    if (contents == 1 && from.count > 1) best_tones[0] = best_tone(&from, own, loudest, on, by, of, columns, memory);
-    if (best_tones[0] < 0) return NEEDS_ONSETS;
+    if (contents == 1 && from.count > 1) best_tones[0] = best_tone(&from, own, loudest, on, by, of, memory);
     if (contents > 1) {
         bring_to_level(own, loudest, &from, k, by, of, memory);
         to->is_apart = best_combination(best_tones, &from, own, loudest, on, by, of, memory);
@@ -289,8 +240,7 @@ static int guarded(results *found, const plates *table, const raster *read, cons
     plates on = *table;
     on.k = given->fingers, on.centres = at.centres, on.stiffness = given->stiffness;
     question of = {.contents = given->contents, .bands = given->bands, .quiet_count = given->quiet_count,
-                   .with_onset = given->with_onset, .apart = given->apart,
-                   .level = given->level, .background = given->background, .judging = given->judging,
+                   .apart = given->apart, .level = given->level, .background = given->background, .judging = given->judging,
                    .promise = given->promise, .few = read->few, .fine = read->fine, .few_points = at.few,
                    .fine_points = at.fine, .few_weights = at.few_weights, .fine_weights = at.fine_weights};
     of.starts = given->numbers, of.targets = of.starts + contents + 1, of.quiet = of.targets + of.starts[contents];
@@ -305,7 +255,7 @@ static int guarded(results *found, const plates *table, const raster *read, cons
     return status;
 }
 
-/* FOUND, NOT_REACHED where nothing is felt at all, NEEDS_ONSETS, or NO_MEMORY. */
+/* FOUND, NOT_REACHED where nothing is felt at all, or NO_MEMORY. */
 int answer(results *to, const plates *on, const raster *read, const rules *by, const asked *of) {
     arena memory = {NULL, NULL, NULL};
     const int status = guarded(to, on, read, by, of, &memory);

@@ -13,21 +13,19 @@ typedef struct {
     int kept, missing;             /* frequencies that are ranked first, and how many of these may miss the level */
     int max_by_point, candidates;  /* other fingers whose points count one by one; best tones of a content */
     int max_combinations, pruning_step;
-    int rim_count, is_deep, others, times; /* points of the rim; deep nulls; plates of other thickness; of an onset */
+    int rim_count, is_deep, others; /* points of the rim; deep nulls; plates of other thickness */
     float gain_variance, ridge, margin, highest;
-    float reached, onset_margin, onset_weight;
+    float reached;
     float judged, promised;        /* percentiles of drawn plates */
     phases phases;
     method one_finger, several, within[3];
     const int *rim;
     const float *threshold, *error, *frequencies; /* (f); (f, n); (f) [Hz] */
-    const float *onsets;           /* (f, n, times, r), or none */
 } rules;
 
 /* Fingers (k) and contents, as given. */
 typedef struct {
     int contents, bands, fingers, quiet_count;
-    int with_onset;             /* whether onsets along a plain ramp count */
     float apart;                /* of frequencies [Hz] */
     const int *numbers;         /* (contents + 1) starts of targets; these and quiet ones, by finger; (contents)
                                  * priorities; (contents, bands, 2) first row of a band and one past the last */
@@ -40,7 +38,7 @@ typedef struct {
 
 /* The same with what is found first. */
 typedef struct {
-    int contents, bands, quiet_count, with_onset, is_ranked; /* see `ranked_rows` */
+    int contents, bands, quiet_count, is_ranked; /* see `ranked_rows` */
     float apart;
     const int *starts, *targets, *quiet, *priority;
     const float *level, *background;
@@ -67,6 +65,6 @@ typedef struct {
     float *of_all;      /* worst contrast promised [dB]; loudest at quiet fingers [dB SL]; least factor on levels */
 } answered;
 
-enum { FOUND, NOT_REACHED, NEEDS_ONSETS };
+enum { FOUND, NOT_REACHED };
 
 #endif

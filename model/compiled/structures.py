@@ -84,13 +84,13 @@ class Rules(Structure):
 
     _fields_ = [
         *_fields(i="kept missing max_by_point candidates max_combinations pruning_step"),
-        *_fields(i="rim_count is_deep others times"),
-        *_fields(f="gain_variance ridge margin highest reached onset_margin onset_weight"),
+        *_fields(i="rim_count is_deep others"),
+        *_fields(f="gain_variance ridge margin highest reached"),
         *_fields(f="judged promised", i="starts iterations"),
         ("one_finger", Method),
         ("several", Method),
         ("within", 3 * Method),
-        *_fields(p="rim threshold error frequencies onsets"),
+        *_fields(p="rim threshold error frequencies"),
     ]
 
 
@@ -108,7 +108,7 @@ class GivenQuestion(Structure):
     """`question`: fingers, and what each is to feel; what is found first is not named."""
 
     _fields_ = [
-        *_fields(i="contents bands fingers quiet_count with_onset", f="apart"),
+        *_fields(i="contents bands fingers quiet_count", f="apart"),
         *_fields(p="numbers level places stiffness background judging promise"),
     ]
 

@@ -133,28 +133,16 @@ def is_background(points: FloatArray, targets: Sequence[tuple[float, float]]) ->
     return beyond if beyond.any() else ~beyond
 
 
-def contrast_ratio(
-    targets: Sequence[FloatArray],
-    quiet: FloatArray,
-    weights: Sequence[FloatArray] | None = None,
-) -> FloatArray:
-    """Contrast of peak amplitudes as a ratio: the weakest target to the loudest quiet point.
-
-    A target counts by the mean over its points, by weights (p,) each; None where all points count
-    alike. targets (..., p) each, quiet (..., q) -> (...).
-    """
-    each = weights or [np.full(len(target.T), 1 / len(target.T)) for target in targets]
-    means = [target @ weight for target, weight in zip(targets, each, strict=True)]
-    return np.asarray(np.minimum.reduce(means) / quiet.max(axis=-1))
-
-
 def contrast_db(
-    targets: Sequence[FloatArray],
-    quiet: FloatArray,
-    weights: Sequence[FloatArray] | None = None,
+    targets: Sequence[FloatArray], quiet: FloatArray, weights: Sequence[FloatArray]
 ) -> FloatArray:
-    """Return `contrast_ratio` in dB."""
-    return decibels(contrast_ratio(targets, quiet, weights))
+    """Contrast [dB] of peak amplitudes: the weakest target to the loudest quiet point.
+
+    A target counts by the mean over its points, by weights (p,) each. targets (..., p) each, quiet
+    (..., q) -> (...).
+    """
+    means = [target @ weight for target, weight in zip(targets, weights, strict=True)]
+    return decibels(np.minimum.reduce(means) / quiet.max(axis=-1))
 
 
 def mean_level_db_sl(

@@ -8,7 +8,7 @@ chosen by the worst finger on drawn plates; the promise is of other draws, the s
     C_k = g_k own_k / sqrt(max_p sum_j g_j^2 power_j(p)),  j other contents, p points of finger k
 
 and for a quiet finger the weakest content counts, over all contents. An only content has the tone
-of the highest contrast at its level; of tones that are nearly the same the onset decides, too.
+of the highest contrast at its level.
 
 `model.table.contents_kernel` finds them in C, `model.table.contents_numpy` in numpy.
 """
@@ -47,11 +47,6 @@ MIN_CANDIDATES = 4
 MAX_COMBINATIONS, PRUNING_STEP = 200, 4
 """Combinations of candidates that are kept for the next content and the choice, by some draws."""
 
-# Among tones of nearly the same robust contrast the onset decides, too: a decibel of contrast
-# counts as much as three in the first 100 ms (docs/decisions, on ramps).
-ONSET_WEIGHT = 1 / 3
-ONSET_MARGIN_DB = 0.3
-
 REACHED = 1 - 1e-5
 """Of a level, what counts as reached."""
 
@@ -76,8 +71,7 @@ class Contents:
 
     places: of the fingers [m]; loads: of each relative to the rig's fingertip, empty for 1; quiet:
     by index; apart_hz: distance of the contents' frequencies where bands allow it; background: form
-    of the rest of the plate at all of the table's frequencies, for no other finger; with_onset:
-    whether onsets along a plain ramp count.
+    of the rest of the plate at all of the table's frequencies, for no other finger.
     """
 
     places: tuple[Point, ...]
@@ -86,7 +80,6 @@ class Contents:
     quiet: tuple[int, ...]
     apart_hz: float = 0.0
     background: Complex64Array | None = None
-    with_onset: bool = True
 
     @property
     def is_ranked(self) -> bool:

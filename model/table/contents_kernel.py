@@ -35,8 +35,6 @@ from model.table.contents import (
     MAX_COMBINATIONS,
     MIN_CANDIDATES,
     MISSING,
-    ONSET_MARGIN_DB,
-    ONSET_WEIGHT,
     PROMISED_DRAWS,
     PROMISED_PERCENTILE,
     PRUNING_STEP,
@@ -46,7 +44,6 @@ from model.table.contents import (
 )
 from model.table.contents_numpy import choose_by_numpy
 from model.table.fingers_on_plate import CENTRE_AND_RIM, MAX_FINGERS_BY_POINT, MAX_VARIANCE_FINE
-from model.transients.onset import TIME_COUNT
 
 if TYPE_CHECKING:
     from model.table.table import LocalizationTable
@@ -83,7 +80,7 @@ def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones:
     at = array("d", [coordinate for place in places for coordinate in place])
     background = contents.background
     given = GivenQuestion(
-        *(count, len(streams[0].bands), k, len(quiet), contents.with_onset),
+        *(count, len(streams[0].bands), k, len(quiet)),
         *(contents.apart_hz, numbers.buffer_info()[0], levels.buffer_info()[0]),
         *(at.buffer_info()[0], stiffness.ctypes.data),
         None if background is None else background.ctypes.data,
@@ -93,11 +90,6 @@ def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones:
     rows, figures = array("i", bytes(4 * count)), array("f", bytes(4 * (size + count + 6 * k + 3)))
     to = FoundTones(0, rows.buffer_info()[0], figures.buffer_info()[0])
     status = run(by.library.answer, to, plates, raster, rules, given)
-    if status == _NEEDS_ONSETS:
-        if table.onsets is not None:
-            rules.point(onsets=table.onsets.parts)
-        given.with_onset = table.onsets is not None
-        status = run(by.library.answer, to, plates, raster, rules, given)
     if status != FOUND:
         raise AssertionError("contents must have tones")
     found = figures.tolist()
@@ -150,8 +142,8 @@ def _kept_of(table: "LocalizationTable") -> _Kept:
     rules = Rules(
         *(KEPT, MISSING, MAX_FINGERS_BY_POINT, MIN_CANDIDATES, MAX_COMBINATIONS, PRUNING_STEP),
         *(len(CENTRE_AND_RIM), plate.gain_variance < MAX_VARIANCE_FINE, plate.thickness > 0),
-        *(TIME_COUNT, plate.gain_variance, RIDGE, LEVEL_MARGIN, coherent.NEARLY_HIGHEST, REACHED),
-        *(10 ** (-ONSET_MARGIN_DB / 20), ONSET_WEIGHT, PERCENTILE, PROMISED_PERCENTILE),
+        *(plate.gain_variance, RIDGE, LEVEL_MARGIN, coherent.NEARLY_HIGHEST, REACHED),
+        *(PERCENTILE, PROMISED_PERCENTILE),
         *(coherent.TARGET_STARTS, coherent.ALIGNMENTS),
         *(_method(coherent.ONE_FINGER), _method(coherent.SEVERAL)),
         (Method * 3)(*map(_method, coherent.WITHIN_STROKE)),

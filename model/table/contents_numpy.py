@@ -1,8 +1,8 @@
 """Tones of contents in numpy: where there is no compiler, and what the kernel in C must find."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,8 +18,6 @@ from model.table.contents import (
     MAX_COMBINATIONS,
     MIN_CANDIDATES,
     MISSING,
-    ONSET_MARGIN_DB,
-    ONSET_WEIGHT,
     PRUNING_STEP,
     REACHED,
     Contents,
@@ -33,9 +31,6 @@ if TYPE_CHECKING:
     from model.table.table import LocalizationTable
 
 _TINY, _SAME_FREQUENCY = 1e-20, 1e-3  # -, Hz
-
-OnsetContrast: TypeAlias = Callable[[IntArray], FloatArray | None]
-"""Contrast of ramped onsets of candidates, by index (n,); None where that cannot be solved."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +57,9 @@ def choose_by_numpy(table: "LocalizationTable", contents: Contents) -> Tones:
     if len(contents.streams) > 1:
         best, is_apart = best_combination(table, contents, found, own, loudest)
     elif len(found.rows) > 1:
-
-        def onset(near: IntArray) -> FloatArray | None:
-            return onset_contrast(fingers, contents, found.rows[near], found.weights[near])
-
         quiet = loudest[:, [*contents.quiet]]
         level = float(contents.levels[0])
-        best[0] = best_tone(level, found.scores, own, quiet, onset if contents.with_onset else None)
+        best[0] = best_tone(level, found.scores, own, quiet)
     rows, weights = found.rows[best], found.weights[best]
     return promised(fingers, contents, rows, weights, np.arange(len(rows)), is_apart=is_apart)
 
@@ -160,14 +151,8 @@ def _judged(
     return own, loudest
 
 
-def best_tone(
-    wanted: float,
-    scores: FloatArray,
-    own: FloatArray,
-    quiet: FloatArray,
-    onset: OnsetContrast | None,
-) -> int:
-    """The candidate of an only content: level first, then contrast, of nearly the same the onset.
+def best_tone(wanted: float, scores: FloatArray, own: FloatArray, quiet: FloatArray) -> int:
+    """The candidate of an only content: level first, then contrast.
 
     Without other fingers the score counts, and as much a level that is much the same on all plates.
     wanted: amplitude to threshold; scores (m,); own (m, d), quiet (m, q, d) as of `_judged`.
@@ -179,30 +164,7 @@ def best_tone(
     if not quiet.shape[1]:
         return best_of(reaches * scores * least / percentile(own, 50))
     loud = np.sqrt(quiet.max(axis=1))
-    robust = np.where(reaches, percentile(own / np.maximum(loud, 1e-30)), 0.0)
-    near = np.flatnonzero(robust >= 10 ** (-ONSET_MARGIN_DB / 20) * robust.max())
-    contrast = onset(near) if onset is not None and len(near) > 1 else None
-    if contrast is None:
-        return best_of(robust)
-    return int(near[best_of(robust[near] * contrast**ONSET_WEIGHT)])
-
-
-def onset_contrast(
-    fingers: FingersOnPlate, contents: Contents, rows: IntArray, weights: Complex64Array
-) -> FloatArray | None:
-    """Contrast (m,) along a plain ramp of tones at rows (m,), weights (m, n); None if unsolved."""
-    table, tips = fingers.table, fingers.tips
-    if table.onsets is None:
-        return None
-    # An onset's target counts by the plain mean over its points.
-    targets = [*contents.streams[0].targets]
-    scales = tips.fine.shape[1] * tips.fine_weights[targets]
-    return table.onsets.contrast(
-        rows,
-        weights,
-        targets=list(tips.fine[targets] * scales[:, :, None].astype(np.float32)),
-        quiet=tips.fine[[*contents.quiet]].reshape(-1, tips.fine.shape[2]),
-    )
+    return best_of(np.where(reaches, percentile(own / np.maximum(loud, 1e-30)), 0.0))
 
 
 def best_combination(

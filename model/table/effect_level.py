@@ -25,7 +25,7 @@ from model.transients.loaded_ramps import (
     response_count,
     time_count,
 )
-from model.transients.onset import ringing_time
+from model.transients.ringing import ringing_time
 from model.vibration.excitation import Excitation, base_amplitudes
 
 MIN_CONTRAST_DB = 6.0

@@ -112,7 +112,6 @@ def _contents(table: "LocalizationTable", question: Question) -> Contents:
         (Stream(tuple(range(count)), question.level_db_sl, (band,)),),
         tuple(range(count, len(question.contacts))),
         background=None if question.quiet else table.background(question.targets),
-        with_onset=not question.envelopes,
     )
 
 
@@ -198,7 +197,7 @@ def _best(
     quiet = loudest[:, [*contents.quiet]].astype(float)
     scores, wanted = np.array([score for score, _ in found]), float(contents.levels[0])
     if over_effect is None:
-        return best_tone(wanted, scores, own[:, 1:], quiet[:, :, 1:], None)
+        return best_tone(wanted, scores, own[:, 1:], quiet[:, :, 1:])
     return best_over_effect(drives, scores, own, quiet, wanted, over_effect)
 
 

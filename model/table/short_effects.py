@@ -18,7 +18,7 @@ from model.ensemble.touched_plate import gram
 from model.table.contents import REACHED
 from model.table.fingers_on_plate import FingerForms
 from model.table.pulse_gains import OverEffect, PulseResponses, contrast_over_effect
-from model.transients.onset import RINGING_TIMES, RampedRinging
+from model.transients.ringing import RINGING_TIMES, RampedRinging
 
 _NEARLY = 10 ** (-1 / 20)  # within a decibel
 

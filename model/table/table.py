@@ -31,12 +31,12 @@ from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS
 from model.table.fingers_on_plate import FingersOnPlate
-from model.table.pattern import ONSET_RAMP, Pattern
+from model.table.pattern import Pattern
 from model.table.pattern_query import find_pattern
 from model.table.pulse_gains import OverEffect
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
 from model.table.raster import FingertipShapes, Raster
-from model.transients.onset import RampedOnsets, RampedRinging, ramped_ringing
+from model.transients.ringing import RampedRinging, ramped_ringing
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation, base_amplitudes
 from registry.limits import GuardLimits
@@ -145,7 +145,6 @@ class LocalizationTable:
                 Question((centre,), quiet, level_db_sl=MIN_LEVEL_DB_SL, drive_mode=drive_mode)
             )
         if (drive_mode or self.drive_mode) != "switched":
-            _ = self.onsets  # used only where several patterns are near the best
             for duration in EFFECT_DURATIONS if with_ringing else ():
                 self.ringing(duration)
 
@@ -255,14 +254,6 @@ class LocalizationTable:
             contacts=fingers,
             attachment_shapes=np.vstack([self.attachment_shapes, shapes]),
         )
-
-    @cached_property
-    def onsets(self) -> RampedOnsets | None:
-        """Plain ramps at the table's frequencies; None where too few ERAs support the plate."""
-        try:
-            return RampedOnsets(self.in_time, self.frequencies, ramp=ONSET_RAMP)
-        except InputError:
-            return None
 
     def ringing(self, duration: float) -> RampedRinging | None:
         """Ringing over an effect of about a duration [s]; None where too few ERAs support it."""

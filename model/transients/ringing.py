@@ -1,27 +1,17 @@
-"""Contrast of a drive while it starts along a plain ramp, from precomputed responses.
+"""Ringing of a plate over a short drive along plain ramps, from responses of each ERA alone.
 
 A ramp also excites the plate's own modes, whose ringing is not balanced at a quiet finger. The
-response to the ramp of each ERA alone is known in closed form, and that of a drive is their
-weighted sum. Peaks are those of its envelope, the magnitude of the complex response, at times a few
-milliseconds apart: within some tenths of a decibel of `model.transients.measures`, sample by
-sample, at a hundredth of the work.
+response to the ramp of each ERA is known in closed form, and that of a drive is their weighted sum.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from model.arrays import ComplexArray, Float32Array, FloatArray, IntArray
-from model.finger.perception import contrast_ratio
+from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.transients.base_motion import rise
-from model.transients.measures import ONSET_WINDOW
 from model.transients.time_response import PlateInTime
-
-TIME_COUNT = 12
-"""Times at which an onset is evaluated; uneven, so that they do not all miss a beat."""
 
 RINGING_TIMES = 6
 """Times at which a short effect is evaluated; those of the ringing after it are as close."""
@@ -29,42 +19,6 @@ RINGING_TIMES = 6
 MIN_RINGING_TIME = 0.02  # s
 
 BATCH = 32  # frequencies solved together: some ten megabytes
-
-
-class RampedOnsets:
-    """Onsets of a plate along a raised cosine, at each of a list of frequencies."""
-
-    def __init__(self, plate: PlateInTime, frequencies: FloatArray, *, ramp: float) -> None:
-        """Solve the onsets: frequencies (f,) [Hz], ramp [s]."""
-        # Denser towards the end, where the target has its full level; the first is mid-ramp.
-        times = ONSET_WINDOW - (ONSET_WINDOW - ramp / 2) * np.linspace(1, 0, TIME_COUNT) ** 1.2
-        self._eras = len(plate.eras)
-        batches = np.split(2 * np.pi * frequencies, range(BATCH, len(frequencies), BATCH))
-        parts = [ramp_responses(plate, omega, times, ramp)[0] for omega in batches]
-        self.parts = np.concatenate(parts, dtype=np.complex64, casting="same_kind")
-
-    def contrast(
-        self,
-        frequencies: IntArray,
-        weights: NDArray[np.complex64],
-        *,
-        targets: Sequence[NDArray[np.float32]],
-        quiet: NDArray[np.float32],
-    ) -> FloatArray:
-        """Contrast (n,) as a ratio of drives at frequencies (n,), by index, of weights (n, eras).
-
-        targets, quiet: shapes (p, r) of the reduced plate at their points.
-        """
-        n = len(frequencies)
-        parts = self.parts.take(frequencies, axis=0).reshape(n, self._eras, -1)
-        responses = (weights[:, None, :] @ parts).reshape(n * TIME_COUNT, -1)
-        rows = np.concatenate([responses.real, responses.imag])
-        real, imaginary = (rows @ np.concatenate([*targets, quiet]).T).reshape(2, n, TIME_COUNT, -1)
-        peaks = np.sqrt(np.maximum.reduce(real * real + imaginary * imaginary, axis=1))
-        *at_targets, at_quiet = np.split(
-            peaks, np.cumsum([len(shapes) for shapes in targets]), axis=1
-        )
-        return contrast_ratio(at_targets, at_quiet).astype(float)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.learning import learning
 from controller.learning.estimator_process import EstimatorTimeouts
 from learning_bench import LearningBench, beside_a_process, learning_bench
 from model.identification.learned_file import load_learned
@@ -66,43 +65,6 @@ async def test_touches_go_on_without_an_estimator(tmp_path: Path) -> None:
         assert "no reply within 3 s" in found.cause
         await bench.until("following")
         assert (await bench.learning()).restarts == 2
-
-
-@pytest.mark.long
-@beside_a_process
-async def test_answers_are_robust_after_a_while_without_an_estimator(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Given up after its first failure; `forget` starts another, and answers are as built."""
-    monkeypatch.setattr(learning, "ROBUST_AFTER", 2.0)
-    timeouts = EstimatorTimeouts(1e9, 1e9, max_failures=1)
-    async with learning_bench(tmp_path, timeouts=timeouts) as bench:
-        await bench.until("following")
-        os.kill(bench.estimator, signal.SIGKILL)
-        found = await bench.until("failed")
-        assert not found.robust
-        while not (await bench.learning()).robust:
-            assert await bench.touch(*PAIR) is not None
-        await bench.era.forget()
-        found = await bench.until("following")
-        assert not found.robust
-        assert not bench.file.exists()
-
-
-@pytest.mark.long
-@beside_a_process
-async def test_change_that_nothing_explains_is_said_and_answered_robustly(tmp_path: Path) -> None:
-    """One mount half and another twice as stiff: changed, with what comes nearest, and robust."""
-    async with learning_bench(tmp_path) as bench:
-        await bench.until("following")
-        await bench.patterns(2)
-        bench.change(SW=0.5, NE=2.0)
-        await bench.patterns(6)
-        found = await bench.until("changed")
-        assert found.robust
-        assert "most as if" in found.cause
-        assert found.remedy is not None
-        assert await bench.touch(*PAIR) is not None
 
 
 @beside_a_process

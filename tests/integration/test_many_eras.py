@@ -14,7 +14,6 @@ from controller.sources.capture import read_capture
 from long_form import shortly
 from model.rig.file import load_rig
 from model.table.build import build_table
-from model.table.question import Question
 from tuio_messages import write_schedule
 from virtual_sockets import run_virtual_on_sockets
 
@@ -91,24 +90,6 @@ def test_three_people_each_feel_their_own_content_while_one_slides_and_one_leave
     for row in rows:
         assert row.steady
         assert row.as_json()["fingers"]
-
-
-def test_table_answers_twenty_fingers() -> None:
-    """One target among nineteen quiet fingers has a pattern, of less contrast than beside one.
-
-    No drive does better at more quiet fingers.
-    """
-    table = build_table(load_rig(EXAMPLES / "table.yaml"), frequencies=np.array([120.0]))
-    places = [(x, y) for y in (0.1, 0.3, 0.5, 0.7) for x in (0.1, 0.35, 0.6, 0.85, 1.1)]
-    target, *quiet = places
-    found = []
-    for count in (1, 19):
-        question = Question((target,), tuple(quiet[:count]), drive_mode="phased")
-        found.append(table.query(question).robust_felt_contrast_db)
-    one, many = found
-    assert one is not None
-    assert many is not None
-    assert 0 < many < one
 
 
 @pytest.mark.parametrize("name", CHANNELS)

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import errno
 import inspect
 import json
 import os
@@ -28,6 +27,7 @@ from controller.api.methods import METHODS
 from controller.api.place import SYSTEM_SOCKET, check_peer, find_socket
 from daemon_bench import PLACE, next_event, ready_daemon, running_daemon, until_state
 from model.errors import InputError
+from served_api import request
 from virtual_sockets import in_virtual_time_on_sockets
 
 PAGE = Path(controller.__file__).parent.parent / "docs" / "reference" / "api.md"
@@ -138,6 +138,18 @@ async def test_client_raises_when_the_daemon_has_ended(tmp_path: Path) -> None:
         await era.status()
     await era.close()
     assert [event async for event in era.events()] == []
+
+
+async def test_reply_to_a_subscription_comes_before_its_first_event(tmp_path: Path) -> None:
+    """The present state, of which nothing is missed."""
+    async with ready_daemon(tmp_path) as (bench, _):
+        reader, writer = await asyncio.open_unix_connection(bench.socket)
+        with contextlib.closing(writer):
+            writer.write(request("hello", '{"client":"a"}', id=1))
+            writer.write(request("subscribe", '{"topics":["state"]}', id=2))
+            lines = [json.loads(await reader.readline()) for _ in range(3)]
+        assert [each.get("id") for each in lines] == [1, 2, None]
+        assert lines[2]["params"]["data"]["new"] == READY
 
 
 async def test_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -289,32 +301,6 @@ async def test_stop_is_repeated_while_no_daemon_runs(
             await late.stop()
         assert not refusing
         assert (await era.status()).state == "QUICK_STOP_ACTIVE"
-
-
-async def test_client_waits_while_the_queue_of_the_daemon_is_full(tmp_path: Path) -> None:
-    """A full queue is neither a connection nor a process of a wrong owner."""
-    with socket.socket(socket.AF_UNIX) as server, contextlib.ExitStack() as stack:
-        server.bind(str(tmp_path / "s"))
-        server.listen(0)
-        server.setblocking(False)
-        problem = 0
-        while problem != errno.EAGAIN:
-            client = stack.enter_context(socket.socket(socket.AF_UNIX))
-            client.setblocking(False)
-            problem = client.connect_ex(str(tmp_path / "s"))
-        connecting = asyncio.create_task(AsyncClient.connect(tmp_path / "s"))
-        for _ in range(3):
-            await asyncio.sleep(0)
-        assert not connecting.done()
-        server.accept()[0].close()
-        loop = asyncio.get_running_loop()
-        accepting = asyncio.create_task(loop.sock_accept(server))
-        await asyncio.wait({accepting, connecting}, return_when=asyncio.FIRST_COMPLETED)
-        assert not connecting.done()
-        accepted, _ = await accepting
-        with accepted:
-            await loop.sock_sendall(accepted, HELLO)
-            await (await connecting).close()
 
 
 def test_calls_end_within_the_timeout(tmp_path: Path) -> None:

@@ -27,17 +27,6 @@ async def test_server_continues_after_invalid_lines() -> None:
     assert served.names == ["disarm"]
 
 
-async def test_server_assembles_lines() -> None:
-    """A line in single bytes, and several lines at once."""
-    served = ServedApi()
-    client, wire = served.client()
-    line = request("disarm", id=1)
-    for data in [*(bytes([byte]) for byte in line), line * 3]:
-        client.data_received(data)
-        await served.settle()
-    assert [each["id"] for each in wire.lines()] == [1, 1, 1, 1]
-
-
 async def test_server_closes_when_a_line_exceeds_64_kib() -> None:
     """65 536 bytes with the line feed are served; a byte more, complete or not, is refused."""
     served = ServedApi()
@@ -203,29 +192,6 @@ async def test_touch_frame_with_a_finger_that_the_next_has_not_is_served() -> No
     frames = [each for _, each, _ in served.calls if isinstance(each, TouchParams)]
     fingers = [tuple(each.id for each in frame.touches) for frame in frames]
     assert fingers == [(1,), (2, 3), (3,), ()]
-
-
-async def test_control_loop_runs_between_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between two iterations data is received, and what it wakes runs."""
-    monkeypatch.setattr("controller.api.turns.MAX_TURN", 0.0)  # one line per iteration
-    loop = asyncio.get_running_loop()
-    order: list[str] = []
-
-    def receive_touch() -> None:
-        order.append("touch")
-        loop.call_soon(order.append, "command")
-
-    def called(name: str) -> None:
-        order.append(name)
-        if order == ["status"]:
-            loop.call_soon(receive_touch)
-
-    served = ServedApi()
-    served.called = called
-    client, _ = served.client()
-    client.data_received(request("status", id=1) * 3)
-    await served.settle()
-    assert order == ["status", "touch", "command", "status", "status"]
 
 
 async def test_stop_is_served_among_silent_and_asking_clients() -> None:

@@ -1,4 +1,4 @@
-"""Clients and gateway with daemons of other versions, and our daemon against its own models."""
+"""Clients and the drawn field with a daemon of a later version."""
 
 import asyncio
 import contextlib
@@ -7,17 +7,10 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
-from controller.api.client_protocol import Unreachable
-from controller.api.link import DaemonLink
-from controller.api.methods import METHODS
-from controller.api.topics import TOPICS, EventParams
 from controller.gateway.field import DrawnField
 from daemon_bench import PLACE, holding, running_daemon, until_state
-from virtual_sockets import in_virtual_time_on_sockets
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 # keyed by name, not messages: so many levels deep
@@ -99,64 +92,3 @@ async def test_extra_keys_of_a_later_minor_version_are_ignored(tmp_path: Path) -
                     drawn = await field.newer_than(drawn)
         drawing.cancel()
         await asyncio.wait({drawing})
-
-
-@in_virtual_time_on_sockets
-async def test_daemon_sends_exactly_the_documented_keys(tmp_path: Path) -> None:
-    """Results and notifications read strictly by the models of the reference page."""
-    down = [{"id": 1, "x_m": PLACE[0], "y_m": PLACE[1]}]
-    topics = sorted(TOPICS.keys() - {"link", "log"})
-    received: set[str] = set()
-
-    async with contextlib.AsyncExitStack() as stack:
-        bench = await stack.enter_async_context(running_daemon(tmp_path, "learn: l.npz\n"))
-        async with await bench.client() as era:
-            await until_state(era, READY)
-        reader, writer = await asyncio.open_unix_connection(bench.socket, limit=1 << 20)
-        stack.callback(writer.close)
-
-        async def next_response() -> dict[str, Any]:
-            """The next response; notifications before it are read strictly."""
-            while True:
-                content: dict[str, Any] = json.loads(await reader.readline())
-                if "method" not in content:
-                    return content
-                event = EventParams.model_validate(content["params"])
-                TOPICS[event.topic].data.model_validate_json(json.dumps(event.data))
-                received.add(event.topic)
-
-        async def call(method: str, **params: object) -> None:
-            request = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
-            writer.write(json.dumps(request).encode() + b"\n")
-            response = await next_response()
-            assert response.keys() == {"jsonrpc", "id", "result"}, response
-            METHODS[method].result.model_validate_json(json.dumps(response["result"]))
-
-        async with asyncio.timeout(60):
-            await call("hello", client="me")
-            await call("subscribe", topics=topics, rate_hz=60.0)
-            assert received == set()  # the reply comes before the first event
-            await call("effects")
-            await call("arm", owner="me", lease_s=5.0)
-            for touches, awaited in ((down, "pattern"), ([], "silence")):
-                while awaited not in received:
-                    await call("touch", source="me", touches=touches)
-                    await call("status")
-                    await asyncio.sleep(0.01)
-            await call("stop")
-            await call("clear")
-            while received != set(topics):
-                await call("status")
-                await asyncio.sleep(0.01)
-
-
-async def test_gateway_reports_a_daemon_of_another_major_version(tmp_path: Path) -> None:
-    """Its calls fail with both versions and the remedy."""
-
-    def changed(content: dict[str, Any]) -> dict[str, Any]:
-        return content | {"result": {"api_version": "2.0", "era": 2}}
-
-    other = tmp_path / "other.sock"
-    async with running_daemon(tmp_path) as bench, relay(bench.socket, other, changed):
-        with pytest.raises(Unreachable, match=r"2\.0 .* 1\.\d+; update the older"):
-            await DaemonLink.open(other, "web")

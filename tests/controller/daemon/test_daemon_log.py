@@ -86,21 +86,6 @@ def wait_until(holds: Callable[[], object]) -> None:
         time.sleep(0.001)
 
 
-def test_log_loses_lines_only_while_disk_is_full(logger: logging.Logger, tmp_path: Path) -> None:
-    """/dev/full refuses every byte: these lines are lost, and later ones are written."""
-    file = tmp_path / "log"
-    file.symlink_to("/dev/full")
-    thread = LogThread(file)
-    logger.addHandler(thread)
-    for _ in range(10):
-        logger.warning("lost")
-    wait_until(thread.lines.empty)
-    file.unlink()
-    logger.warning("written")
-    thread.close()
-    assert json.loads(file.read_text("utf-8"))["message"] == "written"
-
-
 def test_log_does_not_block_while_disk_hangs(
     logger: logging.Logger, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,7 +1,7 @@
 """What a finger feels of an effect over every wire, against what was promised, in virtual time."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -15,8 +15,8 @@ from controller.effects.effect import Effect
 from controller.effects.layout import SurfaceLayout
 from controller.effects.ramp import Ramp
 from controller.effects.region import Region
-from long_form import in_turn, shortly
-from model.config.shapes import Circle, Rectangle
+from long_form import in_turn
+from model.config.shapes import Circle
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from paper_table import smooth_rig
@@ -69,31 +69,15 @@ def table() -> LocalizationTable:
 
 
 @cache
-def pressed(case: Case, wire: str, *, is_shaped: bool = True) -> list[Felt]:
+def pressed(case: Case, wire: str) -> list[Felt]:
     """What equal presses feel."""
     where = "on_move" if case.effect.is_for_motion else "on_press"
     region = Region("all", Circle(*CENTRE, 0.06), **{where: "it"})
     layout = SurfaceLayout((region,), {"it": case.effect}, elsewhere=None)
-    chain = Pressed(smooth_rig(), table(), layout, wire, is_shaped=is_shaped)
+    chain = Pressed(smooth_rig(), table(), layout, wire)
     presses = chain.press(*[case.way] * PRESSES.get(wire, FEW), held=case.held)
     assert all(len(each) == 1 for each in presses)
     return [felt for (felt,) in presses]
-
-
-@pytest.mark.parametrize(
-    ("band", "played"), [((170.0, 230.0), {180.0, 220.0}), ((205.0, 205.0), {220.0})]
-)
-def test_notches_of_a_slider_are_alike(band: tuple[float, float], played: set[float]) -> None:
-    """Of the table's frequencies in the band or the nearest, within 2 dB wherever the finger is."""
-    slider = Region("slider", Rectangle(0.02, 0.10, 0.26, 0.04), on_move="notches", band=band)
-    layout = SurfaceLayout((slider,), {"notches": Detents(spacing=0.02, level=18.0)})
-    (notches,) = Pressed(smooth_rig(), table(), layout, "serial").press(
-        lambda since: (0.03 + 0.02 * (since // 0.2), 0.12), held=2.2
-    )
-    assert len(notches) == 10
-    assert {felt.frequency for felt in notches} <= played
-    levels = [felt.level_db_sl(0.030) for felt in notches]
-    assert levels == pytest.approx([18.0] * 10, abs=2.0)
 
 
 @pytest.mark.parametrize(("name", "wire"), in_turn(CASES, [*WIRES]))
@@ -106,11 +90,3 @@ def test_effect_is_felt_as_promised_and_alike_at_every_press(name: str, wire: st
     if name != "ramp":  # which reports each of its steps
         assert levels == pytest.approx([felt.promised_db_sl for felt in presses], abs=3.0)
     assert max(levels) - min(levels) <= 2.0
-
-
-@pytest.mark.parametrize("wire", shortly(WIRES, ["serial"]))
-def test_no_effect_starts_more_than_10_ms_later_than_along_a_plain_ramp(wire: str) -> None:
-    """The slowest press by default, against the slowest without shaped onsets."""
-    shaped = pressed(CASES["buzz"], wire)
-    plain = pressed(replace(CASES["buzz"], held=0.15), wire, is_shaped=False)
-    assert max(felt.delay for felt in shaped) - max(felt.delay for felt in plain) <= 0.010

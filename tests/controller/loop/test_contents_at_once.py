@@ -124,28 +124,6 @@ async def test_one_finger_leaves_and_the_layer_of_the_other_is_not_touched() -> 
 
 
 @in_virtual_time
-async def test_a_slide_keeps_the_content_and_its_layer() -> None:
-    """0.2 m/s over 10 cm beside another: same layer, one frequency, phases kept, never silent."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(0.5)
-        count, applied = len(fingers.committed), len(fingers.applied)
-
-        def slide(since: float) -> None:
-            fingers.at[1] = (0.03 + 0.2 * since, 0.06)
-
-        slide(0.0)
-        await fingers.hold(0.2)
-        await fingers.hold(0.5, slide)
-        numbers = {n for each in fingers.applied[applied:] for n in each.contents}
-        assert numbers == {0, 1}
-        assert len(fingers.applied) - applied >= 5
-        assert all(len(each.targets) == 2 for each in fingers.applied[applied:])
-        for _, _, layers in fingers.committed[count:]:
-            assert all(one.renew or any(c.level for c in one.commands) for one in layers)
-
-
-@in_virtual_time
 async def test_a_slide_keeps_its_frequencies_until_the_finger_rests() -> None:
     """On a way along which others promise 3 dB more: they play within 0.2 s of rest, once."""
     async with fingers_on(table(), LAYOUT) as fingers:

@@ -47,7 +47,6 @@ SLOWEST = (
     "test_diagnosis.py",
     "test_daemon_over_a_wire.py",
     "test_soak.py",
-    "test_lost_sound_server.py",
     "test_daemon_faults_killed.py",
     "test_soft_amp_sound.py",
     "test_nothing_is_lost.py",

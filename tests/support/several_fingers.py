@@ -1,14 +1,15 @@
 """Several fingers on the paper's plate in virtual time, over a serial line, and what was sent."""
 
 import asyncio
-from collections.abc import Mapping
-from contextlib import AbstractAsyncContextManager
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import cache
+from types import MappingProxyType
 
 import numpy as np
 
-from chain import Chain
+from chain import Chain, Position
 from committed_sets import CommittedSets
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
@@ -66,14 +67,22 @@ class Fingers(Chain):
         return found
 
 
-def fingers_on(
-    table: LocalizationTable, layout: SurfaceLayout, *, layers: int = 8, breaks: str | None = None
-) -> AbstractAsyncContextManager[Fingers]:
-    """Fingers on a layout, armed for half a second, with an amplifier of four channels.
+@asynccontextmanager
+async def fingers_on(
+    table: LocalizationTable,
+    layout: SurfaceLayout,
+    *,
+    at: Mapping[int, Position] = MappingProxyType({}),
+    held: float = 0.0,
+    layers: int = 8,
+    breaks: str | None = None,
+) -> AsyncIterator[Fingers]:
+    """Fingers on a layout, armed, with an amplifier of four channels.
 
-    breaks: the only rule of the witness that what is planted breaks.
+    at: those that are held for a time [s] first; breaks: the only rule of the witness that what is
+    planted breaks.
     """
-    return Fingers.armed(
+    async with Fingers.armed(
         Wire("serial", speed=921_600, unpluggable=True),
         smooth_rig(),
         table,
@@ -81,4 +90,7 @@ def fingers_on(
         timing=Timing(table),
         layers=layers,
         breaks=breaks,
-    )
+    ) as fingers:
+        fingers.at = {**at}
+        await fingers.hold(held)
+        yield fingers

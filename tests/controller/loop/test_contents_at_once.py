@@ -61,9 +61,7 @@ def answering_after(seconds: float, monkeypatch: pytest.MonkeyPatch) -> asyncio.
 @in_virtual_time
 async def test_two_fingers_each_feel_their_own_within_1_db_of_the_promise() -> None:
     """Measured at the fingertips over the wire, against the answer for the nominal plate."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(1.0)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=1.0) as fingers:
         (applied,) = fingers.applied
         first, second = (one.content for one in applied.contents.values())
         assert abs(first.frequency - second.frequency) >= 30
@@ -78,9 +76,7 @@ async def test_two_fingers_each_feel_their_own_within_1_db_of_the_promise() -> N
 @in_virtual_time
 async def test_a_third_finger_joins_and_all_are_weighted_anew_in_one_commit() -> None:
     """Each keeps its layer and what it feels keeps its frequency, unless 3 dB more are promised."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(0.5)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.5) as fingers:
         before = {number: one.content for number, one in fingers.applied[-1].contents.items()}
         count = len(fingers.committed)
         fingers.at[3] = ABOVE
@@ -100,9 +96,7 @@ async def test_a_third_finger_joins_and_all_are_weighted_anew_in_one_commit() ->
 @in_virtual_time
 async def test_one_finger_leaves_and_the_layer_of_the_other_is_not_touched() -> None:
     """One set, of its layer alone; what the other feels has the same amplitude before and after."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(0.6)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
         (other,) = (n for n, one in fingers.applied[-1].contents.items() if _id(one) == 2)
         count = len(fingers.committed)
         del fingers.at[1]
@@ -126,9 +120,7 @@ async def test_one_finger_leaves_and_the_layer_of_the_other_is_not_touched() -> 
 @in_virtual_time
 async def test_a_slide_keeps_its_frequencies_until_the_finger_rests() -> None:
     """On a way along which others promise 3 dB more: they play within 0.2 s of rest, once."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: (0.12, 0.10), 2: RIGHT}
-        await fingers.hold(0.5)
+    async with fingers_on(table(), LAYOUT, at={1: (0.12, 0.10), 2: RIGHT}, held=0.5) as fingers:
         before, count = _frequencies(fingers.applied[-1]), len(fingers.applied)
 
         def slide(since: float) -> None:
@@ -151,9 +143,7 @@ async def test_a_lifted_finger_falls_silent_while_an_amplifier_is_degraded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Its layer alone, within 20 ms, though the other moves, which begins anew in its layer."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(0.6)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
         layers = {_id(one): number for number, one in fingers.applied[-1].contents.items()}
         group, count = fingers.controller.group, len(fingers.committed)
         with monkeypatch.context() as patched:
@@ -177,9 +167,7 @@ async def test_a_refused_content_is_left_out_and_the_other_plays_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Two contents are refused together: the newer finger is told why, the other is not silent."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT}
-        await fingers.hold(0.5)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT}, held=0.5) as fingers:
         apply, count = fingers.controller.group.apply, len(fingers.committed)
 
         async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
@@ -200,9 +188,7 @@ async def test_a_refused_content_is_left_out_and_the_other_plays_on(
 @in_virtual_time
 async def test_a_ramp_replaces_an_ending_that_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """One finger lifts as the other moves: that one is not silenced for the ending of the first."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(0.6)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
         apply, count = fingers.controller.group.apply, len(fingers.committed)
 
         async def refuse(layers: Mapping[str, Sequence[Layer]]) -> Played:
@@ -228,9 +214,7 @@ async def test_the_end_of_one_layer_by_itself_is_said_while_the_other_plays(
     Nor does it count as felt once one of the others lifts.
     """
     renewal = Decider.renewal
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT, 3: ABOVE}
-        await fingers.hold(0.5)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=0.5) as fingers:
         layers = {_id(one): n for n, one in fingers.applied[-1].contents.items()}
 
         def not_one(decider: Decider, now: float) -> dict[int, PlateSet]:
@@ -257,9 +241,7 @@ async def test_others_feel_no_change_after_a_click_of_one_finger() -> None:
     layout = SurfaceLayout(
         LAYOUT.regions, {**LAYOUT.effects, "tick": Click(level=14.0)}, elsewhere=None
     )
-    async with fingers_on(table(), layout) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(0.5)
+    async with fingers_on(table(), layout, at={1: LEFT, 2: RIGHT}, held=0.5) as fingers:
         contents = {_id(one): one.content for one in fingers.applied[-1].contents.values()}
         layers = {_id(one): n for n, one in fingers.applied[-1].contents.items()}
         count = len(fingers.committed)
@@ -291,9 +273,7 @@ async def test_a_click_goes_before_what_lasts_of_other_fingers(
     layout = SurfaceLayout(
         LAYOUT.regions, {**LAYOUT.effects, "any": Click(level=14.0)}, elsewhere=None
     )
-    async with fingers_on(table(), layout) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(0.5)
+    async with fingers_on(table(), layout, at={1: LEFT, 2: RIGHT}, held=0.5) as fingers:
         count, begin = len(fingers.committed), loop.time()
         fingers.at[1] = (LEFT[0] + 0.02, LEFT[1])
         await fingers.hold(0.02)
@@ -309,9 +289,9 @@ async def test_latency_counts_from_the_change_that_an_answer_is_for(
 ) -> None:
     """A slide of 1.5 s, answers of 0.2 s, too late for a touch: one that runs, then its own."""
     answering_after(0.2, monkeypatch)
-    async with fingers_on(table(), LAYOUT, breaks="touch") as fingers:
-        fingers.at = {1: (0.03, 0.06), 2: RIGHT}
-        await fingers.hold(0.5)
+    async with fingers_on(
+        table(), LAYOUT, breaks="touch", at={1: (0.03, 0.06), 2: RIGHT}, held=0.5
+    ) as fingers:
         count = len(fingers.applied)
 
         def slide(since: float) -> None:
@@ -330,9 +310,7 @@ async def test_an_answer_for_a_finger_that_has_lifted_changes_nothing(
 ) -> None:
     """A finger comes and lifts while the answer for two is computed: the other's set stays."""
     answering_after(0.2, monkeypatch)
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT}
-        await fingers.hold(0.3)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT}, held=0.3) as fingers:
         count = len(fingers.committed)
         fingers.at[2] = RIGHT
         await fingers.hold(0.05)
@@ -345,9 +323,7 @@ async def test_an_answer_for_a_finger_that_has_lifted_changes_nothing(
 @in_virtual_time
 async def test_arming_again_forgets_no_layer_that_plays() -> None:
     """A finger that lifts just then falls silent, as the other plays on."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(0.6)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
         layers = {_id(one): number for number, one in fingers.applied[-1].contents.items()}
         count = len(fingers.committed)
         await fingers.controller.arm()
@@ -365,9 +341,7 @@ async def test_a_click_that_cannot_be_played_is_said_though_no_layer_changes(
     """A resting finger slides 4 mm into the region of a click, which the table refuses."""
     regions = (LAYOUT.regions[0], replace(LAYOUT.regions[1], on_press="click"))
     layout = SurfaceLayout(regions, {**LAYOUT.effects, "click": Click(level=14.0)}, elsewhere=None)
-    async with fingers_on(table(), layout) as fingers:
-        fingers.at = {1: LEFT, 2: (0.158, 0.049)}
-        await fingers.hold(0.5)
+    async with fingers_on(table(), layout, at={1: LEFT, 2: (0.158, 0.049)}, held=0.5) as fingers:
         count = len(fingers.committed)
 
         def refuse(*_: Any, **__: Any) -> None:
@@ -388,9 +362,7 @@ async def test_stop_and_lift_do_not_wait_for_an_answer(
 ) -> None:
     """While one is computed for 0.2 s: silent as soon as without, and what it says is dropped."""
     loop = answering_after(0.2, monkeypatch)
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT}
-        await fingers.hold(0.3)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT}, held=0.3) as fingers:
         assert len(fingers.applied) == 1
         fingers.at[2] = RIGHT
         await fingers.hold(0.05)  # an answer is being computed
@@ -418,9 +390,7 @@ async def test_a_click_plays_beside_what_lasts() -> None:
     layout = SurfaceLayout(
         LAYOUT.regions, {**LAYOUT.effects, "high": Click(level=14.0)}, elsewhere=None
     )
-    async with fingers_on(table(), layout) as fingers:
-        fingers.at = {1: LEFT}
-        await fingers.hold(0.5)
+    async with fingers_on(table(), layout, at={1: LEFT}, held=0.5) as fingers:
         count = len(fingers.committed)
         fingers.at[2] = RIGHT
         await fingers.hold(0.3)
@@ -440,9 +410,7 @@ async def test_a_click_is_played_though_the_answer_takes_longer_than_it_lasts(
     layout = SurfaceLayout(
         LAYOUT.regions, {**LAYOUT.effects, "any": Click(level=14.0)}, elsewhere=None
     )
-    async with fingers_on(table(), layout) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(0.5)
+    async with fingers_on(table(), layout, at={1: LEFT, 2: RIGHT}, held=0.5) as fingers:
         count, begin = len(fingers.committed), loop.time()
         fingers.at[3] = ABOVE
         await fingers.hold(0.3)
@@ -463,9 +431,7 @@ async def test_an_answer_is_shaped_by_the_timing_it_began_with(
 ) -> None:
     """Others are put in place meanwhile, without a timing: what was begun has its onset."""
     answering_after(0.03, monkeypatch)
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(0.01)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=0.01) as fingers:
         fingers.controller.replace_answers(table(), None)
         await fingers.hold(0.3)
         (applied,) = fingers.applied
@@ -478,9 +444,7 @@ async def test_an_answer_that_takes_more_than_a_second_is_a_fault(
 ) -> None:
     """Silent, with the reason, until it has come."""
     answering_after(2.0, monkeypatch)
-    async with fingers_on(table(), LAYOUT, breaks="touch") as fingers:
-        fingers.at = {1: LEFT}
-        await fingers.hold(0.3)
+    async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.3) as fingers:
         fingers.at[2] = RIGHT
         await fingers.hold(0.95)
         before = len(fingers.silenced)
@@ -526,9 +490,7 @@ async def test_an_answer_that_fails_silences_all_and_says_why(
         calls += 1
         raise ZeroDivisionError("by no finger")
 
-    async with fingers_on(table(), LAYOUT, breaks="touch") as fingers:
-        fingers.at = {1: LEFT}
-        await fingers.hold(0.3)
+    async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.3) as fingers:
         with monkeypatch.context() as patched:
             patched.setattr("controller.loop.selection.query_jointly", fail)
             fingers.at[2] = RIGHT
@@ -546,9 +508,7 @@ async def test_an_answer_that_fails_silences_all_and_says_why(
 @in_virtual_time
 async def test_status_says_what_each_finger_feels() -> None:
     """Keys of the API: by finger its content and verdict; by layer what the ERAs play."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT, 3: ABOVE}
-        await fingers.hold(0.5)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=0.5) as fingers:
         applied = fingers.applied[-1]
         view = PlateView(lambda key: "buzz", applied.contacts, applied)
         event = view.pattern_event()

@@ -53,9 +53,7 @@ def measured(fingers: Fingers) -> dict[int, float]:
 @in_virtual_time
 async def test_status_says_what_leaks_to_a_finger_that_has_moved() -> None:
     """By less than 8 mm no weights change: within a decibel of what is measured there."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT, 3: ABOVE}
-        await fingers.hold(1.2)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.2) as fingers:
         rested = statuses(fingers)
         assert rested == pytest.approx(measured(fingers), abs=1.0)
         count = len(fingers.applied)
@@ -70,9 +68,7 @@ async def test_status_says_what_leaks_to_a_finger_that_has_moved() -> None:
 @in_virtual_time
 async def test_weights_follow_a_finger_at_half_a_metre_a_second() -> None:
     """10 cm in 0.2 s: several answers on the way, after which as little leaks as before."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT, 3: ABOVE}
-        await fingers.hold(1.0)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.0) as fingers:
         rested, count = statuses(fingers)[3], len(fingers.applied)
         on_the_way = []
 
@@ -92,8 +88,6 @@ async def test_weights_follow_a_finger_at_half_a_metre_a_second() -> None:
 @in_virtual_time
 async def test_nothing_leaks_without_fingers() -> None:
     """The status is read when the last has lifted and its silence is not confirmed yet."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT}
-        await fingers.hold(0.3)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT}, held=0.3) as fingers:
         view = PlateView(lambda key: None, (), fingers.applied[-1])
         assert view.statuses_now(table()) == []

@@ -39,9 +39,7 @@ def depth_of(fingers: Fingers, id: str) -> float:
 @in_virtual_time
 async def test_a_modulated_content_beats_at_its_own_finger_and_at_no_other() -> None:
     """Of its envelope all comes and goes 20 times a second; that of the other hardly does."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(1.5)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=1.5) as fingers:
         applied = fingers.applied[-1]
         assert len(applied.contents) == 4
         first, second = applied.targets
@@ -57,9 +55,7 @@ async def test_a_modulated_content_beats_at_its_own_finger_and_at_no_other() -> 
 @in_virtual_time
 async def test_a_modulated_content_is_steady_where_layers_are_few() -> None:
     """Two contents of four layers leave one for a click; a lone one takes three."""
-    async with fingers_on(table(), LAYOUT, layers=4) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(1.0)
+    async with fingers_on(table(), LAYOUT, layers=4, at={1: LEFT, 2: RIGHT}, held=1.0) as fingers:
         assert len(fingers.applied[-1].contents) == 2
         del fingers.at[2]
         await fingers.hold(0.3)
@@ -80,9 +76,7 @@ async def test_a_click_without_a_layer_is_said_until_one_is_free() -> None:
     )
     effects = {**LAYOUT.effects, "click": Click(level=14.0, duration=0.15)}
     layout = replace(LAYOUT, regions=regions, effects=effects)
-    async with fingers_on(table(), layout, layers=4) as fingers:
-        fingers.at = {1: LEFT}
-        await fingers.hold(0.5)
+    async with fingers_on(table(), layout, layers=4, at={1: LEFT}, held=0.5) as fingers:
         fingers.at |= {2: RIGHT, 3: ABOVE}
         await fingers.hold(0.12)
         felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
@@ -100,9 +94,9 @@ async def test_a_slide_to_another_band_keeps_the_beat() -> None:
     west = Region("west", Rectangle(0.0, 0.0, 0.17, 0.12), on_press="rough", on_move="rough")
     east = Region("east", Rectangle(0.17, 0.0, 0.13, 0.12), on_press="rough", on_move="rough")
     bands = replace(west, band=(200.0, 300.0)), replace(east, band=(100.0, 160.0))
-    async with fingers_on(table(), replace(LAYOUT, regions=bands)) as fingers:
-        fingers.at = {1: LEFT}
-        await fingers.hold(0.5)
+    async with fingers_on(
+        table(), replace(LAYOUT, regions=bands), at={1: LEFT}, held=0.5
+    ) as fingers:
         for x in np.linspace(LEFT[0], RIGHT[0], 8):
             fingers.at = {1: (float(x), LEFT[1])}
             await fingers.hold(0.08)
@@ -114,9 +108,7 @@ async def test_a_slide_to_another_band_keeps_the_beat() -> None:
 @in_virtual_time
 async def test_voices_of_one_finger_end_together() -> None:
     """When it lifts, all its layers fall silent, and the other's is not touched."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT}
-        await fingers.hold(1.0)
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=1.0) as fingers:
         contents = fingers.applied[-1].contents
         (own,) = (number for number, one in contents.items() if one.content.key[0].id == 2)
         before = len(fingers.committed)
@@ -132,9 +124,7 @@ async def test_voices_of_one_finger_end_together() -> None:
 @in_virtual_time
 async def test_a_refused_voice_takes_the_others_of_its_finger_along() -> None:
     """A carrier without one side band would be another content: the finger feels none."""
-    async with fingers_on(table(), LAYOUT) as fingers:
-        fingers.at = {2: RIGHT}
-        await fingers.hold(0.5)
+    async with fingers_on(table(), LAYOUT, at={2: RIGHT}, held=0.5) as fingers:
         group = fingers.controller.group
         apply, refusals = group.apply, []
 

@@ -45,9 +45,9 @@ async def test_nothing_plays_that_a_protected_finger_would_notice() -> None:
 
     16 dB SL would need 26 dB of contrast there, of which four ERAs promise fewer than 20.
     """
-    async with fingers_on(table(), LAYOUT, breaks="touch") as fingers:
-        fingers.at = {1: LEFT, 2: RIGHT, 3: ABOVE}
-        await fingers.hold(0.6)
+    async with fingers_on(
+        table(), LAYOUT, breaks="touch", at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=0.6
+    ) as fingers:
         assert levels_at(fingers, 3) < -10
         silenced = fingers.silenced[-1]
         assert {each.contact.key.id for each in silenced.targets} == {1, 2}
@@ -72,9 +72,7 @@ async def test_nothing_plays_that_a_protected_finger_would_notice() -> None:
 async def test_one_content_beside_a_protected_finger(effect: Buzz | Click, is_played: bool) -> None:
     """Played if at most -10 dB SL reach that finger, of a click over its duration; else silent."""
     layout = replace(LAYOUT, effects={**LAYOUT.effects, "left": effect})
-    async with fingers_on(table(), layout, breaks="touch") as fingers:
-        fingers.at = {3: ABOVE}
-        await fingers.hold(0.2)
+    async with fingers_on(table(), layout, breaks="touch", at={3: ABOVE}, held=0.2) as fingers:
         fingers.at[1] = LEFT
         await fingers.hold(1.0)
         assert bool(fingers.applied) is is_played
@@ -90,9 +88,9 @@ async def test_a_protected_finger_feels_its_own_effect() -> None:
     """That of the others is held back for it, whatever their priorities."""
     above = Region("above", UPPER, on_press="above", is_protected=True, priority=0)
     left = replace(LAYOUT.regions[0], priority=5)
-    async with fingers_on(table(), replace(LAYOUT, regions=(left, above))) as fingers:
-        fingers.at = {1: LEFT, 3: ABOVE}
-        await fingers.hold(1.0)
+    async with fingers_on(
+        table(), replace(LAYOUT, regions=(left, above)), at={1: LEFT, 3: ABOVE}, held=1.0
+    ) as fingers:
         verdicts = {each.contact.key.id: each.verdict for each in fingers.applied[-1].targets}
         assert verdicts == {1: "held back", 3: "own"}
         assert levels_at(fingers, 3) > 12
@@ -104,9 +102,9 @@ async def test_a_region_with_its_own_is_never_mixed() -> None:
     third = Region("above", UPPER, on_press="above", priority=1)
     for is_own in (False, True):
         regions = (*LAYOUT.regions[:2], replace(third, is_own=is_own))
-        async with fingers_on(table(), replace(LAYOUT, regions=regions)) as fingers:
-            fingers.at = {1: LEFT, 2: RIGHT, 3: ABOVE}
-            await fingers.hold(1.0)
+        async with fingers_on(
+            table(), replace(LAYOUT, regions=regions), at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.0
+        ) as fingers:
             targets = fingers.applied[-1].targets
             verdicts = {each.contact.key.id: each.verdict for each in targets}
             assert ("held back" in verdicts.values()) is is_own
@@ -122,9 +120,9 @@ async def test_fingers_that_may_share_say_whose_content_they_feel() -> None:
         Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="left", may_share=True),
         Region("right", Rectangle(0.15, 0.0, 0.15, 0.12), "right", may_share=True, priority=1),
     )
-    async with fingers_on(table(), replace(LAYOUT, regions=regions)) as fingers:
-        fingers.at = {1: (0.138, 0.06), 2: (0.165, 0.06)}
-        await fingers.hold(1.0)
+    async with fingers_on(
+        table(), replace(LAYOUT, regions=regions), at={1: (0.138, 0.06), 2: (0.165, 0.06)}, held=1.0
+    ) as fingers:
         applied = fingers.applied[-1]
         view = PlateView(lambda key: ("", "left", "right")[key.id], applied.contacts, applied)
         first, second = view.contact_statuses()

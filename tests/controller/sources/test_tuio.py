@@ -6,6 +6,8 @@ import math
 import re
 import socket
 import struct
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -60,39 +62,133 @@ def test_reader_reads_a_golden_bundle(reader: TuioReader) -> None:
     assert result == TouchFrame(sender, 5.0, (Touch(42, 0.5, 0.25),), 3.0, sender)
 
 
-def test_reader_keeps_unchanged_cursors(reader: TuioReader) -> None:
-    """A cursor that is alive but not set again stays where it was; one not alive is gone."""
-    reader.read(frame((1, 0.25, 0.5), (2, 0.75, 0.5), fseq=1), PEER, now=0)
-    source = message("source", "table@a")
-    moved = bundle(source, message("alive", 1, 2), cursor(2, 0.5, 0.5), message("fseq", 2))
-    assert touches(reader.read(moved, PEER, now=0.01)) == [(1, 0.25, 0.5), (2, 0.5, 0.5)]
-    lifted = bundle(source, message("alive", 2), message("fseq", 3))
-    assert touches(reader.read(lifted, PEER, now=0.02)) == [(2, 0.5, 0.5)]
-    none = bundle(source, message("alive"), message("fseq", 4))
-    assert touches(reader.read(none, PEER, now=0.03)) == []
+def of(*parts: object, source: str = "table@a") -> bytes:
+    """A bundle of a source with these messages."""
+    return bundle(message("source", source), *parts)
 
 
-def test_reader_drops_late_frames(reader: TuioReader) -> None:
-    """A reordered frame changes nothing, neither positions nor what is alive.
-
-    A redundant one (-1) is never late, and does not make the next one late.
-    """
-    reader.read(frame((1, 0.25, 0.5), fseq=10), PEER, now=0)
-    assert reader.read(frame((1, 0.75, 0.5), (2, 0.5, 0.5), fseq=9), PEER, now=0.01) is None
-    again = bundle(message("source", "table@a"), message("alive", 1), message("fseq", 11))
-    assert touches(reader.read(again, PEER, now=0.02)) == [(1, 0.25, 0.5)]
-    assert touches(reader.read(frame((1, 0.5, 0.5), fseq=-1), PEER, now=0.03)) == [(1, 0.5, 0.5)]
-    assert touches(reader.read(frame((1, 0.75, 0.5), fseq=12), PEER, now=0.04)) == [(1, 0.75, 0.5)]
-    assert counts(reader) == {"late": 1}
+def still(*alive: int, fseq: int) -> bytes:
+    """A bundle in which these cursors are alive, and none is set."""
+    return of(message("alive", *alive), message("fseq", fseq))
 
 
-@pytest.mark.parametrize(("before", "pause"), [(5000, 0.001), (50, 0.6)])
-def test_reader_detects_a_restarted_sender(reader: TuioReader, before: int, pause: float) -> None:
-    """Counting from 1 again is a restart after a fall by over 100 or after a pause; all is new."""
-    reader.read(frame((1, 0.25, 0.5), fseq=before), PEER, now=0)
-    first = bundle(message("source", "table@a"), message("alive", 1), message("fseq", 1))
-    assert touches(reader.read(first, PEER, now=pause)) == []
-    assert touches(reader.read(frame((1, 0.5, 0.5), fseq=2), PEER, now=pause)) == [(1, 0.5, 0.5)]
+OTHER = ("127.0.0.1", 50001)
+HALF = [(1, 0.5, 0.5)]
+QUARTER = [(1, 0.25, 0.5)]
+NAMES = [(0.1, PEER, frame(source=f"s{number}"), ...) for number in range(16)]
+OTHERS = [(0.1, OTHER, frame(source=f"o{number}"), []) for number in range(8)]
+
+Read = tuple[float, tuple[str, int], bytes, Any]
+"""Time [s], peer, datagram, and the touches that are read: None for no frame, ... for anything."""
+
+COURSES: Mapping[str, tuple[dict[str, Any], Sequence[Read]]] = {
+    # One that is alive but not set again stays where it was; one not alive is gone.
+    "unchanged cursors": (
+        {},
+        [
+            (0, PEER, frame((1, 0.25, 0.5), (2, 0.75, 0.5), fseq=1), ...),
+            (
+                0.01,
+                PEER,
+                of(message("alive", 1, 2), cursor(2, 0.5, 0.5), message("fseq", 2)),
+                [*QUARTER, (2, 0.5, 0.5)],
+            ),
+            (0.02, PEER, still(2, fseq=3), [(2, 0.5, 0.5)]),
+            (0.03, PEER, still(fseq=4), []),
+        ],
+    ),
+    # A reordered frame changes nothing, neither positions nor what is alive. A redundant one (-1)
+    # is never late, and does not make the next one late.
+    "late frames": (
+        {"late": 1},
+        [
+            (0, PEER, frame((1, 0.25, 0.5), fseq=10), ...),
+            (0.01, PEER, frame((1, 0.75, 0.5), (2, 0.5, 0.5), fseq=9), None),
+            (0.02, PEER, still(1, fseq=11), QUARTER),
+            (0.03, PEER, frame(*HALF, fseq=-1), HALF),
+            (0.04, PEER, frame((1, 0.75, 0.5), fseq=12), [(1, 0.75, 0.5)]),
+        ],
+    ),
+    # Counting from 1 again is a restart after a fall by over 100 or after a pause; all is new.
+    "restart by the number": (
+        {},
+        [
+            (0, PEER, frame((1, 0.25, 0.5), fseq=5000), ...),
+            (0.001, PEER, still(1, fseq=1), []),
+            (0.001, PEER, frame(*HALF, fseq=2), HALF),
+        ],
+    ),
+    "restart after a pause": (
+        {},
+        [
+            (0, PEER, frame((1, 0.25, 0.5), fseq=50), ...),
+            (0.6, PEER, still(1, fseq=1), []),
+            (0.6, PEER, frame(*HALF, fseq=2), HALF),
+        ],
+    ),
+    # The seventeenth sender is refused and counted until one has been quiet for a while.
+    "senders are bounded": (
+        {"too_many_senders": 1},
+        [
+            *((number / 100, PEER, frame(source=f"s{number}"), []) for number in range(16)),
+            (0.2, PEER, frame(source="s16"), None),
+            (0.51, PEER, frame(source="s16"), []),
+        ],
+    ),
+    # Sixteen names that are never quiet keep no other peer out; both have eight in the end.
+    "a peer with all names gives way": (
+        {"too_many_senders": ...},
+        [*[*NAMES, *OTHERS] * 3, (0.1, OTHER, frame(source="o8"), None)],
+    ),
+    # Not a number and off the sensor are the tracker's to judge; the former is counted.
+    "positions are passed unchecked": (
+        {"not_finite": 1},
+        [
+            (
+                0,
+                PEER,
+                frame((1, math.nan, 0.5), (2, 1.5, -3.0)),
+                [(1, pytest.approx(math.nan, nan_ok=True), 0.5), (2, 1.5, -3.0)],
+            )
+        ],
+    ),
+    # Objects and blobs on the same port are neither frames nor errors.
+    "other profiles": (
+        {},
+        [
+            (
+                0,
+                PEER,
+                bundle(
+                    message("alive", 3, address="/tuio/2Dobj"),
+                    message("fseq", 7, address="/tuio/2Dobj"),
+                ),
+                None,
+            )
+        ],
+    ),
+    # More than eight kilobytes are no touch frame; a hundred cursors are.
+    "oversized bundles": (
+        {"oversized": 1},
+        [
+            (0, PEER, frame(*((id, 0.5, 0.5) for id in range(100))), ...),
+            (0, PEER, frame(*((id, 0.5, 0.5) for id in range(200))), None),
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_reader_follows_its_senders(reader: TuioReader, name: str) -> None:
+    """What is read of each datagram, and what is counted in the end."""
+    expected, datagrams = COURSES[name]
+    for time, peer, datagram, wanted in datagrams:
+        result = reader.read(datagram, peer, now=time)
+        if wanted is not ...:
+            assert (None if result is None else touches(result)) == wanted
+    found = counts(reader)
+    assert found.keys() == expected.keys()
+    assert all(count in (..., found[what]) for what, count in expected.items())
 
 
 def test_sources_are_kept_apart(reader: TuioReader) -> None:
@@ -114,43 +210,6 @@ def test_sources_are_kept_apart(reader: TuioReader) -> None:
         if result
     }
     assert len(names) == 4
-
-
-def test_number_of_senders_is_bounded(reader: TuioReader) -> None:
-    """The seventeenth sender is refused and counted until one has been quiet for a while."""
-    for number in range(16):
-        assert reader.read(frame(source=f"s{number}"), PEER, now=number / 100) is not None
-    assert reader.read(frame(source="s16"), PEER, now=0.2) is None
-    assert counts(reader) == {"too_many_senders": 1}
-    assert reader.read(frame(source="s16"), PEER, now=0.51) is not None
-
-
-def test_peer_with_all_names_gives_way_to_another(reader: TuioReader) -> None:
-    """Sixteen names that are never quiet keep no other peer out; both have eight in the end."""
-    other = ("127.0.0.1", 50001)
-    for _ in range(3):
-        for number in range(16):
-            reader.read(frame(source=f"s{number}"), PEER, now=0.1)
-        for number in range(8):
-            assert reader.read(frame(source=f"o{number}"), other, now=0.1) is not None
-    assert reader.read(frame(source="o8"), other, now=0.1) is None
-
-
-def test_reader_passes_positions_unchecked(reader: TuioReader) -> None:
-    """Not a number and off the sensor are the tracker's to judge; the former is counted."""
-    result = touches(reader.read(frame((1, math.nan, 0.5), (2, 1.5, -3.0)), PEER, now=0))
-    assert math.isnan(result[0][1])
-    assert result[1] == (2, 1.5, -3.0)
-    assert counts(reader) == {"not_finite": 1}
-
-
-def test_reader_ignores_other_profiles(reader: TuioReader) -> None:
-    """Objects and blobs on the same port are neither frames nor errors."""
-    objects = bundle(
-        message("alive", 3, address="/tuio/2Dobj"), message("fseq", 7, address="/tuio/2Dobj")
-    )
-    assert reader.read(objects, PEER, now=0) is None
-    assert counts(reader) == {}
 
 
 def _raw(*sizes_and_parts: tuple[int, bytes]) -> bytes:
@@ -195,14 +254,6 @@ def test_reader_counts_malformed_datagrams(
     assert [record.name for record in caplog.records] == ["test"]
     still = bundle(message("source", "table@a"), message("alive", 1, 2), message("fseq", 2))
     assert touches(reader.read(still, PEER, now=0)) == [(1, 0.25, 0.5)]
-
-
-def test_reader_refuses_oversized_bundles(reader: TuioReader) -> None:
-    """More than eight kilobytes are no touch frame; a hundred cursors are."""
-    many = [(id, 0.5, 0.5) for id in range(200)]
-    assert reader.read(frame(*many[:100]), PEER, now=0) is not None
-    assert reader.read(frame(*many), PEER, now=0) is None
-    assert counts(reader) == {"oversized": 1}
 
 
 @given(st.binary(max_size=200), st.integers(0, 300))

@@ -283,11 +283,7 @@ class ExpectedAmplifier:
         if not low <= left <= max(high, 0.0) and self.watchdog < math.inf:
             must = f"{low:.6g} to {high:.6g}"
             self.report("watchdog", end, f"watchdog_left after {cause}", must=must, seen=left)
-        levels = [QUANTITIES["level"].from_wire(level) for level in shown["levels"]]
-        self.outputs.check_levels(levels, when, report_low=self.report)
-        self.outputs.check_tokens(shown["tokens"], when)
-        self.outputs.note_silent(shown["tokens"], end)
-        self.outputs.check_limited(when, is_limited=flag(shown, "limited"))
+        self.outputs.check(shown, when)
         self._check_voltage(shown, when)
         self.last_status = end
 

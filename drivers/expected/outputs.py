@@ -11,7 +11,7 @@ from typing import Protocol, TypeAlias
 from drivers.playback import Playback, playback_of
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.table import QUANTITIES, STATUS_FLAGS
 from drivers.uncertain_playback import Interval, UncertainPlayback
 
 _LATE = 0.002  # s; by which a set may begin later
@@ -131,12 +131,6 @@ class ExpectedOutputs:
         first = max(ends - lag, start) if has_floor and is_known else when[0]
         return first, max(ends + lag, end if is_known else end + ramp)
 
-    def note_silent(self, tokens: Sequence[int], time: float) -> None:
-        """Note the layers that play nothing by a status at a time; they may still fade."""
-        for layer, until in enumerate(self._unknown):
-            if until == math.inf and (layer >= len(tokens) or not tokens[layer]):
-                self._unknown[layer] = time + _MAX_ENDING + _RAMP.high
-
     # What is known
 
     def _widened(self, when: Interval) -> Interval:
@@ -165,17 +159,62 @@ class ExpectedOutputs:
 
     # What is shown
 
-    def check_levels(
-        self, levels: Sequence[float], when: Interval, *, report_low: Report | None
+    def check(self, shown: Values, when: Interval) -> None:
+        """Compare a status that was true at some time between two; the next counts from there."""
+        states, tokens, start = self.possible(when), shown["tokens"], self._widened(when)[0]
+        levels = [_LEVEL.from_wire(level) for level in shown["levels"]]
+        low = self._check_levels(states, levels, when, self._report)
+        if states:
+            self._check_tokens(states, tokens, when)
+            is_limited = bool(shown["flags"] >> STATUS_FLAGS["limited"] & 1)
+            must_be = low > 1 + _TOLERANCE and self.is_exact and not self.may_derate
+            if must_be > is_limited or (is_limited and self._highest < 1):
+                self._report("plays", when[1], "limited", must=must_be, seen=is_limited)
+        for layer, until in enumerate(self._unknown):
+            if until == math.inf and (layer >= len(tokens) or not tokens[layer]):
+                self._unknown[layer] = when[1] + _MAX_ENDING + _RAMP.high  # it may still fade
+        channels = range(self.playback.channels)
+        self._highest = max(self.playback.peak(channel, start) for channel in channels)
+
+    def check_sensors(
+        self,
+        levels: Sequence[float],
+        frequencies: Mapping[int, float],
+        time: float,
+        *,
+        report_low: Report | None,
     ) -> None:
-        """Compare levels of channels that were true at some time between two.
+        """Compare what sensors measure: levels, and frequencies [Hz] of channels that settled.
 
         report_low: takes levels that are too low, None where they may be.
         """
+        when = time, time
         states = self.possible(when)
+        self._check_levels(states, levels, when, report_low)
+        lag = self._plays.lag + self._slack
+        for channel, frequency in frequencies.items() if len(states) == 1 else ():
+            voices = self.playback.voices_of(channel)
+            lasting = sorted({each.frequency for each in voices if not each.has_ended})
+            is_settled = all(each.transition.end < time - lag for each in voices)
+            if lasting and is_settled and all(abs(each - frequency) > _FINE for each in lasting):
+                what = f"frequency of channel {channel}"
+                self._report("plays", time, what, must=_one_of(lasting), seen=frequency)
+
+    def _check_levels(
+        self,
+        states: Sequence[UncertainPlayback],
+        levels: Sequence[float],
+        when: Interval,
+        report_low: Report | None,
+    ) -> float:
+        """Compare levels of channels; returns the largest level that one surely has."""
         can_be_low = self.may_derate or not self.is_exact or report_low is None
+        start, end = self._widened(when)
+        largest = 0.0
         for channel, level in enumerate(levels[: self.playback.channels] if states else ()):
-            low, high = self._bounds(states, channel, when)
+            bounds = [one.bounds(channel, start, end, is_exact=self.interferes) for one in states]
+            low, high = min(each for each, _ in bounds), max(each for _, each in bounds)
+            largest = max(largest, low)
             voices = len(self.playback.all_voices[channel])
             slack = max((_MAX_STEPS + voices) * self._half_step, _TOLERANCE)
             low, high = min(low, 1.0) * self._has_floor - slack, min(high, 1.0) + slack
@@ -185,14 +224,20 @@ class ExpectedOutputs:
                 what = f"level of channel {channel}, {self._since(when)}"
                 must = f"{low:.6g} to {high:.6g}"
                 report(self._rule(channel, level, when), when[1], what, must=must, seen=level)
+        return largest
 
-    def _bounds(
-        self, states: Sequence[UncertainPlayback], channel: int, when: Interval
-    ) -> Interval:
-        """Return the least and the largest sum of a channel between two times."""
-        start, end = self._widened(when)
-        bounds = [one.bounds(channel, start, end, is_exact=self.interferes) for one in states]
-        return min(low for low, _ in bounds), max(high for _, high in bounds)
+    def _check_tokens(
+        self, states: Sequence[UncertainPlayback], tokens: Sequence[int], when: Interval
+    ) -> None:
+        """Compare the token of each layer."""
+        after = states[-1].copied()
+        after.advance(self._widened(when)[1] + 2 * after.lag)
+        known = [one.playback.tokens for one in (*states, after)]
+        for layer, token in enumerate(tokens):
+            must = {each.get(layer, 0) for each in known}
+            if token not in must:
+                what = f"token of layer {layer}, {self._since(when)}"
+                self._report("token", when[1], what, must=_one_of(must), seen=token)
 
     def _since(self, when: Interval) -> str:
         low, high = 1e3 * (when[0] - self.began[1]), 1e3 * (when[1] - self.began[0])
@@ -208,46 +253,6 @@ class ExpectedOutputs:
             return "silent"
         before = self._before[channel] if channel < len(self._before) else 0.0
         return "commit" if abs(level - before) < _TOLERANCE else "plays"
-
-    def check_tokens(self, tokens: Sequence[int], when: Interval) -> None:
-        """Compare the token of each layer."""
-        states = self.possible(when)
-        if not states:
-            return
-        after = states[-1].copied()
-        after.advance(self._widened(when)[1] + 2 * after.lag)
-        known = [one.playback.tokens for one in (*states, after)]
-        for layer, token in enumerate(tokens):
-            must = {each.get(layer, 0) for each in known}
-            if token not in must:
-                what = f"token of layer {layer}, {self._since(when)}"
-                self._report("token", when[1], what, must=_one_of(must), seen=token)
-
-    def check_limited(self, when: Interval, *, is_limited: bool) -> None:
-        """Compare whether a sum was limited since the last status, and begin anew."""
-        channels, states = range(self.playback.channels), self.possible(when)
-        if states:
-            low = max(self._bounds(states, channel, when)[0] for channel in channels)
-            must_be = low > 1 + _TOLERANCE and self.is_exact and not self.may_derate
-            if is_limited and self._highest < 1:
-                self._report("plays", when[1], "limited", must=False, seen=True)
-            elif must_be and not is_limited:
-                self._report("plays", when[1], "limited", must=True, seen=False)
-        start = self._widened(when)[0]
-        self._highest = max(self.playback.peak(channel, start) for channel in channels)
-
-    def check_frequencies(self, measured: Mapping[int, float], time: float) -> None:
-        """Compare the frequency [Hz] that a channel vibrates with, where it must have settled."""
-        if len(self.possible((time, time))) != 1:
-            return
-        for channel, frequency in measured.items():
-            voices = self.playback.voices_of(channel)
-            lasting = sorted({each.frequency for each in voices if not each.has_ended})
-            lag = self._plays.lag + self._slack
-            is_settled = all(each.transition.end < time - lag for each in voices)
-            if lasting and is_settled and all(abs(each - frequency) > _FINE for each in lasting):
-                what = f"frequency of channel {channel}"
-                self._report("plays", time, what, must=_one_of(lasting), seen=frequency)
 
 
 def _one_of(known: Sequence[object] | set[int]) -> str:

@@ -178,6 +178,5 @@ class WatchedAmplifier(ExpectedAmplifier):
         is_fault_possible = self.is_enabled or not self.is_shown
         report_low = self.report_silence if is_fault_possible else self.report
         may_be_off = self.is_enabled and time > self.expiry[0] - self.slack
-        when = time, time
-        self.outputs.check_levels(levels, when, report_low=None if may_be_off else report_low)
-        self.outputs.check_frequencies(frequencies, time)
+        report = None if may_be_off else report_low
+        self.outputs.check_sensors(levels, frequencies, time, report_low=report)

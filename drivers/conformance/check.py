@@ -205,6 +205,8 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Exceptio
             if subject.level < step:
                 raise CommandError(f"level must be at least {step:g}, its step, got {level:g}")
             await subject.rest()
+        else:
+            await subject.watch()
         rows = check.run(subject)
         await (rows if isawaitable(rows) else subject.run(rows))
         if client.heard:

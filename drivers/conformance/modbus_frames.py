@@ -11,11 +11,11 @@ from drivers.codec.modbus.adu import (
     EXCEPTION,
     READ,
     WRITE,
-    Adu,
-    checked,
     framed,
     read_pdu,
+    response_form,
     response_size,
+    split_rtu,
     split_tcp,
     write_pdu,
 )
@@ -67,21 +67,12 @@ class ModbusClient(Client):
 
     def received(self, data: bytes) -> None:
         """Take bytes from the port."""
-        self._buffer += data
-        for adu in self._split():
+        split = partial(split_rtu, size_of=response_size) if self.is_rtu else split_tcp
+        found, self._buffer = split(self._buffer + data)
+        for adu in found:
             expect(bool(adu.pdu), "response", expected="a valid frame", seen=adu.raw.hex())
             heard = Heard(clock.now(), adu.transaction, adu.pdu[0], (), (adu.unit, adu.pdu))
             self.take(heard)
-
-    def _split(self) -> list[Adu]:
-        if not self.is_rtu:
-            found, self._buffer = split_tcp(self._buffer)
-            return found
-        found = []
-        while 0 < (size := response_size(self._buffer)) <= len(self._buffer):
-            frame, self._buffer = self._buffer[:size], self._buffer[size:]
-            found.append(checked(frame) or Adu(frame[0], b"", raw=frame))
-        return found
 
     def adu(self, pdu: bytes, *, unit: int | None = None) -> bytes:
         """Return a PDU in a frame under the next transaction number."""
@@ -100,16 +91,17 @@ class ModbusClient(Client):
         unit, response = heard.frame
         seen = unit, response[0] & ~EXCEPTION
         expect_equal(seen, (self.address, pdu[0]), "unit, function of a response")
-        if response[0] == WRITE:
-            expect_equal(response, pdu[:5], "response to a write")
+        head, size = response_form(pdu)
+        if not response[0] & EXCEPTION:
+            seen = response[: len(head)], len(response)
+            expect_equal(seen, (head, size), f"first bytes, size of the response to {pdu[:5]!r}")
         return response, When(sent, heard.at)
 
     async def read(self, first: int, count: int, *, function: int = READ) -> tuple[int, ...]:
         """Read registers; Violation for an exception."""
         response, _ = await self.transact(read_pdu(first, count, function=function))
-        what = f"head of the response to a read of {count} registers from {first}"
-        head = bytes([function, 2 * count])
-        expect_equal((response[:2], len(response)), (head, 2 + 2 * count), what)
+        what = f"function of the response to a read of {count} registers from {first}"
+        expect_equal(response[0], function, what)
         return struct.unpack(f">{count}H", response[2:])
 
     async def hello(self) -> Values:

@@ -23,9 +23,10 @@ def achieved_problem(
     shares: dict[int, float] = {}
     if beyond := found.keys() - {tone.channel for tone in one.commands}:
         return "commit", "channels that are not driven", "none", sorted(beyond)
-    if found and (reply["ramp"], reply["valid_for"]) != (one.ramp, one.valid_for):
-        seen = reply["ramp"], reply["valid_for"]
-        return "plays", "ramp, valid_for", (one.ramp, one.valid_for), seen
+    names = ("layer", "ramp", "valid_for") if found else ("layer",)
+    must, seen = [getattr(one, name) for name in names], [reply[name] for name in names]
+    if must != seen:
+        return "plays", ", ".join(names), must, seen
     for tone in one.commands:
         requested = {name: getattr(tone, name) for name in TONE}
         got = found.get(tone.channel, {**requested, "level": 0})

@@ -280,7 +280,8 @@ class ExpectedAmplifier:
         slack = self._left_slack + self.slack
         low = self.watchdog - (end - self.fed[0]) - slack if self.is_enabled else 0.0
         high = self.watchdog - (when[0] - self.fed[1]) + slack if self.is_enabled else 0.0
-        if not low <= left <= max(high, 0.0) and self.watchdog < math.inf:
+        is_unknown = self.is_enabled and self.watchdog == math.inf
+        if not (low <= left <= max(high, 0.0) or is_unknown):
             must = f"{low:.6g} to {high:.6g}"
             self.report("watchdog", end, f"watchdog_left after {cause}", must=must, seen=left)
         self.outputs.check(shown, when)
@@ -394,7 +395,7 @@ class ExpectedAmplifier:
         """Compare what a layer plays with what it must."""
         outputs, problems = self.outputs, list[Problem]()
         can_scale = outputs.may_derate or not outputs.is_exact
-        for one in outputs.possible(when) if self.is_enabled else ():
+        for one in outputs.possible(when):
             playing, token = one.playback.playing(number), one.playback.tokens.get(number, 0)
             problem: Problem | None = ("token", "token", token, reply["token"])
             if reply["token"] == token:

@@ -11,9 +11,10 @@ from drivers.codec.modbus.adu import (
     READS,
     WRITE,
     Adu,
-    checked,
     request_size,
+    response_form,
     response_size,
+    split_rtu,
     split_tcp,
 )
 from drivers.codec.modbus.registers import (
@@ -44,31 +45,6 @@ from sim.witness.decoded import (
     request_of,
 )
 
-
-def split_rtu(direction: Direction, data: bytes) -> tuple[list[Adu], bytes]:
-    """Split bytes by functions, which determine lengths, and CRC-16; returns what is left, too."""
-    size_of = request_size if direction == "amplifier" else response_size
-    found: list[Adu] = []
-    begin = 0
-    while begin + _RTU_MIN <= len(data):
-        adu = checked(data, begin, size_of(data[begin:]))
-        if adu is None:
-            begin += 1
-            continue
-        if begin:
-            found.append(_no_frame(data[:begin]))
-        found.append(adu)
-        begin, data = 0, data[begin + len(adu.raw) :]
-    if len(data) >= max(_RTU_MIN, size_of(data)):  # it cannot become an ADU
-        return [*found, _no_frame(data)], b""
-    return found, data
-
-
-def _no_frame(data: bytes) -> Adu:
-    return Adu(0, b"", raw=data)
-
-
-_RTU_MIN = 4  # bytes
 _PAUSE = 0.04  # s; a longer pause ends a partial frame on RTU
 
 
@@ -92,16 +68,14 @@ class _Transaction:
 
     def problem_of(self, response: Adu) -> str:
         """Describe why something is no response to it; "" if it is one."""
-        function, got, body = self.adu.pdu[0], response.pdu[0], response.pdu[1:]
-        if got == function | EXCEPTION and len(body) == 1:
+        function, got = self.adu.pdu[0], response.pdu[0]
+        if got == function | EXCEPTION and len(response.pdu) == 2:
             return ""
         if got != function:
             return f"function must be {function}, got {got}"
-        if function == WRITE:
-            is_echo = body == struct.pack(">HH", self.address, self.count)
-            return "" if is_echo else "address and count must be those that were written"
-        is_whole = len(body) == 1 + 2 * self.count and body[0] == 2 * self.count
-        return "" if is_whole else f"registers must be {self.count}"
+        head, size = response_form(self.adu.pdu)
+        is_whole = len(response.pdu) == size and response.pdu.startswith(head)
+        return "" if is_whole else f"response must be {size} bytes from {head.hex()} on"
 
 
 class ModbusDecoder(Decoder):
@@ -131,8 +105,9 @@ class ModbusDecoder(Decoder):
             found, self.rest[direction] = split_tcp(before + data)
             return found
         is_late = before and time > self._last.get(direction, time) + _PAUSE
-        cut_off = [_no_frame(before)] if is_late else []
-        found, self.rest[direction] = split_rtu(direction, data if is_late else before + data)
+        cut_off = [Adu(0, b"", raw=before)] if is_late else []
+        size_of = request_size if direction == "amplifier" else response_size
+        found, self.rest[direction] = split_rtu(data if is_late else before + data, size_of)
         self._last[direction] = time
         return [*cut_off, *found]
 

@@ -5,7 +5,7 @@ counted.
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -101,6 +101,35 @@ def response_size(data: bytes) -> int:
     return 8 if function in _ECHOING else 0
 
 
+def split_rtu(data: bytes, size_of: Callable[[bytes], int]) -> tuple[list[Adu], bytes]:
+    """Split bytes that were heard by CRCs and lengths; returns what is left, too.
+
+    size_of: `request_size` or `response_size`.
+    """
+    found: list[Adu] = []
+    start = 0
+    while start + _RTU_MIN <= len(data):
+        adu = checked(data, start, size_of(data[start:]))
+        if adu is None:
+            start += 1
+            continue
+        if start:
+            found.append(Adu(0, b"", raw=data[:start]))
+        found.append(adu)
+        start, data = 0, data[start + len(adu.raw) :]
+    if len(data) >= max(_RTU_MIN, size_of(data)):  # it cannot become an ADU
+        return [*found, Adu(0, b"", raw=data)], b""
+    return found, data
+
+
+def response_form(pdu: bytes) -> tuple[bytes, int]:
+    """Return the first bytes of the response to a PDU that reads or writes registers; its size."""
+    if pdu[0] == WRITE:
+        return pdu[:5], 5
+    count = int.from_bytes(pdu[3:5], "big")
+    return bytes([pdu[0], 2 * count % 256]), 2 + 2 * count
+
+
 @dataclass(frozen=True)
 class RequestAdu:
     """A request to one unit: its frame, and what identifies its response.
@@ -133,14 +162,9 @@ def build_adu(
     unit: int, transaction: int, address: int, transfer: int | Sequence[int], *, is_rtu: bool
 ) -> RequestAdu:
     """Build the request of registers from an address on: how many to read, or those to write."""
-    if isinstance(transfer, int):
-        pdu = read_pdu(address, transfer)
-        head, size = bytes([READ, 2 * transfer]), 2 + 2 * transfer
-    else:
-        pdu = write_pdu(address, transfer)
-        head, size = pdu[:5], 5
+    pdu = read_pdu(address, transfer) if isinstance(transfer, int) else write_pdu(address, transfer)
     frame = framed(unit, pdu, transaction, is_rtu=is_rtu)
-    return RequestAdu(unit, transaction, frame, head, size)
+    return RequestAdu(unit, transaction, frame, *response_form(pdu))
 
 
 class ResponseReader:

@@ -6,16 +6,14 @@ Bytes are forwarded before they are checked, to add as little latency as possibl
 import asyncio
 import contextlib
 import logging
-import os
 import time
 from asyncio import StreamReader, StreamWriter
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
-import serial
-
 from drivers.errors import CommandError, LinkError
+from drivers.ports.serial_port import open_port
 from drivers.urls import Place
 from drivers.wires.known import address_of
 from model.errors import InputError
@@ -33,16 +31,17 @@ _KINDS = {
 
 @dataclass(frozen=True)
 class WireEndpoint:
-    """A parsed URL. kind: of wire; location: device or HOST:PORT; address: on the wire.
-
-    baud: of a serial device, 0 for a port of the network.
-    """
+    """A parsed URL. kind: of wire; place: its device or port of the network; address: on it."""
 
     url: str
     kind: str
-    location: str
+    place: Place
     address: int
-    baud: int
+
+    @property
+    def location(self) -> str:
+        """The device, or HOST:PORT."""
+        return self.place.name
 
     def url_via(self, other: str) -> str:
         """The URL with another location."""
@@ -60,7 +59,7 @@ def parse_endpoint(url: str) -> WireEndpoint:
     if kind is None or not isinstance(place, Place) or place.name not in url:
         known = ", ".join(_KINDS)
         raise InputError(f"{url}: scheme must be one of {known}, with a device or HOST:PORT")
-    return WireEndpoint(url, kind, place.name, address.number, place.baud if place.device else 0)
+    return WireEndpoint(url, kind, place, address.number)
 
 
 _READ_MAX = 4096
@@ -84,7 +83,7 @@ async def relays(
     async with contextlib.AsyncExitStack() as stack:
         for endpoint, name in zip(endpoints, names, strict=True):
             if endpoint.location not in relayed:
-                relay = _serial_relay if endpoint.baud else _tcp_relay
+                relay = _serial_relay if endpoint.place.device else _tcp_relay
                 relayed[endpoint.location] = await stack.enter_async_context(
                     relay(endpoint, name, observer)
                 )
@@ -126,83 +125,54 @@ async def _serial_relay(
     endpoint: WireEndpoint, name: str, observer: _Observer
 ) -> AsyncIterator[str]:
     """Relay a serial port through a pseudo-terminal."""
-    try:
-        port = serial.Serial(endpoint.location, baudrate=endpoint.baud, timeout=0, exclusive=True)
-    except (OSError, ValueError) as problem:
-        number = getattr(problem, "errno", None)
-        reason = os.strerror(number) if number else problem
-        raise LinkError(
-            f"serial port {endpoint.location}: cannot be opened: {reason}; check its name, and "
-            "close other programs that use it"
-        ) from problem
-    loop = asyncio.get_running_loop()
 
     def to_amplifier(data: bytes) -> None:
         before = time.monotonic()  # it arrives afterwards, however long this program is delayed
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(LinkError):
             port.write(data)
         observer.record(name, "amplifier", before, data)
 
-    terminal = PseudoTerminal(to_amplifier)
-
-    def to_host() -> None:
-        try:
-            data = os.read(port.fileno(), _READ_MAX)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
+    def to_host(data: bytes) -> None:
         at = time.monotonic()
-        if data:
-            terminal.write(data)
-            observer.record(name, "host", at, data)
-        else:
-            loop.remove_reader(port.fileno())
-            observer.witness.closed(name, at)
+        terminal.write(data)
+        observer.record(name, "host", at, data)
 
-    with contextlib.closing(port), contextlib.closing(terminal):
-        loop.add_reader(port.fileno(), to_host)
-        terminal.listen()
+    def lost(cause: str) -> None:
+        observer.witness.closed(name, time.monotonic())
+
+    terminal = PseudoTerminal(to_amplifier)
+    with contextlib.closing(terminal):
+        port = await open_port(endpoint.place, to_host, lost)
         try:
+            terminal.listen()
             yield terminal.port
         finally:
-            loop.remove_reader(port.fileno())
+            port.close()
+            await port.wait_closed()
 
 
 @asynccontextmanager
 async def _tcp_relay(endpoint: WireEndpoint, name: str, observer: _Observer) -> AsyncIterator[str]:
     """Relay a server through a port of the loopback interface."""
-    host, _, port = endpoint.location.rpartition(":")
     running: set[asyncio.Task[None]] = set()
 
-    async def forward(source: StreamReader, sink: StreamWriter, direction: Direction) -> None:
-        with contextlib.suppress(OSError):
-            while data := await source.read(_READ_MAX):
-                before = time.monotonic()
-                sink.write(data)
-                observer.record(name, direction, before, data)
-
     async def relay(from_host: StreamReader, to_host: StreamWriter) -> None:
+        def received(data: bytes) -> None:
+            at = time.monotonic()
+            to_host.write(data)
+            observer.record(name, "host", at, data)
+
         with contextlib.closing(to_host):
             try:
-                from_amplifier, to_amplifier = await asyncio.open_connection(host, int(port))
-            except OSError as problem:
-                _logger.warning(
-                    "%s: connection refused (%s), closing the relayed one; check power and URL",
-                    endpoint.location,
-                    problem.strerror or problem,
-                )
+                port = await open_port(endpoint.place, received, lambda cause: to_host.close())
+            except LinkError as problem:
+                _logger.warning("%s; closing the relayed connection", problem)
                 return
-            with contextlib.closing(to_amplifier):
-                ways = [
-                    asyncio.ensure_future(forward(from_host, to_amplifier, "amplifier")),
-                    asyncio.ensure_future(forward(from_amplifier, to_host, "host")),
-                ]
-                try:
-                    await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
-                finally:
-                    for way in ways:
-                        way.cancel()
+            with contextlib.closing(port), contextlib.suppress(OSError, LinkError):
+                while data := await from_host.read(_READ_MAX):
+                    before = time.monotonic()
+                    port.write(data)
+                    observer.record(name, "amplifier", before, data)
 
     def opened(from_host: StreamReader, to_host: StreamWriter) -> None:
         observer.witness.opened(name, time.monotonic())

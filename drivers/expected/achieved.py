@@ -23,7 +23,7 @@ def achieved_problem(
     shares: dict[int, float] = {}
     if beyond := found.keys() - {tone.channel for tone in one.commands}:
         return "commit", "channels that are not driven", "none", sorted(beyond)
-    names = ("layer", "ramp", "valid_for") if found else ("layer",)
+    names = ("layer", "ramp") if found else ("layer",)
     must, seen = [getattr(one, name) for name in names], [reply[name] for name in names]
     if must != seen:
         return "plays", ", ".join(names), must, seen

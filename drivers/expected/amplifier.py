@@ -9,7 +9,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-from drivers.expected.achieved import TONE, Problem, achieved_problem
+from drivers.expected.achieved import Problem, achieved_problem
 from drivers.expected.outputs import ExpectedOutputs, Report, Unclear
 from drivers.expected.sets import ExpectedSet
 from drivers.protocol.records import Values
@@ -235,10 +235,6 @@ class ExpectedAmplifier:
         elif known and seen not in known:
             what = f"missing, staged, played after part {part['index']} of set {token}"
             self.report("commit", end, what, must=" or ".join(map(str, known)), seen=seen)
-        is_fine = all(self.can.get(f"{each}_step", 1) <= 1 for each in TONE)
-        is_fine = is_fine and not self.outputs.may_derate
-        if is_fine and any(seen[1:]):
-            self._expect("plays", end, f"exact of set {token}", 1, reply["exact"])
         if reply["played"]:
             self._play(token, when)
 
@@ -402,6 +398,9 @@ class ExpectedAmplifier:
                 problem = achieved_problem(
                     playing, reply, self.can, is_exact=outputs.is_exact, can_scale=can_scale
                 )
+            lasting = outputs.lasting.get(number, {0})
+            if problem is None and reply["commands"] and reply["valid_for"] not in lasting:
+                problem = "plays", "valid_for", sorted(lasting), reply["valid_for"]
             if problem is None:
                 return
             problems.append(problem)

@@ -49,7 +49,8 @@ class ExpectedOutputs:
 
     can: its capabilities, empty while unknown; slack [s]: of times. began: when what plays was
     changed last, by its cause. is_exact: levels are those asked for, to the step; may_derate: or
-    lower, since it is warm. interferes: levels show how tones of one frequency interfere.
+    lower, since it is warm. interferes: levels show how tones of one frequency interfere. lasting:
+    `valid_for` that a layer may show, of its set, a renewal or what waits.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class ExpectedOutputs:
         self._half_step = can.get("level_step", 1) / 2 / _LEVEL.per_unit
         self._has_floor = True  # or levels may be lower: of a fault, whose fade may be shorter
         self._unknown = [-math.inf] * _LAYERS  # until when what a layer plays is unknown [s]
+        self.lasting: dict[int, set[int]] = {}
         self._before: Sequence[float] = ()  # levels of channels before the last set
         self._highest = 0.0  # of the sums of a channel since the last status, at most
 
@@ -105,6 +107,10 @@ class ExpectedOutputs:
         self._before = [*map(self.playback.settled, channels)]
         for one in layers:
             number, ends = one.layer, self.playback.end_of(one.layer)
+            lasting = self.lasting.setdefault(number, set())
+            if not (one.renew or one.after):
+                lasting.clear()
+            lasting.add(one.valid_for)
             half = self._plays.half[number]
             is_ending = start - half <= ends <= end + half
             if is_ending and (one.renew or any(each.keep_phase for each in one.commands)):

@@ -230,9 +230,9 @@ class ExpectedAmplifier:
             return
         known = self.sets.taken(part, reply, when)
         seen = reply["missing"], reply["staged"], reply["played"]
-        if not known and self._unclear is not None:
+        if known is None and self._unclear is not None:
             self._unclear("a part came as its set expired")
-        elif known and seen not in known:
+        elif known is not None and seen not in known:
             what = f"missing, staged, played after part {part['index']} of set {token}"
             self.report("commit", end, what, must=" or ".join(map(str, known)), seen=seen)
         if reply["played"]:

@@ -58,10 +58,10 @@ class ExpectedSet:
             return -math.inf, -math.inf
         return self._began[0] + STAGED_LIFE, self._began[1] + STAGED_LIFE
 
-    def taken(self, part: Values, reply: Values, when: Interval) -> list[Sequence[int]]:
+    def taken(self, part: Values, reply: Values, when: Interval) -> list[Sequence[int]] | None:
         """Note the reply to a part that came within an interval.
 
-        Returns what it may say: missing, staged and played; nothing where its set expired just
+        Returns what it may say: missing, staged and played; None where its set expired just
         then. A part without a reply may have come.
         """
         token, count = part["token"], part["parts"]
@@ -79,5 +79,7 @@ class ExpectedSet:
             if index not in self._taken:
                 possible.append((index, 0, 0))
             if index not in self._sent:
-                return possible * (not is_unclear)
-        return [*possible, (0, 1 - part["now"], part["now"])] * (not is_unclear)
+                break
+        else:
+            possible.append((0, 1 - part["now"], part["now"]))
+        return None if is_unclear else possible

@@ -13,10 +13,11 @@ from contextlib import (
 )
 from dataclasses import dataclass, field, replace
 from functools import partial
-from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from drivers.codec.can_bus.canopen import BITRATE
-from drivers.urls import ADDRESS, BAUD, RTU_BAUD
+from drivers.errors import CommandError
+from drivers.urls import ADDRESS, BAUD, RTU_BAUD, Place
+from drivers.wires.known import address_of
 from model.errors import InputError
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.can_bus.adapters import BUS_NAME, SlcanAdapter, SocketcandClient
@@ -216,32 +217,22 @@ def _wire_of_option(text: str, option: str, defaults: Wire) -> Wire:
 
 
 def _wire_of_url(name: str, url: str, defaults: Wire) -> Wire:
-    """The wire that a URL names."""
-    parts = urlsplit(url)
-    kind = _KIND_OF_SCHEME.get(parts.scheme)
-    try:
-        port = parts.port if kind in _PORTED else None
-    except ValueError as error:
-        raise InputError(f"amplifier {name}: {url}: invalid port: {error}") from None
-    if kind is None or (kind in _PORTED and port is None):
+    """The wire that a URL names; amplifiers whose URLs name one line share it."""
+    kind, place = _KIND_OF_SCHEME.get(url.partition("://")[0].lower()), Place()
+    if kind is not None:
+        try:
+            address = address_of(url)
+        except CommandError as problem:
+            raise InputError(f"amplifier {name}: {problem}") from problem
+        place = getattr(address, "place", place)
+    is_ported = kind in _PORTED
+    if kind is None or (is_ported and place.name not in url):
         schemes = ", ".join(_KIND_OF_SCHEME)
         raise InputError(
             f"amplifier {name}: scheme must be one of {schemes}, with a port over TCP, got {url}; "
             "add --serial (a pseudo-terminal each), --modbus-tcp PORT, --modbus-rtu, --socketcand "
             f"PORT or --slcan for all, or --wire {name}=serial"
         )
-    wire = replace(defaults, kind=kind, port=port or 0, address=_address(parts))
-    if port is None:  # amplifiers whose URLs name one line share it
-        wire = replace(wire, line=parts.netloc + parts.path, shared=True)
-    return wire
-
-
-def _address(parts: SplitResult) -> int | None:
-    """The unit, node or address in a URL."""
-    if parts.scheme == "modbus+tcp":
-        text = parts.path.strip("/")
-    elif parts.scheme == "serial":
-        text = parse_qs(parts.query).get("address", [""])[0]
-    else:
-        text = parts.fragment
-    return int(text) if text.isascii() and text.isdigit() and int(text) > 0 else None
+    if is_ported:
+        return replace(defaults, kind=kind, port=place.port, address=address.number)
+    return replace(defaults, kind=kind, address=address.number, line=place.name, shared=True)

@@ -133,8 +133,8 @@ def on_held_out(
     felt = felt_on(table, question, excitation, plates)
     assert felt.contrast is not None
     return (
-        float(np.percentile(decibels(felt.contrast.felt[0]), 10)),
-        float(np.percentile(decibels(felt.level[0]), 10)),
+        float(np.percentile(decibels(felt.contrast), 10)),
+        float(np.percentile(decibels(felt.level), 10)),
     )
 
 

@@ -38,7 +38,7 @@ def check_figure(
     """Draw three panels, with one mark for each touch; crosses where nothing is felt.
 
     Level: what is felt less what is promised, the worse of alone and beside a resting finger;
-    frequency; and how far a resting finger feels less on nine of ten plates. Below, fingers in two
+    frequency; and how far a resting finger feels less, as promised. Below, fingers in two
     and in three regions at once, at their worst places, and what the worst one is promised.
     """
     ratio = table.plate.width / table.plate.length
@@ -47,7 +47,7 @@ def check_figure(
     panels: list[tuple[str, Callable[[CheckedEffect, SimulatedTouch], float | None]]] = [
         ("felt minus promised / dB", _off_level),
         ("frequency / Hz", _frequency),
-        ("above a resting second finger\non nine of ten plates / dB", _contrast),
+        ("above a resting second finger\npromised / dB", _contrast),
     ]
     low, high = float(table.frequencies[0]), float(table.frequencies[-1])
     scales: list[tuple[Normalize, str]] = [

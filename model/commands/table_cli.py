@@ -182,17 +182,17 @@ def _answer(
     if as_json:
         print(json.dumps(found))
         return
-    print("finger [m]         frequency   level  contrast  foreign level")
+    print("finger [m]         frequency       level  contrast  foreign level")
     for layer in found["layers"]:
         print(
             f"{_place(layer):18s} {_cell(layer['frequency_hz'], 'Hz'):>9s} "
-            f"{_cell(layer['promised_level_db_sl']):>7s} "
+            f"{_cell(layer['promised_level_db_sl'], 'dB SL'):>10s} "
             f"{_cell(layer['robust_felt_contrast_db'], 'dB'):>9s} "
             f"{_cell(layer['foreign_level_db_sl'], 'dB SL'):>14s}  {layer['verdict']}"
         )
     for finger in found["quiet"]:
         print(
-            f"{_place(finger):18s} {'':9s} {'':7s} "
+            f"{_place(finger):18s} {'':9s} {'':10s} "
             f"{_cell(finger['robust_felt_contrast_db'], 'dB'):>9s} "
             f"{_cell(finger['foreign_level_db_sl'], 'dB SL'):>14s}  quiet"
         )

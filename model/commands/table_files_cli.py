@@ -161,7 +161,10 @@ def contrast_map(
     inches = figure_size(size)
     is_csv = output is not None and output.suffix.lower() == ".csv"
     if output is not None:
-        check_place(output, example="map.csv") if is_csv else check_picture(output)
+        if is_csv:
+            check_place(output, example="map.csv")
+        else:
+            check_picture(output, instead=", or that of a table in .csv")
     fingers = [parse_point(text, what="--quiet") for text in quiet]
     places = Grid(*parse_pair(grid, what="--grid")) if grid else None
     table = load_table(table_file)

@@ -2,8 +2,8 @@
 
 A drive is a complex weight for each ERA at each frequency. It is ranked by its robust score: the
 amplitude at the target, over the root of the expected power at the loudest quiet fingertip, over
-all plates within the rig's uncertainty (`model.ensemble.touched_plate`). The optimum for the plate
-as modelled relies on cancellation and is 10 dB worse on a real one.
+all plates within the rig's uncertainty (`model.ensemble.touched_plate`). The optimum for the
+nominal plate relies on cancellation and is 10 dB worse on a real one.
 
 Tones of different frequencies are felt together as the root of the sum of their squares over the
 detection thresholds, and so are a score's powers: each in units of its threshold.

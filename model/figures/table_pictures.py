@@ -152,7 +152,7 @@ def answer_figure(table: LocalizationTable) -> Figure:
         draw_fingertip(axes, place, felt=False)
     draw_level_scale(figure, [axes], shrink=0.8)
     axes.set_title(
-        f"Felt contrast at least {pattern.robust_felt_contrast_db:.0f} dB on nine of ten plates, "
+        f"Felt contrast {pattern.robust_felt_contrast_db:.0f} dB promised, "
         f"{pattern.felt_contrast_db:.0f} dB nominal\n"
         f"{_in_words(table, pattern)}",
         fontsize=10,

@@ -42,16 +42,19 @@ def begins_with(path: Path, start: bytes) -> bool:
         return stream.read(len(start)) in (start, b"")
 
 
-def check_picture_name(path: Path) -> None:
-    """Raise InputError for an ending that is not in PICTURE_ENDINGS."""
+def check_picture_name(path: Path, *, instead: str = "") -> None:
+    """Raise InputError for an ending that is not in PICTURE_ENDINGS.
+
+    instead: what other ending the caller takes, in words.
+    """
     if path.suffix.lower() not in PICTURE_ENDINGS:
         raise InputError(
             f"{path}: a picture's name must end in {', '.join(PICTURE_ENDINGS[:-1])} or "
-            f"{PICTURE_ENDINGS[-1]}, for instance {path.stem}.png"
+            f"{PICTURE_ENDINGS[-1]}{instead}, for instance {path.stem}.png"
         )
 
 
-def check_picture(path: Path) -> None:
+def check_picture(path: Path, *, instead: str = "") -> None:
     """Raise InputError for a path to which no picture can be written; call before long work."""
-    check_picture_name(path)
+    check_picture_name(path, instead=instead)
     check_place(path, example="map.png")

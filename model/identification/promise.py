@@ -4,16 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import FloatArray, least_gap
+from model.arrays import FloatArray
 from model.ensemble.measures import PERCENTILE
 from model.identification.identify import Identification
 from model.table.build import build_table
 from model.table.exact_plates import draw_plates, felt_on
-from model.table.question import MIN_LEVEL_DB_SL, Point, Question
-from model.table.table import LocalizationTable
+from model.table.question import MIN_LEVEL_DB_SL, Question
+from model.table.random_contacts import MIN_DISTANCE, random_contacts
 
 _PLATES = 60
-_APART, _MARGIN = 0.05, 0.013  # m, of fingers from each other and from the edges
+_MARGIN = 0.013  # m, of fingers from the edges
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,15 @@ def expected_contrast(
         build_table(rig, frequencies=frequencies, drive_mode="phased")
         for rig in (found.before, found.rig)
     )
-    expected = []
+    expected, plate = [], identified.plate
+    shorter = min(plate.length, plate.width)
+    margin = min(_MARGIN, shorter / 4)
     for quiet in (1, 2, 3):
         rng = np.random.default_rng([found.seed, quiet])
+        apart = min(MIN_DISTANCE, shorter / (2 * (quiet + 1)))
         rows = []
         for _ in range(sets):
-            places = _contacts(rng, quiet + 1, identified)
+            places = random_contacts(rng, quiet + 1, plate, margin=margin, apart=apart)
             question = Question(places[:1], places[1:], level_db_sl=MIN_LEVEL_DB_SL)
             plates = draw_plates(
                 rng,
@@ -63,18 +66,8 @@ def expected_contrast(
                 drive = table.query(question).excitation
                 contrast = felt_on(identified, question, drive, plates).contrast
                 assert contrast is not None  # noqa: S101  there are quiet fingers
-                each.append(20 * np.log10(contrast.acceleration[0]))
+                each.append(20 * np.log10(contrast))
             before, after = each
             rows.append((np.median(before), np.median(after), np.percentile(after, PERCENTILE)))
         expected.append(ExpectedContrast(quiet, *np.median(rows, axis=0).tolist()))
     return expected
-
-
-def _contacts(rng: np.random.Generator, count: int, table: LocalizationTable) -> tuple[Point, ...]:
-    """Random contacts on a plate, apart from each other as fingers are."""
-    sides = np.array([table.plate.length, table.plate.width])
-    margin, apart = min(_MARGIN, sides.min() / 4), min(_APART, sides.min() / (2 * count))
-    while True:
-        places = rng.uniform(margin, sides - margin, (count, 2))
-        if least_gap(places) > apart:
-            return tuple((float(x), float(y)) for x, y in places)

@@ -12,12 +12,13 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 from model.arguments import expect_at_least
 from model.choice import best_by, best_of
 from model.drive_modes.tones import excitation_of
 from model.errors import InputError
-from model.table.contents import Contents, Stream
+from model.table.contents import Contents, Stream, Tones
 from model.table.contents_kernel import choose_tones
 from model.table.request import (
     APART_HZ,
@@ -221,23 +222,10 @@ class _Answering:
                 weights, self.table.eras, self.table.frequencies, gain=found.gains[number]
             )
             for finger in stream.targets:
-                level, promised_level = found.level_db_sl[finger]
-                figures = *found.contrast_db[finger], found.foreign_db_sl[finger]
-                nominal, median, promised, others_level = [
-                    None if math.isnan(each) else each for each in figures
-                ]
+                figures = figures_of(found, finger)
                 is_shared = finger != stream.targets[0]
-                layers[finger] = Layer(
-                    self.requests[finger],
-                    excitation,
-                    "shared" if is_shared else verdict_of(promised),
-                    level_db_sl=level,
-                    promised_level_db_sl=promised_level,
-                    felt_contrast_db=nominal,
-                    median_felt_contrast_db=median,
-                    promised_contrast_db=promised,
-                    foreign_level_db_sl=others_level,
-                )
+                verdict = "shared" if is_shared else verdict_of(figures["promised_contrast_db"])
+                layers[finger] = Layer(self.requests[finger], excitation, verdict, **figures)
         heard = [-math.inf] * len(self._every) if found is None else found.foreign_db_sl
         for finger, contrast, is_disturbing in plan.held:
             layers[finger] = Layer(
@@ -264,6 +252,21 @@ class _Answering:
             1.0 if found is None else found.stroke_factor,
             applied,
         )
+
+
+def figures_of(tones: Tones, finger: int) -> dict[str, Any]:
+    """What a finger feels of the tones of all contents, by fields of `Layer`."""
+    level, promised_level = tones.level_db_sl[finger]
+    figures = *tones.contrast_db[finger], tones.foreign_db_sl[finger]
+    nominal, median, promised, of_others = [None if math.isnan(each) else each for each in figures]
+    return {
+        "level_db_sl": level,
+        "promised_level_db_sl": promised_level,
+        "felt_contrast_db": nominal,
+        "median_felt_contrast_db": median,
+        "promised_contrast_db": promised,
+        "foreign_level_db_sl": of_others,
+    }
 
 
 def _worst_of(found: Answer) -> float:

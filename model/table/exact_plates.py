@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.ensemble.measures import Felt, felt
+from model.ensemble.measures import over_fingertips
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import (
     FingertipLoad,
@@ -75,14 +75,30 @@ def draw_plates(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Felt:
+    """What fingers feel on d plates: amplitude to threshold at the weakest target (d,).
+
+    contrast (d,): of it to that at the loudest quiet point, None without quiet fingers.
+    """
+
+    level: FloatArray
+    contrast: FloatArray | None
+
+
 def felt_on(
     table: LocalizationTable, question: Question, excitation: Excitation, plates: Plates
 ) -> Felt:
-    """Measures of an excitation on plates, (1, d)."""
+    """What the fingers of a question feel of an excitation on plates; powers of its tones add."""
     rows, power = powers_on(table, question, excitation, plates)
+    sensed = (power / table.thresholds[rows, None, None].astype(float) ** 2).sum(axis=0)
     weights = table.read_fingertips(question.contacts).fine_weights
-    one, targets = np.zeros(1, dtype=int), len(question.targets)
-    return felt(power, table.thresholds[rows], one, weights, targets)
+    (means,), (loudest,) = over_fingertips(sensed[None], weights)
+    count = len(question.targets)
+    level = means[:count].min(axis=0)
+    if not question.quiet:
+        return Felt(level, None)
+    return Felt(level, level / np.maximum(np.sqrt(loudest[count:].max(axis=0)), 1e-30))
 
 
 def powers_on(

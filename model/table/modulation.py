@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from model.arrays import FloatArray
 from model.choice import best_of
-from model.ensemble.measures import percentile
-from model.ensemble.touched_by_kernel import touch
 from model.finger.perception import decibels
-from model.table.answer import answer
-from model.table.contents import PROMISED_DRAWS, PROMISED_PERCENTILE
+from model.table.answer import answer, figures_of
+from model.table.contents import Contents, Stream
+from model.table.fingers_on_plate import FingersOnPlate
+from model.table.promised import promised
 from model.table.request import (
     ANY_BAND,
     APART_HZ,
@@ -25,6 +24,7 @@ from model.table.request import (
     Answer,
     Finger,
     Layer,
+    QuietFinger,
     Request,
     verdict_of,
 )
@@ -205,95 +205,54 @@ def _promised(
     found: Answer,
 ) -> Answer:
     """The answer with what all tones of layers promise together, on the same plates."""
-    tips = table.read_fingertips([each.at for each in every])
-    loads = tuple(each.load for each in every)
-    owners, rows, weights = [], [], []
+    owners, rows, weights, streams = list[int](), list[int](), [], list[Stream]()
     strokes = np.array([era.stroke for era in table.eras])
-    for number, layer in enumerate(layers):
-        for tones in (layer.excitation, *layer.side_bands):
-            if tones and layer.verdict != "shared":
-                frequencies, bases = base_amplitudes(tones, table.eras)
-                owners.append(number)
-                rows.append(int(np.searchsorted(table.frequencies, frequencies[0])))
-                weights.append(bases[0] / strokes)
-    shares, owner = tips.fine_weights, np.array(owners)
-    powers = touch(table.on_eras, tips.few[:, 0], loads).drawn(
-        *(PROMISED_DRAWS, np.array(rows), np.array(weights, dtype=np.complex64)),
-        *(tips.fine.reshape(-1, tips.fine.shape[2]), shares, table.error_power, table.thresholds),
-        with_powers=True,
-    ).powers  # fmt: skip
-    power = np.asarray(powers, dtype=float).reshape(len(rows), *shares.shape, -1)
-    contents = {number: layers[number].excitation for number in dict.fromkeys(owners)}
-    content_of = {
-        finger: next(number for number, each in contents.items() if each == layer.excitation)
-        for finger, layer in enumerate(layers)
-        if layer.excitation
-    }
-    felt = {
-        finger: np.sqrt(
-            sum((shares[finger] @ np.sqrt(each[finger])) ** 2 for each in power[owner == number])
-        )
-        for finger, number in content_of.items()
-    }
-    ratios, new, quiet = [], [*layers], [*found.quiet]
-    for finger in range(len(every)):
-        is_target = finger in felt
-        is_held = finger < len(layers) and not is_target
-        if is_held and layers[finger].foreign_level_db_sl is None:  # nor protected
+    for layer in layers:
+        if not layer.excitation or layer.verdict == "shared":
             continue
-        others = power[owner != content_of.get(finger)][:, finger]
-        own = felt[finger] if is_target else np.min([*felt.values()], axis=0)
-        heard = np.sqrt(np.maximum(others.sum(axis=0).max(axis=0), 1e-20)) if len(others) else None
-        ratio = None if heard is None else own / heard
-        if ratio is not None:
-            ratios.append(ratio)
-        if is_held and heard is not None:
-            level = _promise(heard, 100 - PROMISED_PERCENTILE)
-            new[finger] = replace(new[finger], foreign_level_db_sl=level)
-        elif not is_target and ratio is not None and heard is not None:
-            at = finger - len(layers)
-            quiet[at] = replace(
-                quiet[at],
-                felt_contrast_db=float(decibels(ratio[0])),
-                promised_contrast_db=_promise(ratio),
-                level_db_sl=_promise(heard, 100 - PROMISED_PERCENTILE),
-            )
-        if not is_target:
-            continue
-        new[finger] = replace(
-            new[finger], level_db_sl=float(decibels(own[0])), promised_level_db_sl=_promise(own)
+        for voice in (layer.excitation, *layer.side_bands):
+            frequencies, bases = base_amplitudes(voice, table.eras)
+            owners.append(len(streams))
+            rows.append(int(np.searchsorted(table.frequencies, frequencies[0])))
+            weights.append(bases[0] / strokes)
+        targets = [n for n, each in enumerate(layers) if each.excitation == layer.excitation]
+        streams.append(Stream(tuple(targets), layer.request.level_db_sl, ()))
+    protected = [
+        number
+        for number, each in enumerate(layers)
+        if not each.excitation and each.foreign_level_db_sl is not None
+    ]
+    places, loads = tuple(each.at for each in every), tuple(each.load for each in every)
+    contents = Contents(
+        places, loads, tuple(streams), (*protected, *range(len(layers), len(every)))
+    )
+    tones = promised(
+        FingersOnPlate.of(table, places, loads),
+        contents,
+        np.array(rows),
+        np.array(weights, dtype=np.complex64),
+        np.array(owners),
+        at_levels=False,
+    )
+    new = [*layers]
+    for number in protected:
+        new[number] = replace(new[number], foreign_level_db_sl=tones.foreign_db_sl[number])
+    for number in (finger for stream in streams for finger in stream.targets):
+        new[number] = replace(new[number], **figures_of(tones, number))
+        if new[number].verdict != "shared":
+            verdict = verdict_of(new[number].promised_contrast_db)
+            new[number] = replace(new[number], verdict=verdict)
+    quiet = [
+        QuietFinger(each.at, contrast[0], contrast[2], level)
+        for each, contrast, level in zip(
+            found.quiet,
+            tones.contrast_db[len(layers) :],
+            tones.foreign_db_sl[len(layers) :],
+            strict=True,
         )
-        if ratio is not None and heard is not None:
-            new[finger] = _compared(new[finger], ratio)
-            level = _promise(heard, 100 - PROMISED_PERCENTILE)
-            new[finger] = replace(new[finger], foreign_level_db_sl=level)
-    worst = np.min(ratios, axis=0) if ratios else None
-    if len(felt) == 1 and worst is not None:
-        (only,) = felt
-        new[only] = _compared(new[only], worst)
-    return replace(
-        found,
-        layers=tuple(new),
-        quiet=tuple(quiet),
-        promised_worst_db=None if worst is None else _promise(worst),
-    )
-
-
-def _compared(layer: Layer, ratio: FloatArray) -> Layer:
-    """A layer with contrasts from ratios on plates (1 + d,), the nominal one first."""
-    promised = _promise(ratio)
-    return replace(
-        layer,
-        felt_contrast_db=float(decibels(ratio[0])),
-        median_felt_contrast_db=_promise(ratio, 50),
-        promised_contrast_db=promised,
-        verdict=layer.verdict if layer.verdict == "shared" else verdict_of(promised),
-    )
-
-
-def _promise(values: FloatArray, percent: float = PROMISED_PERCENTILE) -> float:
-    """Percentile of the drawn plates, without the first, the nominal one [dB]."""
-    return float(decibels(percentile(values[1:], percent)))
+    ]
+    worst = None if math.isnan(tones.worst_db) else tones.worst_db
+    return replace(found, layers=tuple(new), quiet=tuple(quiet), promised_worst_db=worst)
 
 
 def _scaled(excitation: Excitation, gain_db: float) -> Excitation:

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from model.arrays import FloatArray
+from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, highest_measured
 from model.table.question import Question
+from model.table.random_contacts import random_contacts
 from model.table.table import LocalizationTable
 from model.table.weak_cells import (
     Ask,
     Contrasts,
     WeakCells,
-    are_apart,
     ask_once,
     find_weak_cells,
     map_grid,
@@ -79,17 +80,18 @@ def contrast_distribution(
     Sets with an unreachable target are left out, and all on a plate too small for them. ask:
     answers questions, `ask_once` by default; progress: called with the number of finished sets.
     """
-    size = np.array([table.plate.length, table.plate.width])
     ask = ask or ask_once(table)
     contrasts: list[Contrasts] = []
-    drawn = (rng.uniform(0, size, (others + 1, 2)) for _ in range(50 * CONTACT_SETS))
-    for tried, contacts in enumerate(filter(are_apart, drawn), start=1):
-        target, *quiet = [(float(x), float(y)) for x, y in contacts]
-        found = ask(Question((target,), tuple(quiet)))
+    for _ in range(2 * CONTACT_SETS):
+        try:
+            contacts = random_contacts(rng, others + 1, table.plate, tries=50 * CONTACT_SETS)
+        except InputError:
+            break
+        found = ask(Question(contacts[:1], contacts[1:]))
         if found is not None:
             contrasts.append(found)
         progress(len(contrasts))
-        if len(contrasts) == CONTACT_SETS or tried == 2 * CONTACT_SETS:
+        if len(contrasts) == CONTACT_SETS:
             break
     return np.array(contrasts, dtype=float).reshape(-1, 2).T
 

@@ -19,9 +19,9 @@ from model.finger.perception import decibels, detection_threshold
 from model.table.exact_plates import amplitudes_on, draw_plates
 from model.table.pattern import Pattern
 from model.table.question import Point, Question
+from model.table.random_contacts import are_apart
 from model.table.table import LocalizationTable
 from model.table.verify import MIN_KEPT_SHARE, PLATES, sensed
-from model.table.weak_cells import are_apart
 
 _TRIES = 1000
 _MAX_OTHERS = 3

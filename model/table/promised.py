@@ -24,26 +24,17 @@ def promised(
     owners: IntArray,
     *,
     is_apart: bool = True,
+    at_levels: bool = True,
 ) -> Tones:
     """What fingers feel of tones at rows (m,) of weights (m, n), brought to their levels.
 
-    owners (m,): the content of each tone.
+    owners (m,): the content of each tone; at_levels: False for tones as they are.
     """
-    shares, streams, levels = fingers.tips.fine_weights, contents.streams, contents.levels
+    shares, streams, k = fingers.tips.fine_weights, contents.streams, len(contents.places)
     power = fingers.powers(PROMISED_DRAWS, rows, weights)
-    k, alone = len(shares), np.arange(len(rows))  # as if each had a frequency of its own
-    own = [
-        promise(felt_amplitudes(power, shares, alone, owners == j, s.targets))
-        for j, s in enumerate(streams)
-    ]
-    drives = np.zeros((len(streams), weights.shape[1]))
-    np.add.at(drives, owners, np.abs(weights))
-    gains, factor = share_stroke(
-        levels / np.maximum(own, 1e-30),
-        drives,
-        levels.astype(float),
-        [stream.priority for stream in streams],
-    )
+    gains, factor = np.ones(len(streams)), 1.0
+    if at_levels:
+        gains, factor = _gains_to_levels(contents, power, shares, weights, owners)
     by_tone = gains[owners]
     power = power * np.square(by_tone, dtype=np.float32)[:, None, None, None]
     contrast, level, of_others = (np.full(size, np.nan) for size in ((k, 3), (k, 2), k))
@@ -84,6 +75,26 @@ def promised(
         stroke_factor=factor,
         is_apart=is_apart,
     )
+
+
+def _gains_to_levels(
+    contents: Contents,
+    power: Float32Array,
+    shares: Float32Array,
+    weights: Complex64Array,
+    owners: IntArray,
+) -> tuple[FloatArray, float]:
+    """Gains (K,) of contents to their levels on nine of ten plates, as `share_stroke`."""
+    streams, levels = contents.streams, contents.levels
+    alone = np.arange(len(owners))  # as if each had a frequency of its own
+    own = [
+        promise(felt_amplitudes(power, shares, alone, owners == j, s.targets))
+        for j, s in enumerate(streams)
+    ]
+    drives = np.zeros((len(streams), weights.shape[1]))
+    np.add.at(drives, owners, np.abs(weights))
+    priorities = [stream.priority for stream in streams]
+    return share_stroke(levels / np.maximum(own, 1e-30), drives, levels.astype(float), priorities)
 
 
 def share_stroke(

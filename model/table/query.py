@@ -60,16 +60,6 @@ _OF_OWN = {"bands_may_swap", "apart_hz"}
 """Keys of a line that only one of both kinds of questions has."""
 
 
-def question_from_json(line: str, defaults: Mapping[str, Any] = MappingProxyType({})) -> Question:
-    """Parse the question of one line, `{"target": [x, y], "quiet": [[x, y], ...], "mode": ...}`.
-
-    Several targets: `"targets": [[x, y], ...]`; also `"level_db_sl"`,
-    `"envelopes"`, and `"loads"`, of each contact relative to the rig's fingertip, targets first.
-    defaults: of keys that the line leaves out. Raises InputError.
-    """
-    return _question(_parsed(line, defaults))
-
-
 def _parsed(line: str, defaults: Mapping[str, Any]) -> _Line:
     try:
         asked = _Line.model_validate_json(line)

@@ -30,8 +30,8 @@ from model.structure.attachments import fingertip_loads, footprints_of
 from model.table.exact_plates import draw_plates, felt_on
 from model.table.pattern import Pattern
 from model.table.question import Question
+from model.table.random_contacts import random_contacts
 from model.table.table import LocalizationTable
-from model.table.weak_cells import are_apart
 from model.transients.base_motion import ramped_onset
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
@@ -246,9 +246,7 @@ def _kept_share(
     contrast = felt_on(table, question, pattern.excitation, plates).contrast
     if contrast is None or pattern.robust_felt_contrast_db is None:
         return math.nan
-    return float(
-        (decibels(contrast.felt[0]) >= pattern.robust_felt_contrast_db - ROUNDING_DB).mean()
-    )
+    return float((decibels(contrast) >= pattern.robust_felt_contrast_db - ROUNDING_DB).mean())
 
 
 def _check_content(
@@ -355,17 +353,14 @@ def _random_answer(
     table: LocalizationTable, rng: np.random.Generator, *, others: int
 ) -> tuple[Question, Pattern]:
     """Contacts at least 5 cm apart, and the table's answer; where they do not fit, fewer."""
-    size = [table.plate.length, table.plate.width]
     for tries in range(1000):
         count = 1 + max(1, others - tries // 200)
-        contacts = rng.uniform(0, size, (count, 2))
-        if not are_apart(contacts):
-            continue
-        target, *quiet = ((float(x), float(y)) for x, y in contacts)
-        question = Question((target,), tuple(quiet))
         with contextlib.suppress(InputError):
+            contacts = random_contacts(rng, count, table.plate, tries=1)
+            question = Question(contacts[:1], contacts[1:])
             return question, table.query(question)
+    length, width = table.plate.length, table.plate.width
     raise InputError(
-        f"no random contacts on this plate of {size[0]:g} x {size[1]:g} m have an answer at 20 dB "
+        f"no random contacts on this plate of {length:g} x {width:g} m have an answer at 20 dB "
         "SL to verify; is it smaller than two fingers, or its stroke too small?"
     )

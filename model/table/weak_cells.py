@@ -15,17 +15,15 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.arrays import FloatArray, least_gap
+from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
 from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Plate
 from model.table.question import Point, Question
+from model.table.random_contacts import MIN_DISTANCE
 from model.table.table import LocalizationTable
-
-MIN_DISTANCE = 0.05
-"""Distance of the fingers of a contact set at least [m], as fingertips of two hands."""
 
 WANTED_CONTRAST_DB = FELT_DB_SL
 WANTED_LEVEL_DB_SL = STRONG_DB_SL
@@ -87,11 +85,6 @@ class WeakCells:
             "is_weak": self.weak.tolist(),
             "is_feasible": self.feasible.tolist(),
         }
-
-
-def are_apart(contacts: FloatArray) -> bool:
-    """Whether all contacts (n, 2) [m] are MIN_DISTANCE apart."""
-    return least_gap(contacts) >= MIN_DISTANCE
 
 
 def sampling_error(values: ArrayLike, percent: float) -> float:

@@ -1,6 +1,7 @@
 """Questions to the table, also thorough ones."""
 
 import json
+import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -12,7 +13,7 @@ from model.errors import InputError
 from model.rig.uncertainty import Uncertainty
 from model.table.file import save_table
 from model.table.pattern import Pattern
-from model.table.query import question_from_json
+from model.table.query import query_batch
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.thorough_query import LEVEL_STEP, query_thoroughly
@@ -29,34 +30,36 @@ def table_file(tmp_path_factory):
     return path
 
 
-def test_question_from_json_reads_every_key():
+def test_a_line_of_a_batch_is_read_key_by_key():
     """Targets, quiet fingers, mode, level and loads."""
-    question = question_from_json(
-        '{"targets": [[0.1, 0.1], [0.2, 0.2]], "quiet": [[0.05, 0.02]], "mode": "phased",'
+    line = (
+        '{"targets": [[0.1, 0.1], [0.2, 0.2]], "quiet": [[0.05, 0.02]], "mode": "switched",'
         ' "level_db_sl": 15, "loads": [1, 2, 0.5]}'
     )
-    assert question.loads == (1.0, 2.0, 0.5)
-    assert question.targets == ((0.1, 0.1), (0.2, 0.2))
-    assert question.quiet == ((0.05, 0.02),)
-    assert (question.drive_mode, question.level_db_sl) == ("phased", 15.0)
-    assert question_from_json('{"target": [0.1, 0.1]}').targets == ((0.1, 0.1),)
+    (found,) = query_batch(smooth_table(), [line])
+    places = ((0.1, 0.1), (0.2, 0.2)), ((0.05, 0.02),)
+    question = Question(*places, 15.0, drive_mode="switched", loads=(1.0, 2.0, 0.5))
+    expected = smooth_table().query(question)
+    assert found["drive"] == smooth_table().drive_of(expected.excitation)
+    assert found["robust_contrast_db"] == expected.robust_contrast_db
 
 
-@pytest.mark.parametrize(
-    ("line", "named"),
-    [
-        ("nonsense", r'such as \{"target".*Invalid JSON'),
-        ("[]", r'such as \{"target".*object'),
-        ('{"target": [0.1]}', "target"),
-        ('{"target": [0.1, 0.1], "loud": 3}', "loud"),
-        ('{"target": [0.1, "x"]}', "target.1"),
-        ("{}", "at least one target"),
-    ],
-)
-def test_question_from_json_refuses_a_bad_line(line, named):
+BAD_LINES = {
+    "nonsense": r'such as \{"target".*Invalid JSON',
+    "[]": r'such as \{"target".*object',
+    '{"target": [0.1]}': "target",
+    '{"target": [0.1, 0.1], "loud": 3}': "loud",
+    '{"target": [0.1, "x"]}': "target.1",
+    "{}": "at least one target",
+}
+
+
+def test_a_bad_line_of_a_batch_is_refused():
     """The key that is wrong is named."""
-    with pytest.raises(InputError, match=named):
-        question_from_json(line)
+    found = list(query_batch(smooth_table(), BAD_LINES))
+    for number, (answer, named) in enumerate(zip(found, BAD_LINES.values(), strict=True), start=1):
+        assert answer["line"] == number
+        assert re.search(named, answer["error"])
 
 
 @pytest.mark.parametrize("has_errors", [True, False])

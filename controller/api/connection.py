@@ -49,8 +49,6 @@ class Connection(asyncio.BufferedProtocol):
         self.received_at = clock()  # s; when the last bytes arrived
         self.has_spoken = False  # whether it has sent a complete line
         self.is_reserve = False  # whether it is in reserve
-        self.excess = 0  # requests beyond the rate since its last pause
-        self.is_paused = False  # whether the server pauses to serve it
         self.reading_time = 0.0  # s; processor time of reading, not yet subtracted from a budget
         self.is_at_end = False  # whether it has closed its side
         self.pending: set[asyncio.Task[None]] = set()
@@ -73,7 +71,7 @@ class Connection(asyncio.BufferedProtocol):
         self._distrusted_until = -math.inf  # s
         self._lost = 0
         self._losing_since: float | None = None
-        self._rate = RateLimiter(MAX_REQUEST_RATE, clock=clock)
+        self.rate = RateLimiter(MAX_REQUEST_RATE, clock=clock)
 
     @property
     def is_open(self) -> bool:
@@ -179,12 +177,6 @@ class Connection(asyncio.BufferedProtocol):
         """Close after the last response, if the client has closed its side."""
         if self.is_at_end and not self.has_lines and not self.pending:
             self.close()
-
-    def take_request(self) -> bool:
-        """Whether another request is within the rate; counts it."""
-        is_within = self._rate.take()
-        self.excess += not is_within
-        return is_within
 
     def note_false_alarm(self) -> None:
         """Note that it is urgent without a stop, which for a while it cannot be again."""

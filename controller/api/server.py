@@ -186,7 +186,7 @@ class ApiServer:
         if is_urgent and STOP in line and call.method != "stop":
             connection.note_false_alarm()
         is_limited = call.error is not None or METHODS[call.method].is_limited
-        if not is_limited or connection.take_request():
+        if not is_limited or connection.rate.take():
             return call
         if call.error is not None:
             connection.refuse(_BUSY)

@@ -28,7 +28,8 @@ from drivers.protocol.table import ENABLED, QUANTITIES
 _T = TypeVar("_T")
 _SESSION, _TOKEN = QUANTITIES["session"], QUANTITIES["token"]
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
-_MAX_STATUS_LOAD = 0.05  # of the line's time, for statuses that show whether the watchdog runs down
+_STATUS_INTERVAL = 0.19  # s; at the least, between statuses that show whether the watchdog runs down
+_MAX_STATUS_LOAD = 0.05  # of the line's time, for these
 _logger = logging.getLogger(__name__)
 
 
@@ -54,7 +55,7 @@ class Group(Members):
         self._silencing: set[asyncio.Future[Any]] = set()  # stops and disarms in progress
         self._stopped = 0  # epoch of the last stop, until it is cleared
         self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # of stops
-        self._running_read_at: dict[str, float] = {}  # statuses just before a heartbeat
+        self._running_due: dict[str, float] = {}  # statuses just before a heartbeat
         self._readings: dict[str, asyncio.Future[Values]] = {}  # of amplifiers that do not reply
 
     async def open(self) -> None:
@@ -142,7 +143,8 @@ class Group(Members):
 
         Of one that does not reply the status is read meanwhile; one that replies again must still
         play its set. A watchdog that runs down, and starts anew with each heartbeat, shows that it
-        would silence the amplifier: so its status is read just before it is fed.
+        would silence the amplifier: so its status is read just before it is fed, five times a
+        second, and less often on a slow wire.
         """
         self._check_armed()
         await self._exchange(self._beat())
@@ -156,12 +158,11 @@ class Group(Members):
     async def _feed(self, amplifier: Amplifier, before: int) -> None:
         name = amplifier.name
         if amplifier.silence_cause is None:
-            # The status first, unless the wire is too slow for that.
-            now, pause = amplifier.line.time(), amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
-            if now - self._running_read_at.get(name, 0.0) >= pause:
-                self._running_read_at[name] = now
+            if (now := amplifier.line.time()) >= self._running_due.get(name, 0.0):
+                pause = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
+                self._running_due[name] = now + max(pause, _STATUS_INTERVAL)
                 await amplifier.read_status(Priority.HEARTBEAT)
-            self.check_none_since(before)
+                self.check_none_since(before)
             await amplifier.ping()
         elif name not in self._readings or self._readings[name].done():
             reading = amplifier.read_status(Priority.READING)

@@ -4,6 +4,7 @@ What a person would feel is read from the simulated amplifiers themselves.
 """
 
 import asyncio
+from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
 
 import pytest
@@ -22,7 +23,7 @@ from drivers.host.group import Group
 from drivers.host.wire import Broken
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import STATES
+from drivers.protocol.table import MESSAGES, STATES
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine, grouped, layer, losing, tone, unaltered, with_group
 
@@ -220,6 +221,22 @@ async def test_watchdog_is_fed_by_the_group_alone(group: Group, ends: list[Memor
     assert ends[0].levels("a") == [0.0, 0.0]
     with pytest.raises(CommandRefused):
         await group.beat()
+
+
+@grouped(("a",))
+async def test_watchdog_is_seen_to_run_down_five_times_a_second(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """Before one of four heartbeats, or less on a slow wire: their own reply shows a full one."""
+    status, ping = (MESSAGES[name].number for name in ("GetStatus", "Ping"))
+    before = len(ends[0].sent)
+    for _ in range(20):
+        await group.beat()
+        await asyncio.sleep(0.05)
+    kinds = Counter(each.partition(":")[2] for _, each in ends[0].sent[before:])
+    assert kinds.keys() == {f"{status}", f"{ping}"}
+    assert kinds[f"{ping}"] == 20
+    assert 2 <= kinds[f"{status}"] <= 5
 
 
 @grouped(("a",))

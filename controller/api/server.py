@@ -29,7 +29,6 @@ from controller.api.jsonrpc import (
 from controller.api.methods import METHODS, TouchParams
 from controller.api.schema import Empty, Message
 from controller.api.turns import Turns
-from controller.api.waiting_touches import supersedes
 from controller.sources.contacts import CONTACT_TIMEOUT
 from drivers import clock
 from drivers.errors import CommandRefused, DriverError, LinkError
@@ -58,7 +57,8 @@ class _Call:
     def is_superseded_by(self, other: "_Call | None") -> bool:
         """Whether both are touch frames of one source without an id, and the newer one is enough.
 
-        A frame holds all fingers of its source, hence no lift is lost.
+        A frame holds all fingers of its source, hence no lift is lost; nor is a finger that came,
+        for the newer one must have all of the older one.
         """
         return (
             other is not None
@@ -66,7 +66,8 @@ class _Call:
             and isinstance(self.params, TouchParams)
             and isinstance(other.params, TouchParams)
             and self.params.source == other.params.source
-            and supersedes(other.params, self.params)
+            and {each.id for each in self.params.touches}
+            <= {each.id for each in other.params.touches}
         )
 
 

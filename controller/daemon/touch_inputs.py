@@ -5,10 +5,8 @@ import logging
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain
 
 from controller.api.methods import TouchParams
-from controller.api.waiting_touches import add_frame
 from controller.daemon.config import API_SOURCES, TouchInput
 from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
@@ -82,18 +80,13 @@ class TouchInputs:
 
 
 class ApiTouches:
-    """Touch frames of API clients, delivered once per loop iteration.
-
-    Of each source the newest, and those before it with a finger that the newest does not have.
-    """
+    """Touch frames of API clients, each delivered in its turn; which clients have fingers down."""
 
     def __init__(self, plate: Plate, deliver: Callable[[TouchFrame], None]) -> None:
         self._plate = plate
         self._deliver = deliver
-        self._waiting: dict[str, list[TouchFrame]] = {}
         # With fingers down, and the time [s] of the last frame.
         self._sources: dict[object, dict[str, float]] = {}
-        self._is_scheduled = False
 
     def add(self, client: object, params: TouchParams, *, client_name: str, now: float) -> None:
         """Add a frame that arrived at a time [s]; raises InputError for too many sources.
@@ -116,22 +109,9 @@ class ApiTouches:
             Touch(point.id, point.x_m / self._plate.length, 1 - point.y_m / self._plate.width)
             for point in params.touches
         )
-        origin = f"{API_SOURCES}:{client_name}"
-        self._deliver_soon(TouchFrame(source, now, touches, origin=origin))
+        self._deliver(TouchFrame(source, now, touches, origin=f"{API_SOURCES}:{client_name}"))
 
     def lift_all(self, client: object, *, now: float) -> None:
         """Lift all fingers of a client at a time [s]."""
         for source in self._sources.pop(client, ()):
-            self._deliver_soon(TouchFrame(source, now, ()))
-
-    def _deliver_soon(self, frame: TouchFrame) -> None:
-        add_frame(self._waiting.setdefault(frame.source, []), frame)
-        if not self._is_scheduled:
-            self._is_scheduled = True
-            asyncio.get_running_loop().call_soon(self._deliver_waiting)
-
-    def _deliver_waiting(self) -> None:
-        self._is_scheduled = False
-        waiting, self._waiting = self._waiting, {}
-        for frame in chain.from_iterable(waiting.values()):
-            self._deliver(frame)
+            self._deliver(TouchFrame(source, now, ()))

@@ -24,7 +24,6 @@ NOTES: Mapping[str, str] = {
     "partd": "BSD-3-Clause according to its text",
     "pillow": "wheels contain libjpeg, libtiff, freetype and others, all permissive",
     "python-can": "copyleft, see below",
-    "python-osc": "Unlicense according to its text: public domain",
     "scipy": "wheels contain OpenBLAS (BSD-3-Clause), libgfortran (GPL-3.0 with the GCC exception) "
     "and libquadmath (LGPL-2.1)",
 }
@@ -39,7 +38,7 @@ is under the MIT licence. It contains none of these packages: pip downloads them
 BOTTOM = """
 ## Obligations
 
-All but one are permissive (MIT, BSD, ISC, Apache-2.0, PSF, Unlicense): they require their notices
+All but one are permissive (MIT, BSD, ISC, Apache-2.0, PSF): they require their notices
 in every copy, and are compatible with the MIT licence.
 
 **python-can** is under the LGPL, version 3. era-haptics imports it unchanged, so your programs

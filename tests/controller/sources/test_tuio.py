@@ -229,11 +229,13 @@ MALFORMED = {
     "no arguments": bytes(message().dgram),
     "text that is not UTF-8": b"/tuio/2Dcur\0,s\0\0\xff\xfe\0\0",
     "types nobody expects": bytes(message("alive", True).dgram),
-    "types python-osc would log about": b"/tuio/2Dcur\0,sXi\0\0\0\0alive\0\0\0\0\0\0\1",
+    "a type that is unknown": b"/tuio/2Dcur\0,sXi\0\0\0\0alive\0\0\0\0\0\0\1",
     "an id that is a float": bytes(message("alive", 1.0).dgram),
     "a position that is text": bytes(message("set", 1, "0.5", 0.5, 0.0, 0.0, 0.0).dgram),
     "positions that are integers": bytes(message("set", 1, 0, 1, 0.0, 0.0, 0.0).dgram),
     "too few arguments": bytes(message("set", 1, 0.5, 0.5).dgram),
+    "text without its last zeros": bytes(message("source", "abcd").dgram)[:-1],
+    "text without an end": bytes(message("source", "abcd").dgram)[:-4],
     "floats cut off": bytes(message("set", 1, 0.5, 0.5, 0.0, 0.0, 0.0).dgram)[:-20],
     "unknown command": bytes(message("wave", 1).dgram),
     "one bad message among good ones": bundle(
@@ -247,7 +249,7 @@ MALFORMED = {
 def test_reader_counts_malformed_datagrams(
     reader: TuioReader, datagram: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Each is counted and logged, none raises or changes a touch, and python-osc stays silent."""
+    """Each is counted and logged, none raises or changes a touch."""
     reader.read(frame((1, 0.25, 0.5), fseq=1), PEER, now=0)
     assert reader.read(datagram, PEER, now=0) is None
     assert counts(reader) == {"malformed": 1}

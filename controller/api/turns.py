@@ -58,7 +58,8 @@ class Turns:
         if lane is not waits_in:
             if waits_in is not None:
                 waits_in.waiting.remove(connection)
-            lane.add(connection)
+            lane.waiting.append(connection)
+            lane.schedule()
 
     def _take(self, waiting: deque[Connection], budget: RateLimiter) -> None:
         """Serve a line of each connection, round and round, until the turn's time is up."""
@@ -102,12 +103,7 @@ class _Lane:
         self._is_turn_scheduled = False
         self._deferred_since: float | None = None
 
-    def add(self, connection: Connection) -> None:
-        """Let a client wait for its turn."""
-        self.waiting.append(connection)
-        self._schedule()
-
-    def _schedule(self, delay: float = 0.0) -> None:
+    def schedule(self, delay: float = 0.0) -> None:
         """Schedule a turn unless one is: after a delay [s], or in the next iteration but one.
 
         Data that arrived meanwhile and what it wakes, such as the control loop for a touch, run
@@ -132,7 +128,7 @@ class _Lane:
                 self._deferred_since = None
                 self._take(self.waiting, self.budget)
         finally:  # whatever fails: others wait, perhaps with a stop
-            self._schedule(delay)
+            self.schedule(delay)
 
     def _delay(self) -> float:
         """Return the time [s] by which the turn that is due has to wait, 0 for none."""

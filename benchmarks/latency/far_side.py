@@ -117,12 +117,14 @@ class _Device:
             if frame.kind in (_SET, _COMMIT):
                 self.changed_at = now
                 self.bytes += frame_length(len(frame.payload))
-                self._note(frame, now)
             elif frame.kind == _STOP:
                 self.stopped_at = now
+        self._end.receive(data, now)
+        for frame in frames:  # after the reply: this is not the amplifier's
+            if frame.kind in (_SET, _COMMIT):
+                self._note(frame, now)
         if frames:
             self._changed()
-        self._end.receive(data, now)
         self.used += time.monotonic() - now
 
     def _reply(self, data: bytes) -> None:

@@ -11,7 +11,7 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 
@@ -112,9 +112,9 @@ def on_wire(envelopes: Envelopes | None, strokes: Mapping[str, float]) -> dict[s
     """Return envelopes in integers of the wire; strokes [m]: by ERA, as envelopes are."""
     if not envelopes:
         return {}
-    rows = [[knot / strokes[name] for knot in one.knots[:-1]] for name, one in envelopes.items()]
-    counts = [*map(len, rows)]
-    each = np.array([knot for row in rows for knot in row], dtype=complex)
+    counts = [len(each.knots) - 1 for each in envelopes.values()]
+    motions = np.array([*chain.from_iterable([each.knots[:-1] for each in envelopes.values()])])
+    each = motions.astype(complex) / np.repeat([strokes[name] for name in envelopes], counts)
     levels = np.rint(np.abs(each) * _LEVEL.per_unit).astype(int)
     phases = np.rint(np.degrees(np.angle(each)) * _PHASE.per_unit).astype(int)
     phases[phases > _PHASE.maximum] = _PHASE.minimum  # half a turn

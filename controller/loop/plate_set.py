@@ -113,7 +113,7 @@ class SetBuilder:
         )
         ramp = next(iter(layers.values())).ramp
         pattern = replace(pattern, ramp=ramp, onset=onset, ending=ending)
-        settled = max([ramp, *[each.duration for each in (onset or {}).values()]])
+        settled = max(ramp, next(iter(onset.values())).duration) if onset else ramp
         return PlateSet(layers, settled, bool(ending), bool(onset or ending)), pattern
 
     def plain(self, shaped: PlateSet) -> PlateSet:

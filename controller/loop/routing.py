@@ -36,7 +36,7 @@ def route(
 ) -> dict[str, Layer]:
     """Return the layer of a number for every amplifier of the rig, by name.
 
-    Every wired channel has a tone: level = amplitude / stroke, phase in degrees within (-180, 180],
+    Every wired channel has a tone: level = amplitude / stroke, phase in degrees within half a turn,
     level 0 for an ERA that is not driven. ramp [s]: lengthened to the rig's slew limit, on all
     amplifiers alike. playing: what each ERA plays now in this layer (`tones_by_era`); a frequency
     keeps its phase if all its ERAs play it already, unless it restarts. valid_for [s]: of the
@@ -62,11 +62,14 @@ def route(
             frequency = onset[name].frequency if onset and shape else rig.limits.frequency_min
             tone = Tone(channel.number, frequency, 0.0, 0.0, False, True, shape, endings.get(name))
         else:
+            phase = driven.phase  # not finite it stays so, and the ledger refuses it
+            if math.isfinite(phase):
+                phase = math.degrees(math.remainder(phase, math.tau))
             tone = Tone(
                 channel.number,
                 driven.frequency,
                 level=driven.amplitude / strokes[name],
-                phase=_degrees(driven.phase),
+                phase=phase,
                 keep_phase=driven.frequency not in restarted,
                 onset=shape,
                 ending=endings.get(name),
@@ -119,10 +122,3 @@ def restarted_by(excitation: physics.Excitation, playing: Drive) -> set[float]:
         if name not in playing or playing[name].frequency != tone.frequency:
             restarted.add(tone.frequency)
     return restarted
-
-
-def _degrees(phase: float) -> float:
-    """Convert a phase [rad] to degrees within (-180, 180]."""
-    # Not finite stays so; the ledger refuses it.
-    degrees = math.degrees(math.remainder(phase, math.tau)) if math.isfinite(phase) else phase
-    return 180.0 if degrees == -180.0 else degrees

@@ -15,7 +15,7 @@ from typing import TypeAlias
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused
 from drivers.protocol.records import Values, WireQuantity
-from drivers.protocol.sets import Command, Envelope, LayerSet
+from drivers.protocol.sets import NO_KNOT, Command, LayerSet
 from drivers.protocol.table import QUANTITIES
 from registry.limits import GuardLimits
 
@@ -171,6 +171,8 @@ class Rounding:
         phase = round(tone.phase * _PHASE.per_unit)
         if not _PHASE.minimum <= phase <= _PHASE.maximum:
             phase = _PHASE.to_wire(float(tone.phase))
+        if onset or tone.ending:
+            self._check_envelopes(tone)
         return Command(
             channel,
             frequency,
@@ -178,25 +180,28 @@ class Rounding:
             phase,
             bool(tone.keep_phase),
             bool(tone.skip_ending),
-            onset and self._envelope(onset, channel),
-            tone.ending and self._envelope(tone.ending, channel),
+            onset,
+            tone.ending,
         )
 
     def _level_refused(self, channel: int, name: str, level: float) -> CommandRefused:
         return _refused(channel, f"{name} must be 0 to {self._level_max:g}, got {level!r}")
 
-    def _envelope(self, envelope: Envelope, channel: int) -> Envelope:
-        """Return an envelope, which has the integers of the wire; raises unless it is allowed."""
-        low, high = self._can["envelope_step_min"], self._can["envelope_step_max"]
-        if not low <= envelope.step <= high:
-            text = f"step of an envelope must be {low} to {high} (0.1 ms), got {envelope.step!r}"
-            raise _refused(channel, text)
-        if len(envelope.knots) > (limit := self._can["knots"]):
-            text = f"knots of an envelope must be at most {limit}, got {len(envelope.knots)}"
-            raise _refused(channel, text)
-        if not 0 <= (peak := envelope.peak) <= self._limits.level:
-            raise self._level_refused(channel, "level of a knot", peak / _LEVEL.per_unit)
-        return envelope
+    def _check_envelopes(self, tone: Tone) -> None:
+        """Raise CommandRefused for an envelope of a tone that is not allowed."""
+        for envelope in (tone.onset, tone.ending):
+            if envelope is None:
+                continue
+            low, high = self._can["envelope_step_min"], self._can["envelope_step_max"]
+            if not low <= envelope.step <= high:
+                text = f"step of an envelope must be {low} to {high} (0.1 ms), got {envelope.step}"
+                raise _refused(tone.channel, text)
+            if (count := len(envelope.knots)) > (limit := self._can["knots"]):
+                text = f"knots of an envelope must be at most {limit}, got {count}"
+                raise _refused(tone.channel, text)
+            peak = max(envelope.knots, default=NO_KNOT)[0]
+            if not 0 <= peak <= self._limits.level:
+                raise self._level_refused(tone.channel, "level of a knot", peak / _LEVEL.per_unit)
 
 
 def _refused(channel: int, text: str) -> CommandRefused:

@@ -154,10 +154,11 @@ class SerialPort(DevicePort):
             data = os.read(self.descriptor, _READ_MAX)
         except BlockingIOError:
             return b""
-        state = select.poll()
-        state.register(self.descriptor, 0)  # a hang-up is told all the same
-        if not data and state.poll(0):
-            raise OSError("end of file")
+        if not data:
+            state = select.poll()
+            state.register(self.descriptor, 0)  # a hang-up is told all the same
+            if state.poll(0):
+                raise OSError("end of file")
         return data
 
     def read_waiting(self) -> bytes:

@@ -10,7 +10,8 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
+from itertools import chain, product, repeat
+from operator import and_
 from typing import Any
 
 from drivers.errors import CommandError, FrameError
@@ -283,7 +284,7 @@ class Record:
                 for number in (min(column), max(column)):
                     if not field.quantity.minimum <= number <= field.quantity.maximum:
                         raise ValueError(_out_of_range(field.name, field.quantity, number))
-        words.extend([number % WORD for row in rows for number in row])
+        words.extend(map(and_, chain.from_iterable(rows), repeat(WORD - 1)))  # without a call
 
     def read_rows(
         self, words: Sequence[int], at: int, count: int

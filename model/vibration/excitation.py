@@ -60,7 +60,8 @@ def base_amplitudes(excitation: Excitation, eras: Sequence[Era]) -> tuple[FloatA
     frequencies = sorted({tone.frequency for tone in excitation.values()})
     amplitudes = np.zeros((len(frequencies), len(eras)), dtype=complex)
     for name, tone in excitation.items():
-        amplitudes[frequencies.index(tone.frequency), names.index(name)] = tone.phasor
+        phasor = cmath.rect(tone.amplitude, tone.phase)  # without a call for each
+        amplitudes[frequencies.index(tone.frequency), names.index(name)] = phasor
     return np.array(frequencies), amplitudes
 
 

@@ -7,7 +7,7 @@ patterns costs least, a further cost for each parameter that changed; where even
 residuals that chance does not, the plate has changed in a way not known.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,119 +75,133 @@ class Explanation:
 
 def explain(before: State, patterns: Sequence[Touched]) -> Explanation:
     """Find the one change that explains patterns, from the state before it."""
-    space = patterns[0].space
-    tried = [
-        _Tried(name, changed, wider, update(wider, patterns, evaluations=_FIRST_EVALUATIONS))
-        for name, changed in _kinds(space)
-        for wider in [_widened(before, space, changed)]
-    ]
-    tried += _by_mass(before, patterns)
-    for alteration in _ALTERATIONS:
-        tried += _by_alteration(before, patterns, alteration)
-    tried = ranked_by(tried, lambda each: -each.cost)
-    names = list(dict.fromkeys(each.name for each in tried))
+    tried = ranked_by(
+        [
+            _Tried(each, each.update(evaluations=each.evaluations, start=start))
+            for each in _hypotheses(before, patterns)
+            for start in each.starts
+        ],
+        _likelihood,
+    )
+    names = list(dict.fromkeys(each.supposed.name for each in tried))
     # Hands and cracks may still be far from their least cost.
     followed = {*names[:_FOLLOWED], *(each.name for each in _ALTERATIONS)}
     within = tried[0].cost + _WITHIN_REACH
     for number, each in enumerate(tried):
-        if each.name not in followed or each.cost > within:
+        if each.supposed.name not in followed or each.cost > within:
             continue
-        followed.remove(each.name)
+        followed.remove(each.supposed.name)
         x = np.concatenate([each.after.state.x, each.after.fingers])
-        measured = each.altered or patterns
-        after = update(each.prior, measured, evaluations=_EVALUATIONS, start=x)
+        after = each.supposed.update(evaluations=_EVALUATIONS, start=x)
         tried[number] = replace(each, after=after)
-    tried = ranked_by(tried, lambda each: -each.cost)
-    best = tried[0]
-    others = [each.cost for each in tried if each.name != best.name]
-    lead = min(others) - best.cost
+    best, *others = ranked_by(tried, _likelihood)
+    supposed, after, first = best.supposed, best.after, best.supposed.patterns[0]
+    lead = min(each.cost for each in others if each.supposed.name != supposed.name) - best.cost
+    altered = first if isinstance(first, Altered) else None
     # What a crack leaves is the error of its model, which is of the first order.
-    is_rough = best.is_coarse and lead > _FAR_AHEAD and best.cost < _ROUGHLY * best.after.count
-    if not is_rough and chdtrc(best.after.count, best.cost) < _UNLIKELY:
-        return Explanation("", 0.0, 0.0, before, resembles=best.name)
-    if best.altered:
-        theta = best.after.state.x[len(before.x) :]
-        first = best.altered[0]
-        x, y = 100 * first.place(theta)
-        what = f"{first.alteration.described(theta[2:])} at {x:.1f}, {y:.1f} cm"
-        return Explanation(best.name, float(theta[2]), lead, before, found=what)
-    index = next(iter(best.changed))
-    change = float(space.std[index] * (best.after.state.x[index] - before.x[index]))
-    return Explanation(best.name, change, lead, best.after.state)
+    is_coarse = altered is not None and altered.alteration.is_of_modes
+    is_rough = is_coarse and lead > _FAR_AHEAD and best.cost < _ROUGHLY * after.count
+    if not is_rough and chdtrc(after.count, best.cost) < _UNLIKELY:
+        return Explanation("", 0.0, 0.0, before, resembles=supposed.name)
+    if altered is not None:
+        theta = after.state.x[len(before.x) :]
+        x, y = 100 * altered.place(theta)
+        what = f"{altered.alteration.described(theta[2:])} at {x:.1f}, {y:.1f} cm"
+        return Explanation(supposed.name, float(theta[2]), lead, before, found=what)
+    index = supposed.changed[0]
+    change = float(first.space.std[index] * (after.state.x[index] - before.x[index]))
+    return Explanation(supposed.name, change, lead, after.state)
+
+
+@dataclass(frozen=True, eq=False)
+class _Hypothesis:
+    """What may have changed: name, numbers of the parameters, their prior, patterns with them.
+
+    starts: of the first estimates, by so many evaluations at most; None: the state before.
+    """
+
+    name: str
+    changed: tuple[int, ...]
+    prior: State
+    patterns: Sequence[Touched]
+    starts: Sequence[FloatArray | None] = (None,)
+    evaluations: int = _FIRST_EVALUATIONS
+
+    def update(self, *, evaluations: int, start: FloatArray | None) -> Updated:
+        """The batch estimate by the patterns."""
+        return update(self.prior, self.patterns, evaluations=evaluations, start=start)
 
 
 @dataclass(frozen=True, eq=False)
 class _Tried:
-    """One hypothesis: name, what changes by which deviation, its prior, and what it leads to.
+    """A hypothesis, and what it leads to."""
 
-    altered: the patterns with a hand or a crack, none for a change of the plate's parameters.
-    """
-
-    name: str
-    changed: dict[int, float]
-    prior: State
+    supposed: _Hypothesis
     after: Updated
-    altered: tuple[Altered, ...] = ()
-
-    @property
-    def is_coarse(self) -> bool:
-        """Whether its model is known to leave something."""
-        return bool(self.altered) and self.altered[0].alteration.is_of_modes
 
     @property
     def cost(self) -> float:
         """Of residuals and changes, and of supposing a change."""
-        return self.after.cost + _COST_OF_CHANGE * len(self.changed)
+        return self.after.cost + _COST_OF_CHANGE * len(self.supposed.changed)
 
 
-def _kinds(space: Space) -> list[tuple[str, dict[int, float]]]:
-    """Names, and by number of the parameters that change their standard deviations."""
+def _likelihood(tried: _Tried) -> float:
+    return -tried.cost
+
+
+def _hypotheses(before: State, patterns: Sequence[Touched]) -> Iterator[_Hypothesis]:
+    """All that may have changed; a mass, a hand or a crack where it would explain most."""
+    space = patterns[0].space
     kinds = [(space.names[n], {n: _SPRING}) for n in space.indices("stiffness")]
     for gain, phase in zip(space.indices("gain"), space.indices("phase"), strict=True):
         kinds.append((space.names[gain], {gain: _GAIN, phase: _PHASE}))
     kinds.append(("thickness", {space.groups["thickness"].start: _THICKNESS}))
-    return [kind for kind in kinds if all(space.std[n] > 0 for n in kind[1])]
+    for name, changed in kinds:
+        if all(space.std[n] > 0 for n in changed):
+            yield _Hypothesis(name, (*changed,), _widened(before, space, changed), patterns)
+    yield _by_mass(before, patterns)
+    for alteration in _ALTERATIONS:
+        yield _by_alteration(before, patterns, alteration)
 
 
 def _widened(before: State, space: Space, changed: dict[int, float]) -> State:
+    """The state with further deviations of some parameters, in their units."""
     covariance = before.covariance.copy()
     for number, std in changed.items():
         covariance[number, number] += (std / space.std[number]) ** 2
     return State(before.x, covariance)
 
 
-def _by_mass(before: State, patterns: Sequence[Touched]) -> list[_Tried]:
-    """Batch estimates with a mass, from the places where it would explain most."""
-    space, sides = patterns[0].space, _sides(patterns)
-    mass = space.groups["masses"].stop - 3
+def _by_mass(before: State, patterns: Sequence[Touched]) -> _Hypothesis:
+    space, plate = patterns[0].space, patterns[0].touched.rig.plate
+    sides, mass = np.array([plate.length, plate.width]), space.groups["masses"].stop - 3
     changed = {mass: _MASS, mass + 1: sides[0] / 3, mass + 2: sides[1] / 3}
-    wider = _widened(before, space, changed)
-    found = []
+    starts = []
     for size, place in _scan(before, patterns, None, _MASS)[:_STARTS]:
         start = before.x.copy()
         start[mass] = size / space.std[mass]
         start[mass + 1 : mass + 3] = (place - sides / 2) / space.std[mass + 1 : mass + 3]
-        after = update(wider, patterns, evaluations=_FIRST_EVALUATIONS, start=start)
-        found.append(_Tried(BY_MASS, changed, wider, after))
-    return found
+        starts.append(start)
+    prior = _widened(before, space, changed)
+    return _Hypothesis(BY_MASS, (*changed,), prior, patterns, starts)
 
 
 def _by_alteration(
     before: State, patterns: Sequence[Touched], alteration: Alteration
-) -> list[_Tried]:
-    """Batch estimates with a hand or a crack, from the places where it would explain most."""
-    altered = tuple(Altered.by(alteration, each) for each in patterns)
-    p, e = len(before.x), alteration.size
-    x = np.concatenate([before.x, np.zeros(e)])
-    wider = State(x, linalg.block_diag(before.covariance, np.eye(e)))
-    changed = {p + number: 1.0 for number in range(e)}
-    found = []
-    for size, place in _scan(before, patterns, alteration, 1.0)[:_ALTERED_STARTS]:
-        theta = altered[0].parameters(place, alteration.start(size))
-        start = np.concatenate([before.x, theta])
-        after = update(wider, altered, evaluations=_ALTERED_EVALUATIONS, start=start)
-        found.append(_Tried(alteration.name, changed, wider, after, altered))
-    return found
+) -> _Hypothesis:
+    altered, p = [Altered.by(alteration, each) for each in patterns], len(before.x)
+    wider = linalg.block_diag(before.covariance, np.eye(alteration.size))
+    return _Hypothesis(
+        alteration.name,
+        (*range(p, p + alteration.size),),
+        State(np.concatenate([before.x, np.zeros(alteration.size)]), wider),
+        altered,
+        [
+            np.concatenate([before.x, altered[0].parameters(place, alteration.start(size))])
+            for size, place in _scan(before, patterns, alteration, 1.0)[:_ALTERED_STARTS]
+        ],
+        _ALTERED_EVALUATIONS,
+    )
 
 
 def _scan(
@@ -215,8 +229,3 @@ def _scan(
         slope += (each.pattern.numbers - predicted) @ weighted
         curvature += (column * weighted).sum(axis=0)
     return [(size, points[n]) for n, size in single_changes(slope, curvature, std)]
-
-
-def _sides(patterns: Sequence[Touched]) -> FloatArray:
-    plate = patterns[0].touched.rig.plate
-    return np.array([plate.length, plate.width])

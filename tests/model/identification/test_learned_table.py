@@ -104,7 +104,7 @@ def test_unexplained_change_widens_the_errors_of_answers(
         stiffness=hidden.mounted.stiffness * [0.5, 1.0, 2.0, 1.0],
         gain=hidden.mounted.gain * [1.0, 0.5j, 1.0, 1.0],
     )
-    last = [learned.take(each) for each in settled_patterns(hidden, odd, count=6, start=12)][-1]
+    last = [learned.take(each) for each in settled_patterns(hidden, odd, count=7, start=12)][-1]
     assert last.report.explanation is not None
     assert last.report.explanation.resembles
     assert last.table is learned.current

@@ -1,0 +1,147 @@
+"""Whether what is promised of a click is kept, on plates that deviate and vibrate in time.
+
+    python -m benchmarks.promise.clicks [--only RIG ...] [--sets 24] [--plates 40]
+
+Clicks of 40 ms and 20 dB SL along plain ramps, fingers anywhere on the plate, 5 cm apart, one to
+three of them quiet. For each of the plates, drawn within the uncertainty of the rig (default) or
+one as after `era rig identify` (identified), the contrast over the click: at the target over its
+duration, at the loudest quiet point the strongest as long, ringing after it included. Median of
+what is promised, share of all plates that give it, and by how much it differs from what nine of
+ten plates of a set give: mean and standard deviation over the sets [dB].
+"""
+
+import argparse
+import math
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+from benchmarks.setting import use_one_thread
+
+if TYPE_CHECKING:
+    from model.arrays import FloatArray
+    from model.rig.rig import Rig
+    from model.table.effect_level import RaisedPattern
+    from model.table.question import Question
+    from model.table.table import LocalizationTable
+
+RIGS = ("paper_plate", "eight_eras", "car_display", "table")
+DURATION, LEVEL_DB_SL = 0.04, 20.0
+
+Clicks = list[tuple["Question", "RaisedPattern"]]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.promise.clicks",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--only", nargs="+", metavar="RIG", default=RIGS)
+    parser.add_argument("--sets", type=int, default=24)
+    parser.add_argument("--plates", type=int, default=40)
+    options = parser.parse_args()
+    use_one_thread()
+    import numpy as np
+
+    from benchmarks.promise.cases import EXAMPLES, IDENTIFIED
+    from model.rig.file import load_rig
+    from model.table.build import build_table
+
+    print("| rig | uncertainty | promised [dB] | kept | beyond nine of ten [dB] |")
+    print("|---|---|---|---|---|")
+    for name in options.only:
+        written = load_rig(EXAMPLES / f"{name}.yaml")
+        for label, known in (("default", written.uncertainty), ("identified", IDENTIFIED)):
+            rig = replace(written, uncertainty=known)
+            table = build_table(rig, drive_mode="phased")
+            clicks = clicks_on(table, options.sets)
+            promised = np.array([each.promised_contrast_db for _, each in clicks])
+            found = given(table, rig, clicks, options.plates)
+            beyond = promised - np.percentile(found, 10, axis=1)
+            print(
+                f"| `{name}` | {label} | {np.median(promised):.1f} | "
+                f"{100 * np.mean(found >= promised[:, None]):.0f} % | "
+                f"{beyond.mean():+.1f} ± {beyond.std():.1f} |",
+                flush=True,
+            )
+
+
+def clicks_on(table: "LocalizationTable", sets: int) -> Clicks:
+    """Questions with one to three quiet fingers in turn, and what is played for a click there."""
+    import numpy as np
+
+    from model.table.effect_level import DriveLimits, EffectLevels
+    from model.table.pulse_gains import OverEffect
+    from model.table.question import Question
+    from model.table.random_contacts import random_contacts
+
+    rng, levels, found = np.random.default_rng(3), EffectLevels(table), []
+    full = DriveLimits({era.name: era.stroke for era in table.eras})
+    for number in range(sets):
+        places = random_contacts(rng, 2 + number % 3, table.plate, margin=0.013)
+        question = Question(places[:1], places[1:], LEVEL_DB_SL)
+        solve = partial(levels.responses, question=question, duration=DURATION)
+        pattern = table.query(question, OverEffect(DURATION, solve))
+        raised = levels.raised(
+            pattern, question, level_db_sl=LEVEL_DB_SL, duration=DURATION, limits=full
+        )
+        found.append((question, raised))
+    return found
+
+
+def given(table: "LocalizationTable", rig: "Rig", clicks: Clicks, plates: int) -> "FloatArray":
+    """Contrast [dB] over clicks on plates that differ from a rig's within its uncertainty."""
+    import numpy as np
+
+    from model.finger.fingertip import fingertip_points, fingertip_weights
+    from model.table.effect_level import EffectLevels
+    from model.table.exact_plates import draw_plates
+    from model.table.live_table import table_following
+    from model.vibration.excitation import Tone
+
+    drawn = draw_plates(
+        np.random.default_rng(4),
+        rig.uncertainty,
+        count=plates,
+        era_count=len(rig.eras),
+        contact_count=1,
+    )
+    found = np.empty((len(clicks), plates))
+    for number in range(plates):
+        factor, finger = float(drawn.thickness[number]), rig.fingertip
+        eras = tuple(
+            replace(era, stiffness=k * era.stiffness, damping=drawn.damping[number] * era.damping)
+            for era, k in zip(rig.eras, drawn.stiffness[number].tolist(), strict=True)
+        )
+        plate = replace(
+            rig.plate,
+            thickness=factor * rig.plate.thickness,
+            loss_factor=float(drawn.loss[number]) * rig.plate.loss_factor,
+        )
+        load = float(drawn.load[number, 0])
+        other = table_following(
+            table,
+            replace(rig, plate=plate, eras=eras, fingertip=finger and finger.multiplied(load)),
+        )
+        levels = EffectLevels(other)
+        gains = dict(zip((era.name for era in eras), drawn.gain[number], strict=True))
+        for row, (question, click) in enumerate(clicks):
+            tones = {
+                name: Tone(tone.frequency, abs(z := tone.phasor * gains[name]), float(np.angle(z)))
+                for name, tone in click.pattern.excitation.items()
+            }
+            pulse = levels.gains_db(tones, question, ramp=click.pattern.ramp, duration=DURATION)
+            (target,) = question.targets
+            frequencies, amplitudes = other.amplitudes(
+                tones, fingertip_points(*target, plate), contacts=question.contacts
+            )
+            threshold = other.thresholds[np.searchsorted(other.frequencies, frequencies)]
+            steady = np.linalg.norm(amplitudes / threshold[:, None], axis=0)
+            level = 20 * math.log10(float(steady @ fingertip_weights(*target, plate)))
+            found[row, number] = level + pulse.targets[0] - (pulse.quiet_db_sl or 0.0)
+    return found
+
+
+if __name__ == "__main__":
+    main()

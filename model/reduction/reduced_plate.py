@@ -55,27 +55,13 @@ _DEPENDENT = 1e-9
 class ReductionBasis:
     """Source of a reduction: the solved free plate and the footprints (n, 3) [m].
 
-    truncated_terms: between those points (`model.reduction.truncation`); residual_transform
-    (RESIDUAL_VECTORS n, s): from the residual vectors of the points to the coordinates.
+    residual_transform (RESIDUAL_VECTORS n, s): from the residual vectors of the points to the
+    coordinates.
     """
 
     free: FreePlate
     points: FloatArray
-    truncated_terms: FloatArray
     residual_transform: FloatArray
-
-    def terms_with(self, other: "ReductionBasis") -> FloatArray:
-        """Its `truncated_terms`, between its points and another's, (m, n, k)."""
-        # Most are shared, as when a finger comes or goes, and need no solve.
-        same = (self.points[:, None] == other.points).all(axis=2)
-        truncated_terms = self.truncated_terms[:, :, same.argmax(axis=0)]
-        missing = ~same.any(axis=0)
-        if missing.any():
-            solver = self.free.modes
-            truncated_terms[:, :, missing] = solver.truncated_terms(
-                self.points, other.points[missing]
-            )
-        return truncated_terms
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +113,8 @@ class ReducedPlate:
         modes = len(self.origin.free.modes.eigenvalues)
         projection = np.zeros((len(self.omega), len(other.omega)))
         projection[:modes, :modes] = np.eye(modes)
-        mass = _products(self.origin.terms_with(other.origin), power=1)
+        terms = self.origin.free.modes.truncated_terms(self.origin.points, other.origin.points)
+        mass = _products(terms, power=1)
         projection[modes:, modes:] = (
             self.origin.residual_transform.T @ mass @ other.origin.residual_transform
         )
@@ -175,7 +162,7 @@ def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
         np.concatenate([np.sqrt(free.modes.eigenvalues), omega]),
         np.concatenate([free.modes.losses, np.zeros(len(omega))]),
         shapes,
-        ReductionBasis(free, attached, truncated_terms, residual_transform),
+        ReductionBasis(free, attached, residual_transform),
         free.modes.dispersion and free.modes.dispersion.padded(len(omega)),
     )
 

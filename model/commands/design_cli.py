@@ -21,6 +21,7 @@ from model.commands.options import (
 from model.config.units import LENGTH, STIFFNESS, Dimension, quantity
 from model.counting import counted
 from model.errors import InputError
+from model.finger import MAX_CONTENTS
 
 if TYPE_CHECKING:
     from model.design.run import Machines
@@ -65,7 +66,8 @@ def design(
         ),
     ] = "edge",
     contents: Annotated[
-        int, typer.Option(min=1, help="Contents at the same time, a finger for each.")
+        int,
+        typer.Option(min=1, max=MAX_CONTENTS, help="Contents at the same time, a finger for each."),
     ] = 1,
     contacts: ContactsOption = None,
     apart: Annotated[

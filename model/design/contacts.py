@@ -23,7 +23,7 @@ from model.config.shapes import (
 )
 from model.config.units import LENGTH
 from model.errors import InputError
-from model.finger import MAX_CONTACTS
+from model.finger import MAX_CONTACTS, MAX_CONTENTS
 from model.rig.sections import Identifier
 from model.structure.plate import Plate
 
@@ -32,9 +32,6 @@ DEFAULT_APART = 0.05
 
 DEFAULT_QUIET = {True: (1, 3), False: (0, 1)}
 """Fewest and most quiet fingers beside one content, and beside several."""
-
-MAX_CONTENTS = 6
-"""Contents at the same time; more have no contrast left on any plate."""
 
 MIN_FINGERS = 2
 """Fingers of a set."""

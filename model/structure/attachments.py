@@ -246,16 +246,10 @@ def attached_stiffness(
     return np.column_stack([at_eras, *(load.dynamic_stiffness(omega) for load in loads)])
 
 
-def base_stiffness(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
-    """Force on the plate per displacement of an ERA's base, k_b + i omega c [N/m], (f, eras)."""
-    stiffness = np.array([era.stiffness for era in eras], dtype=float)
-    damping = np.array([era.damping for era in eras], dtype=float)
-    return dynamic_stiffness(stiffness, damping, 0.0, omega[:, None])
-
-
 def drive_forces(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
     """Force of each ERA at full stroke, its own gain included [N], (f, eras) (paper Eq. 25)."""
-    return np.asarray(base_stiffness(eras, omega) * full_strokes(eras, omega))
+    k, c = np.array([(era.stiffness, era.damping) for era in eras], dtype=float).reshape(-1, 2).T
+    return np.asarray(dynamic_stiffness(k, c, 0.0, omega[:, None]) * full_strokes(eras, omega))
 
 
 def full_strokes(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:

@@ -193,16 +193,8 @@ def ramped_pulse(
     """
     ramp = min(ramp, duration)
     onset = ramped_onset(excitation, eras, ramp=ramp)
-    release: list[tuple[Term, ...]] = []
-    for era in eras:
-        tone = excitation.get(era.name)
-        if tone is None:
-            release.append(())
-            continue
-        # What rises from the end on is the tone itself, in opposite phase.
-        omega = 2 * math.pi * tone.frequency
-        opposite = -tone.phasor * cmath.exp(1j * omega * duration)
-        release.append(raised_cosine(duration, ramp, omega, 0j, opposite))
+    # What rises from the end on is the tone itself, in opposite phase.
+    release = _faded(excitation, eras, ramp=ramp, gains=(0.0, -1.0), start=duration)
     return tuple((*rise, *fall) for rise, fall in zip(onset, release, strict=True))
 
 
@@ -212,13 +204,18 @@ def shaped(envelopes: Envelopes, eras: Sequence[Era]) -> Bases:
 
 
 def _faded(
-    excitation: Excitation, eras: Sequence[Era], *, ramp: float, gains: tuple[float, float]
+    excitation: Excitation,
+    eras: Sequence[Era],
+    *,
+    ramp: float,
+    gains: tuple[float, float],
+    start: float = 0.0,
 ) -> Bases:
-    return tuple(
-        raised_cosine(
-            0.0, ramp, 2 * math.pi * tone.frequency, *(gain * tone.phasor for gain in gains)
-        )
-        if (tone := excitation.get(era.name))
-        else ()
-        for era in eras
-    )
+    """Motion of the bases from one gain of an excitation to another, from start [s] on."""
+    found: list[tuple[Term, ...]] = [()] * len(eras)
+    for number, era in enumerate(eras):
+        if tone := excitation.get(era.name):
+            omega = 2 * math.pi * tone.frequency
+            now = tone.phasor * cmath.exp(1j * omega * start)
+            found[number] = raised_cosine(start, ramp, omega, *(gain * now for gain in gains))
+    return tuple(found)

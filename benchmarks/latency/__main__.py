@@ -3,11 +3,10 @@
     python -m benchmarks.latency [--touches N] [--report]
 
 The daemon, floods and programs that load the machine are processes; the panel and the amplifiers,
-on pseudo-terminals or, beside floods, behind serial servers, are this one. A touch is sent when the
-set of the one before has come and no other is under way, so that the next set is its own; a case
-with a planted delay proves that. Six minutes. Beside each figure is how busy other programs kept
-the processors: on a machine that is not left alone figures are upper bounds. --report: write
-docs/measured/latency.md.
+behind serial servers, are this one. A touch is sent when the set of the one before has come and no
+other is under way, so that the next set is its own; a case with a planted delay proves that. Six
+minutes. Beside each figure is how busy other programs kept the processors: on a machine that is not
+left alone figures are upper bounds. --report: write docs/measured/latency.md.
 """
 
 import argparse
@@ -95,9 +94,7 @@ async def opened(case: Case) -> AsyncIterator[Session]:
             session = await stack.enter_async_context(plain_session(rig))
         else:
             program = _PLANTED if case.is_planted else DAEMON
-            daemon = daemon_session(
-                rig, program=program, is_two=case.is_two, is_crowded=case.is_loaded
-            )
+            daemon = daemon_session(rig, program=program, is_two=case.is_two)
             session = await stack.enter_async_context(daemon)
         if case.is_loaded:
             await stack.enter_async_context(crowd.floods(session.socket, *crowd.ALL))
@@ -176,8 +173,7 @@ async def further_row(
     name: str, rig: str, goal: str, act: _Act, kinds: Sequence[tuple[str, int]], touches: int
 ) -> str:
     """Measure something else than taps; returns its row."""
-    started = daemon_session(_RIGS[rig], is_crowded=bool(kinds))
-    async with started as session, crowd.floods(session.socket, *kinds):
+    async with daemon_session(_RIGS[rig]) as session, crowd.floods(session.socket, *kinds):
         load = OtherLoad()
         text, others = await act(session, touches), load.processors()
     return _joined([name, rig, text, goal, f"{others:.2f}"])

@@ -1,4 +1,4 @@
-"""Amplifiers of a rig on pseudo-terminals, or behind serial servers, and a clock for what comes."""
+"""Amplifiers of a rig behind serial servers, and a clock for what reaches them."""
 
 import asyncio
 import socket
@@ -13,7 +13,6 @@ from drivers.protocol.table import MAX_WORDS, MESSAGES, read_request
 from model.rig.rig import Rig
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from sim.transport.pseudo_terminal import PseudoTerminal, make_terminal
 
 BAUD = 921_600
 BITS = 10  # of a byte on the line: start, eight, stop
@@ -31,7 +30,11 @@ class Vibration:
 
 
 class _Server:
-    """A serial server of this machine for one host: bytes need no thread of the kernel between.
+    """A serial server of this machine for one host.
+
+    Not a pseudo-terminal: its bytes are carried by a thread of the kernel, of ordinary priority,
+    which on a busy machine has no processor for as long as a watchdog lasts, whatever the
+    priorities of the daemon and of this program.
 
     on_data: called with bytes from the host, once `listen` was called.
     """
@@ -85,15 +88,13 @@ class _Server:
 
 
 class _Device:
-    """One amplifier; is_server: behind a serial server, not on a pseudo-terminal.
+    """One amplifier.
 
     bytes: on its line until now, of sets and commits with their replies; used [s]: its own time for
     them.
     """
 
-    def __init__(
-        self, name: str, channels: int, changed: Callable[[], None], *, is_server: bool
-    ) -> None:
+    def __init__(self, name: str, channels: int, changed: Callable[[], None]) -> None:
         self.vibrations: list[Vibration] = []
         self.stopped_at = self.changed_at = 0.0  # s; when the last stop, and set, arrived
         self.bytes, self.used = 0, 0.0
@@ -101,14 +102,9 @@ class _Device:
         self._reader, self._assembly = FrameReader(), Assembly()
         self._staged: dict[int, frozenset[int]] = {}
         self._end = SerialAmplifiers({1: Amplifier(name, channels=channels)}, self._reply)
-        self._line: _Server | PseudoTerminal
-        if is_server:
-            self._line = _Server(self._arrived)
-            self.url = self._line.url
-        else:
-            self._line = make_terminal(self._arrived)
-            self.url = f"serial://{self._line.port}?baud={BAUD}"
+        self._line = _Server(self._arrived)
         self._line.listen()
+        self.url = self._line.url
 
     def _arrived(self, data: bytes) -> None:
         now = time.monotonic()
@@ -157,16 +153,15 @@ class _Device:
 
 
 class FarSide:
-    """All amplifiers of a rig; urls by name; is_server: behind serial servers."""
+    """All amplifiers of a rig; urls by name."""
 
-    def __init__(self, rig: Rig, *, is_server: bool = False) -> None:
+    def __init__(self, rig: Rig) -> None:
         self._changed = asyncio.Event()
         self._devices: Sequence[_Device] = [
             _Device(
                 name,
                 1 + max(each.number for each in rig.wiring.values() if each.amplifier == name),
                 self._changed.set,
-                is_server=is_server,
             )
             for name in rig.amplifiers
         ]

@@ -1,8 +1,7 @@
 """Programs of the benchmark, their priorities and processor time, and load by others.
 
 Amplifiers and a panel would not use the daemon's processors: the program that represents them has
-the highest priority. The daemon has that of `examples/systemd`, floods the ordinary one. A thread
-of the kernel, which carries the bytes of a pseudo-terminal, has the ordinary one as well.
+the highest priority. The daemon has that of `examples/systemd`, floods the ordinary one.
 """
 
 import asyncio

@@ -10,11 +10,10 @@ port.
 import asyncio
 import contextlib
 import gc
-import os
+import socket
 import sys
 from collections.abc import Iterator
 
-import serial
 from pythonosc.osc_packet import OscPacket
 
 from drivers.codec.serial_line.frame import Frame, encode_frame, pack_words
@@ -31,7 +30,7 @@ LEVEL = 0.2
 class Panel(asyncio.DatagramProtocol):
     """Touches in, sets out."""
 
-    def __init__(self, ports: list[int]) -> None:
+    def __init__(self, ports: list[socket.socket]) -> None:
         self._ports = ports
         message = MESSAGES["Set"]
         self._sets = [
@@ -53,7 +52,7 @@ class Panel(asyncio.DatagramProtocol):
         frame = encode_frame(chosen._replace(sequence=token, payload=payload))
         for port in self._ports:
             with contextlib.suppress(BlockingIOError):  # no room: the touch is lost
-                os.write(port, frame)
+                port.send(frame)
 
 
 def _sets() -> Iterator[Values]:
@@ -71,10 +70,12 @@ async def main() -> None:
     ports = []
     for url in sys.argv[1:]:
         place = SerialAddress(url).place
-        ports.append(serial.Serial(place.device, place.baud, timeout=0, exclusive=True))
-        loop.add_reader(ports[-1].fileno(), os.read, ports[-1].fileno(), 4096)
+        ports.append(socket.create_connection((place.host, place.port)))
+        ports[-1].setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        ports[-1].setblocking(False)
+        loop.add_reader(ports[-1], ports[-1].recv, 4096)
     transport, _ = await loop.create_datagram_endpoint(
-        lambda: Panel([each.fileno() for each in ports]), local_addr=("127.0.0.1", 0)
+        lambda: Panel(ports), local_addr=("127.0.0.1", 0)
     )
     gc.collect()
     gc.freeze()

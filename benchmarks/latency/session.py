@@ -64,17 +64,11 @@ async def daemon_session(
     *,
     program: Sequence[object] = DAEMON,
     is_two: bool = False,
-    is_crowded: bool = False,
 ) -> AsyncIterator[Session]:
-    """Run and arm a daemon for a rig of the examples; is_two: each half of it has a content.
-
-    is_crowded: its amplifiers are behind serial servers. A pseudo-terminal's bytes are carried by a
-    thread of the kernel, of ordinary priority, which other programs keep from them for as long as
-    a watchdog lasts, whatever the priorities of the daemon and of its amplifiers.
-    """
+    """Run and arm a daemon for a rig of the examples; is_two: each half of it has a content."""
     with TemporaryDirectory(prefix="era-latency-") as name:
         folder, port = Path(name), _free_port()
-        rig, far = _rig_on_lines(rig_name, folder, is_server=is_crowded)
+        rig, far = _rig_on_lines(rig_name, folder)
         try:
             more = ""
             if is_two:
@@ -190,12 +184,12 @@ def _fingers(rng: random.Random, rig: Rig, number: int, *, is_two: bool) -> tupl
             return first, second
 
 
-def _rig_on_lines(rig_name: str, folder: Path, *, is_server: bool = False) -> tuple[Rig, FarSide]:
+def _rig_on_lines(rig_name: str, folder: Path) -> tuple[Rig, FarSide]:
     """Write a rig into a folder with the URLs of a far side in place of simulated amplifiers."""
     text = (EXAMPLES / f"{rig_name}.yaml").read_text("utf-8")
     (folder / "rig.yaml").write_text(text, "utf-8")
     rig = load_rig(folder / "rig.yaml")
-    far = FarSide(rig, is_server=is_server)
+    far = FarSide(rig)
     for url in far.urls.values():
         text = text.replace('"sim://"', f'"{url}"', 1)
     (folder / "rig.yaml").write_text(text, "utf-8")

@@ -19,6 +19,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
+from controller.api.rate_limit import RateLimiter
+
 _MAX_QUEUED = 2000  # lines
 _BURST = 5  # lines of one logging call at once
 _RATE = 1.0  # 1/s after a burst
@@ -72,22 +74,22 @@ class RateLimitFilter(logging.Filter):
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
         self._clock = clock
-        self._buckets: dict[tuple[str, int], tuple[float, float, int]] = {}
+        # Of each call, and how many of its records were not written since the last one.
+        self._calls: dict[tuple[str, int], tuple[RateLimiter, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether to write a record; its field `skipped` counts the records not written before."""
         if getattr(record, "topic", None) == "state":
             return True
-        call, now = (record.pathname, record.lineno), self._clock()
-        tokens, updated_at, skipped = self._buckets.get(call, (float(_BURST), now, 0))
-        tokens = min(float(_BURST), tokens + _RATE * (now - updated_at))
-        if tokens < 1:
-            self._buckets[call] = (tokens, now, skipped + 1)
-            return False
-        self._buckets[call] = (tokens - 1, now, 0)
-        if skipped:
+        call = record.pathname, record.lineno
+        if call not in self._calls:
+            self._calls[call] = RateLimiter(_RATE, burst=_BURST, clock=self._clock), 0
+        limiter, skipped = self._calls[call]
+        is_written = limiter.take()
+        self._calls[call] = limiter, 0 if is_written else skipped + 1
+        if is_written and skipped:
             record.__dict__["skipped"] = skipped
-        return True
+        return is_written
 
 
 class LogThread(logging.Handler):

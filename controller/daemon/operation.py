@@ -49,7 +49,6 @@ _LOG_LEVELS = {
 }
 
 _logger = logging.getLogger(__name__)
-_rate_limited_logger = logging.getLogger(f"{__name__}.background")
 _T = TypeVar("_T")
 
 
@@ -173,9 +172,9 @@ class Operator:
         try:
             await work
         except DriverError as error:
-            _rate_limited_logger.info("failed: %s", error)
+            _logger.info("failed: %s", error)
         except Exception as error:
-            _rate_limited_logger.exception("failed, stopping all amplifiers")
+            _logger.exception("failed, stopping all amplifiers")
             await self._fail(error)
 
     def stop(self, cause: str, remedy: str | None = None) -> Awaitable[Mapping[str, Stopped]]:
@@ -265,7 +264,7 @@ class Operator:
         try:
             await self._check_links()
         except Exception:
-            _rate_limited_logger.exception("handling of a lost link failed")
+            _logger.exception("handling of a lost link failed")
         return outcomes
 
     async def _stop(self) -> None:

@@ -35,7 +35,6 @@ STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
 _RECHECK = 0.05  # s; of whether the watchdog of a lost amplifier has passed
 
 _logger = logging.getLogger(__name__)
-_rate_limited_logger = logging.getLogger(f"{__name__}.background")
 
 
 class Supervisor(Operator):
@@ -130,7 +129,7 @@ class Supervisor(Operator):
             try:
                 return await self._fail(error)
             except Exception:
-                _rate_limited_logger.exception("stop after a failure of the control loop failed")
+                _logger.exception("stop after a failure of the control loop failed")
                 await asyncio.sleep(_RECHECK)
 
     async def close(self, cause: str) -> None:
@@ -172,9 +171,9 @@ class Supervisor(Operator):
                 if self.operation.state is DaemonState.COMM_LOST:
                     await self._controller.release()
         except DriverError as error:
-            _rate_limited_logger.info("failed: %s", error)
+            _logger.info("failed: %s", error)
         except Exception:
-            _rate_limited_logger.exception("reconnection failed")
+            _logger.exception("reconnection failed")
             await self._pause(STATUS_INTERVAL)
 
     async def _reconnect(self) -> None:
@@ -229,7 +228,7 @@ class Supervisor(Operator):
         except DriverError:
             pass  # preempted by another request, which reports for itself
         except Exception:
-            _rate_limited_logger.exception("status read failed")
+            _logger.exception("status read failed")
 
     async def _check_disarmed(self) -> None:
         epoch, group = self.operation.epoch, self._controller.group
@@ -245,7 +244,7 @@ class Supervisor(Operator):
             and state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
             and self.operation.epoch not in self._clears  # a clear reads back for itself
         ):
-            _rate_limited_logger.error("stop repeated: %s", problem)
+            _logger.error("stop repeated: %s", problem)
             await self._stop()
 
     def _check_own_stop(self, cause: str) -> bool:
@@ -273,7 +272,7 @@ class Supervisor(Operator):
             change, level, remedy = "degraded", logging.WARNING, "check cables and supply"
             cause = f"amplifier {', '.join(degraded)} does not reply; nothing new is played"
         self.post(DaemonEvent(Trigger.LINK_CHANGED, cause, remedy))
-        _rate_limited_logger.log(level, "link: %s: %s", change, cause, extra={"topic": "link"})
+        _logger.log(level, "link: %s: %s", change, cause, extra={"topic": "link"})
         self._link_changed(change, degraded, cause)
 
     def _amplifier_event(self, name: str, event: Values) -> None:

@@ -25,7 +25,6 @@ from controller.daemon.touch_inputs import ApiTouches, TouchInputs
 from controller.learning.learning import Learning
 from controller.loop.loop import Controller
 from controller.loop.observer import Observer
-from controller.sources.touch import TouchFrame
 from drivers import clock
 from drivers.garbage_collection import no_long_collections, without_collections
 from drivers.host.amplifier import WATCHDOG, Amplifier
@@ -105,12 +104,13 @@ class Daemon:
             urls=config.urls,
             serial_numbers=config.section.serial_numbers,
             connected=self._connected,
-            observer=self._supervisor.observe(self._publisher.observer()),
+            observer=self._supervisor.observer(),
             intent_source=self._layout,
             timing=timing,
             drive_mode=config.section.mode,
             watchdog=watchdog,
         )
+        self._controller.observers.append(self._publisher.observer())
         if config.learn is not None:
             self.learning = Learning(
                 config.rig,
@@ -123,8 +123,8 @@ class Daemon:
             )
             self._controller.observers.append(self.learning.observer)
         self._controller.observers.append(observer)
-        self._touches = ApiTouches(config.rig.plate, self._deliver)
-        self._inputs = TouchInputs(self._deliver)
+        self._touches = ApiTouches(config.rig.plate, self._controller.deliver)
+        self._inputs = TouchInputs(self._controller.deliver)
         self._api = ApiService(
             config,
             table,
@@ -260,10 +260,6 @@ class Daemon:
         """Follow amplifiers whose lines have been opened."""
         self._dumps.follow(amplifiers)
         self._supervisor.connected(amplifiers)
-
-    def _deliver(self, frame: TouchFrame) -> None:
-        """Pass touches to the control loop."""
-        self._controller.deliver(frame)
 
     def _follow_state(self, old: Operation, new: Operation) -> None:
         """Learn of the plate from when all amplifiers are open."""

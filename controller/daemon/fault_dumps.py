@@ -51,7 +51,9 @@ class FaultDumps:
         self._writer: threading.Thread | None = None
 
     def follow(self, amplifiers: Mapping[str, Amplifier]) -> None:
-        """Record the messages of the lines of amplifiers, by name, from now on."""
+        """Record the messages of the lines of amplifiers, by name, from now on, if for a dump."""
+        if self._folder is None:
+            return
         by_line: dict[Line, dict[int, str]] = {}
         for name, amplifier in amplifiers.items():
             by_line.setdefault(amplifier.line, {})[amplifier.address] = name

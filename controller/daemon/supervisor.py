@@ -7,7 +7,6 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 
 from controller.daemon.deferred_calls import call_guarded
@@ -40,7 +39,7 @@ _logger = logging.getLogger(__name__)
 class Supervisor(Operator):
     """The operation of the plate by the amplifiers of a controller.
 
-    The controller must be created with `observe(observer)` and `connected` of this supervisor.
+    The controller must be created with `observer` and `connected` of this supervisor.
     link_changed receives the kind of change, the lost amplifiers ("lost" only) and a message; alive
     is called after each cycle of the control loop, which runs in every state.
     """
@@ -58,29 +57,24 @@ class Supervisor(Operator):
         self._closing = asyncio.Event()
         self._is_degraded = False  # as reported last
 
-    def observe(self, observer: Observer) -> Observer:
-        """Wrap an observer so that the supervisor sees refusals, losses and cycles first."""
-
-        def refused(reason: str) -> None:
-            if not self._check_own_stop(reason):
-                observer.refused(reason)
-
-        def link_lost(cause: str) -> None:
-            if not self._is_loss_handled:
-                self._spawn(self._in_background(self._handle_loss(LinkError(cause))))
-            observer.link_lost(cause)
-
-        def cycle_completed() -> None:
-            self._check_own_stop(
-                "the control loop has stopped the amplifiers, because an exchange failed"
-            )
-            self._check_degraded()
-            call_guarded(self._alive)
-            observer.cycle_completed()
-
-        return replace(
-            observer, refused=refused, link_lost=link_lost, cycle_completed=cycle_completed
+    def observer(self) -> Observer:
+        """The first observer of the control loop: of refusals, losses and cycles."""
+        return Observer(
+            refused=self._check_own_stop,
+            link_lost=self._link_lost,
+            cycle_completed=self._cycle_completed,
         )
+
+    def _link_lost(self, cause: str) -> None:
+        if not self._is_loss_handled:
+            self._spawn(self._in_background(self._handle_loss(LinkError(cause))))
+
+    def _cycle_completed(self) -> None:
+        self._check_own_stop(
+            "the control loop has stopped the amplifiers, because an exchange failed"
+        )
+        self._check_degraded()
+        call_guarded(self._alive)
 
     def connected(self, amplifiers: Mapping[str, Amplifier]) -> None:
         """Listen to the events of amplifiers, by name, whose lines have been opened."""
@@ -247,14 +241,13 @@ class Supervisor(Operator):
             _logger.error("stop repeated: %s", problem)
             await self._stop()
 
-    def _check_own_stop(self, cause: str) -> bool:
+    def _check_own_stop(self, cause: str) -> None:
         """Post a fault where the loop itself has stopped the amplifiers of an armed plate."""
         is_armed = self.operation.state is DaemonState.OPERATION_ENABLED
         group = self._controller.group
         is_stopped = is_armed and self._controller.is_open and not group.is_armed
         if is_stopped:
             self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
-        return is_stopped
 
     def _check_degraded(self) -> None:
         """Say that armed amplifiers have ceased to reply, or that all reply again."""

@@ -187,12 +187,13 @@ class _Run:
             intent_source=BuzzNewestContact(),
             urls=self.far.urls,
             connected=supervisor.connected,
-            observer=supervisor.observe(
-                Observer(
-                    pattern_applied=self._applied,
-                    refused=lambda why: self.note("observer refused", why),
-                )
-            ),
+            observer=supervisor.observer(),
+        )
+        controller.observers.append(
+            Observer(
+                pattern_applied=self._applied,
+                refused=lambda why: self.note("observer refused", why),
+            )
         )
         for command in get_args(OperatorCommand):
             tell_first(controller, command, partial(self.witness.operator_command, command))

@@ -298,8 +298,9 @@ async def watched(*amplifiers: str, refuses: bool = False) -> AsyncIterator[Watc
         lines=lambda: BenchLines(dict(zip(bench.rig.amplifiers, bench.far_ends, strict=True))),
         intent_source=BuzzNewestContact(),
         connected=supervisor.connected,
-        observer=supervisor.observe(observer),
+        observer=supervisor.observer(),
     )
+    controller.observers.append(observer)
     daemon = Watched(supervisor, controller, bench.far_ends)
     if refuses:
         daemon.refuse("GetCaps")

@@ -250,6 +250,6 @@ async def test_touch_that_came_and_went_during_a_pause_plays_nothing(tmp_path: P
         await era.arm("me", lease_s=60)
         begin = clock.now()
         for ago, touches in ((0.12, (Touch(1, 0.4, 0.5),)), (0.06, ())):
-            bench.daemon._deliver(TouchFrame("brief", begin - ago, touches))
+            bench.daemon._controller.deliver(TouchFrame("brief", begin - ago, touches))
         await journal.hear(10)
         assert not journal.raising_since(begin)

@@ -239,14 +239,14 @@ def test_latency_percentiles_are_values_that_occurred() -> None:
 
 
 @in_virtual_time
-async def test_failing_recorder_prevents_no_stop() -> None:
+async def test_failing_recorder_prevents_no_stop(tmp_path: Path) -> None:
     """The wire gets the Stop, and the caller its outcome."""
 
     class Full(deque[MessageRecord]):
         def append(self, record: MessageRecord) -> None:
             raise MemoryError
 
-    far_end, recorder = FarEnd(), FaultDumps(None)
+    far_end, recorder = FarEnd(), FaultDumps(tmp_path)
     host = await BenchLines({"main": far_end}).amplifier("", LIMITS, name="main")
     recorder.follow({"main": host})
     await host.open()

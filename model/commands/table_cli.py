@@ -49,14 +49,6 @@ def query(
     envelopes: Annotated[
         bool, typer.Option("--envelopes", help="Shape onset and ending by envelopes.")
     ] = False,
-    thorough: Annotated[
-        bool,
-        typer.Option(
-            "--thorough",
-            help="Try all drive modes within this one and all higher levels, so that no lower "
-            "level and no richer mode has less contrast; takes some tenths of a second.",
-        ),
-    ] = False,
     batch: Annotated[
         Path | None,
         typer.Option(
@@ -86,13 +78,11 @@ def query(
             "mode": drive_mode,
             "envelopes": envelopes,
         }
-        _query_batch(table_file, batch, defaults, thorough=thorough)
+        _query_batch(table_file, batch, defaults)
         return
     if own:
-        if target or drive_mode or envelopes or thorough:
-            raise InputError(
-                "--own must be given without --target, --mode, --envelopes and --thorough"
-            )
+        if target or drive_mode or envelopes:
+            raise InputError("--own must be given without --target, --mode and --envelopes")
         _answer(table_file, own, quiet or [], level=level, swap_bands=swap_bands, as_json=as_json)
         return
     if not target:
@@ -108,8 +98,8 @@ def query(
         envelopes=envelopes,
     )
     table = load_table(table_file)
-    table.prepare(drive_mode)
-    answer = query_as_json(table, question, prepared_timing(table), thorough=thorough)
+    table.prepare(drive_mode, with_ringing=False)
+    answer = query_as_json(table, question, prepared_timing(table))
     if as_json:
         print(json.dumps(answer))
     else:
@@ -233,9 +223,7 @@ def _usable(answer: dict[str, Any]) -> str:
     return "dB SL or more" if is_bound else "dB SL"
 
 
-def _query_batch(
-    table_file: Path, batch: Path, defaults: dict[str, Any], *, thorough: bool
-) -> None:
+def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> None:
     """Answer line by line; exit with 1 at the end if a line had no answer.
 
     defaults: of keys that lines leave out.
@@ -248,7 +236,7 @@ def _query_batch(
     has_failed = False
     try:
         with open(batch, encoding="utf-8", opener=regular_file) as lines:
-            for answer in query_batch(table, lines, defaults, thorough=thorough):
+            for answer in query_batch(table, lines, defaults):
                 has_failed = has_failed or "error" in answer
                 print(json.dumps(answer))
     except OSError as error:

@@ -108,17 +108,8 @@ def powers_on(
 
     At the fine points of `read_fingertips` of a question, finger by finger.
     """
-    tips = table.read_fingertips(question.contacts)
-    frequencies, bases = base_amplitudes(excitation, table.eras)
-    rows = np.searchsorted(table.frequencies, frequencies)
-    fingers = fingertip_loads(table.fingertip, question.contacts, question.loads)
-    responses = np.array(
-        [
-            _response(table, tips.fine.astype(float), fingers, row, base, plates)
-            for row, base in zip(rows, bases, strict=True)
-        ]
-    )
-    return rows, np.abs(responses) ** 2
+    rows, found = _responses(table, *_touched(table, question), excitation, plates)
+    return rows, np.abs(found) ** 2
 
 
 def fields_on(
@@ -129,14 +120,10 @@ def fields_on(
     At the points of `read_fingertips` of a question, finger by finger, at a row of the table's
     frequencies; without the deviation of the field.
     """
-    tips = table.read_fingertips(question.contacts)
-    fingers = fingertip_loads(table.fingertip, question.contacts, question.loads)
     exact = replace(plates, deviation=np.zeros_like(plates.deviation))
     bases = np.diag([complex(era.stroke) for era in table.eras])
-    each = [
-        _response(table, tips.fine.astype(float), fingers, row, base, exact).T for base in bases
-    ]
-    return np.stack(each, axis=-1)
+    touched = _touched(table, question)
+    return np.stack([_response(table, *touched, row, base, exact).T for base in bases], axis=-1)
 
 
 def amplitudes_on(
@@ -146,15 +133,34 @@ def amplitudes_on(
 
     points [m]; plates: of as many contacts as points, whose loads count for nothing.
     """
+    shapes = table.shapes_at(points)[:, None]
+    rows, found = _responses(table, shapes, (), excitation, plates)
+    return table.frequencies[rows], np.abs(found)
+
+
+def _touched(
+    table: LocalizationTable, question: Question
+) -> tuple[FloatArray, Sequence[FingertipLoad]]:
+    """Shapes at the fine points of a question's fingers (k, p, r), and their loads."""
+    fine = table.read_fingertips(question.contacts).fine.astype(float)
+    return fine, fingertip_loads(table.fingertip, question.contacts, question.loads)
+
+
+def _responses(
+    table: LocalizationTable,
+    discs: FloatArray,
+    fingers: Sequence[FingertipLoad],
+    excitation: Excitation,
+    plates: Plates,
+) -> tuple[IntArray, ComplexArray]:
+    """Rows of an excitation's frequencies (m,), and its accelerations (m, points, d) [m/s²]."""
     frequencies, bases = base_amplitudes(excitation, table.eras)
     rows = np.searchsorted(table.frequencies, frequencies)
-    shapes = table.shapes_at(points)[:, None]
-    return frequencies, np.array(
-        [
-            np.abs(_response(table, shapes, (), row, base, plates))
-            for row, base in zip(rows, bases, strict=True)
-        ]
-    )
+    found = [
+        _response(table, discs, fingers, row, base, plates)
+        for row, base in zip(rows, bases, strict=True)
+    ]
+    return rows, np.array(found)
 
 
 def _response(

@@ -17,7 +17,6 @@ from model.table.pattern import Pattern
 from model.table.question import Question
 from model.table.request import APART_HZ, Finger, Request
 from model.table.table import LocalizationTable
-from model.table.thorough_query import query_thoroughly
 from model.table.timing import Timing
 from model.transients.base_motion import Envelopes
 
@@ -96,15 +95,14 @@ def query_table(
     timing: Timing,
     *,
     measures: bool = True,
-    thorough: bool = False,
 ) -> tuple[Pattern, float]:
     """Query a table; also return the time [s] that the pattern took without its measures.
 
     The pattern has envelopes if the question wants them; measures: compute those in time and over
-    the whole plate; thorough: as `query_thoroughly`.
+    the whole plate.
     """
     started = time.perf_counter()
-    pattern = query_thoroughly(table, question) if thorough else table.query(question)
+    pattern = table.query(question)
     if question.envelopes:
         pattern = timing.with_envelopes(question, pattern)
     elapsed = time.perf_counter() - started
@@ -114,11 +112,9 @@ def query_table(
     return with_concentration(table, question, pattern), elapsed
 
 
-def query_as_json(
-    table: LocalizationTable, question: Question, timing: Timing, *, thorough: bool = False
-) -> dict[str, Any]:
+def query_as_json(table: LocalizationTable, question: Question, timing: Timing) -> dict[str, Any]:
     """Query a table with all measures and return the JSON object of `era table query`."""
-    pattern, elapsed = query_table(table, question, timing, thorough=thorough)
+    pattern, elapsed = query_table(table, question, timing)
     concentration = pattern.concentration
     return {
         "drive": table.drive_of(pattern.excitation),
@@ -259,14 +255,12 @@ def query_batch(
     table: LocalizationTable,
     lines: Iterable[str],
     defaults: Mapping[str, Any] = MappingProxyType({}),
-    *,
-    thorough: bool = False,
 ) -> Iterator[dict[str, Any]]:
     """Answer every line that is not empty; `{"error": ..., "line": n}` for one without answer.
 
     defaults: of keys that lines leave out.
     """
-    table.prepare()
+    table.prepare(with_ringing=False)
     timing = prepared_timing(table)
     for number, line in enumerate(lines, start=1):
         if not line.strip():
@@ -276,6 +270,6 @@ def query_batch(
             if asked.own:
                 yield _answer_of_line(table, asked)
             else:
-                yield query_as_json(table, _question(asked), timing, thorough=thorough)
+                yield query_as_json(table, _question(asked), timing)
         except InputError as error:
             yield {"error": str(error), "line": number}

@@ -258,10 +258,9 @@ async def _stop(chain: Chain, wire: str, scene: str, tally: Tally) -> None:
         await chain.judge(outcomes, scene)
 
 
-async def _disturbed_stops(wire: str, rng: random.Random, tally: Tally) -> list[str]:
+async def _disturbed_stops(chain: Chain, wire: str, tally: Tally, seed: int) -> None:
     """Stops of one chain while frames are lost, late and doubled."""
-    chain = Chain(wire, rng)
-    await chain.group.open()
+    rng = chain.rng
     for _ in range(PER_CHAIN):
         scene = rng.choice(tuple(SCENES))
         is_early = rng.random() < 0.5
@@ -274,28 +273,23 @@ async def _disturbed_stops(wire: str, rng: random.Random, tally: Tally) -> list[
         await _stop(chain, wire, scene, tally)
         chain.disturb(is_on=False)
         await asyncio.sleep(0.3)
-    chain.close()
-    return chain.found
 
 
-async def _stop_with_exception(wire: str, rng: random.Random, tally: Tally, at: int) -> list[str]:
-    """One stop, on the way of which an exception is raised at the line of this number."""
-    chain = Chain(wire, rng)
-    await chain.group.open()
-    scene = rng.choice(("playing", "applying", "stopping"))
+async def _stop_with_exception(chain: Chain, wire: str, tally: Tally, seed: int) -> None:
+    """One stop, on the way of which an exception is raised at a line whose number is drawn."""
+    at = random.Random(-seed).randint(1, random.Random(seed).choice((100, 500, _MOST_LINES)))
+    scene = chain.rng.choice(("playing", "applying", "stopping"))
     await SCENES[scene](chain)
-    if rng.random() < 0.5:
+    if chain.rng.random() < 0.5:
         chain.disturb()
     with _exception_at(at) as planted:
         await _stop(chain, wire, f"{scene}, exception at line {at} {planted}", tally)
-    chain.close()
-    return [f"{one} {planted}" for one in chain.found]
+    chain.found = [f"{one} {planted}" for one in chain.found]
 
 
-async def _stop_by_command(wire: str, rng: random.Random, tally: Tally) -> list[str]:
+async def _stop_by_command(chain: Chain, wire: str, tally: Tally, seed: int) -> None:
     """Stop one amplifier of a killed host by `era amp stop`."""
-    chain = Chain(wire, rng)
-    await chain.group.open()
+    rng = chain.rng
     scene = rng.choice(tuple(SCENES))
     await SCENES[scene](chain)
     if is_early := rng.random() < 0.5:
@@ -322,7 +316,6 @@ async def _stop_by_command(wire: str, rng: random.Random, tally: Tally) -> list[
     tally.counts[wire, "stops"] += 1
     tally.counts[wire, "confirmed" if is_confirmed else "may play"] += 1
     await chain.judge({name: Stopped(is_confirmed, silent_from)}, f"{scene}, killed")
-    return chain.found
 
 
 @contextmanager
@@ -363,28 +356,26 @@ def _is_of_far_end(frame: types.FrameType | None) -> bool:
     return False
 
 
-def disturbed_stops(seed: int, tally: Tally) -> None:
-    """Stop a chain some times, with faults of frames; seeds go over all wires in turn."""
-    _run(_disturbed_stops, seed, tally)
+PROGRAMMES: Mapping[str, Callable[[Chain, str, Tally, int], Awaitable[None]]] = {
+    "frames lost, late and doubled": _disturbed_stops,
+    "one exception each": _stop_with_exception,
+    "by era amp stop, of a killed host": _stop_by_command,
+}
 
 
-def stop_with_exception(seed: int, tally: Tally) -> None:
-    """Stop once with one exception."""
-    at = random.Random(-seed).randint(1, random.Random(seed).choice((100, 500, _MOST_LINES)))
-    _run(lambda *given: _stop_with_exception(*given, at), seed, tally)
-
-
-def stop_of_killed_host(seed: int, tally: Tally) -> None:
-    """Stop one amplifier of a killed host by command."""
-    _run(_stop_by_command, seed, tally)
-
-
-def _run(
-    main: Callable[[str, random.Random, Tally], Awaitable[list[str]]], seed: int, tally: Tally
-) -> None:
+def play(programme: str, seed: int, tally: Tally) -> None:
+    """Stop a chain once, or some times, and judge it; seeds go over all wires in turn."""
     wire, rng = tuple(LINES)[seed % len(LINES)], random.Random(seed)
+
+    async def run() -> list[str]:
+        chain = Chain(wire, rng)
+        await chain.group.open()
+        await PROGRAMMES[programme](chain, wire, tally, seed)
+        chain.close()
+        return chain.found
+
     try:
-        found = run_virtual(main(wire, rng, tally), rng=rng)  # type: ignore[arg-type]
+        found = run_virtual(run(), rng=rng)
     except Stuck as problem:
         found = [str(problem)]
     tally.found += [f"seed {seed} on {wire}: {one}" for one in found]
@@ -400,15 +391,12 @@ def main() -> int:
     options = parser.parse_args()
     logging.disable(logging.CRITICAL)
     failed = 0
-    for name, play, limit in (
-        ("frames lost, late and doubled", disturbed_stops, options.stops),
-        ("one exception each", stop_with_exception, options.exceptions),
-        ("by era amp stop, of a killed host", stop_of_killed_host, options.killed),
-    ):
+    limits = (options.stops, options.exceptions, options.killed)
+    for name, limit in zip(PROGRAMMES, limits, strict=True):
         tally = Tally()
         seed = options.first
         while tally.total("stops") < limit:
-            play(seed, tally)
+            play(name, seed, tally)
             seed += 1
         lines = (name, tally.table(), *tally.found, f"untrue or endless: {len(tally.found)}")
         sys.stdout.write("\n".join(lines) + "\n\n")

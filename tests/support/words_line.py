@@ -192,6 +192,16 @@ def layer(number: int, *tones: Tone, **other: object) -> Layer:
     return Layer(number, tones, 0.001, **other)  # type: ignore[arg-type]
 
 
+async def group_of(*ends: MemoryLine, is_armed: bool = True, **options: Any) -> Group:
+    """The group of all hosts of lines, open and armed; options: as a `Group` takes them."""
+    hosts = {name: host for end in ends for name, host in end.hosts.items()}
+    group = Group(hosts, **{"draw": lambda low, high: 77, **options})
+    await group.open()
+    if is_armed:
+        await group.arm()
+    return group
+
+
 def with_group(
     test: Callable[[Group, list[MemoryLine]], Awaitable[None]], wire: str, *lines: tuple[str, ...]
 ) -> None:
@@ -199,11 +209,7 @@ def with_group(
 
     async def run() -> None:
         ends = [MemoryLine(wire, *names) for names in lines]
-        hosts = {name: host for end in ends for name, host in end.hosts.items()}
-        group = Group(hosts, draw=lambda low, high: 77)
-        await group.open()
-        await group.arm()
-        await test(group, ends)
+        await test(await group_of(*ends), ends)
 
     run_virtual(run())
 

@@ -14,7 +14,7 @@ from drivers.host.group import Group
 from drivers.host.wire import Arrival, Broken, Event, Nak, OtherHost, Reply, Several
 from drivers.protocol.table import MESSAGES
 from virtual_loop import in_virtual_time, run_virtual
-from words_line import MemoryLine
+from words_line import MemoryLine, group_of
 
 NODE = 5
 PING, GET_STATUS, STOP = 12, 9, 8
@@ -140,8 +140,7 @@ def beside_another_host(test: Callable[[Group, MemoryLine], Awaitable[None]]) ->
 
     async def run() -> None:
         end = MemoryLine("can", "a")
-        group = Group(end.hosts, draw=lambda low, high: 77)
-        await group.open()
+        group = await group_of(end, is_armed=False)
         await test(group, end)
 
     run_virtual(run())

@@ -7,13 +7,12 @@ import pytest
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused
 from drivers.host.amplifier import achieved_problem
-from drivers.host.group import Group
 from drivers.host.sensors import read_measured
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
 from sim.amplifier.readings import capabilities
 from virtual_loop import in_virtual_time
-from words_line import KINDS, MemoryLine
+from words_line import KINDS, MemoryLine, group_of
 
 SENT = LayerSet(2, 20, 0, (Command(0, 2000, 5000, 17_990), Command(1, 2000, 0, 0)))
 CAN = {**capabilities(2), "frequency_step": 3, "level_step": 5, "phase_step": 41}
@@ -52,9 +51,7 @@ async def test_ledger_goes_on_with_what_was_achieved(kind: str) -> None:
     end = MemoryLine(kind, "a")
     far, (host,) = end.far["a"], end.hosts.values()
     far.capabilities = {**far.capabilities, "level_step": 1000}
-    group = Group(end.hosts, draw=lambda low, high: 77)
-    await group.open()
-    await group.arm()
+    group = await group_of(end)
     commit = far.playback.commit
 
     def rounded(layers: tuple[LayerSet, ...], token: int, time: float) -> None:
@@ -83,9 +80,7 @@ async def test_levels_that_are_measured_have_an_error() -> None:
     end = MemoryLine("serial", "a")
     far, (host,) = end.far["a"], end.hosts.values()
     far.capabilities = {**far.capabilities, "features": far.capabilities["features"] | 1 << 2}
-    group = Group(end.hosts, draw=lambda low, high: 77)
-    await group.open()
-    await group.arm()
+    group = await group_of(end)
     await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)]})
     status = far.status
 

@@ -8,11 +8,10 @@ import pytest
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, DriverError, LinkError, LinkTimeout, Preempted
 from drivers.host.amplifier import Amplifier as Host
-from drivers.host.group import Group
 from sim.amplifier.contract import Amplifier
 from sim.amplifier.readings import capabilities
 from virtual_loop import in_virtual_time, run_virtual
-from words_line import KINDS, LIMITS, MemoryLine, unaltered
+from words_line import KINDS, LIMITS, MemoryLine, group_of, unaltered
 
 
 @pytest.fixture(params=KINDS)
@@ -40,8 +39,7 @@ def restart(end: MemoryLine, **changes: object) -> None:
 async def test_amplifier_that_was_switched_off_is_armed_with_its_new_limits(wire: str) -> None:
     """It plays at most 0.3 since: 0.4 is refused here, before anything is sent."""
     end = MemoryLine(wire, "a")
-    group = Group(end.hosts, draw=lambda low, high: 77)
-    await group.open()
+    group = await group_of(end, is_armed=False)
     restart(end, level_max=3000)
     await group.arm()
     end.sent.clear()
@@ -55,8 +53,7 @@ async def test_amplifier_that_was_switched_off_is_armed_with_its_new_limits(wire
 async def test_another_amplifier_is_not_armed(wire: str) -> None:
     """Exchanged while it was switched off: its serial number is another."""
     end = MemoryLine(wire, "a")
-    group = Group(end.hosts, draw=lambda low, high: 77)
-    await group.open()
+    group = await group_of(end, is_armed=False)
     end.far["a"].identity["serial_number"] = "SIM-other"
     with pytest.raises(LinkError):
         await group.arm()
@@ -67,9 +64,7 @@ async def test_another_amplifier_is_not_armed(wire: str) -> None:
 async def test_amplifier_that_restarts_amid_a_session_can_be_cleared_and_armed(wire: str) -> None:
     """Its latches begin anew, so that the stop is not confirmed; clear and arm know it again."""
     end = MemoryLine(wire, "a")
-    group = Group(end.hosts, draw=lambda low, high: 77)
-    await group.open()
-    await group.arm()
+    group = await group_of(end)
     assert (await group.stop())["a"].is_confirmed
     await group.clear()
     group._draw = lambda low, high: 78
@@ -131,9 +126,7 @@ def test_request_that_waits_on_a_busy_machine_contradicts_nothing(wire: str) -> 
 
     async def run(is_answered: bool) -> None:
         end = MemoryLine(wire, "a")
-        group = Group(end.hosts, draw=lambda low, high: 77)
-        await group.open()
-        await group.arm()
+        await group_of(end)
         (host,) = end.hosts.values()
         end.inward = lambda name, data: [(0.025, data)]
         if is_answered:
@@ -158,9 +151,7 @@ async def test_ping_that_a_network_delivers_late_is_accounted_for() -> None:
     By hand: the last of three attempts goes out at 60 ms and feeds at 260 ms, for 250 ms.
     """
     end = MemoryLine("tcp", "a")
-    group = Group(end.hosts, draw=lambda low, high: 77)
-    await group.open()
-    await group.arm()
+    group = await group_of(end)
     await group.apply({"a": [loud(0.5)]})
     (host,) = end.hosts.values()
     end.inward = lambda name, data: [(0.2, data)]
@@ -179,9 +170,7 @@ async def test_ping_that_a_network_delivers_late_is_accounted_for() -> None:
 async def test_mute_amplifier_leaves_the_others_disarmed_and_without_a_fault(wire: str) -> None:
     """It is known within 0.1 s not to reply: before the watchdogs of those armed pass."""
     ends = [MemoryLine(wire, "a"), MemoryLine(wire, "b")]
-    hosts = {name: host for end in ends for name, host in end.hosts.items()}
-    group = Group(hosts, draw=lambda low, high: 77)
-    await group.open()
+    group = await group_of(*ends, is_armed=False)
     ends[1].outward = lambda name, data: []
     began = ends[0].loop.time()
     with pytest.raises(LinkError):

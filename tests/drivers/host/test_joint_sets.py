@@ -16,7 +16,7 @@ from drivers.host.serial_wire import SerialWire
 from drivers.host.wire import Wire
 from drivers.protocol.table import MESSAGES
 from virtual_loop import in_virtual_time
-from words_line import KINDS, MemoryLine
+from words_line import KINDS, MemoryLine, group_of
 
 LAYER = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
 # By hand: a commit is a frame of 16 bytes of ten bits, of 15 of eleven after 3.5 characters, of one
@@ -51,18 +51,15 @@ async def test_commits_arrive_together_on_lines_of_any_speed_that_are_busy(
 ) -> None:
     """Within 0.2 ms, while the second line carries a status whose reply takes 9 ms or more."""
     ends = [timed_line(name, each) for name, each in zip(names, "ab", strict=True)]
-    hosts = {name: host for end in ends for name, host in end.hosts.items()}
-    group = Group(hosts, watchdog=1.0, draw=lambda low, high: 77)
-    await group.open()
-    await group.arm()
+    group = await group_of(*ends, watchdog=1.0)
     ends[1].outward = lambda name, data: [(0.009 if name == "GetStatus" else 0.0002, data)]
 
     async def keep_busy() -> None:
         await asyncio.sleep(0.0005)
-        await hosts["b"].read_status()
+        await group.amplifiers["b"].read_status()
 
     busy = asyncio.ensure_future(keep_busy())
-    await group.apply({name: [LAYER] for name in hosts})
+    await group.apply({name: [LAYER] for name in group.amplifiers})
     await busy
     first, second = [*started(ends[0]), *started(ends[1])]
     assert abs(first - second) < 0.0002
@@ -72,14 +69,11 @@ async def test_commits_arrive_together_on_lines_of_any_speed_that_are_busy(
 async def test_line_that_is_busy_for_too_long_commits_nothing() -> None:
     """Three readings without reply take 270 ms, a set is admitted for 100: silent, not armed."""
     ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
-    hosts = {name: host for end in ends for name, host in end.hosts.items()}
-    group = Group(hosts, watchdog=1.0, draw=lambda low, high: 77)
-    await group.open()
-    await group.arm()
+    group = await group_of(*ends, watchdog=1.0)
     ends[1].outward = lambda name, data: [] if name == "GetStatus" else [(0.0002, data)]
-    reads = [asyncio.ensure_future(hosts["b"].read_status()) for _ in range(3)]
+    reads = [asyncio.ensure_future(group.amplifiers["b"].read_status()) for _ in range(3)]
     with pytest.raises(DriverError, match="commits must be sent together") as refused:
-        await group.apply({name: [LAYER] for name in hosts})
+        await group.apply({name: [LAYER] for name in group.amplifiers})
     assert not isinstance(refused.value, Preempted)  # nothing came first: it is to be told
     await asyncio.gather(*reads, return_exceptions=True)
     assert [started(end) for end in ends] == [[], []]
@@ -129,13 +123,10 @@ async def test_commits_that_would_arrive_too_late_are_not_sent() -> None:
 async def test_stop_while_a_line_is_kept_for_its_commit_commits_nothing() -> None:
     """One line is free, the other busy for 90 ms: the stop goes out at once on the first."""
     ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
-    hosts = {name: host for end in ends for name, host in end.hosts.items()}
-    group = Group(hosts, draw=lambda low, high: 77)
-    await group.open()
-    await group.arm()
+    group = await group_of(*ends)
     ends[1].outward = lambda name, data: [(0.025, data)]
-    applying = asyncio.ensure_future(group.apply({name: [LAYER] for name in hosts}))
-    reading = asyncio.ensure_future(hosts["b"].read_status())
+    applying = asyncio.ensure_future(group.apply({name: [LAYER] for name in group.amplifiers}))
+    reading = asyncio.ensure_future(group.amplifiers["b"].read_status())
     moments, select = 0, ends[0].loop.select  # type: ignore[attr-defined]
 
     def counted(timeout: float | None) -> list[object]:
@@ -173,10 +164,7 @@ async def test_amplifier_that_was_left_out_for_long_takes_the_next_set(
     Of each 4096 sets to the other amplifier one is sent; the rest only count.
     """
     ends = [MemoryLine(kind, "a"), MemoryLine(kind, "b")]
-    hosts = {name: host for end in ends for name, host in end.hosts.items()}
-    group = Group(hosts, draw=lambda low, high: 7)
-    await group.open()
-    await group.arm()
+    group = await group_of(*ends)
     await group.apply(
         {"a": [loud(0, 0.5)], "b": [loud(each, 0.1) for each in layers] or [Layer(0)]}
     )
@@ -189,6 +177,6 @@ async def test_amplifier_that_was_left_out_for_long_takes_the_next_set(
     assert [(each.origin, each.layer) for each in after] == [
         (each.origin, each.layer) for each in before
     ]
-    await group.apply({name: [loud(0, 0.2)] for name in hosts})
+    await group.apply({name: [loud(0, 0.2)] for name in group.amplifiers})
     await group.silence(0.0)
     assert [ends[0].levels("a")[0], ends[1].levels("b")[0]] == [0.0, 0.0]

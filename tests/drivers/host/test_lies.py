@@ -20,7 +20,7 @@ from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import MESSAGES
 from sim.far_ends import serial_amplifiers
 from virtual_loop import in_virtual_time, run_virtual
-from words_line import KINDS, Alter, MemoryLine, unaltered
+from words_line import KINDS, Alter, MemoryLine, group_of, unaltered
 
 PACKED = len(pack_frames([CanFrame(0, b"")]))
 LOUD = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
@@ -66,9 +66,7 @@ def altered(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, int, int], None]:
 async def armed(wire: str) -> tuple[Group, MemoryLine]:
     """A group of one amplifier, armed."""
     end = MemoryLine(wire, "a")
-    group = Group(end.hosts, draw=random.Random(3).randint)
-    await group.open()
-    await group.arm()
+    group = await group_of(end, draw=random.Random(3).randint)
     return group, end
 
 

@@ -58,12 +58,6 @@ class FarSide:
         found = self.bench.amplifiers[name or self.device.name]
         return found.summary(self.bench.time)
 
-    def silent_from(self) -> float:
-        """When the amplifier is silent for good [s], or infinity, by its own clock."""
-        self.bench.advance(clock.now())
-        ends = [tone.silent_from for output in self.amplifier.outputs for tone in output]
-        return max(ends, default=self.bench.time)
-
 
 def after_each(
     device: AmplifierDevice, note: Callable[[str, Values, Values, float], object]

@@ -13,7 +13,6 @@ from controller.daemon.dashboard_process import gateway_options
 from controller.gateway.settings import read_token
 from daemon_bench import (
     ENABLED,
-    PLACE,
     READY,
     daemon_at,
     error_code,
@@ -28,38 +27,6 @@ from daemon_bench import (
 from rig_files import TWO_AMPLIFIERS
 from sim.faults.fault_window import FaultWindow
 from virtual_sockets import in_virtual_time_on_sockets
-
-
-@in_virtual_time_on_sockets
-async def test_daemon_plays_touches_only_while_armed(tmp_path: Path) -> None:
-    """Disarmed nothing is sent; armed the pattern plays and is reported; lifted, all is silent."""
-    async with ready_daemon(tmp_path) as (bench, era):
-        await era.subscribe("pattern", "silence", "contacts")
-        await era.touch([PLACE])
-        assert (await next_event(era, "contacts")).data["contacts"] == []
-        (contact,) = (await next_event(era, "contacts")).data["contacts"]
-        assert (contact["x_m"], contact["y_m"]) == pytest.approx(PLACE)
-        assert contact["role"] is None
-        assert not any(bench.far.summary().levels)
-        assert bench.far.summary().state == "SWITCH_ON_DISABLED"
-        await era.arm("me", lease_s=30)
-        async with holding(era, PLACE, (0.25, 0.2), far=bench.far):
-            pattern = (await next_event(era, "pattern")).data
-            while len(pattern["contacts"]) == 1:  # that finger was down when it was armed
-                pattern = (await next_event(era, "pattern")).data
-            assert [contact["role"] for contact in pattern["contacts"]] == ["quiet", "target"]
-            assert 20 <= pattern["contacts"][1]["level_db_sl"] < 22
-            assert pattern["latency_ms"] > 0
-            status = await era.status()
-            assert (status.state, status.armed_by) == (ENABLED, "me")
-            assert 0 < (status.lease_left_s or 0) <= 30
-            commanded = [pattern["drive"][era]["level"] for era in ("SW", "SE", "NE", "NW")]
-            await until(lambda: bench.far.summary().levels == pytest.approx(commanded, abs=1e-4))
-            assert (await era.status()).drive.keys() == pattern["drive"].keys()
-        await era.touch([])
-        await until(lambda: not any(bench.far.summary().levels))
-        assert (await next_event(era, "silence")).data["reason"]
-        assert (await era.status()).drive == {}
 
 
 @in_virtual_time_on_sockets

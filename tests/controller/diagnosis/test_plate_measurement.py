@@ -86,7 +86,7 @@ async def measured(
             rig, Lines, far.urls, is_quick=is_quick, on_step=on_step
         ).run()
     finally:
-        far.silent_from()
+        far.summary()
         for each in far.bench.amplifiers.values():
             assert each.state == "SWITCH_ON_DISABLED"
             assert not any(output for output in each.outputs)

@@ -1,8 +1,9 @@
 """What the daemon says and answers by as its estimator replies, without a process."""
 
 import asyncio
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
@@ -106,8 +107,9 @@ def ready() -> Ready:
     return Ready(0.2, "", "", None, answers(), change="")
 
 
-async def opened(folder: Path) -> tuple[Learning, Taking]:
-    """A learning whose estimator is started."""
+@asynccontextmanager
+async def opened(folder: Path) -> AsyncIterator[tuple[Learning, Taking]]:
+    """A learning whose estimator is started, closed at the end."""
     taking = Taking()
     learning = Learning(
         make_paper_rig(12, 9),
@@ -118,62 +120,79 @@ async def opened(folder: Path) -> tuple[Learning, Taking]:
     )
     learning.open()
     await asyncio.sleep(0.1)
-    return learning, taking
-
-
-@in_virtual_time
-async def test_plate_that_had_changed_stays_so_over_a_restart(
-    estimators: Estimators, tmp_path: Path
-) -> None:
-    """Ready with the flag: changed and robust, until an estimate says that it is as it was."""
-    learning, _ = await opened(tmp_path)
-    estimators.reply(replace(ready(), answers=answers(), change="a crack"))
-    assert learning.status.state is LearningState.CHANGED
-    assert learning.status.are_robust
-    estimators.reply(replace(QUIET, change="a crack"))
-    assert learning.status.state is LearningState.CHANGED
-    estimators.reply(replace(QUIET, answers=answers()))
-    assert learning.status.state is LearningState.FOLLOWING
-    assert learning.status.remedy is None
-    assert not learning.status.are_robust
+    yield learning, taking
     await asyncio.sleep(0.1)
     await learning.close()
 
 
-@in_virtual_time
-async def test_refreshed_answers_are_taken_again_after_a_change(
-    estimators: Estimators, tmp_path: Path
-) -> None:
-    """Not while patterns are held or answers are robust, and as soon as neither is so."""
-    learning, taking = await opened(tmp_path)
-    estimators.reply(ready())
-    refreshed = Refreshed(answers(), answers())
-    estimators.reply(replace(QUIET, alarm=True, is_held=True))
-    estimators.reply(refreshed)
-    assert taking.taken == []
-    estimators.reply(replace(QUIET, explanation="a crack", change="a crack", answers=answers()))
-    estimators.reply(refreshed)
-    assert len(taking.taken) == 1
-    estimators.reply(replace(QUIET, answers=answers()))
-    estimators.reply(refreshed)
-    assert len(taking.taken) == 3
-    await asyncio.sleep(0.1)
-    await learning.close()
+@dataclass(frozen=True)
+class Told:
+    """What the estimator tells, and what is so thereafter, by the names of the status.
+
+    taken: how many tables the controller has taken in all; levels: of what was logged for it.
+    """
+
+    reply: Reply
+    state: LearningState
+    are_robust: bool | None = None
+    taken: int | None = None
+    levels: Sequence[str] | None = None
 
 
+def watching() -> Ready:
+    """Of an estimator that can only give alarms."""
+    return replace(ready(), only_alarms="never measured")
+
+
+REFRESHED = Refreshed(answers(), answers())
+CHANGED, FOLLOWING = LearningState.CHANGED, LearningState.FOLLOWING
+EXPLAINING, ONLY_ALARMS = LearningState.EXPLAINING, LearningState.ONLY_ALARMS
+COURSES = {
+    # Changed and robust, until an estimate says that it is as it was.
+    "a plate that had changed stays so over a restart": [
+        Told(replace(ready(), answers=answers(), change="a crack"), CHANGED, are_robust=True),
+        Told(replace(QUIET, change="a crack"), CHANGED),
+        Told(replace(QUIET, answers=answers()), FOLLOWING, are_robust=False),
+    ],
+    # Not while patterns are held or answers are robust, and as soon as neither is so.
+    "refreshed answers are taken again after a change": [
+        Told(ready(), FOLLOWING),
+        Told(replace(QUIET, alarm=True, is_held=True), EXPLAINING),
+        Told(REFRESHED, EXPLAINING, taken=0),
+        Told(replace(QUIET, explanation="a crack", change="a crack", answers=answers()), CHANGED),
+        Told(REFRESHED, CHANGED, taken=1),
+        Told(replace(QUIET, answers=answers()), FOLLOWING),
+        Told(REFRESHED, FOLLOWING, taken=3),
+    ],
+    # Held, then quiet: the state is again that of a plate that was not measured.
+    "a watched plate is only watched after a failure": [
+        Told(watching(), ONLY_ALARMS),
+        Told(replace(QUIET, is_held=True), EXPLAINING),
+        Told(QUIET, ONLY_ALARMS),
+    ],
+    # It is all that such a plate can tell.
+    "an alarm of a watched plate is a warning": [
+        Told(watching(), ONLY_ALARMS),
+        Told(replace(QUIET, alarm=True), ONLY_ALARMS, levels=["WARNING"]),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", COURSES)
 @in_virtual_time
-async def test_watched_plate_is_only_watched_after_a_failure(
-    estimators: Estimators, tmp_path: Path
+async def test_status_follows_the_estimator(
+    estimators: Estimators, tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str
 ) -> None:
-    """Held, then quiet: the state is again that of a plate that was not measured."""
-    learning, _ = await opened(tmp_path)
-    estimators.reply(replace(ready(), only_alarms="never measured"))
-    assert learning.status.state is LearningState.ONLY_ALARMS
-    estimators.reply(replace(QUIET, is_held=True))
-    estimators.reply(QUIET)
-    assert learning.status.state is LearningState.ONLY_ALARMS
-    await asyncio.sleep(0.1)
-    await learning.close()
+    """After each reply of a course."""
+    async with opened(tmp_path) as (learning, taking):
+        for told in COURSES[name]:
+            caplog.clear()
+            estimators.reply(told.reply)
+            status = learning.status
+            assert status.state is told.state, told
+            assert told.are_robust in (None, status.are_robust), told
+            assert told.taken in (None, len(taking.taken)), told
+            assert told.levels in (None, [each.levelname for each in caplog.records]), told
 
 
 @in_virtual_time
@@ -181,38 +200,35 @@ async def test_file_that_cannot_be_removed_is_still_followed(
     estimators: Estimators, tmp_path: Path
 ) -> None:
     """`forget` names the file, and another estimator starts from it."""
-    learning, _ = await opened(tmp_path)
-    estimators.reply(ready())
-    await asyncio.sleep(0.1)
-    (tmp_path / "learned.npz").mkdir()
-    with pytest.raises(CommandError, match=r"learned\.npz"):
-        await learning.forget()
-    assert estimators.count == 2
-    assert learning.status.state is LearningState.STARTING
-    estimators.reply(replace(ready(), answers=answers()))
-    assert learning.status.state is LearningState.FOLLOWING
-    await asyncio.sleep(0.1)
-    await learning.close()
+    async with opened(tmp_path) as (learning, _):
+        estimators.reply(ready())
+        await asyncio.sleep(0.1)
+        (tmp_path / "learned.npz").mkdir()
+        with pytest.raises(CommandError, match=r"learned\.npz"):
+            await learning.forget()
+        assert estimators.count == 2
+        assert learning.status.state is LearningState.STARTING
+        estimators.reply(replace(ready(), answers=answers()))
+        assert learning.status.state is LearningState.FOLLOWING
 
 
 @in_virtual_time
 async def test_readings_that_fail_are_started_anew(estimators: Estimators, tmp_path: Path) -> None:
     """Failed with the cause at once; read again after a pause, and followed after an estimate."""
-    learning, _ = await opened(tmp_path)
-    estimators.reply(ready())
-    await asyncio.sleep(0.1)
-    before = Readings.count
-    Readings.ending.set()
-    await asyncio.sleep(0.1)
-    assert learning.status.state is LearningState.FAILED
-    assert "a sensor of no kind" in learning.status.cause
-    await asyncio.sleep(11.0)
-    assert Readings.count == before + 1
-    estimators.reply(QUIET)
-    assert learning.status.state is LearningState.FOLLOWING
-    await asyncio.sleep(61.0)
-    assert not learning.status.are_robust
-    await learning.close()
+    async with opened(tmp_path) as (learning, _):
+        estimators.reply(ready())
+        await asyncio.sleep(0.1)
+        before = Readings.count
+        Readings.ending.set()
+        await asyncio.sleep(0.1)
+        assert learning.status.state is LearningState.FAILED
+        assert "a sensor of no kind" in learning.status.cause
+        await asyncio.sleep(11.0)
+        assert Readings.count == before + 1
+        estimators.reply(QUIET)
+        assert learning.status.state is LearningState.FOLLOWING
+        await asyncio.sleep(61.0)
+        assert not learning.status.are_robust
 
 
 @in_virtual_time
@@ -220,13 +236,12 @@ async def test_readings_that_stay_away_make_answers_robust(
     estimators: Estimators, tmp_path: Path
 ) -> None:
     """Nobody watches the plate: after a minute what was learned is not trusted."""
-    learning, _ = await opened(tmp_path)
-    estimators.reply(ready())
-    await asyncio.sleep(0.1)
-    Readings.ending.set()
-    await asyncio.sleep(61.0)
-    assert learning.status.are_robust
-    await learning.close()
+    async with opened(tmp_path) as (learning, _):
+        estimators.reply(ready())
+        await asyncio.sleep(0.1)
+        Readings.ending.set()
+        await asyncio.sleep(61.0)
+        assert learning.status.are_robust
 
 
 @in_virtual_time
@@ -240,30 +255,13 @@ async def test_sensors_that_were_not_read_are_asked_for_again(
         raise LinkError("no reply of A")
 
     monkeypatch.setattr(module, "plate_sensors", silent)
-    learning, _ = await opened(tmp_path)
-    assert learning.status.state is LearningState.OFF
-    assert "no reply of A" in learning.status.cause
-    assert learning.status.remedy is not None
-    monkeypatch.setattr(module, "plate_sensors", replying)
-    await asyncio.sleep(11.0)
-    assert learning.status.state is LearningState.STARTING
-    await asyncio.sleep(0.1)
-    await learning.close()
-
-
-@in_virtual_time
-async def test_alarm_of_a_watched_plate_is_a_warning(
-    estimators: Estimators, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """It is all that such a plate can tell."""
-    learning, _ = await opened(tmp_path)
-    estimators.reply(replace(ready(), only_alarms="never measured"))
-    await asyncio.sleep(0.1)
-    caplog.clear()
-    estimators.reply(replace(QUIET, alarm=True))
-    assert learning.status.state is LearningState.ONLY_ALARMS
-    assert [each.levelname for each in caplog.records] == ["WARNING"]
-    await learning.close()
+    async with opened(tmp_path) as (learning, _):
+        assert learning.status.state is LearningState.OFF
+        assert "no reply of A" in learning.status.cause
+        assert learning.status.remedy is not None
+        monkeypatch.setattr(module, "plate_sensors", replying)
+        await asyncio.sleep(11.0)
+        assert learning.status.state is LearningState.STARTING
 
 
 @in_virtual_time
@@ -276,9 +274,8 @@ async def test_forget_asks_for_sensors_that_were_never_read(
         raise RuntimeError("no such words")
 
     monkeypatch.setattr(module, "plate_sensors", failing)
-    learning, _ = await opened(tmp_path)
-    assert learning.status.state is LearningState.FAILED
-    await learning.forget()
-    await asyncio.sleep(0.1)
-    assert (learning.status.state, estimators.count) == (LearningState.FAILED, 0)
-    await learning.close()
+    async with opened(tmp_path) as (learning, _):
+        assert learning.status.state is LearningState.FAILED
+        await learning.forget()
+        await asyncio.sleep(0.1)
+        assert (learning.status.state, estimators.count) == (LearningState.FAILED, 0)

@@ -385,23 +385,6 @@ async def test_stop_and_lift_do_not_wait_for_an_answer(
 
 
 @in_virtual_time
-async def test_a_click_plays_beside_what_lasts() -> None:
-    """On a layer of its own, in the commit by which what lasts is kept away from its finger."""
-    layout = SurfaceLayout(
-        LAYOUT.regions, {**LAYOUT.effects, "high": Click(level=14.0)}, elsewhere=None
-    )
-    async with fingers_on(table(), layout, at={1: LEFT}, held=0.5) as fingers:
-        count = len(fingers.committed)
-        fingers.at[2] = RIGHT
-        await fingers.hold(0.3)
-        started, ended = (layers for _, _, layers in fingers.committed[count:])
-        assert sorted(one.layer for one in started) == [0, 1]  # what lasts is kept away from it
-        (one,) = ended
-        assert one.layer == 1
-        assert not any(command.level for command in one.commands)
-
-
-@in_virtual_time
 async def test_a_click_is_played_though_the_answer_takes_longer_than_it_lasts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -1,7 +1,8 @@
 """Questions to the table for an intent, and when a pattern is selected again."""
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -183,101 +184,114 @@ def test_selector_saturates_at_full_stroke_on_a_plate() -> None:
     assert loudest == pytest.approx(1e-4)
 
 
-def test_selector_queries_nothing_without_targets(table: Table) -> None:
-    """No target, or none on the plate; the reason is that of the intent."""
-    for intent in (wanting(), wanting(c9=20.0)):
-        selector = Selector(table)
-        for contacts in [(), (at(1, 0.1),), (at(1, 0.29),)]:
-            selection = selector.select(contacts, intent, CAPABILITIES)
-            assert (selection.targets, selection.pattern) == ((), None)
-            assert selection.reason == "nothing is wanted"
-    assert table.asked == []
+@dataclass(frozen=True)
+class Chosen:
+    """What a selector chooses for contacts and an intent.
+
+    is_asked: whether it asks the table for it, else it keeps what it chose before, or asks nothing;
+    reason: for silence; loads, frequencies: of the question. The table refuses targets left of
+    refuse_below [m], or fails with an error.
+    """
+
+    contacts: Sequence[Contact]
+    intent: HapticIntent
+    is_asked: bool
+    reason: str = ""
+    loads: tuple[float, ...] | None = None
+    frequencies: tuple[float, float] | None = None
+    refuse_below: float = 0.0
+    error: Exception | None = None
 
 
-@pytest.mark.parametrize("mover", [0, 1])
-def test_selector_keeps_a_pattern_within_8_mm(table: Table, mover: int) -> None:
-    """The distance of any contact counts from where the pattern was selected."""
-    selector, intent = Selector(table), wanting(c2=20.0)
-
-    def contacts(distance: float) -> tuple[Contact, ...]:
-        moved = [0.0, 0.0]
-        moved[mover] = distance
-        return (at(1, 0.1, 0.1 + moved[0]), at(2, 0.2, 0.1 - moved[1]))
-
-    first = selector.select(contacts(0.0), intent, CAPABILITIES)
-    assert selector.select(contacts(0.004), intent, CAPABILITIES) is first
-    assert selector.select(contacts(0.0079), intent, CAPABILITIES) is first
-    second = selector.select(contacts(0.0081), intent, CAPABILITIES)
-    assert second.pattern != first.pattern
-    assert selector.select(contacts(0.0), intent, CAPABILITIES) is not second
+def loaded(one: Contact, load: float) -> Contact:
+    """A contact that presses."""
+    return replace(one, load=load)
 
 
-def test_selector_queries_again_for_a_contact_of_another_load(table: Table) -> None:
-    """Loads are asked for in the order of the question, and not at all where all are 1."""
-    selector, intent = Selector(table), wanting(c2=20.0)
-    asked: list[tuple[float, ...]] = []
-    for loads in ((1.0, 1.0), (1.6, 1.0), (1.6, 1.0), (1.6, 2.4), (1.0, 1.0)):
-        contacts = [
-            replace(at(1, 0.1), load=loads[0]),
-            replace(at(2, 0.2), load=loads[1]),
-        ]
-        selection = selector.select(contacts, intent, CAPABILITIES)
-        assert selection.question is not None
-        asked.append(selection.question.loads)
-    assert asked == [(), (1.0, 1.6), (1.0, 1.6), (2.4, 1.6), ()]
-    assert len(table.asked) == 4
+def moving(mover: int) -> list[Chosen]:
+    """One of two contacts moves; its distance counts from where the pattern was selected."""
+    at_distance = [
+        (at(1, 0.1, 0.1 + (distance if mover == 0 else 0.0)),
+         at(2, 0.2, 0.1 - (distance if mover == 1 else 0.0)))
+        for distance in (0.0, 0.004, 0.0079, 0.0081, 0.0)
+    ]  # fmt: skip
+    asked = (True, False, False, True, True)
+    return [Chosen(c, wanting(c2=20.0), a) for c, a in zip(at_distance, asked, strict=True)]
 
 
-def test_selector_keeps_a_short_pulse_when_a_finger_presses_harder(table: Table) -> None:
-    """It is over before a change would help."""
-    selector, pulse = Selector(table), Pulse(0.04, requested_at=0.0, is_raised=False)
-    intent = HapticIntent((Target(ContactKey("a", 1), 20.0, pulse=pulse),))
-    first = selector.select((at(1, 0.1),), intent, CAPABILITIES)
-    pressed = replace(at(1, 0.1), load=2.0)
-    assert selector.select((pressed,), intent, CAPABILITIES) is first
+ONE, TWO, NONE = at(1, 0.1), at(2, 0.2), "nothing is wanted"
+PULSE = Pulse(0.04, requested_at=0.0, is_raised=False)
+PULSED = HapticIntent((Target(ContactKey("a", 1), 20.0, pulse=PULSE),))
+REFUSED = "nothing is felt there"
+BAND, ALONE = (45.0, 300.0), (100.0, 100.0)
+FAILED = "ZeroDivisionError: by no ERA"
+
+COURSES: Mapping[str, Sequence[Chosen]] = {
+    # No target, or none on the plate; the reason is that of the intent.
+    "no target": [
+        *(Chosen(contacts, wanting(), False, NONE) for contacts in ((), (ONE,), (at(1, 0.29),))),
+        *(Chosen(contacts, wanting(c9=20.0), False, NONE) for contacts in ((), (ONE,))),
+    ],
+    "the quiet contact moves": moving(0),
+    "the target moves": moving(1),
+    # Loads are asked for in the order of the question, and not at all where all are 1.
+    "another load": [
+        Chosen((ONE, TWO), wanting(c2=20.0), True, loads=()),
+        Chosen((loaded(ONE, 1.6), TWO), wanting(c2=20.0), True, loads=(1.0, 1.6)),
+        Chosen((loaded(ONE, 1.6), TWO), wanting(c2=20.0), False),
+        Chosen((loaded(ONE, 1.6), loaded(TWO, 2.4)), wanting(c2=20.0), True, loads=(2.4, 1.6)),
+        Chosen((ONE, TWO), wanting(c2=20.0), True, loads=()),
+    ],
+    # It is over before a change would help.
+    "a short pulse": [
+        Chosen((ONE,), PULSED, True),
+        Chosen((loaded(ONE, 2.0),), PULSED, False),
+    ],
+    # Another level, another target; the level first at the frequency that plays.
+    "another intent": [
+        Chosen((ONE, TWO), wanting(c1=20.0), True, frequencies=BAND),
+        Chosen((ONE, TWO), wanting(c1=20.0), False),
+        Chosen((ONE, TWO), wanting(c1=14.0), True, frequencies=ALONE),
+        Chosen((ONE, TWO), wanting(c1=14.0), False),
+        Chosen((ONE, TWO), wanting(c2=14.0), True),
+        Chosen((ONE, TWO), wanting(c2=14.0), False),
+    ],
+    # A change would be felt at the target.
+    "a quiet contact lifts": [
+        Chosen((ONE, TWO), wanting(c2=20.0), True),
+        Chosen((TWO,), wanting(c2=20.0), False),
+    ],
+    # The reason is that of the table; contacts that change cause another query: without the quiet
+    # one it might have been possible.
+    "the table refuses": [
+        Chosen((at(1, 0.25), at(2, 0.1)), wanting(c2=20.0), True, REFUSED, refuse_below=0.2),
+        Chosen((at(1, 0.25), at(2, 0.1)), wanting(c2=20.0), False, REFUSED, refuse_below=0.2),
+        Chosen((at(2, 0.1),), wanting(c2=20.0), True, REFUSED, refuse_below=0.2),
+        Chosen((at(2, 0.21),), wanting(c2=20.0), True, refuse_below=0.2),
+    ],
+    # Its exception is the reason for silence until the contacts change.
+    "the table fails": [
+        Chosen((ONE,), wanting(c1=20.0), True, FAILED, error=ZeroDivisionError("by no ERA")),
+        Chosen((ONE,), wanting(c1=20.0), False, FAILED, error=ZeroDivisionError("by no ERA")),
+        Chosen((at(1, 0.2),), wanting(c1=20.0), True),
+    ],
+}
 
 
-def test_selector_queries_again_for_another_intent(table: Table) -> None:
-    """Another level, another target; the level first at the frequency that plays."""
-    selector, contacts = Selector(table), (at(1, 0.1), at(2, 0.2))
-    for levels in ({"c1": 20.0}, {"c1": 14.0}, {"c2": 14.0}):
-        chosen = selector.select(contacts, wanting(**levels), CAPABILITIES)
-        assert selector.select(contacts, wanting(**levels), CAPABILITIES) is chosen
-    assert [each.frequencies for each in table.asked[:2]] == [(45.0, 300.0), (100.0, 100.0)]
-    assert len(table.asked) == 3
-
-
-def test_selector_keeps_the_pattern_when_a_quiet_contact_lifts(table: Table) -> None:
-    """A change would be felt at the target."""
-    selector, intent = Selector(table), wanting(c2=20.0)
-    first = selector.select((at(1, 0.1), at(2, 0.2)), intent, CAPABILITIES)
-    assert selector.select((at(2, 0.2),), intent, CAPABILITIES) is first
-
-
-def test_selector_is_silent_when_the_table_refuses(table: Table) -> None:
-    """The reason is that of the table; contacts that change cause another query."""
-    table.refuse_below = 0.2
-    selector, intent = Selector(table), wanting(c2=20.0)
-    refused = selector.select((at(1, 0.25), at(2, 0.1)), intent, CAPABILITIES)
-    assert [contact.key.id for contact, _ in refused.targets] == [2]
-    assert (refused.pattern, refused.reason) == (None, "nothing is felt there")
-    assert selector.select((at(1, 0.25), at(2, 0.1)), intent, CAPABILITIES) is refused
-    assert len(table.asked) == 1
-    assert selector.select((at(2, 0.1),), intent, CAPABILITIES).reason == "nothing is felt there"
-    assert len(table.asked) == 2  # without the quiet contact it might have been possible
-    assert selector.select((at(2, 0.21),), intent, CAPABILITIES).pattern is not None
-
-
-def test_selector_queries_a_failing_table_once(table: Table) -> None:
-    """Its exception is the reason for silence until the contacts change."""
-    table.error = ZeroDivisionError("by no ERA")
-    selector, intent = Selector(table), wanting(c1=20.0)
-    failed = selector.select((at(1, 0.1),), intent, CAPABILITIES)
-    assert (failed.pattern, failed.reason) == (None, "ZeroDivisionError: by no ERA")
-    assert selector.select((at(1, 0.1),), intent, CAPABILITIES) is failed
-    assert len(table.asked) == 1
-    table.error = None
-    assert selector.select((at(1, 0.2),), intent, CAPABILITIES).pattern is not None
+@pytest.mark.parametrize("name", COURSES)
+def test_selector_asks_again_when_it_must(table: Table, name: str) -> None:
+    """And keeps what it has chosen otherwise; silence has its reason."""
+    selector, before = Selector(table), None
+    for step in COURSES[name]:
+        table.refuse_below, table.error, count = step.refuse_below, step.error, len(table.asked)
+        chosen = selector.select(step.contacts, step.intent, CAPABILITIES)
+        assert len(table.asked) - count == step.is_asked, step
+        assert step.is_asked is (chosen is not before) or not chosen.targets, step
+        assert (chosen.pattern is None) is bool(step.reason), step
+        assert step.reason in ("", chosen.reason), step
+        for wanted, found in ((step.loads, "loads"), (step.frequencies, "frequencies")):
+            assert wanted in (None, getattr(chosen.question, found, None)), step
+        before = chosen
 
 
 def test_a_pulse_is_held_back_where_others_use_the_whole_stroke(table: Table) -> None:

@@ -2,7 +2,10 @@
 
 import math
 import random
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from types import EllipsisType
 
 import pytest
 
@@ -96,27 +99,144 @@ def test_limits_that_leave_nothing_are_refused(name: str) -> None:
             Ledger(replace(WIDE, **{name: value}), CAN)
 
 
-def test_layers_are_bounded_together() -> None:
-    """0.6 in one layer leaves 0.4 for another; once it has faded, 0.9 is admitted."""
-    ledger = Ledger(WIDE, CAN)
-    play(ledger, 1, 0.0, Layer(0, (tone(level=0.6),)))
-    assert refusal(ledger, Layer(1, (tone(level=0.41, frequency=200),))).channel == 0
-    assert ledger.admit([Layer(1, (tone(level=0.4, frequency=200),))], 1.0)
-    play(ledger, 2, 1.0, Layer(0, ()))
-    refusal(ledger, Layer(1, (tone(level=0.9, frequency=200),)), at=1.01)
-    assert ledger.admit([Layer(1, (tone(level=0.9, frequency=200),))], 1.03)
+@dataclass(frozen=True)
+class Asked:
+    """A layer that is asked for at a time [s], and what becomes of it.
+
+    It is admitted unless it is refused; then until is when it would be allowed, None for never and
+    ... for anything. valid_for, longest [ms]: bounds of its time and of its ramp as admitted.
+    plays: whether it is sent and confirmed, too.
+    """
+
+    at: float
+    layer: Layer
+    plays: bool = False
+    is_refused: bool = False
+    until: float | EllipsisType | None = ...
+    valid_for: tuple[int, int] = (0, 65_535)
+    longest: int = 65_535
 
 
-def test_refusal_says_from_when_the_set_would_be_allowed() -> None:
-    """0.6 fades for 20 ms from 1.0 on; what is too loud at any time has no such moment."""
-    ledger = Ledger(WIDE, CAN)
-    play(ledger, 1, 0.0, Layer(0, (tone(level=0.6),)))
-    play(ledger, 2, 1.0, Layer(0, ()))
-    too_early = refusal(ledger, Layer(1, (tone(level=0.9, frequency=200),)), at=1.01)
-    assert too_early.until == pytest.approx(1.02)
-    assert ledger.admit([Layer(1, (tone(level=0.9, frequency=200),))], 1.02 + 1e-9)
-    play(ledger, 3, 2.0, Layer(0, (tone(level=0.6),)))
-    assert refusal(ledger, Layer(1, (tone(level=0.9, frequency=200),)), at=3.0).until is None
+plays = partial(Asked, plays=True)
+refused = partial(Asked, is_refused=True)
+HIGH = partial(tone, frequency=200.0)
+RISING = Layer(0, (tone(),), ramp=0.1)
+SHAPED = Layer(0, (tone(level=0.2, onset=Envelope(100, ((1000, 0), (2000, 0)))),))
+SWELLING = tone(level=0.05, onset=Envelope(500, ((500, 0),)))
+ENDING = tone(level=0.1, ending=Envelope(100, ((8000, 0),)))
+
+COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
+    # 0.6 in one layer leaves 0.4 for another; once it has faded, 0.9 is admitted.
+    "layers are bounded together": (
+        WIDE,
+        [
+            plays(0.0, Layer(0, (tone(level=0.6),))),
+            refused(1.0, Layer(1, (HIGH(level=0.41),))),
+            Asked(1.0, Layer(1, (HIGH(level=0.4),))),
+            plays(1.0, Layer(0, ())),
+            refused(1.01, Layer(1, (HIGH(level=0.9),))),
+            Asked(1.03, Layer(1, (HIGH(level=0.9),))),
+        ],
+    ),
+    # 0.6 fades for 20 ms from 1.0 on; what is too loud at any time has no such moment.
+    "a refusal says from when": (
+        WIDE,
+        [
+            plays(0.0, Layer(0, (tone(level=0.6),))),
+            plays(1.0, Layer(0, ())),
+            refused(1.01, Layer(1, (HIGH(level=0.9),)), until=1.02),
+            Asked(1.02 + 1e-9, Layer(1, (HIGH(level=0.9),))),
+            plays(2.0, Layer(0, (tone(level=0.6),))),
+            refused(3.0, Layer(1, (HIGH(level=0.9),)), until=None),
+        ],
+    ),
+    # Level 0.1 with an ending through 0.8 waits: 0.3 beside it is refused, 0.15 is not.
+    "a set that waits counts with its ending": (
+        WIDE,
+        [
+            plays(0.0, Layer(0, (SWELLING,))),
+            plays(0.01, Layer(0, (ENDING,), after=True)),
+            refused(0.02, Layer(1, (HIGH(level=0.3),))),
+            Asked(0.02, Layer(1, (HIGH(level=0.15),))),
+        ],
+    ),
+    # Gains of a raised cosine add up to one, in power to less than one.
+    "a cross-fade at full level": (
+        replace(WIDE, power=1.0),
+        [
+            plays(0.0, Layer(0, (tone(0, 1.0),))),
+            Asked(1.0, Layer(0, (tone(0, 1.0, 200.0),))),
+            Asked(1.0, Layer(0, (tone(1, 1.0, 200.0),))),
+        ],
+    ),
+    # 0.5 in two layers of one channel: 1, in two channels: a half.
+    "power of all layers and channels": (
+        replace(WIDE, power=0.6),
+        [
+            plays(0.0, Layer(0, (tone(0),))),
+            refused(1.0, Layer(1, (HIGH(0),))),
+            Asked(1.0, Layer(1, (HIGH(1),))),
+        ],
+    ),
+    # pi/2 · 0.5 / 0.1 s = 7.85 per second along a ramp; 10 by a knot; a fade never rises.
+    "a rise": (replace(WIDE, slew=7.86), [Asked(0.0, RISING)]),
+    "a rise that is too fast": (
+        replace(WIDE, slew=7.85),
+        [refused(1.0, RISING), refused(1.0, SHAPED)],
+    ),
+    "a fade": (
+        replace(WIDE, slew=10.01),
+        [Asked(0.0, SHAPED), plays(0.0, RISING), Asked(1.0, Layer(0, (), ramp=0.001))],
+    ),
+    # 2 s: 1.98 s and a ramp of 20 ms; after 1.5 s of it the rest less 100 ms of way.
+    "on-time": (
+        replace(WIDE, on_time=2.0),
+        [
+            plays(0.0, Layer(0, (tone(),)), valid_for=(1980, 1980)),
+            Asked(1.5, Layer(1, (tone(1),)), valid_for=(380, 380)),
+            refused(1.9, Layer(0, renew=True)),
+            Asked(1.9, Layer(0, (), ramp=1.0), longest=100),
+        ],
+    ),
+    # 2 s of 10 s: after two of 0.5 s and a ramp of 20 ms, 0.94 s and such a ramp are left; each may
+    # have been played up to 0.1 s later.
+    "duty": (
+        replace(WIDE, duty=0.2),
+        [
+            plays(0.0, Layer(0, (tone(),), valid_for=0.5)),
+            plays(2.0, Layer(0, (tone(),), valid_for=0.5)),
+            Asked(4.0, Layer(0, (tone(),)), valid_for=(740, 940)),
+        ],
+    ),
+    # Three sets a second; silence is never refused.
+    "rate": (
+        replace(WIDE, rate=3.0),
+        [
+            *(plays(0.1 * number, Layer(0, (tone(),))) for number in range(3)),
+            refused(0.5, Layer(0, (tone(),)), until=1.1),
+            Asked(0.5, Layer(0, ())),
+            Asked(1.11, Layer(0, (tone(),))),
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_ledger_admits_what_is_within_the_limits(name: str) -> None:
+    """Each set of a course, with what was played before; a refusal names the first channel."""
+    limits, course = COURSES[name]
+    ledger = Ledger(limits, CAN)
+    for token, asked in enumerate(course, start=1):
+        if asked.is_refused:
+            error = refusal(ledger, asked.layer, at=asked.at)
+            assert error.channel in (0, None)
+            assert asked.until in (..., error.until and pytest.approx(error.until)), asked
+            continue
+        (one,) = ledger.admit([asked.layer], asked.at)
+        assert asked.valid_for[0] <= one.valid_for <= asked.valid_for[1]
+        assert one.ramp <= asked.longest
+        if asked.plays:
+            play(ledger, token, asked.at, asked.layer)
 
 
 def test_check_that_fails_refuses_and_leaves_silence_possible() -> None:
@@ -157,46 +277,6 @@ def test_other_capabilities_leave_what_was_spent() -> None:
     assert 0 < one.valid_for <= 100
 
 
-def test_set_that_waits_counts_with_its_ending() -> None:
-    """Level 0.1 with an ending through 0.8 waits: 0.3 beside it is refused, 0.15 is not."""
-    ledger = Ledger(WIDE, CAN)
-    onset, ending = Envelope(500, ((500, 0),)), Envelope(100, ((8000, 0),))
-    play(ledger, 1, 0.0, Layer(0, (tone(level=0.05, onset=onset),)))
-    play(ledger, 2, 0.01, Layer(0, (tone(level=0.1, ending=ending),), after=True))
-    refusal(ledger, Layer(1, (tone(level=0.3, frequency=200),)), at=0.02)
-    assert ledger.admit([Layer(1, (tone(level=0.15, frequency=200),))], 0.02)
-
-
-def test_cross_fade_at_full_level_is_admitted() -> None:
-    """Gains of a raised cosine add up to one, in power to less than one."""
-    ledger = Ledger(replace(WIDE, power=1.0), CAN)
-    play(ledger, 1, 0.0, Layer(0, (tone(0, 1.0),)))
-    assert ledger.admit([Layer(0, (tone(0, 1.0, 200.0),))], 1.0)
-    assert ledger.admit([Layer(0, (tone(1, 1.0, 200.0),))], 1.0)
-
-
-def test_power_is_that_of_all_layers_and_channels() -> None:
-    """0.5 in two layers of one channel: 1, in two channels: a half."""
-    ledger = Ledger(replace(WIDE, power=0.6), CAN)
-    play(ledger, 1, 0.0, Layer(0, (tone(0),)))
-    refusal(ledger, Layer(1, (tone(0, frequency=200),)))
-    assert ledger.admit([Layer(1, (tone(1, frequency=200),))], 1.0)
-
-
-def test_rise_is_bounded() -> None:
-    """pi/2 · 0.5 / 0.1 s = 7.85 per second along a ramp; 10 by a knot; a fade never rises."""
-    ramp = Layer(0, (tone(),), ramp=0.1)
-    assert Ledger(replace(WIDE, slew=7.86), CAN).admit([ramp], 0.0)
-    ledger = Ledger(replace(WIDE, slew=7.85), CAN)
-    assert refusal(ledger, ramp).channel == 0
-    shaped = Layer(0, (tone(level=0.2, onset=Envelope(100, ((1000, 0), (2000, 0)))),))
-    assert refusal(ledger, shaped).channel == 0
-    ledger = Ledger(replace(WIDE, slew=10.01), CAN)
-    assert ledger.admit([shaped], 0.0)
-    play(ledger, 1, 0.0, ramp)
-    assert ledger.admit([Layer(0, (), ramp=0.001)], 1.0)
-
-
 def test_doubt_admits_silence_only_until_it_is_resolved() -> None:
     """By confirmation, or by a status with another token; nothing is kept of refused sets."""
     ledger = Ledger(WIDE, CAN)
@@ -211,40 +291,6 @@ def test_doubt_admits_silence_only_until_it_is_resolved() -> None:
     ledger.sent(8, ledger.admit([layer], 1.0), 1.0)
     ledger.resolve(8, 1.01)
     assert ledger.playback.level(0, 2.0) == pytest.approx(0.5)
-
-
-def test_on_time_and_duty_shorten_what_is_admitted() -> None:
-    """On-time 2 s: 1.98 s and a ramp of 20 ms; after 1.5 s of it the rest less 100 ms of way."""
-    ledger = Ledger(replace(WIDE, on_time=2.0), CAN)
-    layer = Layer(0, (tone(),))
-    (one,) = ledger.admit([layer], 0.0)
-    assert one.valid_for == 1980
-    play(ledger, 1, 0.0, layer)
-    (one,) = ledger.admit([Layer(1, (tone(1),))], 1.5)
-    assert one.valid_for == 380
-    refusal(ledger, Layer(0, renew=True), at=1.9)
-    (silent,) = ledger.admit([Layer(0, (), ramp=1.0)], 1.9)
-    assert silent.ramp <= 100
-
-
-def test_duty_counts_vibrations_that_have_ended() -> None:
-    """2 s of 10 s: after two of 0.5 s and a ramp of 20 ms, 0.94 s and such a ramp are left."""
-    ledger = Ledger(replace(WIDE, duty=0.2), CAN)
-    for token, at in ((1, 0.0), (2, 2.0)):
-        play(ledger, token, at, Layer(0, (tone(),), valid_for=0.5))
-    (one,) = ledger.admit([Layer(0, (tone(),))], 4.0)
-    assert 740 <= one.valid_for <= 940  # each may have been played up to 0.1 s later
-
-
-def test_rate_is_limited_with_the_time_from_which_it_is_allowed() -> None:
-    """Three sets a second; silence is never refused."""
-    ledger = Ledger(replace(WIDE, rate=3.0), CAN)
-    for number in range(3):
-        play(ledger, number + 1, 0.1 * number, Layer(0, (tone(),)))
-    error = refusal(ledger, Layer(0, (tone(),)), at=0.5)
-    assert error.until == pytest.approx(1.1)
-    assert ledger.admit([Layer(0, ())], 0.5)
-    assert ledger.admit([Layer(0, (tone(),))], 1.11)
 
 
 def random_layer(random_: random.Random, number: int) -> Layer:

@@ -60,7 +60,7 @@ def check(
     files = []
     if picture is not None:
         from controller.effects.check_picture import check_figure
-        from model.figures.drawing import save_figure
+        from model.figures import save_figure
 
         save_figure(check_figure(layout, table, checked, together), picture)
         files = [str(picture)]

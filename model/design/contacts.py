@@ -36,7 +36,6 @@ DEFAULT_QUIET = {True: (1, 3), False: (0, 1)}
 MIN_FINGERS = 2
 """Fingers of a set."""
 
-_ROUNDING = 1e-9  # m
 _MAX_TRIES = 20_000
 _DRAWN_FOR_EACH = 8  # drawn for each place of a pool, of which the loneliest is taken
 

@@ -2,14 +2,10 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from model.files.array_file import whole_or_nothing
-from model.files.replacing import check_picture_name
 from model.rig.rig import Rig
 from model.structure.attachments import Era
 from model.structure.plate import Plate
@@ -20,7 +16,6 @@ COLORS = "viridis"
 ACTIVE_COLOR = "#d62728"
 RESTING_COLOR = "#2ca02c"
 
-_DPI = 150
 POINTS_ALONG = 97
 
 
@@ -79,20 +74,6 @@ def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None
 def map_figure(rig: Rig, plate_map: PlateMap, *, active: Collection[str], title: str) -> Figure:
     """One map with its ERAs, nulls as red crosses and a colour bar in g."""
     return maps_figure([MapPanel(title, plate_map, rig.eras, active)], columns=1)
-
-
-def save_figure(figure: Figure, path: Path, *, inches: tuple[float, float] | None = None) -> None:
-    """Write a figure in the format of the name's ending, without a display.
-
-    inches: width and height, the figure's own for None. Raises InputError for an ending that is not
-    in PICTURE_ENDINGS, and OSError.
-    """
-    check_picture_name(path)
-    FigureCanvasAgg(figure)
-    if inches is not None:
-        figure.set_size_inches(inches)
-    with whole_or_nothing(path) as stream:
-        figure.savefig(stream, dpi=_DPI, format=path.suffix[1:].lower())
 
 
 def label_plate(axes: Axes) -> None:

@@ -202,7 +202,7 @@ def modal_matrices(
     )
     elasticity = ModalElasticity.of(reduced.plate, reduced.omega**2, reduced.losses)
     elastic = np.diag(elasticity.eigenvalues)
-    M, C, K = _contribution(phi[: len(fixed)], fixed)
+    M, C, K = contribution(phi[: len(fixed)], fixed)
     M += np.eye(len(elastic))
     K += elastic
     eigenvalues, psi = linalg.eigh(K, M)
@@ -216,7 +216,7 @@ def modal_matrices(
     return _under_fingertips((M, C, K), phi[len(fixed) :], [each.fingertip for each in contacts])
 
 
-def _contribution(
+def contribution(
     phi: FloatArray, loads: Sequence[PointLoad]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Contribution of loads with these shapes (n, r) to M, C and K."""

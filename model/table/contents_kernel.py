@@ -51,8 +51,6 @@ if TYPE_CHECKING:
 MAX_TARGETS = 4
 """Of a content that the kernel serves: the room of its search grows by five for each."""
 
-_NEEDS_ONSETS = 2
-
 
 def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones:
     """Choose a tone for each content, and find what it promises."""

@@ -18,7 +18,7 @@ from model.fem.plate import (
     simply_supported_modes,
 )
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.reduction.reduced_plate import reduce_free_plate
+from model.reduction.reduced_plate import contribution, reduce_free_plate
 from model.rig.rig import Rig
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import PlateMesh, SpectralMesh
@@ -101,11 +101,9 @@ def natural_modes(
 def _modes_with(free: FreePlate, attached: list[PointLoad]) -> NaturalModes:
     """All modes of the undamped plate with attachments, of the truncated ones some mixtures."""
     reduced = reduce_free_plate(free, footprints_of(attached))
-    phi = reduced.at(footprints_of(attached)).T
+    M, _, K = contribution(reduced.at(footprints_of(attached)), attached)
     elastic = ModalElasticity.of(reduced.plate, reduced.omega**2, reduced.losses).eigenvalues
-    K = np.diag(elastic) + (phi * [load.stiffness for load in attached]) @ phi.T
-    M = np.eye(len(K)) + (phi * [load.mass for load in attached]) @ phi.T
-    squares, coordinates = linalg.eigh(K, M)
+    squares, coordinates = linalg.eigh(K + np.diag(elastic), M + np.eye(len(M)))
     frequencies = np.sqrt(np.maximum(squares, 0)) / (2 * np.pi)
     return NaturalModes(frequencies, reduced.at, coordinates, free.mesh)
 

@@ -298,6 +298,9 @@ class ExpectedAmplifier:
             must = " or ".join(map(self._name_of, known))
             self.report(self._rule_against(now), end, what, must=must, seen=self._name_of(now))
             return False
+        if fault and fault != self.fault and self._may_fail and not self.is_shown:
+            self.fault = fault  # which came before the watchdog, of which nothing was seen
+            self._faults[0] = fault, (self.last_status, end)
         rule, cause = "latched" if now in LATCHED else "state", self.outputs.cause
         self._expect(rule, end, f"fault after {cause}", self.fault, fault)
         if self.latch is not None:

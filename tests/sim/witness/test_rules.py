@@ -118,6 +118,14 @@ def test_reply_that_is_delayed_beyond_newer_ones_says_nothing_of_now() -> None:
     assert late.found == []
 
 
+def test_fault_that_came_before_the_watchdog_may_show_afterwards() -> None:
+    """Nothing was asked for 0.4 s, in which an arc was sooner than the watchdog of 0.25 s."""
+    talk = Talk().armed().rest(0.4)
+    talk.says(hand.FAULT, kind=hand.GET_STATUS, fault=hand.ARC, latch=1)
+    talk.exchange(hand.GET_FAULTS, (), (1, hand.ARC, 255, 0, 300))
+    assert talk.found == []
+
+
 def test_disarm_after_the_last_lift_releases_only_what_plays() -> None:
     """An amplifier that was silent under the finger has nothing to end in time."""
     idle = Talk().armed().told("contacts", [1]).rest(0.01).told("contacts", []).rest(0.01)

@@ -53,7 +53,7 @@ class ExpectedAmplifier:
     report: takes what is wrong, always: what nothing excuses, unclear: why it cannot be told.
     may_fail: it may have faults of its own. slack: of times, left_slack: of the time that is left
     of the watchdog. fed: when that was fed last, silent: when all that fades is silent. is_shown:
-    it has shown its state itself. last_status: when it was seen last. can: its capabilities.
+    it has shown its state itself. last_status: since when nothing was seen. can: its capabilities.
     """
 
     def __init__(
@@ -282,7 +282,7 @@ class ExpectedAmplifier:
             self.report("watchdog", end, f"watchdog_left after {cause}", must=must, seen=left)
         self.outputs.check(shown, when)
         self._check_voltage(shown, when)
-        self.last_status = end
+        self.last_status = when[0]
 
     def note_state(self, shown: Values, when: Interval) -> bool:
         """Compare state, fault and latch, and go on with them; returns whether the state fits."""
@@ -359,7 +359,7 @@ class ExpectedAmplifier:
                 self._faults.appendleft((shown["fault"], (-math.inf, when[1])))
         self.fault, self.latch = shown["fault"], shown["latch"]
         self.token = shown.get("token", self.token)
-        self.is_shown, self.last_status = True, when[1]
+        self.is_shown, self.last_status = True, when[0]
 
     def _name_of(self, state: int | None) -> str:
         return "unknown" if state is None else name_of(STATES, state)

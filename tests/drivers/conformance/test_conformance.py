@@ -6,6 +6,7 @@ import os
 import pty
 import re
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -357,6 +358,32 @@ RISE = LayerSet(0, 100, 0, (Command(0, 2200, 5000, 0),))
 """To half of full level along 100 ms."""
 
 
+OFF = {
+    **{"state": 1, "fault": 0, "flags": 0, "latch": 7, "temperature": 250, "token": 0},
+    **{"watchdog_left": 0, "levels": [0] * 4, "tokens": [0] * 8},
+}
+ARMED = {**OFF, "state": 4, "flags": 1}
+
+
+def armed(watchdog: int) -> Judge:
+    """Return the judge of an amplifier that is armed at 0 s with a watchdog [ms]."""
+    start = When(0.0, 0.0)
+    judge = Judge(capabilities(4), OFF, start)
+    judge.granted("Arm", {"session": 1, "watchdog": watchdog}, {}, start)
+    return judge
+
+
+@pytest.mark.parametrize("age", [70, 20, 85])
+def test_fault_may_come_while_a_status_is_on_its_way(age: int) -> None:
+    """It was asked for at 0.09 s and came at 0.105 s, amid which the watchdog of 0.1 s tripped."""
+    judge = armed(100)
+    judge.check({**ARMED, "watchdog_left": 5}, When(0.09, 0.105))
+    judge.check({**OFF, "state": 7, "fault": 1, "latch": 8}, When(0.105, 0.106))
+    faults = {"faults": [{"fault": 1, "channel": 255, "age": age}]}
+    with nullcontext() if age == 70 else pytest.raises(Violation, match="listed faults"):
+        judge.granted("GetFaults", {}, faults, When(0.17, 0.17))
+
+
 PART = {"token": 1, "now": 1, "index": 0, "parts": 1, "missing": 0, "exact": 1}
 
 
@@ -366,15 +393,12 @@ def expected_by(moment: float, level: float) -> None:
     Raises Violation.
     """
     start, when = When(0.0, 0.0), When(moment, moment)
-    off = {"state": 1, "fault": 0, "flags": 0, "latch": 7, "temperature": 250, "token": 0}
-    off |= {"watchdog_left": 0, "levels": [0] * 4, "tokens": [0] * 8}
-    judge = Judge(capabilities(4), off, start)
-    judge.granted("Arm", {"session": 1, "watchdog": 1000}, {}, start)
+    judge = armed(1000)
     judge.sets.sent({**PART, "stream": pack_layers([RISE])}, 0.0)
     judge.granted("Set", {**PART, "session": 1}, {**PART, "staged": 0, "played": 1}, start)
     left = {"watchdog_left": round(1000 - 1000 * moment), "token": 1}
     played = {"levels": [round(10_000 * level), 0, 0, 0], "tokens": [1, *[0] * 7]}
-    judge.check({**off, "state": 4, "flags": 1, **left, **played}, when)
+    judge.check({**ARMED, **left, **played}, when)
 
 
 # A raised cosine has risen by (1 - cos 45 degrees)/2 after a quarter, by half after half.

@@ -9,6 +9,7 @@ import cmath
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -66,8 +67,8 @@ def query_jointly(
     modulations, playable = _modulations(targets, capabilities.layers), capabilities.frequencies
     found = with_modulation(table, requests, fingers, found, modulations, playable=playable)
     strokes = {era.name: era.stroke for era in table.eras}
-    free = found
-    if _factor_within(found, capabilities, strokes) < 1 - NEARLY:
+    free, factor = found, _factor_within(found, capabilities, strokes)
+    if factor < 1 - NEARLY:
         gains_db = _gains_db(requests, found, capabilities, strokes)
         lowered = with_gains(table, requests, fingers, found, gains_db)
         if lowered is None:  # who is lowered is not served any more: by the rule, then
@@ -79,15 +80,19 @@ def query_jointly(
                 table, softer, fingers, lowered, modulations, playable=playable
             )
         found = lowered
-    places = [each.at for each in requests]
-    fields = table.unit_fields(np.array(places), contacts=places)
-    factor = _factor_within(found, capabilities, strokes)
+        factor = _factor_within(found, capabilities, strokes)
     change = float(decibels(factor))
     unfelt = {
         number
         for number, (then, now) in enumerate(zip(free.layers, found.layers, strict=True))
         if now.promised_level_db_sl + change < 0 <= then.promised_level_db_sl
     }
+
+    @cache
+    def fields() -> Complex64Array:
+        places = [each.at for each in requests]
+        return table.unit_fields(np.array(places), contacts=places)
+
     contents: list[Content] = []
     skipped: list[Prediction] = []
     for number, ((contact, target), layer) in enumerate(zip(targets, found.layers, strict=True)):
@@ -113,10 +118,10 @@ def query_jointly(
             carrier = before.get((contact.key, 0))
             for voice, tones in enumerate(voices):
                 pattern = _pattern(table, replace(layer, excitation=tones), capabilities)
-                pattern = pattern.scaled(change)
+                pattern = pattern.scaled(change) if change else pattern
                 if carrier is not None or layer.side_bands:
                     then = carrier if is_continued else None
-                    pattern = _in_phase(pattern, then, fields[:, :, number], table)
+                    pattern = _in_phase(pattern, then, fields(), number, table)
                 contents.append(
                     _content(served, targets, quiet, pattern, is_continued, factor, shape, voice)
                 )
@@ -229,10 +234,18 @@ def _worst(found: Answer) -> float:
 def _factor_within(
     found: Answer, capabilities: PlaybackCapabilities, strokes: Mapping[str, float]
 ) -> float:
-    """The factor, 1 at most, by which all contents together are within the amplifiers' limits."""
-    full: list[float] = _shares(found, capabilities.max_amplitudes).sum(axis=0).tolist()
-    power = sum(level**2 for level in _shares(found, strokes).sum(axis=0).tolist())
-    return 1.0 / max(1.0, *full, math.sqrt(power / capabilities.max_power))
+    """The factor, 1 at share, by which all contents together are within the amplifiers' limits."""
+    total = dict.fromkeys(strokes, 0.0)
+    for layer in found.layers:
+        if layer.verdict not in (HELD_BACK, SHARED):
+            for tones in (layer.excitation, *layer.side_bands):
+                for name, tone in tones.items():
+                    total[name] += tone.amplitude
+    share, power = 1.0, 0.0
+    for name, amplitude in total.items():
+        share = max(share, amplitude / capabilities.max_amplitudes[name])
+        power += (amplitude / strokes[name]) ** 2
+    return 1.0 / max(share, math.sqrt(power / capabilities.max_power))
 
 
 def _shares(found: Answer, amplitudes: Mapping[str, float]) -> FloatArray:
@@ -384,13 +397,19 @@ def _held_back(contact: Contact, layer: Layer) -> Prediction:
 
 
 def _in_phase(
-    pattern: Pattern, before: Content | None, fields: Complex64Array, table: LocalizationTable
+    pattern: Pattern,
+    before: Content | None,
+    fields: Complex64Array,
+    number: int,
+    table: LocalizationTable,
 ) -> Pattern:
     """Turn a pattern so that its finger feels it in the phase of the tone before, 0 without any.
 
     Side bands in phase with their carrier modulate its amplitude, not its frequency: all have the
-    phase of the carrier before. fields (f, eras): at the finger, of each ERA at full stroke.
+    phase of the carrier before. fields (f, eras, fingers): of each ERA at full stroke; number: of
+    the finger.
     """
+    fields = fields[:, :, number]
     felt = _felt(pattern.excitation, fields, table)
     felt_before = {} if before is None else _felt(before.pattern.excitation, fields, table)
     (then,) = felt_before.values() if len(felt_before) == 1 else (1.0,)

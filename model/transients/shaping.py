@@ -52,6 +52,8 @@ class Shaper:
         self._carriers: dict[float, Carrier] = {}
         self._centres = _SURROUNDINGS.centres(plate.reduced.plate)
         self._shapes = plate.shapes_at(self._centres)
+        # Of fingers, the last ones: contents that begin together have each other's.
+        self._fingers: dict[Position, tuple[FloatArray, FloatArray]] = {}
         self._felt = lru_cache(_KEPT)(self._read)
         self._resting = lru_cache(_KEPT)(self._quiet_rows)
 
@@ -148,12 +150,20 @@ class Shaper:
 
     def _fingertips(self, positions: tuple[Position, ...]) -> tuple[FloatArray, FloatArray]:
         """Weights (k, p) of points under fingertips, and their shapes (k, p, r)."""
-        plate = self._plate.reduced.plate
-        points, weights = fingertips_on(
-            np.array(positions), length=plate.length, width=plate.width, rule=FIVE_POINTS
-        )
-        shapes = self._plate.shapes_at(points.reshape(-1, 2))
-        return weights, shapes.reshape(*weights.shape, -1)
+        known = self._fingers
+        new = [each for each in dict.fromkeys(positions) if each not in known]
+        if new:
+            plate = self._plate.reduced.plate
+            points, weights = fingertips_on(
+                np.array(new), length=plate.length, width=plate.width, rule=FIVE_POINTS
+            )
+            shapes = self._plate.shapes_at(points.reshape(-1, 2))
+            shapes = shapes.reshape(*weights.shape, -1)
+            known.update(zip(new, zip(weights, shapes, strict=True), strict=True))
+        weights, shapes = map(np.stack, zip(*[known[each] for each in positions], strict=True))
+        while len(known) > _KEPT:
+            del known[next(iter(known))]
+        return weights, shapes
 
     def _surroundings(self, targets: Sequence[Position]) -> FloatArray:
         """The same for the plate beyond 50 mm of all targets; all of a plate too small for it."""

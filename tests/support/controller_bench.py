@@ -290,6 +290,13 @@ class Bench:
             TouchFrame("test", now - ago, tuple(Touch(*touch) for touch in touches))
         )
 
+    async def touches(
+        self, *touches: tuple[int, float, float], rest: float, ago: float = 0.0
+    ) -> None:
+        """Deliver a frame, and rest for a time [s]."""
+        self.touch(*touches, ago=ago)
+        await asyncio.sleep(rest)
+
     async def hold(self, *touches: tuple[int, float, float], seconds: float) -> None:
         """Repeat a frame every 50 ms, as a source must."""
         for _ in range(round(seconds / 0.05)):

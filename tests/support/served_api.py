@@ -106,6 +106,11 @@ class ServedApi:
         self._clients.append(client)
         return client, wire
 
+    async def takes(self, client: Connection, data: bytes) -> None:
+        """Let a client send bytes, and serve what is to be served at once."""
+        client.data_received(data)
+        await self.settle()
+
     async def settle(self) -> None:
         """Run the event loop until nothing is left to be served at once, and a little longer."""
         left = 8
@@ -129,3 +134,9 @@ class ServedApi:
     async def _arm(self) -> Message:
         await self.may_arm.wait()
         return Empty()
+
+
+def serving() -> tuple[ServedApi, Connection, Wire]:
+    """A server with one client."""
+    served = ServedApi()
+    return served, *served.client()

@@ -20,7 +20,7 @@ from controller.api.hub import Hub
 from controller.api.schema import MAX_RATE, Message
 from controller.api.topics import ContactsEvent, LogEvent
 from drivers.garbage_collection import no_long_collections
-from served_api import ServedApi, Wire, request
+from served_api import ServedApi, Wire, request, serving
 
 
 async def iterate() -> None:
@@ -58,15 +58,12 @@ def test_connection_closes_when_unread_responses_exceed_256_kib() -> None:
 
 async def test_input_of_a_client_is_bounded() -> None:
     """Nothing is read while 64 KiB wait to be served; no line is, beside 64 stops on their way."""
-    served = ServedApi()
-    client, wire = served.client()
+    served, client, wire = serving()
     client.pending = {asyncio.ensure_future(asyncio.sleep(3600)) for _ in range(64)}
-    client.data_received(request("stop") * 2000)
-    await served.settle()
+    await served.takes(client, request("stop") * 2000)
     assert (served.names, wire.is_read) == ([], False)
     client.pending.pop().cancel()
-    client.data_received(b"\n")
-    await served.settle()
+    await served.takes(client, b"\n")
     assert (served.names, wire.is_read) == (["stop"] * 2000, True)
     for each in client.pending:
         each.cancel()
@@ -100,34 +97,28 @@ NO_TOUCH = '{"source":"a","touches":[]}'
 
 async def test_server_limits_the_request_rate_except_for_stop_and_touch() -> None:
     """After 2000 requests at once the next is refused; stop and touch are served."""
-    served = ServedApi()
-    client, _ = served.client()
+    served, client, _ = serving()
     for line in [request("disarm")] * (int(MAX_REQUEST_RATE) + 1):
-        client.data_received(line)
-        await served.settle()
+        await served.takes(client, line)
     assert served.names == ["disarm"] * 2000
     for line in (
         request("stop"),
         request("touch", '{"source":"a","touches":[]}'),
         request("clear"),
     ):
-        client.data_received(line)
-        await served.settle()
+        await served.takes(client, line)
     assert served.names[2000:] == ["stop", "touch"]
 
 
 async def test_refused_requests_count_in_the_rate() -> None:
     """Whatever is wrong with them: after 2000 at once the connection is closed."""
     for wrong in (b"\n", b"{}\n", request("nothing"), request("stop", '{"x":1}')):
-        served = ServedApi()
-        client, wire = served.client()
+        served, client, wire = serving()
         for _ in range(int(MAX_REQUEST_RATE)):
             wire.waiting = b""
-            client.data_received(wrong)
-            await served.settle()
+            await served.takes(client, wrong)
         assert client.is_open
-        client.data_received(wrong)
-        await served.settle()
+        await served.takes(client, wrong)
         assert wire.is_aborted
         assert wire.lines()[-1]["error"]["code"] == 1005
 

@@ -8,18 +8,16 @@ import pytest
 from controller.api import turns
 from controller.api.jsonrpc import ErrorCode
 from controller.api.methods import TouchParams
-from served_api import ServedApi, request
+from served_api import ServedApi, request, serving
 
 ARM = '{"owner":"me","lease_s":5}'
 
 
 async def test_server_continues_after_invalid_lines() -> None:
     """Invalid JSON, requests, methods and parameters get an error each; the next line is served."""
-    served = ServedApi()
-    client, wire = served.client()
+    served, client, wire = serving()
     client.data_received(b"garbage\n\n\xff\n[]\n" + request("no_such_method", id=1))
-    client.data_received(request("disarm", '{"level": 2}', id=1) + request("disarm", id=9))
-    await served.settle()
+    await served.takes(client, request("disarm", '{"level": 2}', id=1) + request("disarm", id=9))
     *errors, last = wire.lines()
     codes = [each["error"]["code"] for each in errors]
     assert codes == [-32700, -32700, -32700, -32600, -32601, -32602]
@@ -38,8 +36,7 @@ async def test_server_closes_when_a_line_exceeds_64_kib() -> None:
         (b"x" * 65536, False),
     ):
         client, wire = served.client()
-        client.data_received(line)
-        await served.settle()
+        await served.takes(client, line)
         (reply,) = wire.lines()
         assert ("result" in reply, client.is_open) == (is_served, is_served)
         assert is_served or reply["error"]["code"] == -32700
@@ -48,10 +45,8 @@ async def test_server_closes_when_a_line_exceeds_64_kib() -> None:
 
 async def test_request_without_id_gets_no_response() -> None:
     """Not even an error; and without an id nothing is armed, as its lease would be unknown."""
-    served = ServedApi()
-    client, wire = served.client()
-    client.data_received(request("disarm") + request("nothing") + request("arm", ARM))
-    await served.settle()
+    served, client, wire = serving()
+    await served.takes(client, request("disarm") + request("nothing") + request("arm", ARM))
     assert (wire.lines(), served.names) == ([], ["disarm"])
 
 
@@ -59,10 +54,8 @@ async def test_bug_in_a_method_is_reported_without_details(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Code -32603; the details are in the log alone."""
-    served = ServedApi()
-    client, wire = served.client()
-    client.data_received(request("play", '{"effect":"x","x_m":0,"y_m":0}', id=1))
-    await served.settle()
+    served, client, wire = serving()
+    await served.takes(client, request("play", '{"effect":"x","x_m":0,"y_m":0}', id=1))
     response = json.dumps(wire.lines())
     assert "-32603" in response
     assert "/a/path" not in response
@@ -84,8 +77,7 @@ async def test_server_stops_all_when_a_stop_fails_on_its_way(
     else:
         served.called = fail
     client, wire = served.client()
-    client.data_received(request("stop", id=1) + request("status", id=2))
-    await served.settle()
+    await served.takes(client, request("stop", id=1) + request("status", id=2))
     assert served.stops == 1
     assert {"error" in line for line in wire.lines()} == {True}
 
@@ -99,23 +91,18 @@ async def test_arm_is_not_carried_out_after_what_silences(
     served = ServedApi()
     served.may_arm.set()
     client, wire = served.client()
-    client.data_received(request("arm", ARM, id=1) + request(silencing, id=2))
-    await served.settle()
+    await served.takes(client, request("arm", ARM, id=1) + request(silencing, id=2))
     assert served.names == [silencing]
     assert [line["error"]["code"] for line in wire.lines() if line["id"] == 1] == [ErrorCode.LEASE]
-    client.data_received(request(silencing, id=3) + request("arm", ARM, id=4))
-    await served.settle()
+    await served.takes(client, request(silencing, id=3) + request("arm", ARM, id=4))
     assert served.names == [silencing] * 2 + ["arm"]
 
 
 async def test_stop_is_served_while_requests_are_pending() -> None:
     """Eight may be pending, further ones are refused, a stop is served at once."""
-    served = ServedApi()
-    client, wire = served.client()
-    client.data_received(b"".join(request("arm", ARM, id=id) for id in range(10)))
-    await served.settle()
-    client.data_received(request("stop", id=99))
-    await served.settle()
+    served, client, wire = serving()
+    await served.takes(client, b"".join(request("arm", ARM, id=id) for id in range(10)))
+    await served.takes(client, request("stop", id=99))
     lines = wire.lines()
     assert {line["id"] for line in lines} == {8, 9, 99}
     assert [line["error"]["code"] for line in lines if "error" in line] == [1005, 1005]
@@ -126,8 +113,7 @@ async def test_stop_is_served_while_requests_are_pending() -> None:
 
 async def test_client_that_closed_its_side_gets_pending_responses() -> None:
     """End of input, then the responses, then the end; only arming is for those who stay."""
-    served = ServedApi()
-    client, wire = served.client()
+    served, client, wire = serving()
     client.data_received(request("stop", id=1) + request("arm", ARM, id=2))
     client.eof_received()
     assert client.is_open
@@ -144,8 +130,7 @@ def touch(source: str, *ids: int, x: float = 0.1, id: int | None = None) -> byte
 
 async def test_touch_frame_is_superseded_by_the_next_of_its_source() -> None:
     """Only by a valid frame of the same source without an id, directly after it."""
-    served = ServedApi()
-    client, wire = served.client()
+    served, client, wire = serving()
     lines = [touch("a", 1, x=0.01 * number) for number in range(4)]  # the last one is served
     lines += [touch("b", 1, x=0.04), touch("a", 1, x=0.05), request("disarm")]
     lines += [
@@ -160,8 +145,7 @@ async def test_touch_frame_is_superseded_by_the_next_of_its_source() -> None:
     ]
     for number, line in enumerate(invalid):
         lines += [touch("a", 1, x=0.08 + 0.01 * number), line]
-    client.data_received(b"".join(lines) + request("stop", id=8))
-    await served.settle()
+    await served.takes(client, b"".join(lines) + request("stop", id=8))
     # Two of the invalid ones are not requests, hence errors without an id.
     assert [each["id"] for each in wire.lines()] == [7, None, None, 8]
     frames = [each for _, each, _ in served.calls if isinstance(each, TouchParams)]
@@ -178,17 +162,14 @@ async def test_touch_read_ahead_of_a_client_that_left_is_not_served() -> None:
     client, _ = served.client()
     leave = asyncio.get_running_loop().call_soon
     served.called = lambda name: leave(client.connection_lost, None)
-    client.data_received(touch("a", 1, x=0.1) + touch("a", 2, x=0.2))
-    await served.settle()
+    await served.takes(client, touch("a", 1, x=0.1) + touch("a", 2, x=0.2))
     assert served.names == ["touch"]
 
 
 async def test_touch_frame_with_a_finger_that_the_next_has_not_is_served() -> None:
     """A tap whose frames come together is not lost; one more finger supersedes."""
-    served = ServedApi()
-    client, _ = served.client()
-    client.data_received(b"".join(touch("a", *ids) for ids in [(1,), (2,), (2, 3), (3,), ()]))
-    await served.settle()
+    served, client, _ = serving()
+    await served.takes(client, b"".join(touch("a", *ids) for ids in [(1,), (2,), (2, 3), (3,), ()]))
     frames = [each for _, each, _ in served.calls if isinstance(each, TouchParams)]
     fingers = [tuple(each.id for each in frame.touches) for frame in frames]
     assert fingers == [(1,), (2, 3), (3,), ()]
@@ -202,19 +183,18 @@ async def test_stop_is_served_among_silent_and_asking_clients() -> None:
     served = ServedApi()
     asking = [served.client() for _ in range(32)]
     for client, wire in asking:
-        client.data_received(request("effects", id=1))
-        await served.settle()
+        await served.takes(client, request("effects", id=1))
         assert "result" in wire.lines()[0]
     for _ in range(160):
         served.client()
     client, wire = served.client(process=2)
     client.data_received(request("effects", id=1) + request("hello", '{"client":"me"}', id=2))
-    client.data_received(b"".join(request(each, id=3) for each in ("status", "stop", "disarm")))
-    await served.settle()
+    await served.takes(
+        client, b"".join(request(each, id=3) for each in ("status", "stop", "disarm"))
+    )
     replies = wire.lines()
     assert ["result" in each for each in replies] == [False, True, True, True, True]
     assert replies[0]["error"]["code"] == 1005
     asking[0][0].connection_lost(None)
-    client.data_received(request("effects", id=1))
-    await served.settle()
+    await served.takes(client, request("effects", id=1))
     assert "result" in wire.lines()[0]  # there is a place for all methods now

@@ -58,8 +58,7 @@ async def test_lost_link_stops_the_others() -> None:
 async def test_finger_of_a_silent_source_is_lifted_while_the_link_is_lost() -> None:
     """150 ms after its last frame, as with a link; not only once all are open again."""
     async with running() as bench:
-        bench.touch(FINGER)
-        await asyncio.sleep(0.05)
+        await bench.touches(FINGER, rest=0.05)
         bench.far_end.line.lose("the cable was pulled")
         await asyncio.sleep(0)
         assert bench.reports.contacts == [1]
@@ -73,8 +72,7 @@ async def test_amplifiers_stage_before_any_commits() -> None:
     async with running("a", "b") as bench:
         bench.far_ends[0].delay = 0.004
         before = len(bench.far_ends[1].asked)
-        bench.touch(FINGER)
-        await asyncio.sleep(0.03)
+        await bench.touches(FINGER, rest=0.03)
         first, second = bench.far_ends
         assert second.names(before) == ["Set", "Commit"]
         assert second.times("Commit")[-1] >= first.times("Set")[-1] + 0.004
@@ -92,8 +90,7 @@ async def test_a_touch_while_arming_ends_is_felt(monkeypatch: pytest.MonkeyPatch
 
         async def armed_late() -> None:
             await arm()
-            bench.touch(FINGER)
-            await asyncio.sleep(0)
+            await bench.touches(FINGER, rest=0)
 
         monkeypatch.setattr(bench.controller.group, "arm", armed_late)
         await bench.controller.arm()
@@ -137,8 +134,7 @@ async def test_stop_is_latched_until_clear() -> None:
         assert bench.controller.group.state is GroupState.DISARMED
         await bench.controller.clear()
         await bench.controller.arm()
-        bench.touch(FINGER)
-        await asyncio.sleep(0.01)
+        await bench.touches(FINGER, rest=0.01)
         assert not bench.far_end.sets()[-1].is_silent
 
 
@@ -300,8 +296,7 @@ async def test_mute_amplifier_is_lost_though_the_finger_was_lifted() -> None:
     async with running("a", "b", far_ends=local) as bench:
         await bench.hold(FINGER, seconds=0.2)
         bench.far_ends[1].is_deaf = True
-        bench.touch()
-        await asyncio.sleep(0.6)
+        await bench.touches(rest=0.6)
         assert bench.reports.lost
         assert bench.controller.group.state is GroupState.LOST
         assert not any(bench.far_ends[0].levels)

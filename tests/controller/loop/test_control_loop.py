@@ -60,8 +60,7 @@ async def test_touch_is_from_rest_400_ms_after_the_last_vibration() -> None:
     async with running() as bench:
         for pause in (0.1, 0.3, 0.5):
             await bench.hold(FINGER, seconds=0.2)
-            bench.touch()
-            await asyncio.sleep(pause)
+            await bench.touches(rest=pause)
         await bench.hold(FINGER, seconds=0.1)
         assert [each.from_rest for each in bench.reports.applied] == [True, False, False, True]
 
@@ -95,8 +94,7 @@ async def test_latency_counts_to_the_commit_with_several_amplifiers() -> None:
     async with running("west", "east") as bench:
         for far_end in bench.far_ends:
             far_end.delay = 0.010
-        bench.touch(FINGER, ago=0.003)
-        await asyncio.sleep(0.040)
+        await bench.touches(FINGER, ago=0.003, rest=0.040)
         (applied,) = bench.reports.applied
         assert applied.latency == pytest.approx(0.013)
 
@@ -110,8 +108,7 @@ async def test_controller_keeps_phase_when_a_finger_moves() -> None:
         await bench.hold((1, 0.6, 0.5), seconds=0.1)
         bench.table.excitation = BOTH
         await bench.hold((1, 0.7, 0.5), seconds=0.1)
-        bench.touch()
-        await asyncio.sleep(0.01)
+        await bench.touches(rest=0.01)
         await bench.hold((2, 0.7, 0.5), seconds=0.1)
         played = [each for each in bench.far_end.sets() if not each.is_silent]
         assert [[c.keep_phase for c in each.commands] for each in played] == [
@@ -143,8 +140,7 @@ async def test_controller_silences_a_lift_while_a_reply_is_awaited(kind: str) ->
         bench.far_end.answer = lambda name, values: None
         await asyncio.sleep(0.001)
         lifted = now()
-        bench.touch()
-        await asyncio.sleep(0.02)
+        await bench.touches(rest=0.02)
         assert_silenced_within_20_ms(bench, lifted)
         bench.far_end.delay = 0.0
         beats = len(bench.far_end.times("Ping"))
@@ -176,8 +172,7 @@ async def test_lift_as_a_set_is_confirmed_precedes_a_due_heartbeat(later: int) -
         for far_end in bench.far_ends:
             far_end.delay = 0.002
         bench.far_ends[-1].answer = answer
-        bench.touch(FINGER)
-        await asyncio.sleep(0.05)
+        await bench.touches(FINGER, rest=0.05)
         for far_end, count in zip(bench.far_ends, before, strict=True):
             sent = far_end.names(count)
             assert sent.index("Silence") < sent.index("Ping")
@@ -192,8 +187,7 @@ async def test_controller_silences_a_timeout_while_a_reply_is_awaited(ago: float
     """
     async with running() as bench:
         bench.far_end.delay = 0.04
-        bench.touch(FINGER)
-        await asyncio.sleep(0.002)
+        await bench.touches(FINGER, rest=0.002)
         bench.touch(FINGER, ago=ago)
         over = max(now(), now() - ago + 0.15)
         await asyncio.sleep(0.1)
@@ -221,8 +215,7 @@ async def test_heartbeat_stops_when_the_loop_hangs() -> None:
         slow, other = bench.far_ends
         slow.delay = 0.2
         hung = now()
-        bench.touch(FINGER)
-        await asyncio.sleep(0.08)
+        await bench.touches(FINGER, rest=0.08)
         assert [time for time in other.times("Ping") if time > hung] == []
         slow.delay = 0.0
         await asyncio.sleep(0.5)
@@ -257,10 +250,8 @@ async def test_controller_retries_a_pattern_when_the_rate_limit_permits(
         bench.table.excitation = BOTH
         begin = now()
         for _ in range(2):
-            bench.touch(FINGER)
-            await asyncio.sleep(0.010)
-            bench.touch()
-            await asyncio.sleep(0.010)
+            await bench.touches(FINGER, rest=0.010)
+            await bench.touches(rest=0.010)
         asked = len(bench.table.asked)
         await bench.hold(FINGER, seconds=1.0)
         (refusal,) = bench.reports.refused
@@ -273,13 +264,10 @@ async def test_controller_retries_a_pattern_when_the_rate_limit_permits(
         assert len(bench.table.asked) == asked + 1
         assert bench.reports.applied[-1].time == pytest.approx(begin + 1.1, abs=1e-3)
         for refused in (1, 2):
-            bench.touch()
-            await asyncio.sleep(0.010)
-            bench.touch(FINGER)
-            await asyncio.sleep(0.010)
+            await bench.touches(rest=0.010)
+            await bench.touches(FINGER, rest=0.010)
             assert len(bench.reports.refused) == refused
-        bench.touch()
-        await asyncio.sleep(2)
+        await bench.touches(rest=2)
         assert not any(bench.far_end.levels)
         assert len(bench.reports.applied) == 4
 
@@ -308,10 +296,8 @@ async def test_controller_survives_a_failing_observer(caplog: pytest.LogCaptureF
 
     observer = Observer(contacts_changed=fail, pattern_applied=fail, silenced=fail)
     async with running(observer=observer) as bench:
-        bench.touch(FINGER)
-        await asyncio.sleep(0.01)
-        bench.touch()
-        await asyncio.sleep(0.2)
+        await bench.touches(FINGER, rest=0.01)
+        await bench.touches(rest=0.2)
         assert bench.silences() == [True, False, True]
         assert len(bench.far_end.requests("Ping")) > 3
     assert "no disk space for this row" in caplog.text

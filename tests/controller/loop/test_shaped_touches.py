@@ -105,8 +105,7 @@ async def test_touch_starts_along_its_onset(link: FarEnd, shapes: Shapes) -> Non
     """
     async with running(far_ends=[link], timing=shapes) as bench:
         begin = asyncio.get_running_loop().time()
-        bench.touch(FINGER, OTHER)
-        await asyncio.sleep(ONSET / 2)
+        await bench.touches(FINGER, OTHER, rest=ONSET / 2)
         (played,) = sets(link)
         driven, silent = played.commands
         assert (silent.onset, silent.ending, silent.level) == (None, None, 0.0)
@@ -132,14 +131,12 @@ async def test_lifted_target_fades_along_its_ending(link: FarEnd, shapes: Shapes
     """While another finger stays; reported as silence."""
     async with running(far_ends=[link], timing=shapes) as bench:
         await bench.hold(OTHER, FINGER, seconds=0.3)
-        bench.touch(OTHER)
-        await asyncio.sleep(0.020)
+        await bench.touches(OTHER, rest=0.020)
         assert level(link) == pytest.approx(FULL / 2, abs=1e-3)
         await asyncio.sleep(0.0205)
         assert link.levels == (0, 0)
         assert bench.reports.silenced[-1].reason == "the target was lifted"
-        bench.touch()
-        await asyncio.sleep(0.001)
+        await bench.touches(rest=0.001)
         assert link.names()[-1] == "Silence"
 
 
@@ -149,8 +146,7 @@ async def test_last_lift_skips_the_ending(link: FarEnd, shapes: Shapes, held: fl
     """Zero at once and within 20 ms, whether the onset is over or not."""
     async with running(far_ends=[link], timing=shapes) as bench:
         await bench.hold(FINGER, seconds=held)
-        bench.touch()
-        await asyncio.sleep(0)
+        await bench.touches(rest=0)
         await asyncio.sleep(0.020)
         assert link.levels == (0, 0)
 
@@ -290,8 +286,7 @@ async def test_vibration_ends_by_itself_if_a_contact_of_a_dead_panel_stays(
         monkeypatch.setattr(ContactTracker, "next_expiry", never, raising=False)
         monkeypatch.setattr(ContactTracker, "expire", lambda tracker, now: Change())
         begin = asyncio.get_running_loop().time()
-        bench.touch(FINGER)
-        await asyncio.sleep(60.0)
+        await bench.touches(FINGER, rest=60.0)
         assert not bench.silences()[-1]
         ends = [time - begin + (each.valid_for or math.inf) for time, each in vibrations(bench)]
         assert max(ends) < 2.1

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
-from model.drive_modes.forms import Forms
 from model.drive_modes.switched import amplitude_powers, members_of, sums_of_sources
 from model.ensemble.attached_plate import AttachedPlate, attach
 from model.ensemble.plate_on_eras import PlateOnEras
@@ -30,7 +29,6 @@ from model.structure.attachments import Era, Fingertip, PointLoad, fingertip_loa
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 from model.table.contents import JUDGING_DRAWS, PROMISED_DRAWS
-from model.table.fingers_on_plate import FingersOnPlate
 from model.table.pattern import Pattern
 from model.table.pattern_query import find_pattern
 from model.table.pulse_gains import OverEffect
@@ -151,15 +149,6 @@ class LocalizationTable:
     def inherit_ringing(self, other: "LocalizationTable") -> None:
         """Take what is prepared of ringing from a table of nearly the same plate."""
         self._ringings.update(other._ringings)
-
-    def forms(self, question: Question) -> Forms:
-        """Expected powers at the fingertips of a question, at all frequencies of the table."""
-        background = None if question.quiet else self.background(question.targets)
-        fingers = FingersOnPlate.of(self, question.contacts, question.loads)
-        every = range(len(question.contacts))
-        count = len(question.targets)
-        formed = fingers.forms(np.arange(len(self.frequencies)), with_fine=True)
-        return formed.of(every[:count], every[count:], question.level_db_sl, background)
 
     def unit_fields(
         self, points: FloatArray, *, contacts: Sequence[Point] = (), loads: Sequence[float] = ()

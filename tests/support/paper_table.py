@@ -5,9 +5,12 @@ from functools import cache
 
 import numpy as np
 
+from model.drive_modes.forms import Forms
 from model.fem.mesh import ELEMENTS, Mesh
 from model.rig.rig import Rig
 from model.table.build import build_table
+from model.table.fingers_on_plate import FingersOnPlate
+from model.table.question import Question
 from model.table.table import LocalizationTable
 from paper_plate import make_paper_rig
 
@@ -18,6 +21,14 @@ def smooth_rig() -> Rig:
     """The paper's rig on 6x5 elements of the fifth order."""
     rig = make_paper_rig(6, 5)
     return replace(rig, mesh=Mesh(6, 5, rig.plate.length, rig.plate.width, ELEMENTS["Q5"]))
+
+
+def forms_of(table: LocalizationTable, question: Question) -> Forms:
+    """Expected powers at the fingertips of a question, at all frequencies of a table."""
+    fingers = FingersOnPlate.of(table, question.contacts, question.loads)
+    formed = fingers.forms(np.arange(len(table.frequencies)), with_fine=True)
+    every, count = range(len(question.contacts)), len(question.targets)
+    return formed.of(every[:count], every[count:], question.level_db_sl)
 
 
 @cache

@@ -15,7 +15,7 @@ from model.drive_modes.forms import Forms
 from model.finger.fingertip import fingertip_points
 from model.rig.uncertainty import Uncertainty
 from model.table.question import Question
-from paper_table import contact_sets, smooth_table
+from paper_table import contact_sets, forms_of, smooth_table
 from random_forms import random_forms
 
 F, E = 5, 3
@@ -23,16 +23,15 @@ F, E = 5, 3
 
 def forms_on_plate(places, *, targets=1, level=12.0):
     """Forms of fingertips on the paper's plate."""
-    return smooth_table().forms(
-        Question(tuple(places[:targets]), tuple(places[targets:]), level_db_sl=level)
-    )
+    question = Question(tuple(places[:targets]), tuple(places[targets:]), level_db_sl=level)
+    return forms_of(smooth_table(), question)
 
 
 def test_the_loudest_point_of_a_quiet_fingertip_counts_as_modelled():
     """Of a rig that is known exactly, in place of the mean of a few points."""
     (places,) = contact_sets(1, fingers=3, seed=8)
     known = replace(smooth_table(), uncertainty=Uncertainty.none())
-    given = known.forms(Question((places[0],), tuple(places[1:])))
+    given = forms_of(known, Question((places[0],), tuple(places[1:])))
     rng = np.random.default_rng(0)
     weights = (rng.standard_normal((27, 4)) + 1j * rng.standard_normal((27, 4))).astype("c8")
     power = given.quiet_power(weights)

@@ -20,7 +20,7 @@ from model.table.fingers_on_plate import FingersOnPlate
 from model.table.promised import share_stroke
 from model.table.question import Question
 from model.table.table import LocalizationTable
-from paper_table import contact_sets, smooth_rig
+from paper_table import contact_sets, forms_of, smooth_rig
 
 RNG = np.random.default_rng(5)
 PLACES = [(float(x), float(y)) for x, y in RNG.uniform([0.02, 0.02], [0.29, 0.21], (8, 2))]
@@ -126,7 +126,7 @@ def test_bound_and_level_are_those_of_the_best_weights_for_the_mean() -> None:
     """
     of = table()
     question = Question((PLACES[0],), tuple(PLACES[1:4]), level_db_sl=20.0)
-    forms, contents = of.forms(question), only(of, question)
+    forms, contents = forms_of(of, question), only(of, question)
     c = forms.targets[0].conj().astype(complex)
     R = forms.quiet.mean(axis=1).astype(complex)
     bounds, levels = [], []

@@ -16,7 +16,7 @@ left.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
@@ -142,16 +142,10 @@ class Altered(Touched):
     @classmethod
     def by(cls, alteration: Alteration, touched: Touched) -> Self:
         """A pattern whose plate was altered."""
-        space, own = touched.space, alteration
-        edge, free = np.full(2, 1.5), np.full(own.size - 2, np.inf)
-        names = tuple(f"{each} of {own.name}" for each in ("x", "y", *own.own))
-        wider = replace(
-            space,
-            names=space.names + names,
-            std=np.concatenate([space.std, np.ones(own.size)]),
-            lower=np.concatenate([space.lower, -edge, np.full(own.size - 2, _LEAST)]),
-            upper=np.concatenate([space.upper, edge, free]),
-        )
+        names = [f"{each} of {alteration.name}" for each in ("x", "y", *alteration.own)]
+        free = len(alteration.own)
+        bounds = np.array([[-1.5] * 2 + [_LEAST] * free, [1.5] * 2 + [np.inf] * free])
+        wider = touched.space.and_further("alteration", names, 1.0, bounds)
         return cls(touched.pattern, wider, touched.touched, touched.noise, alteration=alteration)
 
     @property

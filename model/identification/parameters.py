@@ -153,6 +153,19 @@ class Space:
             ).reshape(3, -1)
         return replace(self, std=columns[0], lower=columns[1], upper=columns[2])
 
+    def and_further(
+        self, kind: str, names: Sequence[str], std: float, bounds: FloatArray
+    ) -> "Space":
+        """The same with further parameters of a kind at its end; bounds (2, n)."""
+        first, count = self.size, len(names)
+        return Space(
+            (*self.names, *names),
+            np.append(self.std, np.full(count, std)),
+            np.append(self.lower, bounds[0]),
+            np.append(self.upper, bounds[1]),
+            self.groups | {kind: slice(first, first + count)},
+        )
+
     def of_kinds(self, known: Callable[[Kind], float]) -> FloatArray:
         """What is known of the kind of each parameter, in its unit (p,), 0 where it is known."""
         found = np.zeros(self.size)

@@ -84,18 +84,10 @@ class Touched:
         noise: float = 1.0,
     ) -> "Touched":
         """A model under the fingers of a pattern, of loads known to finger_std (of logarithms)."""
-        count = len(FINGER_PARTS) * len(pattern.fingers)
-        names = tuple(f"finger part {number}" for number in range(count))
-        bounds = np.full(count, np.inf)
-        space, size = model.space, model.space.size
-        wider = replace(
-            space,
-            names=space.names + names,
-            std=np.concatenate([space.std, np.full(count, finger_std)]),
-            lower=np.concatenate([space.lower, -bounds]),
-            upper=np.concatenate([space.upper, bounds]),
-            groups=space.groups | {"fingers": slice(size, size + count)},
-        )
+        count, space = len(FINGER_PARTS) * len(pattern.fingers), model.space
+        names = [f"finger part {number}" for number in range(count)]
+        bounds = np.full((2, count), [[-np.inf], [np.inf]])
+        wider = space.and_further("fingers", names, finger_std, bounds)
         touched = replace(
             model,
             frequencies=np.array([pattern.frequency]),

@@ -35,24 +35,40 @@ def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> Non
     if plate is not None and not mesh_given:
         _check_mesh(validation, plate, frequency_max=high)
     names = tuple(validation.mapping(("eras",)))
-    _check_places(validation, names, plate)
-    for name in validation.mapping(("masses",)):
-        place = validation.field(("masses", name, "at"), MassSection)
-        if place is not None:
-            _check_on_plate(validation, ("masses", name, "at"), plate, place, what="mass")
-    _check_feet(validation, names)
-    _check_wiring(validation, names)
     for name in names:
-        if {"damping", "damping_ratio"} <= validation.mapping(("eras", name)).keys():
+        _check_era(validation, name)
+    _check_places(validation, names, plate)
+    _check_wiring(validation, names)
+    for name in validation.mapping(("masses",)):
+        _check_on_plate(validation, ("masses", name), MassSection, plate, what="mass")
+
+
+def _check_era(validation: Validation[RigSection], name: str) -> None:
+    """Check what keys of an ERA require of each other."""
+    given = _given(validation, ("eras", name))
+    if {"damping", "damping_ratio"} <= validation.mapping(("eras", name)).keys():
+        validation.add(
+            ("eras", name, "damping"),
+            "must not be given with damping_ratio; remove one of the two",
+        )
+    for key, other in (("amplifier", "channel"), ("channel", "amplifier")):
+        if other in given and key not in given:
             validation.add(
-                ("eras", name, "damping"),
-                "must not be given with damping_ratio; remove one of the two",
+                ("eras", name, key),
+                f"missing; add it, or remove {other} too for an ERA that only supports",
             )
+    stiffness = validation.field(("eras", name, "stiffness"), EraSection)
+    if stiffness is not None and stiffness >= STIFF_MOUNT and "foot" not in given:
+        validation.add(
+            ("eras", name, "foot"),
+            f"missing; add the radius of the patch on which it holds the plate: at "
+            f"{stiffness:g} N/m, {STIFF_MOUNT:g} N/m or more, the response depends on it",
+        )
 
 
 def _check_plate(validation: Validation[RigSection], *, frequency_max: float) -> Plate | None:
     """The plate if its section is valid: thickness and material, or layers."""
-    given = {key for key, value in validation.mapping(("plate",)).items() if value is not None}
+    given = _given(validation, ("plate",))
     if not given:
         return None
     if "layers" in given:
@@ -114,10 +130,9 @@ def _check_places(
 ) -> None:
     placed: dict[str, tuple[float, float]] = {}
     for name in names:
-        place = validation.field(("eras", name, "at"), EraSection)
+        place = _check_on_plate(validation, ("eras", name), EraSection, plate, what="ERA")
         if place is None:
             continue
-        _check_on_plate(validation, ("eras", name, "at"), plate, place, what="ERA")
         for other, taken in placed.items():
             if math.dist(taken, place) < SAME_POINT:
                 validation.add(
@@ -127,56 +142,40 @@ def _check_places(
         placed[name] = place
 
 
-def _check_feet(validation: Validation[RigSection], names: tuple[str, ...]) -> None:
-    """Check that ERAs stiff enough for it to matter say how large they are."""
-    for name in names:
-        stiffness = validation.field(("eras", name, "stiffness"), EraSection)
-        given = _has(validation, name, "foot")
-        if stiffness is not None and stiffness >= STIFF_MOUNT and not given:
-            validation.add(
-                ("eras", name, "foot"),
-                f"missing; add the radius of the patch on which it holds the plate: at "
-                f"{stiffness:g} N/m, {STIFF_MOUNT:g} N/m or more, the response depends on it",
-            )
-
-
 def _check_on_plate(
     validation: Validation[RigSection],
-    key: tuple[str, ...],
+    path: tuple[str, ...],
+    section: type[EraSection | MassSection],
     plate: Plate | None,
-    place: tuple[float, float],
     *,
     what: str,
-) -> None:
+) -> tuple[float, float] | None:
+    """Check the place of an ERA or a mass; the place, None if it is invalid by itself."""
+    place: tuple[float, float] | None = validation.field((*path, "at"), section)
+    if place is None or plate is None:
+        return place
     x, y = place
-    if plate is not None and not (
+    if not (
         -SAME_POINT <= x <= plate.length + SAME_POINT
         and -SAME_POINT <= y <= plate.width + SAME_POINT
     ):
         validation.add(
-            key,
+            (*path, "at"),
             f"must be on the plate, from (0, 0) to ({plate.length:g}, {plate.width:g}) m, got "
             f"({x:g}, {y:g}) m; move the {what}",
         )
+    return place
 
 
 def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) -> None:
     amplifiers = validation.mapping(("amplifiers",))
     wired: dict[tuple[str, int], str] = {}
-    if names and not any(_has(validation, name, "amplifier") for name in names):
+    if names and not any("amplifier" in _given(validation, ("eras", name)) for name in names):
         validation.add(("eras",), "must have at least one ERA with an amplifier; add its amplifier")
     for name in names:
-        amplifier = validation.field(("eras", name, "amplifier"), EraSection)
-        channel = validation.field(("eras", name, "channel"), EraSection)
-        given = {
-            key for key, value in validation.mapping(("eras", name)).items() if value is not None
-        }
-        for key, other_key in (("amplifier", "channel"), ("channel", "amplifier")):
-            if other_key in given and key not in given:
-                validation.add(
-                    ("eras", name, key),
-                    f"missing; add it, or remove {other_key} too for an ERA that only supports",
-                )
+        amplifier, channel = (
+            validation.field(("eras", name, key), EraSection) for key in ("amplifier", "channel")
+        )
         if amplifier is not None and amplifier not in amplifiers:
             known = ", ".join(key_name((key,)) for key in amplifiers) or "none"
             validation.add(
@@ -195,6 +194,6 @@ def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) ->
             )
 
 
-def _has(validation: Validation[RigSection], name: str, key: str) -> bool:
-    """Whether an ERA has a key that is not empty."""
-    return validation.mapping(("eras", name)).get(key) is not None
+def _given(validation: Validation[RigSection], path: tuple[str, ...]) -> set[str]:
+    """Keys of a section that are not empty."""
+    return {key for key, value in validation.mapping(path).items() if value is not None}

@@ -60,6 +60,11 @@ class Group(Members):
         self._running_due: dict[str, float] = {}  # statuses just before a heartbeat
         self._readings: dict[str, asyncio.Future[Values]] = {}  # of amplifiers that do not reply
 
+    @property
+    def is_silencing(self) -> bool:
+        """Whether a stop or disarm goes on."""
+        return bool(self._silencing)
+
     async def open(self) -> None:
         """Identify all amplifiers and leave them disarmed.
 

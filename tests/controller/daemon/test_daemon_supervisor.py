@@ -238,3 +238,20 @@ async def test_set_that_was_not_staged_stops_all_and_is_a_fault() -> None:
         assert daemon.far_end.state == STOPPED
         assert daemon.state is DaemonState.FAULT
         assert "era clear" in (daemon.supervisor.operation.remedy or "")
+
+
+@in_virtual_time
+async def test_stop_in_progress_is_not_repeated(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A look at the amplifiers finds it at work; one after its end, without silence, does not."""
+    monkeypatch.setattr("controller.daemon.supervisor.STATUS_INTERVAL", 0.02)
+    async with watched("main") as daemon:
+        daemon.answer("Stop", "GetStatus", levels=[1000, 0], state="QUICK_STOP_ACTIVE")
+        stopping = asyncio.ensure_future(daemon.supervisor.stop("a test"))
+        await asyncio.sleep(0.1)
+        assert not stopping.done()
+        assert "stop repeated" not in caplog.text
+        await stopping
+        await asyncio.sleep(0.1)
+        assert "stop repeated" in caplog.text

@@ -24,13 +24,16 @@ class FiniteElementModes:
     def __init__(self, plate: Plate, mesh: Mesh, *, shift: float, cutoff_frequency: float) -> None:
         self._matrices = matrices = assemble(plate, mesh)
         self._factor = factorise(matrices.stiffness + shift * matrices.mass)
-        cut, count = (2 * math.pi * cutoff_frequency) ** 2, plate.modes_below(cutoff_frequency)
-        eigenvalues = np.zeros(1)
-        while eigenvalues[-1] < cut and len(eigenvalues) < matrices.dof:
-            count = min(count + count // 3 + RIGID_BODY_MODES + 4, matrices.dof)
+        cut = (2 * math.pi * cutoff_frequency) ** 2
+        count = plate.modes_below(cutoff_frequency) + RIGID_BODY_MODES + 4
+        while True:
+            count = min(count, matrices.dof)
             eigenvalues, vectors = lowest_modes(
                 matrices.stiffness, matrices.mass, count, shift=shift
             )
+            if eigenvalues[-1] >= cut or count == matrices.dof:
+                break
+            count += count // 3 + 1
         eigenvalues[:RIGID_BODY_MODES] = 0.0
         vectors[:, :RIGID_BODY_MODES] = _rigid_modes(matrices)
         products = np.linalg.cholesky(vectors.T @ (matrices.mass @ vectors))  # a solver is 1e-7 off

@@ -234,7 +234,7 @@ def _worst(found: Answer) -> float:
 def _factor_within(
     found: Answer, capabilities: PlaybackCapabilities, strokes: Mapping[str, float]
 ) -> float:
-    """The factor, 1 at share, by which all contents together are within the amplifiers' limits."""
+    """The factor, 1 at most, by which all contents together are within the amplifiers' limits."""
     total = dict.fromkeys(strokes, 0.0)
     for layer in found.layers:
         if layer.verdict not in (HELD_BACK, SHARED):

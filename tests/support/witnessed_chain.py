@@ -231,7 +231,7 @@ SCENARIOS: Mapping[str, Sequence[Step]] = {
     ],
     # Touches, a neighbour, a lift, a stop amid a touch, clearing, arming, disarming.
     "day": [
-        *(operate("arm", rest=0.12), touch(1, rest=0.1), touch(1, 2, rest=0.12)),
+        *(operate("arm", rest=0.12), touch(1, rest=0.12), touch(1, 2, rest=0.12)),
         *(touch(1, rest=0.05), touch(rest=0.1), touch(1, rest=0.1), touch(rest=0.1)),
         *(touch(3, rest=0.1), operate("stop", rest=0.1), touch(), operate("clear")),
         *(operate("arm"), touch(4, rest=0.06), operate("disarm", rest=0.1), touch()),

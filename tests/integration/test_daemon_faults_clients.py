@@ -15,6 +15,7 @@ from controller.api.jsonrpc import RpcError
 from daemon_bench import PATIENCE, far_end, holding, until
 from daemon_process import DaemonProcess, Journal, daemon_process, loudness, play, plays_on, run_era
 from floods import flood
+from long_form import shortly
 
 pytestmark = pytest.mark.alone
 
@@ -76,3 +77,24 @@ async def test_stops_are_served_while_clients_connect_again_and_again(tmp_path: 
                         served += 1
             status, _, problem = await run_era("stop", "--socket", daemon.socket)
         assert (served, status, problem) == (25, 0, "")
+
+
+@pytest.mark.parametrize("kind", shortly(["garbage", "asking"], ["asking"]))
+async def test_daemon_plays_on_when_clients_flood(tmp_path: Path, kind: str) -> None:
+    """With malformed or endless requests any client can stop it, and the log stays short."""
+    async with (
+        far_end(tmp_path) as far,
+        daemon_process(tmp_path, far, program=patient_daemon.PROGRAM) as daemon,
+    ):
+        journal = Journal(far)
+        async with await daemon.client() as era, holding(era):
+            await play(era, far)
+            before = resident(daemon.process.pid)
+            async with flood(kind, daemon.socket, 4), flood(kind, daemon.socket, 5):
+                await plays_on(f"clients flood: {kind}", daemon, era, journal)
+                await stop_by_new_client(daemon)
+            await play(era, far)
+            assert resident(daemon.process.pid) - before < MAX_GROWTH
+        assert not daemon.has_logged("Traceback")
+        assert not daemon.has_logged("no json")
+        assert len(daemon.log) < 200  # invalid requests do not fill the disk

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 
 from controller.daemon.run import check_daemon
-from daemon_bench import daemon_table, write_daemon
+from daemon_bench import ENABLED, daemon_table, holding, ready_daemon, write_daemon
 from model.errors import InputError
 from model.table.file import save_table
+from virtual_sockets import in_virtual_time_on_sockets
 
 MAX_TIME = 5.0  # s; expanded aliases would take minutes, and gigabytes
 
@@ -81,3 +82,31 @@ def test_daemon_refuses_the_table_of_another_plate(tmp_path: Path) -> None:
     write_daemon(tmp_path, {"main": "sim://"}, "table: table.npz\n", changes=changes)
     with pytest.raises(InputError, match=r"table\.npz"):
         check_daemon(path)
+
+
+@in_virtual_time_on_sockets
+async def test_running_daemon_keeps_configuration_when_reload_is_invalid(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Each invalid file: nothing is applied, not even valid changes beside it; it plays on."""
+    layout, config = tmp_path / "layout.yaml", tmp_path / "daemon.yaml"
+    layout.write_text(LAYOUT, encoding="utf-8")
+    async with ready_daemon(tmp_path, "layout: layout.yaml\n") as (bench, era):
+        await era.arm("test", lease_s=60)
+        effects = await era.effects()
+        async with holding(era, far=bench.far):
+            good = config.read_text("utf-8")
+            config.write_text(f"{good}dashboard: 127.0.0.1:1\n", encoding="utf-8")
+            invalid = [each.values[0] for each in INVALID if each.values[0] is not None]
+            for content in invalid:
+                layout.write_bytes(content)
+                await bench.daemon.reload()
+            rejected = [one for one in caplog.messages if "reload rejected" in one]
+            assert len(rejected) == len(invalid)
+            assert not any("reload failed" in one for one in caplog.messages)
+            assert await era.effects() == effects
+            assert any(bench.far.summary().levels)
+        status = await era.status()
+        assert (status.state, (status.lease_left_s or 0) > 5) == (ENABLED, True)
+    with pytest.raises(InputError, match=r"layout\.yaml"):
+        check_daemon(config)

@@ -9,8 +9,11 @@ from typing import Any
 
 from controller.api.async_client import AsyncClient
 from controller.api.client import Client
+from controller.api.methods import METHODS
+from controller.api.topics import TOPICS, EventParams
 from controller.gateway.field import DrawnField
 from daemon_bench import PLACE, holding, running_daemon, until_state
+from virtual_sockets import in_virtual_time_on_sockets
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 # keyed by name, not messages: so many levels deep
@@ -92,3 +95,52 @@ async def test_extra_keys_of_a_later_minor_version_are_ignored(tmp_path: Path) -
                     drawn = await field.newer_than(drawn)
         drawing.cancel()
         await asyncio.wait({drawing})
+
+
+@in_virtual_time_on_sockets
+async def test_daemon_sends_exactly_the_documented_keys(tmp_path: Path) -> None:
+    """Results and notifications read strictly by the models of the reference page."""
+    down = [{"id": 1, "x_m": PLACE[0], "y_m": PLACE[1]}]
+    topics = sorted(TOPICS.keys() - {"link", "log"})
+    received: set[str] = set()
+
+    async with contextlib.AsyncExitStack() as stack:
+        bench = await stack.enter_async_context(running_daemon(tmp_path, "learn: l.npz\n"))
+        async with await bench.client() as era:
+            await until_state(era, READY)
+        reader, writer = await asyncio.open_unix_connection(bench.socket, limit=1 << 20)
+        stack.callback(writer.close)
+
+        async def next_response() -> dict[str, Any]:
+            """The next response; notifications before it are read strictly."""
+            while True:
+                content: dict[str, Any] = json.loads(await reader.readline())
+                if "method" not in content:
+                    return content
+                event = EventParams.model_validate(content["params"])
+                TOPICS[event.topic].data.model_validate_json(json.dumps(event.data))
+                received.add(event.topic)
+
+        async def call(method: str, **params: object) -> None:
+            request = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
+            writer.write(json.dumps(request).encode() + b"\n")
+            response = await next_response()
+            assert response.keys() == {"jsonrpc", "id", "result"}, response
+            METHODS[method].result.model_validate_json(json.dumps(response["result"]))
+
+        async with asyncio.timeout(60):
+            await call("hello", client="me")
+            await call("subscribe", topics=topics, rate_hz=60.0)
+            assert received == set()  # the reply comes before the first event
+            await call("effects")
+            await call("arm", owner="me", lease_s=5.0)
+            for touches, awaited in ((down, "pattern"), ([], "silence")):
+                while awaited not in received:
+                    await call("touch", source="me", touches=touches)
+                    await call("status")
+                    await asyncio.sleep(0.01)
+            await call("stop")
+            await call("clear")
+            while received != set(topics):
+                await call("status")
+                await asyncio.sleep(0.01)

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import random
 import socket
 import threading
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from drivers import clock
 from examples.make_touches import tuio_datagram
 from model.errors import InputError
 from model.structure.plate import Material, Plate
-from tuio_messages import free_port
+from tuio_messages import free_port, panel
 from virtual_sockets import in_virtual_time_on_sockets
 
 PLATE = Plate(0.4, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
@@ -227,3 +228,28 @@ async def test_touch_that_came_and_went_during_a_pause_plays_nothing(tmp_path: P
             bench.daemon._controller.deliver(TouchFrame("brief", begin - ago, touches))
         await journal.hear(10)
         assert not journal.raising_since(begin)
+
+
+@in_virtual_time_on_sockets
+async def test_few_of_a_flood_of_touches_become_sets(tmp_path: Path) -> None:
+    """Of three fingers that jump at 10 kHz fewer than a quarter; silent once they lift."""
+    port, chance, count = free_port(), random.Random(3), 1000
+    async with ready_daemon(tmp_path, panel(port)) as (bench, era):
+        journal = Journal(bench.far)
+        await era.arm("me", lease_s=60)
+        begin = clock.now()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            for number in range(count + 1):
+                touches = tuple(
+                    Touch(finger, chance.uniform(0.1, 0.9), chance.uniform(0.1, 0.9))
+                    for finger in range(3 if number < count else 0)
+                )
+                frame = TouchFrame("flood", 0.0, touches)
+                sender.sendto(tuio_datagram(frame, -1), ("127.0.0.1", port))
+                await asyncio.sleep(1e-4)
+        assert journal.raising_since(begin)
+        await until(lambda: not any(bench.far.summary().levels))
+        silent = clock.now()
+        await journal.hear(5)
+        assert not journal.raising_since(silent)
+        assert len(journal.raising_since(begin)) < count / 4

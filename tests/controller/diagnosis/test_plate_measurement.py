@@ -13,22 +13,35 @@ from controller.diagnosis.plate_measurement import (
     checked_level,
 )
 from controller.diagnosis.plate_sensors import PlateSensor
+from controller.diagnosis.tone_player import TonePlayer
 from drivers.errors import CommandRefused
-from drivers.host.sensors import Reading, SensorReading
+from drivers.host.sensors import Reading, SensorReading, measure_tones
 from drivers.opening import Lines
 from memory_machine import live_in_memory
 from model.errors import InputError
 from model.identification.forward import Sensor
+from model.identification.identify import identify
 from model.identification.measured_plate import MeasuredPlate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
+from model.table.build import build_table
+from model.table.question import Question
 from model.vibration.natural_modes import direct_responder
 from rig_on_wire import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers
 from sim.bench import bench
 from sim.plant.accelerometer import Accelerometer
 from sim.sensors.recorder import Accelerometers
 from virtual_loop import run_virtual
+
+TONES = np.arange(60.0, 480.0, 35.0)
+FINGERS = (
+    ((0.08, 0.06), (0.22, 0.16)),
+    ((0.25, 0.05), (0.06, 0.17)),
+    ((0.15, 0.11), (0.04, 0.04)),
+    ((0.05, 0.19), (0.24, 0.19)),
+    ((0.20, 0.08), (0.10, 0.15)),
+)
 
 NOISE = 0.01  # m/s²/sqrt(Hz), of each foot: a thousandth of what it hears in a reading
 
@@ -186,3 +199,69 @@ def test_level_stays_10_db_below_what_the_rig_allows(rig: Rig) -> None:
     for each, level in ((rig, 0.4), (narrow, 0.1), (rig, 0.0), (rig, math.nan)):
         with pytest.raises(InputError, match="--level"):
             checked_level(each, level)
+
+
+async def contrasts(rig: Rig, far: FarSide, known: Rig) -> list[float]:
+    """Contrast [dB] of a known rig's patterns at pairs of fingers, measured in time."""
+    sensors = Accelerometers(far.bench)
+    table = build_table(known, frequencies=TONES, drive_mode="phased")
+    player = TonePlayer(rig, Lines, far.urls)
+    found = []
+    try:
+        await player.open()
+        (amplifier,) = player.amplifiers.values()
+        await player.group.arm()
+        for target, quiet in FINGERS:
+            sensors.place([Accelerometer("T", *target), Accelerometer("Q", *quiet)])
+            pattern = table.query(Question((target,), (quiet,), level_db_sl=35.0))
+            plays = await player.play(pattern.excitation)
+            for _ in range(30):
+                await asyncio.sleep(0.05)
+                await player.group.beat()
+            (frequency,) = {command.frequency for command in plays.values()}
+            reading = await measure_tones(amplifier, [frequency], 0.1)
+            await player.group.beat()
+            one, other = (each.tones[0][0] for each in reading.sensors[-2:])
+            found.append(20 * math.log10(one / other))
+    finally:
+        await player.close()
+    return found
+
+
+def test_identified_rig_is_the_truth_and_its_patterns_have_more_contrast(
+    rig: Rig, truth: Rig
+) -> None:
+    """Parameters agree within three standard errors; contrast in time rises by 6 dB and more."""
+
+    async def run() -> tuple[MeasuredPlate, list[float], Rig, list[float]]:
+        live_in_memory()
+        async with far_side(WIRES["serial"], truth) as far:
+            taken = await measured(rig, far)
+            found = identify(rig, taken.measurement)
+            assert found.is_explained
+            check(
+                found.posterior.space.names,
+                found.posterior.x * found.posterior.space.std,
+                found.posterior.std,
+            )
+            before = await contrasts(rig, far, rig)
+            return taken, before, found.rig, await contrasts(rig, far, found.rig)
+
+    def check(names: tuple[str, ...], x: np.ndarray, std: np.ndarray) -> None:
+        found = dict(zip(names, zip(x, std, strict=True), strict=True))
+        for era, real in zip(rig.eras, truth.eras, strict=True):
+            for name, expected in (
+                (f"stiffness {era.name}", math.log(real.stiffness / era.stiffness)),
+                (f"gain {era.name}", math.log(real.gains[0][1])),
+                (f"phase {era.name}", real.gains[0][2]),
+                (f"x of {era.name}", real.x - era.x),
+                ("mass 1", 3e-3),
+                ("x of mass 1", 0.11 - rig.plate.length / 2),
+                ("y of mass 1", 0.15 - rig.plate.width / 2),
+            ):
+                value, error = found[name]
+                assert abs(value - expected) < 3 * error, name
+
+    taken, before, _, after = run_virtual(run())
+    assert taken.duration < 10
+    assert np.median(after) > np.median(before) + 6

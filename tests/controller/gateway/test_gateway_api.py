@@ -3,6 +3,7 @@
 import contextlib
 import json
 import re
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,7 +13,8 @@ import httpx
 import pytest
 
 from controller.api.methods import METHODS, RequestedBy
-from controller.api.topics import LogEvent
+from controller.api.schema import PlayedTone
+from controller.api.topics import LogEvent, PatternEvent
 from gateway_bench import (
     TOKEN,
     UNCONFIRMED,
@@ -307,3 +309,43 @@ def test_websocket_message_in_two_fragments_is_one(gateway: GatewayProcess) -> N
         ws.send(text[:at], first=0x01)
         ws.send(text[at:], first=0x80)
         assert json.loads(ws.next()[1]) == {"jsonrpc": "2.0", "id": "ü", "result": {}}
+
+
+def test_websocket_receives_the_field_of_the_drive(
+    gateway: GatewayProcess, daemon: ScriptedDaemon
+) -> None:
+    """Encoded as docs/reference/gateway.md says.
+
+    Far below the first natural frequency the plate is rigid on four springs: driven at its
+    south-west corner it moves most there.
+    """
+    with RawWebSocket(gateway, target="/api/v1/ws?field") as ws:
+        daemon.publish(
+            "pattern",
+            PatternEvent(
+                contacts=[],
+                drive={},
+                layers={"2": {"SW": PlayedTone(frequency_hz=10.0, level=0.5, phase_deg=0.0)}},
+                predicted_contrast_db=None,
+                predicted_level_db_sl=None,
+                latency_ms=1.0,
+            ),
+        )
+        while True:
+            opcode, payload = ws.next()
+            if opcode == 2 and struct.unpack_from("<H", payload, 4) == (1,):
+                break
+    columns, rows, count, zero = struct.unpack_from("<4H", payload)
+    scale, frequency, threshold, layer = struct.unpack_from("<3fH", payload, 8)
+    assert (count, zero, frequency, layer) == (1, 0, 10.0, 2)
+    assert threshold == pytest.approx(0.0788)  # by the set's file
+    assert columns > rows > 2
+    parts = struct.unpack_from(f"<{2 * rows * columns}h", payload, 22)
+    assert len(payload) == 22 + 4 * rows * columns
+    assert max(map(abs, parts)) == 32767
+    strength = [abs(complex(*parts[at : at + 2])) for at in range(0, len(parts), 2)]
+    assert scale > 0
+    south_west, south_east = strength[0], strength[columns - 1]
+    north_west = strength[-columns]
+    assert south_west == max(strength)
+    assert south_west > 2 * max(south_east, north_west)

@@ -266,3 +266,17 @@ async def test_gateway_starts_where_its_priority_cannot_be_lowered(
     monkeypatch.setattr("controller.gateway.serving.check_certificate", reached)
     with pytest.raises(InputError, match="reached"):
         await serve(Settings(socket=Path("era.sock")), announce=lambda port: None)
+
+
+def test_gateway_connects_to_a_daemon_that_starts_later(tmp_path: Path) -> None:
+    """503 with the remedy meanwhile, and again after the daemon has ended."""
+    with gateway_process(tmp_path, tmp_path / "era.sock") as gateway:
+        answer = http(gateway)
+        assert answer.status == 503
+        assert b"era daemon CONFIG" in answer.body
+        for _ in range(2):
+            with ScriptedDaemon(tmp_path) as daemon:
+                wait_for_daemon(gateway)
+                assert http(gateway).status == 200
+                assert daemon.methods == ["arm"]
+            wait_for(lambda: http(gateway).status == 503)

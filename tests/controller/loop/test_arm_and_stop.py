@@ -300,3 +300,26 @@ async def test_mute_amplifier_is_lost_though_the_finger_was_lifted() -> None:
         assert bench.reports.lost
         assert bench.controller.group.state is GroupState.LOST
         assert not any(bench.far_ends[0].levels)
+
+
+@pytest.mark.parametrize("is_armed", [False, True])
+@pytest.mark.parametrize("silencing", ["disarm", "stop", "close"])
+@in_virtual_time
+async def test_silencing_wins_over_arming(silencing: str, is_armed: bool) -> None:
+    """Arming that is under way is refused; what was armed before is not armed anew."""
+    bench = make_bench("a", "b")
+    await bench.controller.open()
+    if is_armed:
+        await bench.controller.arm()
+    for far_end in bench.far_ends:
+        far_end.delay = 0.005
+    arming = asyncio.create_task(bench.controller.arm())
+    await asyncio.sleep(0.001)
+    await getattr(bench.controller, silencing)()
+    with pytest.raises(CommandRefused, match="arm again"):
+        await arming
+    assert bench.controller.group.state is (
+        GroupState.CLOSED if silencing == "close" else GroupState.DISARMED
+    )
+    if silencing != "close":
+        assert ENABLED not in bench.states()

@@ -342,3 +342,26 @@ async def test_tap_within_one_iteration_is_felt_as_a_click() -> None:
         times = await _playing_times(bench, 0.3)
         assert 0.035 <= times[-1] - times[0] <= 0.055
         assert times[-1] < 0.080
+
+
+@in_virtual_time
+async def test_vibration_is_renewed_while_its_contact_is_confirmed() -> None:
+    """It lasts two seconds, and before its end its time begins anew, without any command.
+
+    No other pattern is reported.
+    """
+    async with running() as bench:
+        await bench.hold(FINGER, seconds=10.0)
+        sent = vibrations(bench)
+        (first, *later) = [each for _, each in sent]
+        assert 9 <= len(later) <= 10
+        assert {each.valid_for for _, each in sent} == {2.0}
+        assert not first.renew
+        for each in later:
+            assert each.renew
+            assert each.token not in (first.token, 0)
+            assert each.commands == ()
+        assert max(b - a for (a, _), (b, _) in pairwise(sent)) < 1.1
+        assert len(bench.reports.applied) == 1
+        await asyncio.sleep(0.2)
+        assert bench.silences()[-1]

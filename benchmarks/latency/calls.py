@@ -22,12 +22,10 @@ from controller.loop.loop import Controller
 from controller.loop.observer import Observer
 from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
-from drivers.codec.serial_line.frame import FrameReader
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.host.serial_wire import SerialWire
 from drivers.opening import Lines
-from drivers.protocol.table import MESSAGES
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.table_cache import cached_table
@@ -43,7 +41,6 @@ _OWN = tuple(f"{_ROOT / name}{os.sep}" for name in ("controller", "drivers", "mo
 _DRIVERS = f"{_ROOT / 'drivers'}{os.sep}"
 _FRAME_INTERVAL, _RESTING = 0.05, 2.0  # s
 _LEVEL = 15.0  # dB SL
-_STATUS = MESSAGES["GetStatus"].number
 
 
 class FarEnd:
@@ -57,13 +54,8 @@ class FarEnd:
         self.line = Line(SerialWire(0, sequence=0), self, "line")
 
     def write(self, data: bytes) -> None:
-        """Take bytes of the host; what reads a status back counts with what follows."""
-        profile = sys.getprofile()
-        sys.setprofile(None)
-        (frame,) = FrameReader().feed(data)
-        sys.setprofile(profile)
-        if frame.kind != _STATUS:
-            self._written()
+        """Take bytes of the host."""
+        self._written()
         asyncio.get_running_loop().call_soon(self._receive, data)
 
     def poll(self) -> None:

@@ -50,7 +50,7 @@ class TouchInputs:
         _, late = await asyncio.wait(self._running, timeout=_CLOSE_TIMEOUT)
         for task in late:  # else the end of the program would wait for it
             _logger.warning("%s: does not end when cancelled", task.get_name())
-            with suppress(RuntimeError):  # it ignores this as well
+            with suppress(Exception):  # it ignores this as well, or fails
                 task.get_coro().close()
             task.cancel()
         ends = asyncio.gather(*late, return_exceptions=True)

@@ -88,6 +88,10 @@ class Feeding:
         may_be_fed_again = self.is_kept and self.plays > self.since
         return self.lost_from + (self.watchdog if may_be_fed_again else 0.0)
 
+    def tells(self, sent_at: float) -> bool:
+        """Whether a status asked for at a time [s] would show a watchdog that stands still."""
+        return sent_at - self.confirmed_at > REACTION
+
     def problem(self, left: float, sent_at: float, now: float) -> str | None:
         """Describe an impossible time that is left [s] in a reply to a request; None if possible.
 
@@ -352,6 +356,7 @@ class Dialogue:
             return
         # A status after a request that feeds says nothing of how the watchdog runs down.
         fed, problem = MESSAGES[name].feeds, None
+        tells = not fed and self.feeding.tells(sent_at)
         if not status["flags"] >> STATUS_FLAGS["high_voltage"] & 1:
             problem = "high voltage must be on, got off"
         elif not fed:
@@ -359,7 +364,7 @@ class Dialogue:
             problem = self.feeding.problem(left, sent_at, now)
         problem = problem or self._ledger.problem_of(status, sent_at, now)
         if problem is None:
-            if not (fed and self._was_unfed):
+            if tells or not self._was_unfed:
                 self._contradictions, self._contradicted_at = 0, -math.inf
             return
         self._was_unfed = not fed

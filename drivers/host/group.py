@@ -165,11 +165,12 @@ class Group(Members):
     async def _feed(self, amplifier: Amplifier, before: int) -> None:
         name = amplifier.name
         if amplifier.silence_cause is None:
-            if (now := amplifier.line.time()) >= self._running_due.get(name, 0.0):
+            now, due = amplifier.line.time(), self._running_due.get(name, 0.0)
+            if now >= due and amplifier.feeding.tells(now):
                 pause = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
                 self._running_due[name] = now + max(pause, _STATUS_INTERVAL)
                 await amplifier.read_status(Priority.HEARTBEAT)
-                self.check_none_since(before)
+            self.check_none_since(before)
             await amplifier.ping()
         elif name not in self._readings or self._readings[name].done():
             reading = amplifier.read_status(Priority.READING)

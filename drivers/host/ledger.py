@@ -84,8 +84,9 @@ class Ledger:
             if self.doubt is not None:
                 token = self.doubt.token
                 raise CommandRefused(f"set {token} must be confirmed first; read the status")
+            requested = self._within_budget(requested, now, delay)  # an ending may come amid a ramp
             self._check_sums(requested, now, delay)
-            return self._within_budget(requested, now, delay)
+            return requested
         except CommandRefused:
             raise
         except (ArithmeticError, TypeError, ValueError) as error:
@@ -256,7 +257,7 @@ class Ledger:
         """Whether the limits hold with all that may play at its largest at once: nearly always.
 
         Of one layer, a tone that rises along the ramp and the one that falls along it meanwhile are
-        together at most the larger of both.
+        together at most the larger of both, unless the new one has an ending, which may come amid.
         """
         playback, full = self.playback, _LEVEL.per_unit
         levels, rising = [0.0] * playback.channels, dict[tuple[int, int], float]()
@@ -268,7 +269,7 @@ class Ledger:
                     if shape is not None:
                         peak = max(peak, max(shape.knots, default=NO_KNOT)[0])
                 levels[command.channel] += peak / full
-                if is_at_once and command.onset is None:
+                if is_at_once and command.onset is None and command.ending is None:
                     rising[one.layer, command.channel] = command.level / full
         for channel, voices in enumerate(playback.all_voices):
             for voice in voices:

@@ -247,25 +247,20 @@ class Members:
             raise
 
     async def _play(self, layers: Mapping[str, Sequence[Layer]]) -> Played | CommandRefused:
-        """Play layers by amplifier, staged and committed where they are several.
-
-        A refusal before the first commit is returned.
-        """
+        """Stage and commit layers by amplifier; a refusal before the first commit is returned."""
         before = self.epoch
         if self.token % INTERVAL == 0:
             await self._close_gaps()
         self.token = token = token_after(self.token)
         is_silent = all(map(is_silence, layers.values()))
-        is_at_once = is_silent or len(layers) == 1  # none waits for another
         staging: list[Awaitable[Staged]] = []
         for name, of_one in layers.items():
-            staging.append(self.amplifiers[name].stage(token, of_one, now=is_at_once))
+            staging.append(self.amplifiers[name].stage(token, of_one, now=is_silent))
         results = await asyncio.gather(*staging, return_exceptions=True)
         refusals: dict[str, CommandRefused] = {}
         has_failed = is_silent
         for name, result in zip(layers, results, strict=True):
-            may_play = isinstance(result, CommandRefused) and is_at_once and result.may_play
-            if isinstance(result, CommandRefused) and not (result.is_disarmed or may_play):
+            if isinstance(result, CommandRefused) and not result.is_disarmed:
                 if not isinstance(result, Preempted):
                     refusals[name] = result
             elif isinstance(result, BaseException):
@@ -273,13 +268,10 @@ class Members:
         if refusals and not has_failed:
             return _merged(refusals)
         staged = dict(zip(layers, self.checked(results), strict=True))
-        if not is_at_once:
+        if not is_silent:
             self.check_none_since(before)
-            self.is_set_incomplete = True
+            self.is_set_incomplete = len(layers) > 1
             await self._commit(staged)
-        elif not is_silent:
-            for name, one in staged.items():
-                _check_plays(name, await self.amplifiers[name].read_status(Priority.SET), one)
         self.is_set_incomplete = False
         played: dict[str, tuple[LayerSet, ...]] = {}
         inexact: list[str] = []

@@ -69,35 +69,40 @@ def match_plate(
     """
     model, driven, size = plate.model, np.array(drives), row_rms(values)
     inside = np.isfinite(values)
-    weight = inside / (model_error * size[:, :, None])
     rows: NDArray[np.bool_] = np.asarray(inside.any(axis=2))
     used: NDArray[np.bool_] = np.asarray(rows.any(axis=0))
     gains_of = np.arange(model.space.size)[model.space.groups["gain"]][driven]
     searched = model.space.uncertain & ~model.space.of("gain")
     searched[gains_of[used]] = True
+    std = model.space.std[gains_of]
+    weight = inside / model_error
     tried = []
     for start in starts:
-        at = plate.moved(*start)
+        at, beside = plate.moved(*start), np.zeros(len(driven))
         found = row_rms(np.where(rows[:, :, None], plate.responses(at)[:, driven], np.nan))
         ratio = np.where(rows, np.log(np.maximum(size / found, 1e-6)), np.nan)
-        at[gains_of[used]] = np.nanmedian(ratio[:, used], axis=0)
-        tried.append(
-            fit_with_gains(
-                model,
-                values,
-                weight,
-                at,
-                searched,
-                robust=_ROBUST,
-                drives=drives,
-                tolerance=_GAIN_TOLERANCE,
-            )
+        levels = np.nanmedian(ratio[:, used], axis=0)
+        at[gains_of[used]] = levels / std[used]
+        # Two channels may drive one ERA: each has its own level beside the gain of the last one.
+        beside[used] = levels - std[used] * at[gains_of[used]]
+        scaled = values / np.exp(beside)[:, None]
+        z, best = fit_with_gains(
+            model,
+            scaled,
+            weight / row_rms(scaled)[:, :, None],
+            at,
+            searched,
+            robust=_ROBUST,
+            drives=drives,
+            tolerance=_GAIN_TOLERANCE,
         )
-    z, best = best_by(tried, lambda each: -each[1].cost)
+        tried.append((z, best, beside, scaled))
+    z, best, beside, scaled = best_by(tried, lambda each: -each[1].cost)
     predicted = plate.responses(z)[:, driven]
-    _, residual = project_gains(predicted, values, weight, tolerance=_GAIN_TOLERANCE)
+    weight = weight / row_rms(scaled)[:, :, None]
+    _, residual = project_gains(predicted, scaled, weight, tolerance=_GAIN_TOLERANCE)
     share = (model_error * np.abs(residual))[inside]
-    gains = np.where(used, np.exp(z[gains_of]), np.nan)
+    gains = np.where(used, np.exp(beside + std * z[gains_of]), np.nan)
     return Match(
         plate.rig_at(z),
         plate,
@@ -107,5 +112,5 @@ def match_plate(
         math.sqrt(float((share**2).mean())) if len(share) else math.inf,
         float(np.median(share)) if len(share) else math.inf,
         plate.responses(np.where(plate.model.space.of("gain"), 0.0, z)),
-        np.where(used[:, None], predicted, np.nan),
+        np.where(used[:, None], predicted * np.exp(beside)[:, None], np.nan),
     )

@@ -13,6 +13,7 @@ from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 
 _MAX_CACHED = 4  # sets of points whose residual vectors are kept
+_MAX_KEPT_BYTES = 1 << 26  # of each: those of a map's raster are solved for it alone
 
 
 class FiniteElementModes:
@@ -73,21 +74,23 @@ class FiniteElementModes:
         """Residual vectors of forces at points or footprints, (RESIDUAL_ORDER, n, dof)."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
         key = points.shape, points.tobytes()
-        if key not in self._known:
-            if len(self._known) >= _MAX_CACHED:
-                self._known.pop(next(iter(self._known)))
+        known = self._known.get(key)
+        if known is None:
             force = self._matrices.deflection_at(points).T.toarray()
             mass, vectors = self._matrices.mass, self._vectors
-            solved = np.empty((RESIDUAL_ORDER, *force.T.shape))
-            for term in solved:
+            known = np.empty((RESIDUAL_ORDER, *force.T.shape))
+            for term in known:
                 # Modes that are kept would outweigh the others a million times in the solution.
                 force -= mass @ (vectors @ (vectors.T @ force))
                 found = self._factor.solve(force)
                 found -= vectors @ (vectors.T @ (mass @ found))
                 term[:] = found.T / self.largest_truncated
                 force = mass @ term.T
-            self._known[key] = solved
-        return self._known[key]
+            if known.nbytes <= _MAX_KEPT_BYTES:
+                self._known[key] = known
+                if len(self._known) > _MAX_CACHED:
+                    self._known.pop(next(iter(self._known)))
+        return known
 
 
 def _rigid_modes(matrices: PlateMatrices) -> FloatArray:

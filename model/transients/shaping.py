@@ -151,7 +151,8 @@ class Shaper:
     def _fingertips(self, positions: tuple[Position, ...]) -> tuple[FloatArray, FloatArray]:
         """Weights (k, p) of points under fingertips, and their shapes (k, p, r)."""
         known = self._fingers
-        new = [each for each in dict.fromkeys(positions) if each not in known]
+        found = {each: known.get(each) for each in positions}  # of which others may drop some
+        new = [each for each, one in found.items() if one is None]
         if new:
             plate = self._plate.reduced.plate
             points, weights = fingertips_on(
@@ -159,10 +160,12 @@ class Shaper:
             )
             shapes = self._plate.shapes_at(points.reshape(-1, 2))
             shapes = shapes.reshape(*weights.shape, -1)
-            known.update(zip(new, zip(weights, shapes, strict=True), strict=True))
-        weights, shapes = map(np.stack, zip(*[known[each] for each in positions], strict=True))
-        while len(known) > _KEPT:
-            del known[next(iter(known))]
+            made = dict(zip(new, zip(weights, shapes, strict=True), strict=True))
+            found.update(made)
+            known.update(made)
+        for each in [*known][:-_KEPT]:
+            known.pop(each, None)
+        weights, shapes = map(np.stack, zip(*[found[each] for each in positions], strict=True))
         return weights, shapes
 
     def _surroundings(self, targets: Sequence[Position]) -> FloatArray:

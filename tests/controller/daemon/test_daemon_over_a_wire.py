@@ -123,7 +123,7 @@ async def test_fault_stops_is_dumped_and_must_be_cleared(tmp_path: Path) -> None
         head, *lines = [json.loads(line) for line in dump.read_text("utf-8").splitlines()]
         assert "OVER_VOLTAGE" in head["cause"]
         messages = {line["message"] for line in lines}
-        assert {"Arm", "Set", "Reply"} <= messages
+        assert {"Arm", "Set", "Commit", "Reply"} <= messages
         times = [line["time_s"] for line in lines]
         assert times == sorted(times)
 

@@ -123,8 +123,7 @@ async def test_controller_keeps_phase_when_a_finger_moves() -> None:
 @in_virtual_time
 async def test_controller_silences_a_lift_while_a_reply_is_awaited(kind: str) -> None:
     """Zero is reached within 20 ms also while the reply to another request is missing."""
-    names = ("a", "b") if kind == "Commit" else ("a",)  # one plays its set without a commit
-    async with running(*names) as bench:
+    async with running() as bench:
         if kind in ("GetStatus", "Ping"):
             await bench.hold(FINGER, seconds=0.1)
         awaited = asyncio.Event()

@@ -125,6 +125,7 @@ SHAPED = Layer(0, (tone(level=0.2, onset=Envelope(100, ((1000, 0), (2000, 0)))),
 SWELLING = tone(level=0.05, onset=Envelope(500, ((500, 0),)))
 ENDING = tone(level=0.1, ending=Envelope(100, ((8000, 0),)))
 
+LOUD_END = tone(0, 1.0, 200.0, ending=Envelope(100, ((10000, 0),) * 10))
 COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
     # 0.6 in one layer leaves 0.4 for another; once it has faded, 0.9 is admitted.
     "layers are bounded together": (
@@ -167,6 +168,15 @@ COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
             plays(0.0, Layer(0, (tone(0, 1.0),))),
             Asked(1.0, Layer(0, (tone(0, 1.0, 200.0),))),
             Asked(1.0, Layer(0, (tone(1, 1.0, 200.0),))),
+        ],
+    ),
+    # An ending at full level 1 ms after the commit, amid a ramp of 1 s: with the old tone nearly 2.
+    "an ending amid a cross-fade": (
+        WIDE,
+        [
+            plays(0.0, Layer(0, (tone(0, 1.0),))),
+            refused(1.0, Layer(0, (LOUD_END,), ramp=1.0, valid_for=0.001)),
+            Asked(1.0, Layer(0, (tone(0, 1.0, 200.0),), ramp=1.0, valid_for=0.001)),
         ],
     ),
     # 0.5 in two layers of one channel: 1, in two channels: a half.

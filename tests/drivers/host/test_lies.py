@@ -95,6 +95,21 @@ def test_capabilities_that_cannot_be_are_refused(
     run_virtual(run())
 
 
+@in_virtual_time
+async def test_watchdog_that_stands_still_is_found_amid_sets(
+    altered: Callable[[str, int, int], None],
+) -> None:
+    """Ten sets a second feed it, each with a heartbeat that comes too early to tell."""
+    group, _ = await armed("serial")
+    altered("GetStatus", 4, round(1000 * group.amplifiers["a"].feeding.watchdog))
+    with pytest.raises(DriverError, match="watchdog"):
+        for _ in range(10):
+            await group.apply({"a": [LOUD]})
+            for _ in range(2):
+                await group.beat()
+                await asyncio.sleep(0.05)
+
+
 @pytest.mark.parametrize("lie", STATUS)
 @in_virtual_time
 async def test_status_that_cannot_be_ends_in_silence(

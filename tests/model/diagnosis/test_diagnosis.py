@@ -190,6 +190,17 @@ def test_diagnose_finds_a_channel_on_another_era(coarse_rig, built):
     assert any(row.startswith("WRONG ERA: channel 0") for row in verdict_rows(verdict))
 
 
+def test_diagnose_finds_two_channels_on_one_era(coarse_rig, built):
+    """SE's plug is beside SW's at 0.3 of its stroke: each channel has a gain of its own."""
+    places, values = built
+    broken = values.copy()
+    broken[:, 1] = 0.3 * values[:, 0]
+    channels = diagnose(coarse_rig, observe(places, broken)).channels
+    assert [each.drives for each in channels] == ["SW", "SW", "NE", "NW"]
+    assert channels[1].gain == pytest.approx(0.3 * channels[0].gain, rel=0.02)
+    assert channels[0].gain == pytest.approx(1.0, rel=0.1)
+
+
 def test_diagnose_judges_no_polarity_without_phases(coarse_rig, built):
     """Of a channel that is inverted all but its sign is found well."""
     places, values = built

@@ -2,7 +2,8 @@
 
 In touches.tuio one to three fingers come and go at places drawn once with a fixed seed, at least
 6 cm apart. In the others each person stays in an upright strip of the plate: two_people.tuio; and
-three_people.tuio, where one slides and one leaves before the others. Run it again after a change:
+three_people.tuio, where one slides and one leaves before the others. Run it again after a change;
+it needs python-osc:
 
     python examples/make_touches.py
 """

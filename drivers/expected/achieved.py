@@ -30,7 +30,7 @@ def achieved_problem(
     for tone in one.commands:
         requested = {name: getattr(tone, name) for name in TONE}
         got = found.get(tone.channel, {**requested, "level": 0})
-        for name in TONE:
+        for name in TONE if tone.level else ("level",):  # silence has no phase
             error = abs(got[name] - requested[name])
             error = min(error, _TURN - error) if name == "phase" else error
             allowed = 0.0 if is_exact else _rounding(name, tone, can)

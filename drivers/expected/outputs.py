@@ -13,6 +13,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES, STATUS_FLAGS
 from drivers.uncertain_playback import Interval, UncertainPlayback
+from drivers.voices import amplitudes_of
 
 _LATE = 0.002  # s; by which a set may begin later
 _DRIFT = 1e-3  # of a time; of the amplifier's clock
@@ -121,8 +122,7 @@ class ExpectedOutputs:
         self._plays.commit(layers, token, (start, end))
         self.began, self.cause = when, f"set {token} of layers {[one.layer for one in layers]}"
         self._has_floor, self.is_exact = True, self.is_exact and is_exact
-        peaks = [self.playback.peak(channel, start) for channel in channels]
-        self._highest = max(self._highest, *peaks)
+        self._highest = max(self._highest, self._peak(start))
 
     def silence(
         self, when: Interval, ramp: float, cause: str, *, has_floor: bool = True
@@ -173,14 +173,26 @@ class ExpectedOutputs:
         if states:
             self._check_tokens(states, tokens, when)
             is_limited = bool(shown["flags"] >> STATUS_FLAGS["limited"] & 1)
-            must_be = low > 1 + _TOLERANCE and self.is_exact and not self.may_derate
+            is_beyond = low > 1 + _TOLERANCE + 2 * self._half_step
+            must_be = is_beyond and self.is_exact and not self.may_derate
             if must_be > is_limited or (is_limited and self._highest < 1):
                 self._report("plays", when[1], "limited", must=must_be, seen=is_limited)
         for layer, until in enumerate(self._unknown):
             if until == math.inf and (layer >= len(tokens) or not tokens[layer]):
                 self._unknown[layer] = when[1] + _MAX_ENDING + _RAMP.high  # it may still fade
-        channels = range(self.playback.channels)
-        self._highest = max(self.playback.peak(channel, start) for channel in channels)
+        self._highest = self._peak(start)
+
+    def _peak(self, time: float) -> float:
+        """The largest sum of a channel from a time on, with endings; infinite if a set waits."""
+        if self.playback.waiting:
+            return math.inf
+        return max(
+            sum(
+                max((voice.transition.peak(time), *map(abs, amplitudes_of(voice.ending))))
+                for voice in voices
+            )
+            for voices in self.playback.all_voices
+        )
 
     def check_sensors(
         self,

@@ -76,16 +76,18 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
     frequencies beyond the rig's limits, a response given twice and a sensor at two positions.
     """
     sensors: dict[str, tuple[float, float]] = {}
+    first: dict[str, str] = {}
     eras: dict[tuple[str, tuple[float, float] | None], int] = {}
     found: dict[tuple[float, int, str], complex] = {}
     for each in measured:
         if each.sensor not in sensors:
             _check_point(each, rig)
         known = sensors.setdefault(each.sensor, each.point)
+        place = first.setdefault(each.sensor, each.place)
         if math.dist(known, each.point) > _EDGE_TOLERANCE:
             raise InputError(
                 f"{each.place}: sensor {each.sensor} must have one position, got {_shown(known)} "
-                f"and {_shown(each.point)} m; name sensors differently"
+                f"({place}) and {_shown(each.point)} m; name sensors differently"
             )
         _check_frequency(each, rig)
         if (each.era, each.era_point) not in eras:

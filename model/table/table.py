@@ -135,7 +135,7 @@ class LocalizationTable:
     def prepare(self, drive_mode: str | None = None, *, with_ringing: bool = True) -> None:
         """Compute ahead what the first query in a drive mode needs.
 
-        with_ringing: of short effects, too, which takes three times as long as all else.
+        with_ringing: of short effects, too, which takes the longest.
         """
         centre = (self.plate.length / 2, self.plate.width / 2)
         for quiet in ((), ((0.0, 0.0),)):

@@ -213,10 +213,6 @@ class Playback:
         """Return the sum of the amplitudes to which the voices of a channel lead."""
         return sum(abs(voice.transition.last) for voice in self.all_voices[channel])
 
-    def peak(self, channel: int, time: float) -> float:
-        """Return a bound of the amplitude from a time on: all voices at their largest at once."""
-        return sum(voice.transition.peak(time) for voice in self.all_voices[channel])
-
     @property
     def waiting(self) -> tuple[LayerSet, ...]:
         """Sets of layers that start when onsets have ended."""

@@ -42,6 +42,11 @@ def _amplitudes_at(knots: Sequence[tuple[int, ...]]) -> tuple[complex, ...]:
     return tuple(amplitudes)
 
 
+def peak_of(envelope: Envelope | None) -> float:
+    """Return the largest magnitude of the knots of an envelope in full levels, 0 without one."""
+    return 0.0 if envelope is None else envelope.peak / _PER_FULL
+
+
 @dataclass(slots=True)  # frozen, each takes three times as long to make, and every set makes many
 class Transition:
     """From one complex amplitude to another, from start [s] on until end.
@@ -154,6 +159,10 @@ class Voice:
     def silent_from(self) -> float:
         """Time of silence [s]; infinite for a tone that lasts."""
         return math.inf if self.transition.last else self.transition.end
+
+    def peak(self, time: float) -> float:
+        """Return the largest magnitude from a time on, its ending included."""
+        return max(self.transition.peak(time), peak_of(self.ending))
 
     def faded(self, time: float, ramp: float, uncertainty: float = 0.0) -> "Voice":
         """Return it falling silent along a ramp [s], or as it does if that is no later.

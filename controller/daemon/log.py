@@ -15,11 +15,12 @@ import stat
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
-from controller.api.rate_limit import RateLimiter
+from controller.api.rate_limit import Rates
 
 _MAX_QUEUED = 2000  # lines
 _BURST = 5  # lines of one logging call at once
@@ -73,21 +74,18 @@ class RateLimitFilter(logging.Filter):
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
-        self._clock = clock
-        # Of each call, and how many of its records were not written since the last one.
-        self._calls: dict[tuple[str, int], tuple[RateLimiter, int]] = {}
+        self._rates = Rates(_RATE, burst=_BURST, clock=clock)
+        self._skipped: Counter[tuple[str, int]] = Counter()  # since the last record of each call
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether to write a record; its field `skipped` counts the records not written before."""
         if getattr(record, "topic", None) == "state":
             return True
         call = record.pathname, record.lineno
-        if call not in self._calls:
-            self._calls[call] = RateLimiter(_RATE, burst=_BURST, clock=self._clock), 0
-        limiter, skipped = self._calls[call]
-        is_written = limiter.take()
-        self._calls[call] = limiter, 0 if is_written else skipped + 1
-        if is_written and skipped:
+        is_written = self._rates.of(call).take()
+        if not is_written:
+            self._skipped[call] += 1
+        elif skipped := self._skipped.pop(call, 0):
             record.__dict__["skipped"] = skipped
         return is_written
 

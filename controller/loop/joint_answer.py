@@ -7,7 +7,7 @@ latter counts: another frequency begins with an onset, for which the next place 
 
 import cmath
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -236,11 +236,8 @@ def _factor_within(
 ) -> float:
     """The factor, 1 at most, by which all contents together are within the amplifiers' limits."""
     total = dict.fromkeys(strokes, 0.0)
-    for layer in found.layers:
-        if layer.verdict not in (HELD_BACK, SHARED):
-            for tones in (layer.excitation, *layer.side_bands):
-                for name, tone in tones.items():
-                    total[name] += tone.amplitude
+    for _, name, amplitude in _amplitudes(found):
+        total[name] += amplitude
     share, power = 1.0, 0.0
     for name, amplitude in total.items():
         share = max(share, amplitude / capabilities.max_amplitudes[name])
@@ -252,12 +249,18 @@ def _shares(found: Answer, amplitudes: Mapping[str, float]) -> FloatArray:
     """Each layer's greatest shares of amplitudes [m] by ERA (layers, eras), 0 of no content."""
     names = [*amplitudes]
     full = np.zeros((len(found.layers), len(names)))
-    for row, layer in zip(full, found.layers, strict=True):
+    for number, name, amplitude in _amplitudes(found):
+        full[number, names.index(name)] += amplitude / amplitudes[name]
+    return full
+
+
+def _amplitudes(found: Answer) -> Iterator[tuple[int, str, float]]:
+    """Layer, ERA and amplitude [m] of every tone that plays; fingers that share have one layer."""
+    for number, layer in enumerate(found.layers):
         if layer.verdict not in (HELD_BACK, SHARED):
             for tones in (layer.excitation, *layer.side_bands):
                 for name, tone in tones.items():
-                    row[names.index(name)] += tone.amplitude / amplitudes[name]
-    return full
+                    yield number, name, tone.amplitude
 
 
 def _gains_db(

@@ -50,7 +50,7 @@ _NEVER: Interval = (-math.inf, math.inf)
 class ExpectedAmplifier:
     """One amplifier; state, latch, token and session are None while unknown; times [s].
 
-    report: takes what is wrong, always: what nothing excuses, unclear: why it cannot be told.
+    report: takes what is wrong, always: what nothing excuses, unclear: why that is not known.
     may_fail: it may have faults of its own. slack: of times, left_slack: of the time that is left
     of the watchdog. fed: when that was fed last, silent: when all that fades is silent. is_shown:
     it has shown its state itself. last_status: since when nothing was seen. can: its capabilities.

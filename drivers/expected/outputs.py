@@ -13,7 +13,6 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES, STATUS_FLAGS
 from drivers.uncertain_playback import Interval, UncertainPlayback
-from drivers.voices import amplitudes_of
 
 _LATE = 0.002  # s; by which a set may begin later
 _DRIFT = 1e-3  # of a time; of the amplifier's clock
@@ -34,7 +33,7 @@ class Report(Protocol):
 
 
 Unclear: TypeAlias = Callable[[str], None]
-"""Takes why it cannot be told what plays: things came too close together."""
+"""Takes why it is unclear what plays: things came too close together."""
 
 
 def silent() -> Playback:
@@ -186,13 +185,7 @@ class ExpectedOutputs:
         """The largest sum of a channel from a time on, with endings; infinite if a set waits."""
         if self.playback.waiting:
             return math.inf
-        return max(
-            sum(
-                max((voice.transition.peak(time), *map(abs, amplitudes_of(voice.ending))))
-                for voice in voices
-            )
-            for voices in self.playback.all_voices
-        )
+        return max(sum(voice.peak(time) for voice in voices) for voices in self.playback.all_voices)
 
     def check_sensors(
         self,

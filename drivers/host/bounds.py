@@ -13,7 +13,7 @@ from itertools import chain, pairwise, product, starmap
 from drivers.playback import Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
-from drivers.voices import Voice, amplitude_of, amplitudes_of, steepest
+from drivers.voices import Voice, amplitude_of, amplitudes_of, peak_of, steepest
 
 _PER_RAMP, _PER_STEP = QUANTITIES["ramp"].per_unit, QUANTITIES["envelope_step"].per_unit
 _PER_FULL, _PER_HERTZ = QUANTITIES["level"].per_unit, QUANTITIES["frequency"].per_unit
@@ -113,7 +113,7 @@ class ChannelBounds:
     def _keep(self, voice: Voice, one: LayerSet | None) -> None:
         """Add a voice that the set does not change, but for a layer that may let it fade later."""
         transition, time = voice.transition, self._time
-        self.steady += max(transition.peak(time), _peak(voice.ending))
+        self.steady += voice.peak(time)
         change = transition.slope(time) if transition.end > time else 0.0
         ways = [(change if transition.last or transition.knots else 0.0, change)]
         points = transition.points(time)
@@ -138,7 +138,7 @@ class ChannelBounds:
     ) -> None:
         """Add a voice that a command leads from one of some amplitudes; its ending may follow."""
         self._note_way(frequency, starts, one, command)
-        ending, last = _peak(command.ending), command.level / _PER_FULL
+        ending, last = peak_of(command.ending), command.level / _PER_FULL
         path = self._add_path(starts, command.onset, max(last, ending), one.ramp / _PER_RAMP)
         if one.valid_for and one.valid_for / _PER_VALID_FOR < path.end:  # it may begin amid
             path.magnitudes = tuple(max(each, ending) for each in path.magnitudes)
@@ -167,7 +167,7 @@ class ChannelBounds:
                 self._note(voice.frequency, _steepest_from(points, None, 0j, one.ramp / _PER_RAMP))
                 starts += points if voice.frequency == frequency else ()
         self._note_way(frequency, starts, one, command)
-        self.steady += max(*map(abs, _course(command)), _peak(command.ending))
+        self.steady += max(*map(abs, _course(command)), peak_of(command.ending))
 
     def _note_way(
         self, frequency: float, starts: Sequence[complex], one: LayerSet, command: Command
@@ -242,10 +242,6 @@ def _steepest_from(
     ways = chain(product(starts, course[:1]), pairwise(course))
     step = ramp if envelope is None else envelope.step / _PER_STEP
     return steepest(ways, step, is_cosine=not knots)
-
-
-def _peak(envelope: Envelope | None) -> float:
-    return max(map(abs, amplitudes_of(envelope)), default=0.0)
 
 
 def _course(command: Command) -> tuple[complex, ...]:

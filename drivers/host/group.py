@@ -28,9 +28,7 @@ from drivers.protocol.table import ENABLED, QUANTITIES
 _T = TypeVar("_T")
 _SESSION, _TOKEN = QUANTITIES["session"], QUANTITIES["token"]
 _REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
-_STATUS_INTERVAL = (
-    0.19  # s; at the least, between statuses that show whether the watchdog runs down
-)
+_STATUS_INTERVAL = 0.19  # s at least, between statuses that show if the watchdog runs down
 _MAX_STATUS_LOAD = 0.05  # of the line's time, for these
 _logger = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from drivers.host.bounds import all_bounds, worst
 from drivers.host.limits import COMMIT_DELAY, TOLERANCE, Budget, Rounding, Vibration, wire_limits
 from drivers.playback import playback_of
 from drivers.protocol.records import Values
-from drivers.protocol.sets import NO_KNOT, Command, LayerSet
+from drivers.protocol.sets import Command, LayerSet
 from drivers.protocol.table import QUANTITIES, has_feature
 from registry.limits import GuardLimits
 
@@ -267,7 +267,7 @@ class Ledger:
                 peak = command.level
                 for shape in (command.onset, command.ending):
                     if shape is not None:
-                        peak = max(peak, max(shape.knots, default=NO_KNOT)[0])
+                        peak = max(peak, shape.peak)
                 levels[command.channel] += peak / full
                 if is_at_once and command.onset is None and command.ending is None:
                     rising[one.layer, command.channel] = command.level / full
@@ -278,7 +278,7 @@ class Ledger:
                 if late < way.end:
                     largest = max(largest, abs(way.first), *map(abs, way.knots))
                 if ending is not None:
-                    largest = max(largest, max(ending.knots, default=NO_KNOT)[0] / full)
+                    largest = max(largest, ending.peak / full)
                 if not voice.has_ended and way.last:
                     largest = max(largest - rising.pop((voice.layer, channel), 0.0), 0.0)
                 levels[channel] += largest

@@ -15,7 +15,7 @@ from typing import TypeAlias
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused
 from drivers.protocol.records import Values, WireQuantity
-from drivers.protocol.sets import NO_KNOT, Command, LayerSet
+from drivers.protocol.sets import Command, LayerSet
 from drivers.protocol.table import QUANTITIES
 from registry.limits import GuardLimits
 
@@ -199,8 +199,7 @@ class Rounding:
             if (count := len(envelope.knots)) > (limit := self._can["knots"]):
                 text = f"knots of an envelope must be at most {limit}, got {count}"
                 raise _refused(tone.channel, text)
-            peak = max(envelope.knots, default=NO_KNOT)[0]
-            if not 0 <= peak <= self._limits.level:
+            if not 0 <= (peak := envelope.peak) <= self._limits.level:
                 raise self._level_refused(tone.channel, "level of a knot", peak / _LEVEL.per_unit)
 
 

@@ -156,7 +156,7 @@ class SerialPort(DevicePort):
             return b""
         if not data:
             state = select.poll()
-            state.register(self.descriptor, 0)  # a hang-up is told all the same
+            state.register(self.descriptor, 0)  # a hang-up is reported all the same
             if state.poll(0):
                 raise OSError("end of file")
         return data

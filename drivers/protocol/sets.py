@@ -35,16 +35,17 @@ def is_newer_token(number: int, than: int) -> bool:
     return than == 0 or 0 < (number - than) % _SPAN < _SPAN // 2
 
 
-NO_KNOT = (0, 0)
-"""The largest knot of an envelope without any."""
-
-
 @dataclass(frozen=True, slots=True)
 class Envelope:
     """A transition: knots (level, phase), a step apart; the last step leads to the final level."""
 
     step: int
     knots: tuple[tuple[int, ...], ...]
+
+    @property
+    def peak(self) -> int:
+        """The highest level of a knot, 0 without any."""
+        return max(self.knots)[0] if self.knots else 0
 
     def scaled(self, factor: float) -> "Envelope":
         """Return it with the levels of all knots times a factor."""

@@ -75,7 +75,12 @@ def match_plate(
     searched = model.space.uncertain & ~model.space.of("gain")
     searched[gains_of[used]] = True
     std = model.space.std[gains_of]
-    weight = inside / model_error
+
+    def relative_to(levels: FloatArray) -> tuple[ComplexArray, FloatArray]:
+        """Values by channel relative to levels (e,), logarithms of gains; and their weights."""
+        scaled = values / np.exp(levels)[:, None]
+        return scaled, inside / (model_error * row_rms(scaled)[:, :, None])
+
     tried = []
     for start in starts:
         at, beside = plate.moved(*start), np.zeros(len(driven))
@@ -85,22 +90,19 @@ def match_plate(
         at[gains_of[used]] = levels / std[used]
         # Two channels may drive one ERA: each has its own level beside the gain of the last one.
         beside[used] = levels - std[used] * at[gains_of[used]]
-        scaled = values / np.exp(beside)[:, None]
         z, best = fit_with_gains(
             model,
-            scaled,
-            weight / row_rms(scaled)[:, :, None],
+            *relative_to(beside),
             at,
             searched,
             robust=_ROBUST,
             drives=drives,
             tolerance=_GAIN_TOLERANCE,
         )
-        tried.append((z, best, beside, scaled))
-    z, best, beside, scaled = best_by(tried, lambda each: -each[1].cost)
+        tried.append((z, best, beside))
+    z, best, beside = best_by(tried, lambda each: -each[1].cost)
     predicted = plate.responses(z)[:, driven]
-    weight = weight / row_rms(scaled)[:, :, None]
-    _, residual = project_gains(predicted, scaled, weight, tolerance=_GAIN_TOLERANCE)
+    _, residual = project_gains(predicted, *relative_to(beside), tolerance=_GAIN_TOLERANCE)
     share = (model_error * np.abs(residual))[inside]
     gains = np.where(used, np.exp(beside + std * z[gains_of]), np.nan)
     return Match(

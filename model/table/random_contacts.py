@@ -36,6 +36,6 @@ def random_contacts(
             return tuple((float(x), float(y)) for x, y in places)
     raise InputError(
         f"{count} fingers must be {1000 * apart:g} mm apart, got a plate of {plate.length:g} x "
-        f"{plate.width:g} m on which {tries} random sets are not; use fewer "
-        "fingers or a larger plate"
+        f"{plate.width:g} m on which {tries} random sets are not; "
+        "use fewer fingers or a larger plate"
     )

@@ -56,7 +56,8 @@ def test_random_sets_never_jump_and_keep_their_bounds() -> None:
             else:
                 token += 1
                 playback.commit([_random_layer(chance)], token, time)
-            peak, slope = playback.peak(0, time), slope_of(playback, time)
+            peak = sum(voice.transition.peak(time) for voice in playback.voices_of(0))
+            slope = slope_of(playback, time)
             before = _field(playback.voices_of(0), time)
             for _ in range(12):
                 later = time + chance.random() * 5e-4

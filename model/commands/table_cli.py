@@ -176,7 +176,7 @@ def _answer(
     for layer in found["layers"]:
         print(
             f"{_place(layer):18s} {_cell(layer['frequency_hz'], 'Hz'):>9s} "
-            f"{_cell(layer['promised_level_db_sl'], 'dB SL'):>10s} "
+            f"{_cell(layer['promised_level_db_sl'], 'dB SL'):>11s} "
             f"{_cell(layer['robust_felt_contrast_db'], 'dB'):>9s} "
             f"{_cell(layer['foreign_level_db_sl'], 'dB SL'):>14s}  {layer['verdict']}"
         )

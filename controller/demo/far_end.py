@@ -6,18 +6,19 @@ reads their vibration.
 
 import asyncio
 import contextlib
+import json
 import sys
 import tempfile
 from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
 from controller.child import ended
 from controller.demo.touch_row import FingerVibration, Position
-from controller.plate_control import PlateControl
 from drivers.errors import LinkError
 from model.finger.perception import DEFAULT_THRESHOLD
 
@@ -26,6 +27,8 @@ WATCHDOG = 2.0
 
 STARTUP_TIMEOUT = 120.0  # s; solving the plate takes long on a busy machine
 EXIT_TIMEOUT = 3.0  # s
+_REPLY_TIMEOUT = 30.0  # s; long enough for a busy machine
+_MAX_REPLY = 1 << 20  # bytes; what ten fingers feel takes a fiftieth of it
 _REMEDY = "see its output above and start the demonstration again"
 
 SIM_OPTIONS: Mapping[str, Sequence[str]] = {
@@ -40,33 +43,28 @@ SIM_OPTIONS: Mapping[str, Sequence[str]] = {
 class SimulatedPlate:
     """The plate behind the amplifiers, with their URLs by name; methods raise LinkError.
 
-    readings: a connection of their own for vibrations, so that no finger waits for one.
+    control: path of its control socket; each request has a connection of its own, so that no finger
+    waits for a vibration.
     """
 
     def __init__(
-        self,
-        control: PlateControl,
-        urls: Mapping[str, str],
-        *,
-        threshold: str = DEFAULT_THRESHOLD,
-        readings: PlateControl | None = None,
+        self, control: Path, urls: Mapping[str, str], *, threshold: str = DEFAULT_THRESHOLD
     ) -> None:
         self.urls = urls
-        self._threshold = threshold
         self._control = control
-        self._readings = readings or control
+        self._threshold = threshold
+        self._placing = asyncio.Lock()  # fingers are placed in order
 
     async def place_fingers(
         self, positions: Mapping[str, Position], loads: Mapping[str, float] = MappingProxyType({})
     ) -> None:
         """Place fingers at positions [m] by id, loads by id, too; all others are removed."""
-        await self._control.request(
-            {"op": "fingers", "fingers": dict(positions), "loads": dict(loads)}
-        )
+        async with self._placing:
+            await self._request("fingers", fingers=dict(positions), loads=dict(loads))
 
     async def vibration(self, since: float, until: float) -> dict[str, FingerVibration]:
         """Vibration of each finger by id between two times [s] of time.monotonic()."""
-        reply = await self._readings.request({"op": "felt", "since_s": since, "until_s": until})
+        reply = await self._request("felt", since_s=since, until_s=until)
         return {
             id: FingerVibration(
                 frequencies=np.array(felt["frequencies_hz"], dtype=float),
@@ -79,6 +77,24 @@ class SimulatedPlate:
             )
             for id, felt in reply["fingers"].items()
         }
+
+    async def _request(self, op: str, **values: object) -> dict[str, Any]:
+        """The reply to a request; raises LinkError if there is none or it is an error."""
+        try:
+            async with asyncio.timeout(_REPLY_TIMEOUT):
+                path = str(self._control)
+                reader, writer = await asyncio.open_unix_connection(path, limit=_MAX_REPLY)
+                with contextlib.closing(writer):
+                    writer.write(json.dumps({"op": op, **values}).encode() + b"\n")
+                    reply: dict[str, Any] = json.loads(await reader.readline())
+        except (OSError, ValueError) as error:  # no line, or half of one, is no JSON
+            raise LinkError(
+                f"simulated plate at {self._control}: no reply to {op} "
+                f"({str(error) or 'it took too long'}); {_REMEDY}"
+            ) from error
+        if "error" in reply:
+            raise LinkError(f"simulated plate: {op} refused: {reply['error']}")
+        return reply
 
 
 @contextlib.asynccontextmanager
@@ -99,10 +115,6 @@ async def simulated_plate(
     with tempfile.TemporaryDirectory(prefix="era-") as folder:
         path = Path(folder) / "control"
         async with contextlib.AsyncExitStack() as stack:
-            control = PlateControl(path, remedy=_REMEDY)
-            readings = PlateControl(path, remedy=_REMEDY)
-            stack.push_async_callback(control.close)
-            stack.push_async_callback(readings.close)
             if wire == "sim":
                 plate = "exact" if seed is None else f"seed={seed}"
                 base = f"sim://{quote(str(rig_file))}?control={quote(str(path))}&{plate}&amplifier="
@@ -111,7 +123,7 @@ async def simulated_plate(
                 process = await _start(rig_file, wire=wire, control=path, seed=seed)
                 stack.push_async_callback(_terminate, process)
                 urls = await _read_urls(process, count=len(amplifiers))
-            yield SimulatedPlate(control, urls, threshold=threshold, readings=readings)
+            yield SimulatedPlate(path, urls, threshold=threshold)
 
 
 async def _start(

@@ -14,7 +14,6 @@ from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import FingerVibration, TouchRow
 from controller.loop.content import Prediction, not_served
 from controller.loop.observer import Applied, Silenced
-from controller.plate_control import PlateControl
 from controller.sources.contacts import Change, Contact, ContactKey
 from daemon_bench import ENABLED, ready_daemon, until, until_state
 from drivers import clock
@@ -34,7 +33,7 @@ def contact(number: int) -> Contact:
 
 def recorder_of(rows: list[TouchRow], folder: Path) -> TouchRecorder:
     """A recorder whose plate is not there, which no row waits for."""
-    plate = SimulatedPlate(PlateControl(folder / "missing", remedy="start it again"), {})
+    plate = SimulatedPlate(folder / "missing", {})
     return TouchRecorder(plate, on_row=rows.append)
 
 
@@ -157,3 +156,32 @@ async def test_far_end_reports_exit_status_when_rig_is_invalid(
         async with simulated_plate(rig, ["main"], wire="serial"):
             pass
     assert f"{rig}:1: plate: " in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("said", "reason"),
+    [
+        (b'{"error": "finger is 1; it must be a text"}\n', r"felt refused: finger is 1"),
+        (b'{"fingers": ', r"/sock: no reply to felt"),
+        (b"x" * (2 << 20), r"/sock: no reply to felt"),
+        (None, r"/sock: no reply to felt .*too long"),
+    ],
+    ids=["an error", "half a line", "no line", "nothing"],
+)
+async def test_plate_without_a_reply_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: bytes | None, reason: str
+) -> None:
+    """Of the link, with what was asked; a plate that hangs is not waited for."""
+    monkeypatch.setattr(far_end, "_REPLY_TIMEOUT", 10.0 if said else 0.02)
+    hung = asyncio.Event()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if said is None:
+            await hung.wait()
+        writer.write(said or b"")
+        writer.close()
+
+    async with await asyncio.start_unix_server(serve, tmp_path / "sock"):
+        with pytest.raises(LinkError, match=reason):
+            await SimulatedPlate(tmp_path / "sock", {}).vibration(0.0, 1.0)
+        hung.set()

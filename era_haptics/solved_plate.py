@@ -64,8 +64,7 @@ class SolvedPlate:
 
         raster: number of points along x and y, by default enough for all that the mesh resolves.
         ERAs at one frequency add as complex amplitudes, magnitudes of several frequencies add
-        (paper Eq. 28). Raises InputError for a drive that the rig cannot play. Within 1e-5 of
-        `era plate map`, which is solved directly.
+        (paper Eq. 28). Raises InputError for a drive that the rig cannot play.
         """
         points = (
             None

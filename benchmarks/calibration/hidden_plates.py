@@ -17,12 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.direct_plate import direct_acceleration
 from benchmarks.setting import RIG
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.calibration.responses_file import write_responses_csv
 from model.fem.mesh import ELEMENTS, Mesh
-from model.fem.plate import PlateMatrices, assemble, direct_acceleration
+from model.fem.plate import PlateMatrices, assemble
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad

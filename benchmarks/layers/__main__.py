@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from benchmarks.direct_plate import direct_responder
 from benchmarks.layers.elasticity import strip_frequencies, wave_number
 from benchmarks.setting import RIG
 from model.arrays import FloatArray
@@ -14,7 +15,7 @@ from model.spectral.functions import CLASSES
 from model.spectral.modes import Band, SpectralPlate
 from model.structure.laminate_section import bending, equivalent_plate, wavenumber_of
 from model.structure.plate import AirGap, Laminate, Layer, Material, Plate
-from model.vibration.natural_modes import direct_responder, natural_modes
+from model.vibration.natural_modes import natural_modes
 
 PANEL = load_rig(RIG.parent / "glass_panel.yaml")
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)

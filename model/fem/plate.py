@@ -15,18 +15,10 @@ import numpy as np
 from scipy import linalg, sparse
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem.mesh import DOF_PER_NODE, Mesh
-from model.structure.attachments import (
-    Era,
-    Load,
-    PointLoad,
-    attached_stiffness,
-    drive_forces,
-    footprints_of,
-)
-from model.structure.modal_elasticity import check_of_theory, loss_factors
+from model.structure.attachments import PointLoad, footprints_of
 from model.structure.plate import Plate
 
 RIGID_BODY_MODES = 3  # of a free plate: up and down, and two tilts
@@ -130,40 +122,6 @@ def _stiffness(
         whole = sparse.kron(block, place, format="csc")
         found = found + (whole if of[0] == of[1] else whole + whole.T)
     return sparse.csc_array(found)
-
-
-def direct_acceleration(
-    matrices: PlateMatrices,
-    eras: Sequence[Era],
-    frequencies: FloatArray,
-    points: FloatArray,
-    *,
-    loads: Sequence[Load] = (),
-) -> ComplexArray:
-    """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and driven ERA: (f, eras, p).
-
-    Each ERA alone at full stroke and phase zero, the others at rest. One sparse factorisation per
-    frequency: the reference that `FreePlate.acceleration` is compared with. Raises InputError as
-    `Mesh.check_frequencies`, and for points off the plate.
-    """
-    check_of_theory(matrices.plate)
-    matrices.mesh.check_frequencies(matrices.plate, frequencies)
-    touch = matrices.deflection_at(footprints_of(eras, loads))
-    observe = matrices.deflection_at(points)
-    result = np.empty((len(frequencies), len(eras), observe.shape[0]), dtype=complex)
-    omegas = 2 * np.pi * np.asarray(frequencies, dtype=float)
-    attached, forces = attached_stiffness(eras, loads, omegas), drive_forces(eras, omegas)
-    losses = loss_factors(matrices.plate, omegas)
-    for row, (omega, loss) in enumerate(zip(omegas, losses, strict=True)):
-        dynamic_stiffness = (
-            (1 + 1j * loss) * matrices.stiffness
-            - omega**2 * matrices.mass
-            + touch.T @ sparse.diags_array(attached[row]) @ touch
-        )
-        load = touch[: len(eras)].T @ sparse.diags_array(forces[row])
-        displacement = factorise(dynamic_stiffness).solve(load.toarray())
-        result[row] = -(omega**2) * (observe @ displacement).T
-    return result
 
 
 def simply_supported_modes(

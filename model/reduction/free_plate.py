@@ -62,9 +62,9 @@ class FreePlate:
     ) -> ComplexArray:
         """Acceleration [m/s²] at points [m] (p, 2) per frequency [Hz] (f,) and ERA: (f, eras, p).
 
-        As `direct_acceleration`: each ERA alone at full stroke, the others at rest. Raises
-        InputError for a frequency that is not above zero, above frequency_max or above what the
-        mesh carries, and for points off the plate.
+        Each ERA alone at full stroke and phase zero, the others at rest. Raises InputError for a
+        frequency that is not above zero, above frequency_max or above what the mesh carries, and
+        for points off the plate.
         """
         omega = self._omega(frequencies)
         stiffness = attached_stiffness(eras, loads, omega)

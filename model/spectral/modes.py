@@ -32,7 +32,6 @@ from model.structure.laminate_section import (
     section_of,
     shear_corrections,
 )
-from model.structure.modal_elasticity import loss_factors
 from model.structure.plate import Layer, Plate
 
 NODES = 12
@@ -113,34 +112,6 @@ class SpectralPlate:
     def functions(self, parity: tuple[int, int]) -> ClassFunctions:
         """Functions of a symmetry class."""
         return ClassFunctions(self._x, self._y, parity, len(self._mass))
-
-    def dynamic_stiffness(self, parity: tuple[int, int], frequency: float) -> ComplexArray:
-        """Force by deflection in the polynomials of a class at a frequency [Hz], (m, m).
-
-        With the plate's own loss factor, without an approximation.
-        """
-        of, omega = self.functions(parity), 2 * math.pi * frequency
-        moduli = [layer.modulus(frequency) for layer in self._layers]
-        own_loss = 1j * float(loss_factors(self._plate, np.asarray(omega)))
-        moduli = [each + own_loss * each.real for each in moduli]
-        m = of.deflections
-        D: ComplexArray = np.asarray(
-            self._stiffness(of, [each.real for each in moduli])
-            + 1j * self._stiffness(of, [each.imag for each in moduli])
-        )
-        along = np.eye(of.size - m)
-        D[m:, m:] -= omega**2 * along_mass(of, self._mass, along)
-        D[:m, :m] -= omega**2 * self._density * np.eye(m)
-        result = D[:m, :m] - D[:m, m:] @ np.linalg.solve(D[m:, m:], D[m:, :m])
-        gap = self._plate.air_gap
-        if gap is not None:
-            air = air_motion(of, gap)
-            full = gap.bulk_modulus(frequency) * air.stiffness.astype(complex)
-            full -= omega**2 * gap.inertia(frequency) * np.diag(air.inertia)
-            result = (
-                result + full[:m, :m] - full[:m, m:] @ np.linalg.solve(full[m:, m:], full[m:, :m])
-            )
-        return np.asarray(result)
 
     def modes(
         self, parity: tuple[int, int], *, shift: float, cut: float, band: Band

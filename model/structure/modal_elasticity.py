@@ -15,7 +15,6 @@ from typing import Any, Self
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.errors import InputError
 from model.structure.plate import LOSS_FREQUENCY, Plate
 
 
@@ -61,14 +60,6 @@ def lowest_elastic(eigenvalues: FloatArray, count: int) -> IntArray:
         order = np.argsort(np.round(np.log(eigenvalues), 9), kind="stable")
     elastic = order[eigenvalues[order] > 0]
     return np.asarray(elastic[:count])
-
-
-def check_of_theory(plate: Plate) -> None:
-    """Raise InputError for a plate whose modes differ from its theory."""
-    if plate.mode_deviations:
-        raise InputError(
-            "a direct solution has no modes; remove plate.modes from the rig, which change them"
-        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,9 @@ from model.arrays import ComplexArray, FloatArray, lattice
 from model.counting import counted
 from model.errors import InputError
 from model.files.csv_file import as_frame
-from model.reduction.free_plate import FreePlate
+from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig
 from model.vibration.excitation import Excitation, find_nulls, peak_acceleration, tone_fields
-from model.vibration.natural_modes import direct_responder
 
 MAX_POINTS = 1_000_000
 """More would be finer than any screen, at some hundred bytes of memory each."""
@@ -55,9 +54,8 @@ def plate_map(
 ) -> PlateMap:
     """Solve the rig's plate for an excitation; the raster defaults to that of the mesh.
 
-    free: the same plate where it has been solved before, in place of a direct solve. Raises
-    InputError for a raster below 2x2 or of millions of points, or a frequency that the mesh cannot
-    carry.
+    free: the same plate where it has been solved before. Raises InputError for a raster below 2x2
+    or of millions of points, or a frequency that the mesh cannot carry.
     """
     mesh = rig.mesh
     columns, rows = raster or mesh.raster
@@ -70,10 +68,13 @@ def plate_map(
     x = np.linspace(0, rig.plate.length, columns)
     y = np.linspace(0, rig.plate.width, rows)
     points = lattice(x, y)
-    respond = free.acceleration if free else direct_responder(rig.plate, mesh)
-    frequencies, field = tone_fields(
-        excitation, rig.eras, lambda f: respond(rig.eras, f, points, loads=rig.masses)
-    )
+
+    def respond(driven: FloatArray) -> ComplexArray:
+        highest = max(rig.limits.frequency_max, float(driven.max()))
+        solved = free or solve_free_plate(rig.plate, mesh, frequency_max=highest)
+        return solved.acceleration(rig.eras, driven, points, loads=rig.masses)
+
+    frequencies, field = tone_fields(excitation, rig.eras, respond)
     peak = peak_acceleration(np.abs(field)).reshape(rows, columns)
     nulls = find_nulls(x, y, peak)
     return PlateMap(x, y, peak, nulls, frequencies, field.reshape(-1, rows, columns))

@@ -1,30 +1,26 @@
-"""A plate on any mesh: natural modes for any support, and its response solved directly."""
+"""Natural modes of a plate on any mesh, for any support."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from scipy import linalg
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.fem.plate import (
     RIGID_BODY_MODES,
     assemble,
-    direct_acceleration,
     simply_supported_modes,
 )
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import contribution, reduce_free_plate
 from model.rig.rig import Rig
-from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import PlateMesh, SpectralMesh
 from model.structure.attachments import PointLoad, footprints_of
 from model.structure.modal_elasticity import ModalElasticity
-from model.structure.plate import Plate
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,17 +116,3 @@ def _simply_supported(rig: Rig, count: int, mesh: PlateMesh) -> NaturalModes:
     matrices = assemble(rig.plate, mesh)
     frequencies, unknowns = simply_supported_modes(matrices, count, rig.masses)
     return NaturalModes(frequencies, matrices.deflection_at, unknowns, mesh)
-
-
-Responder: TypeAlias = Callable[..., ComplexArray]
-"""Acceleration [m/s²] of each ERA alone at full stroke, (f, eras, p).
-
-Of ERAs, frequencies (f,) [Hz], points (p, 2) [m], and loads by name.
-"""
-
-
-def direct_responder(plate: Plate, mesh: PlateMesh) -> Responder:
-    """Direct solution of a plate on a mesh, the check of its reduction."""
-    if isinstance(mesh, Mesh):
-        return partial(direct_acceleration, assemble(plate, mesh))
-    return partial(direct_spectral_acceleration, plate, mesh)

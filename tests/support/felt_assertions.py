@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from benchmarks.direct_plate import direct_responder
 from felt_chain import LEVEL_DB_SL, ONSET, SENSORS, Heard, Played, Situation, Stream
 from model.arrays import ComplexArray, FloatArray
 from model.finger.fingertip import fingertip_points, fingertip_weights
@@ -24,7 +25,6 @@ from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.table.timing import Timing
 from model.transients.base_motion import BaseEnvelope, shaped
-from model.vibration.natural_modes import direct_responder
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
 

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from benchmarks.direct_plate import direct_acceleration
 from model.calibration.responses import Responses
-from model.fem.plate import assemble, direct_acceleration
+from model.fem.plate import assemble
 from model.rig.rig import Rig
 
 # Relative to the rig, bolt masses in kg: what assembly and ageing do.

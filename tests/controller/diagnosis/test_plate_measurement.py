@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.direct_plate import direct_responder
 from controller.diagnosis.plate_measurement import (
     PlateSelfMeasurement,
     checked_level,
@@ -27,7 +28,6 @@ from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
 from model.table.build import build_table
 from model.table.question import Question
-from model.vibration.natural_modes import direct_responder
 from rig_on_wire import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers
 from sim.bench import bench
 from sim.plant.accelerometer import Accelerometer

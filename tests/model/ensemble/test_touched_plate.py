@@ -7,13 +7,14 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.direct_plate import direct_acceleration
 from model.ensemble.attached_plate import attach
 from model.ensemble.draws import Drawing
 from model.ensemble.plate_on_eras import MODELLED, PlateOnEras, thickness_nodes
 from model.ensemble.touched_by_kernel import touch
 from model.ensemble.touched_plate import TouchedPlate
 from model.fem.mesh import ELEMENTS, Mesh
-from model.fem.plate import assemble, direct_acceleration
+from model.fem.plate import assemble
 from model.finger.fingertip import FINGERTIP_RADIUS, FIVE_POINTS
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.uncertainty import Uncertainty

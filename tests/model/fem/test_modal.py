@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.direct_plate import direct_acceleration
 from long_form import shortly
 from model.errors import InputError
 from model.fem.mesh import ELEMENTS, Mesh
-from model.fem.plate import assemble, direct_acceleration
+from model.fem.plate import assemble
 from model.rig.meshes import mesh_from_dict, parse_mesh
 from model.structure.attachments import Era
 from model.structure.plate import Plate

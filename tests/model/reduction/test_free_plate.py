@@ -7,9 +7,10 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from benchmarks.direct_plate import direct_acceleration
 from model.errors import InputError
 from model.fem.mesh import ELEMENTS, Mesh
-from model.fem.plate import assemble, direct_acceleration, lowest_modes
+from model.fem.plate import assemble, lowest_modes
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import Era, PointLoad

@@ -5,16 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.direct_plate import direct_spectral_acceleration
+from model.arrays import lattice
 from model.config.document import ConfigError
-from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
 from model.rig.file import example_rig_path, load_rig, parse_rig
 from model.rig.rig import Rig
-from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import footprints_of
 from model.structure.plate import LOSS_FREQUENCY
+from model.table.build import build_table
+from model.table.verify import verify_table
+from model.vibration.excitation import Tone
+from model.vibration.maps import plate_map
 
 FREQUENCIES = np.array([65.0, 150.0, 240.0, 430.0])
 DEVIATIONS = ((0.02, 0.3), (0.0, 0.0), (-0.03, -0.4))
@@ -57,11 +61,23 @@ def test_loss_varies_alike_in_modes_and_in_a_direct_solution(rig: Rig) -> None:
     np.testing.assert_allclose(found, direct, atol=1e-4 * np.abs(direct).max())
 
 
-def test_direct_solution_refuses_modes_of_its_own(rig: Rig) -> None:
-    """What has no modes cannot have some that deviate."""
-    assert isinstance(rig.mesh, SpectralMesh)
-    with pytest.raises(InputError):
-        direct_spectral_acceleration(rig.plate, rig.mesh, rig.eras, FREQUENCIES, POINTS)
+def test_a_map_has_them(rig: Rig) -> None:
+    """Peak acceleration of a single tone is the amplitude of the plate's response."""
+    raster = 5, 4
+    found = plate_map(rig, {rig.eras[1].name: Tone(110.0, rig.eras[1].stroke)}, raster=raster)
+    points = lattice(found.x, found.y)
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
+    expected = np.abs(free.acceleration(rig.eras, np.array([110.0]), points)[0, 1])
+    np.testing.assert_allclose(found.peak.ravel(), expected, rtol=1e-9)
+
+
+def test_a_table_is_verified_with_them(rig: Rig) -> None:
+    """Its fields and one answer are those of the plate anew, not of the plate in theory."""
+    table = build_table(rig)
+    assert verify_table(table, rig, samples=1).failed_count == 0
+    other = replace(rig, plate=replace(rig.plate, mode_deviations=()))
+    checks = verify_table(table, other, samples=1).content
+    assert not any(check.is_passed for check in checks)
 
 
 def test_plate_in_time_has_them(rig: Rig) -> None:

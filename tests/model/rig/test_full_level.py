@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.direct_plate import direct_acceleration
 from model.config.document import ConfigError
 from model.errors import InputError
-from model.fem.plate import assemble, direct_acceleration
+from model.fem.plate import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.file import load_rig, parse_rig

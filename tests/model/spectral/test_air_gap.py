@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.direct_plate import direct_responder
 from benchmarks.layers.gap import air_pressure, cell_middles
 from long_form import in_turn
 from model.reduction.free_plate import solve_free_plate
@@ -14,7 +15,7 @@ from model.spectral.modes import SpectralPlate
 from model.spectral.stiffness import air_motion
 from model.structure.attachments import Era
 from model.structure.plate import HEAT_RATIO, PRESSURE, VISCOSITY, AirGap, Material, Plate
-from model.vibration.natural_modes import direct_responder, natural_modes
+from model.vibration.natural_modes import natural_modes
 
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
 PLATE = Plate(0.375, 0.225, 2.5e-3, GLASS)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.direct_plate import direct_responder
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.reduction.free_plate import solve_free_plate
@@ -13,7 +14,6 @@ from model.structure.attachments import Era, Fingertip, PointLoad
 from model.structure.footprint import mean_over
 from model.structure.plate import Material, Plate
 from model.structure.support import check_supported, rigid_body_frequencies, support_problem
-from model.vibration.natural_modes import direct_responder
 from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
 PLATE = Plate(0.3, 0.2, 0.002, Material("aluminium", E=70e9, rho=2700.0, nu=0.33))

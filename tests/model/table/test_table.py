@@ -6,9 +6,10 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from benchmarks.direct_plate import direct_acceleration
 from model.drive_modes.switched import amplitude_powers, members_of, sums_of_sources
 from model.errors import InputError
-from model.fem.plate import assemble, direct_acceleration
+from model.fem.plate import assemble
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.grid import Grid
 from model.finger.perception import detection_threshold

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.fem.plate import assemble, direct_acceleration
+from benchmarks.direct_plate import direct_acceleration
+from model.fem.plate import assemble
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.table.build import solve_table

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from bench_driving import arm, keep_alive, play
+from benchmarks.direct_plate import direct_acceleration
 from drivers.contents import Tone
 from model.arrays import FloatArray
-from model.fem.plate import assemble, direct_acceleration
+from model.fem.plate import assemble
 from model.finger.fingertip import fingertip_points
 from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, FingertipLoad

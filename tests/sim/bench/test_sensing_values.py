@@ -6,12 +6,13 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.direct_plate import direct_acceleration
 from drivers import clock
 from drivers.host.sensors import measure_tones, read_sensors
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import READING_STATES
-from model.fem.plate import assemble, direct_acceleration
+from model.fem.plate import assemble
 from model.rig.rig import Rig
 from plate_in_time import apart
 from rig_on_wire import layer, on_two_amplifiers, rig_in_memory

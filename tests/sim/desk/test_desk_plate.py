@@ -10,6 +10,7 @@ from benchmarks.desk_plate.lifted_blocks import sampled
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
+from benchmarks.direct_plate import direct_responder
 from desk_card import DeskCard
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, Float32Array, FloatArray
@@ -18,7 +19,6 @@ from model.identification.identify import identify
 from model.identification.measured_plate import MeasuredPlate
 from model.rig.rig import Rig
 from model.structure.attachments import fingertip_loads
-from model.vibration.natural_modes import direct_responder
 from sim.measuring.desk import Desk
 from sim.measuring.multisine import Multisine
 from sim.measuring.plate_measurement import measure_through

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Actuator, Truth, draw_truth
+from benchmarks.direct_plate import direct_responder
 from desk_card import DeskCard
 from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.contents import Tone
@@ -31,7 +32,6 @@ from model.table.promise_at_sensors import Promise, promises
 from model.table.table import LocalizationTable
 from model.table.table_check import CheckSettings
 from model.vibration.excitation import tone_amplitudes
-from model.vibration.natural_modes import direct_responder
 from sim.measuring import table_check
 from sim.measuring.sound_card import SoundCard
 from sim.sensors.sensor_file import read_sensors

@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.direct_plate import direct_acceleration
 from model.errors import InputError
-from model.fem.plate import assemble, direct_acceleration
+from model.fem.plate import assemble
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold, mean_level_db_sl
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate

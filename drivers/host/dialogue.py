@@ -231,7 +231,8 @@ class Dialogue:
         if (now := self._time()) > admitted.until:
             raise CommandRefused(
                 f"amplifier {self.name}: set {token} must be committed {now - admitted.until:.3g} "
-                "s earlier; the wire is too slow or too busy"
+                "s earlier; the wire is too slow or too busy",
+                until=now,
             )
         return values
 

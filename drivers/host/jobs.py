@@ -70,8 +70,8 @@ class JointStart:
         self._keep_back(Preempted(f"one of several commits failed: {error}"))
 
     def _give_up(self) -> None:
-        refusal = CommandRefused("commits must be sent together; one of the lines is too busy")
-        self._keep_back(refusal)
+        text = "commits must be sent together; one of the lines is too busy"
+        self._keep_back(CommandRefused(text, until=self._loop.time()))
 
     def _keep_back(self, error: Exception) -> None:
         """Send none that waits or comes later: each has the first error of them as its result."""

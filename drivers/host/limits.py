@@ -16,7 +16,7 @@ from drivers.contents import Layer, Tone
 from drivers.errors import CommandError, CommandRefused
 from drivers.protocol.records import Values, WireQuantity
 from drivers.protocol.sets import Command, LayerSet
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.table import KNOT, QUANTITIES
 from registry.limits import GuardLimits
 
 FREQUENCY_FLOOR = 10.0
@@ -199,7 +199,11 @@ class Rounding:
             if (count := len(envelope.knots)) > (limit := self._can["knots"]):
                 text = f"knots of an envelope must be at most {limit}, got {count}"
                 raise _refused(tone.channel, text)
-            if not 0 <= (peak := envelope.peak) <= self._limits.level:
+            try:
+                KNOT.append_rows([], envelope.knots)
+            except (TypeError, ValueError) as error:
+                raise _refused(tone.channel, f"knot of an envelope: {error}") from error
+            if (peak := envelope.peak) > self._limits.level:
                 raise self._level_refused(tone.channel, "level of a knot", peak / _LEVEL.per_unit)
 
 

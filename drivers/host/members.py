@@ -271,7 +271,15 @@ class Members:
         if not is_silent:
             self.check_none_since(before)
             self.is_set_incomplete = len(layers) > 1
-            await self._commit(staged)
+            began = clock.now()
+            try:
+                await self._commit(staged)
+            except CommandRefused as refusal:
+                is_sent = any(self.amplifiers[name].played_at >= began for name in staged)
+                if is_sent or refusal.until is None or self.epoch != before:
+                    raise
+                self.is_set_incomplete = False
+                return refusal  # too late for what the ledgers have admitted: none was sent
         self.is_set_incomplete = False
         played: dict[str, tuple[LayerSet, ...]] = {}
         inexact: list[str] = []

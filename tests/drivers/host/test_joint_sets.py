@@ -7,7 +7,7 @@ from itertools import combinations
 import pytest
 
 from drivers.contents import Layer, Tone
-from drivers.errors import DriverError, LinkTimeout, Preempted
+from drivers.errors import CommandRefused, DriverError, LinkTimeout, Preempted
 from drivers.host.can_wire import CanWire
 from drivers.host.group import Group
 from drivers.host.jobs import JointStart
@@ -66,18 +66,23 @@ async def test_commits_arrive_together_on_lines_of_any_speed_that_are_busy(
 
 
 @in_virtual_time
-async def test_line_that_is_busy_for_too_long_commits_nothing() -> None:
-    """Three readings without reply take 270 ms, a set is admitted for 100: silent, not armed."""
+async def test_line_that_is_busy_for_too_long_commits_nothing_and_is_no_fault() -> None:
+    """Three readings without reply take 270 ms, a set is admitted for 100: refused until later."""
     ends = [MemoryLine("serial", "a"), MemoryLine("serial", "b")]
     group = await group_of(*ends, watchdog=1.0)
     ends[1].outward = lambda name, data: [] if name == "GetStatus" else [(0.0002, data)]
     reads = [asyncio.ensure_future(group.amplifiers["b"].read_status()) for _ in range(3)]
-    with pytest.raises(DriverError, match="commits must be sent together") as refused:
+    with pytest.raises(CommandRefused, match="commits must be sent together") as refused:
         await group.apply({name: [LAYER] for name in group.amplifiers})
     assert not isinstance(refused.value, Preempted)  # nothing came first: it is to be told
+    assert refused.value.until is not None
     await asyncio.gather(*reads, return_exceptions=True)
     assert [started(end) for end in ends] == [[], []]
-    assert not group.is_armed
+    assert group.is_armed
+    ends[1].outward = lambda name, data: [(0.0002, data)]
+    await group.amplifiers["b"].read_status()
+    await group.apply({name: [LAYER] for name in group.amplifiers})
+    assert [len(started(end)) for end in ends] == [1, 1]
 
 
 @pytest.mark.parametrize(("names", "fails"), [(("slow serial", "tcp"), 0), (("serial",) * 2, 1)])

@@ -50,6 +50,8 @@ BAD = {
     "channel": tone(3),
     "knot": tone(1, onset=Envelope(100, ((10001, 9000),))),
     "step": tone(1, ending=Envelope(1, ((1000, 0),))),
+    "phase of a knot": tone(1, ending=Envelope(100, ((1000, 0), (1000, 18001)))),
+    "number of a knot": tone(1, onset=Envelope(100, ((1000.5, 0),))),  # type: ignore[arg-type]
     "knots": tone(1, onset=Envelope(100, ((1000, 0),) * 33)),
 }
 

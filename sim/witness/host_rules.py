@@ -384,9 +384,10 @@ class HostRules:
         )
 
     def _expect_stop(self, session: AmplifierSession, time: float) -> None:
-        """A stop command must be sent to this amplifier, unless a stop went out at this moment."""
-        if session.is_stopped and session.last_stop == time:
-            return
+        """A stop command must be sent to this amplifier, unless the reply to one is awaited."""
+        is_under_way = session.is_stopped and session.first_stop is not None
+        if is_under_way and time < session.last_stop + self._times.reply:
+            return  # which must go on until it is confirmed
         session.stop_requested_at = time
 
         def is_sent() -> bool:

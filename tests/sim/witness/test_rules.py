@@ -142,9 +142,11 @@ def test_arm_may_be_withdrawn_before_its_reply() -> None:
     assert "token" not in talk.found
 
 
-def test_stop_in_the_moment_of_its_request_is_not_awaited_again() -> None:
+@pytest.mark.parametrize("later", [0.0, 0.003])
+def test_stop_is_not_awaited_again_while_its_reply_is(later: float) -> None:
     """The host had begun to stop by itself, of which its operator's stop takes part."""
-    talk = Talk().armed().playing().sends(hand.STOP, (5,)).told("operator_command", "stop")
+    talk = Talk().armed().playing().sends(hand.STOP, (5,))
+    talk.rest(later).told("operator_command", "stop")
     talk.rest(0.028).replies(hand.STOP, hand.status(hand.STOPPED, latch=1, token=5))
     assert talk.found == []
 

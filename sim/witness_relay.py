@@ -6,18 +6,18 @@ Bytes are forwarded before they are checked, to add as little latency as possibl
 import asyncio
 import contextlib
 import logging
-import time
 from asyncio import StreamReader, StreamWriter
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
+from drivers import clock
 from drivers.errors import CommandError, LinkError
 from drivers.ports.serial_port import open_port
 from drivers.urls import Place
 from drivers.wires.known import address_of
 from model.errors import InputError
-from sim.transport.pseudo_terminal import PseudoTerminal
+from sim.transport.pseudo_terminal import make_terminal
 from sim.witness.capture import Direction
 from sim.witness.witness import Witness
 
@@ -99,7 +99,7 @@ class _Observer:
 
     def __init__(self, witness: Witness) -> None:
         self.witness = witness
-        self._due = time.monotonic()
+        self._due = clock.now()
 
     def record(self, wire: str, direction: Direction, at: float, data: bytes) -> None:
         """Pass on bytes that were read or written at a time [s]."""
@@ -109,12 +109,12 @@ class _Observer:
     async def watch(self) -> None:
         """Measure how late this program wakes up, until cancelled."""
         while True:
-            self._due = time.monotonic() + _WAKE_INTERVAL
+            self._due = clock.now() + _WAKE_INTERVAL
             await asyncio.sleep(_WAKE_INTERVAL)
             self._check()
 
     def _check(self) -> None:
-        now = time.monotonic()
+        now = clock.now()
         if (late := now - self._due) > _WAKE_INTERVAL:
             self.witness.delayed(now, late)
             self._due = now
@@ -127,20 +127,20 @@ async def _serial_relay(
     """Relay a serial port through a pseudo-terminal."""
 
     def to_amplifier(data: bytes) -> None:
-        before = time.monotonic()  # it arrives afterwards, however long this program is delayed
+        before = clock.now()  # it arrives afterwards, however long this program is delayed
         with contextlib.suppress(LinkError):
             port.write(data)
         observer.record(name, "amplifier", before, data)
 
     def to_host(data: bytes) -> None:
-        at = time.monotonic()
+        at = clock.now()
         terminal.write(data)
         observer.record(name, "host", at, data)
 
     def lost(cause: str) -> None:
-        observer.witness.closed(name, time.monotonic())
+        observer.witness.closed(name, clock.now())
 
-    terminal = PseudoTerminal(to_amplifier)
+    terminal = make_terminal(to_amplifier)
     with contextlib.closing(terminal):
         port = await open_port(endpoint.place, to_host, lost)
         try:
@@ -158,7 +158,7 @@ async def _tcp_relay(endpoint: WireEndpoint, name: str, observer: _Observer) -> 
 
     async def relay(from_host: StreamReader, to_host: StreamWriter) -> None:
         def received(data: bytes) -> None:
-            at = time.monotonic()
+            at = clock.now()
             to_host.write(data)
             observer.record(name, "host", at, data)
 
@@ -170,12 +170,12 @@ async def _tcp_relay(endpoint: WireEndpoint, name: str, observer: _Observer) -> 
                 return
             with contextlib.closing(port), contextlib.suppress(OSError, LinkError):
                 while data := await from_host.read(_READ_MAX):
-                    before = time.monotonic()
+                    before = clock.now()
                     port.write(data)
                     observer.record(name, "amplifier", before, data)
 
     def opened(from_host: StreamReader, to_host: StreamWriter) -> None:
-        observer.witness.opened(name, time.monotonic())
+        observer.witness.opened(name, clock.now())
         task = asyncio.ensure_future(relay(from_host, to_host))
         running.add(task)
         task.add_done_callback(closed)
@@ -183,7 +183,7 @@ async def _tcp_relay(endpoint: WireEndpoint, name: str, observer: _Observer) -> 
     def closed(task: asyncio.Task[None]) -> None:
         running.discard(task)
         if not running:
-            observer.witness.closed(name, time.monotonic())
+            observer.witness.closed(name, clock.now())
 
     server = await asyncio.start_server(opened, "127.0.0.1", 0)
     try:

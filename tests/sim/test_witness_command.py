@@ -20,6 +20,7 @@ from drivers.by_hand.reaching import random_session
 from drivers.contents import Layer, Tone
 from drivers.opening import Lines
 from drivers.protocol.table import STATES
+from memory_machine import live_in_memory
 from model.errors import InputError
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
@@ -31,12 +32,12 @@ from sim.witness.capture import read_capture
 from sim.witness.config import parse_config
 from sim.witness.witness import Witness
 from sim.witness_relay import parse_endpoint, relays
+from virtual_loop import in_virtual_time
 from witness_config import witness_config
 
 
 def _witness(url: str, *, level: float) -> Witness:
-    times = dict.fromkeys(("slack", "reply", "heartbeat"), 5.0)
-    return Witness(witness_config({"main": url}, times_s=times, level=level))
+    return Witness(witness_config({"main": url}, level=level))
 
 
 async def _drive(url: str) -> None:
@@ -55,10 +56,12 @@ async def _drive(url: str) -> None:
 
 
 @pytest.mark.parametrize("wire", WIRES)
+@in_virtual_time
 async def test_relay_shows_a_session_to_the_witness(wire: str, coarse_rig: Rig) -> None:
     """A session passes at a limit of 0.5, and breaks a limit of 0.3."""
-    async with far_side(WIRES[wire], coarse_rig) as far:
-        for level, broken in ((0.5, set()), (0.3, {"limits"})):
+    live_in_memory()
+    for level, broken in ((0.5, set()), (0.3, {"limits"})):
+        async with far_side(WIRES[wire], coarse_rig) as far:
             witness = _witness(far.url, level=level)
             endpoint = parse_endpoint(far.url)
             async with relays([endpoint], [endpoint.location], witness) as (url,):

@@ -15,7 +15,6 @@ from drivers.contents import Tone as Played
 from drivers.errors import LinkError
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.line import Line
-from drivers.host.serial_wire import SerialWire
 from drivers.host.wire import Event
 from drivers.opening import Lines
 from drivers.protocol.records import Values
@@ -26,8 +25,7 @@ from model.vibration.excitation import Tone
 from newest_contact import BuzzNewestContact
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
-from sim.amplifier.contract import Amplifier
-from sim.far_ends.serial_amplifiers import SerialAmplifiers
+from words_line import MemoryLine
 
 FINGER = (1, 0.5, 0.5)
 OTHER = (2, 0.9, 0.9)
@@ -74,7 +72,7 @@ def _sent(one: LayerSet, token: int, time: float) -> Sent:
     )
 
 
-class FarEnd:
+class FarEnd(MemoryLine):
     """A simulated amplifier, on a line of its own, that remembers everything it was asked.
 
     A request arrives at once unless it is deaf, its reply takes `delay` [s], and is not sent if it
@@ -82,39 +80,35 @@ class FarEnd:
     Without envelopes unless knots are given.
     """
 
-    is_blocked = False
-
-    def __init__(self, channels: int = 2, knots: int = 0, baud: int = 0) -> None:
+    def __init__(self, *, wire: str = "serial", channels: int = 2, knots: int = 0) -> None:
+        super().__init__(wire, "main", channels=channels)
         self.asked: list[tuple[float, str, Values]] = []
         self.delay = 0.0
-        self.is_mute = self.is_deaf = self.is_open = self._is_cut = False
+        self.is_mute = self.is_deaf = self._is_cut = False
         self.attempts: list[float] = []
         self.answer: Callable[[str, Values], Values | None] = lambda name, values: None
-        self.amplifier = Amplifier("any", channels=channels)
+        self.amplifier = self.far["main"]
         highest = QUANTITIES["frequency"].to_wire(600.0)
         self.amplifier.capabilities.update(frequency_max=highest, knots=knots)
         self.obey = self.amplifier.handle
         self.amplifier.handle = self._handle  # type: ignore[method-assign]
-        self._baud = baud
-        self._line: Line | None = None
-        self._end: SerialAmplifiers | None = None
+        self.inward = lambda name, data: [] if self.is_deaf else [(0.0, data)]
+        self.outward = lambda name, data: [] if self.is_mute else [(self.delay, data)]
         self._sets = CommittedSets()
+        self.close()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a line to it is."""
+        return self.line.loss is None
 
     def connect(self) -> Line:
         """Open a line to it; raises LinkError while it is cut."""
-        self.attempts.append(asyncio.get_running_loop().time())
+        self.attempts.append(self.loop.time())
         if self._is_cut:
             raise LinkError("wire cut")
-        self._end = SerialAmplifiers({1: self.amplifier}, self._reply)
-        self._line = Line(SerialWire(self._baud, sequence=0), self, "line")
-        self.is_open = True
-        return self._line
-
-    @property
-    def line(self) -> Line:
-        """Its open line."""
-        assert self._line is not None
-        return self._line
+        self.start_host()
+        return self.line
 
     def cut(self) -> None:
         """Cut its line, until `mend`."""
@@ -132,28 +126,7 @@ class FarEnd:
 
     def close(self) -> None:
         """Close its line."""
-        if self._line is not None:
-            self._line.lose("closed")
-        self.is_open = False
-
-    def write(self, data: bytes) -> None:
-        """Send bytes of the host."""
-        loop = asyncio.get_running_loop()
-        assert self._end is not None
-        if self.is_deaf:
-            return
-        loop.call_soon(lambda: self._end.receive(data, loop.time()))  # type: ignore[union-attr]
-
-    def poll(self) -> None:
-        """All that has come was handed over."""
-
-    def _reply(self, data: bytes) -> None:
-        if not self.is_mute:
-            asyncio.get_running_loop().call_later(self.delay, self._arrived, self.line, data)
-
-    def _arrived(self, line: Line, data: bytes) -> None:
-        if line.loss is None:
-            line.received(data)
+        self.line.lose("closed")
 
     def _handle(self, name: str, values: Values, now: float) -> Values:
         self.asked.append((now, name, values))
@@ -164,7 +137,7 @@ class FarEnd:
 
     def status(self) -> Values:
         """What it reports now."""
-        now = asyncio.get_running_loop().time()
+        now = self.loop.time()
         self.amplifier.tick(now)
         return self.amplifier.status(now)
 
@@ -173,11 +146,6 @@ class FarEnd:
         """Its state now."""
         self.status()
         return self.amplifier.state
-
-    @property
-    def levels(self) -> tuple[float, ...]:
-        """Its levels now."""
-        return tuple(self.status()["levels"])
 
     @property
     def token(self) -> int:
@@ -259,13 +227,13 @@ class Bench:
 
     controller: Controller
     rig: Rig
-    far_ends: list[Any]
+    far_ends: list[FarEnd]
     table: SetTable
     reports: Reports
     loop: asyncio.Task[None] | None = None
 
     @property
-    def far_end(self) -> Any:
+    def far_end(self) -> FarEnd:
         """The first amplifier."""
         return self.far_ends[0]
 
@@ -307,18 +275,20 @@ class Bench:
 def make_bench(
     *amplifiers: str,
     observer: Observer | None = None,
+    wire: str = "serial",
     channels: int = 2,
-    far_ends: list[Any] | None = None,
+    knots: int = 0,
     rate: float = math.inf,
     on_time: float = math.inf,
     **options: Any,
 ) -> Bench:
     """A bench within a running loop; one amplifier unless more are named.
 
-    rate [1/s], on_time [s]: limits of the rig; options: as a `Controller` takes them.
+    wire, channels, knots: of each far end; rate [1/s], on_time [s]: limits of the rig; options: as
+    a `Controller` takes them.
     """
     names = amplifiers or ("main",)
-    far_ends = far_ends or [FarEnd(channels) for _ in names]
+    far_ends = [FarEnd(wire=wire, channels=channels, knots=knots) for _ in names]
     reports = Reports()
     limits = GuardLimits(40.0, 500.0, 1.0, rate=rate, on_time=on_time)
     rig = make_rig(names, limits, eras=2)

@@ -72,7 +72,7 @@ class Watched:
     @property
     def is_loud(self) -> bool:
         """Whether any amplifier plays."""
-        return any(any(each.levels) for each in self.far_ends)
+        return any(any(each.levels()) for each in self.far_ends)
 
     @property
     def opened(self) -> int:
@@ -270,12 +270,15 @@ def _coded(what: str, value: Any) -> Any:
 
 
 @asynccontextmanager
-async def watched(*amplifiers: str, refuses: bool = False) -> AsyncIterator[Watched]:
+async def watched(
+    *amplifiers: str, refuses: bool = False, wire: str = "serial"
+) -> AsyncIterator[Watched]:
     """A supervisor with a running control loop, which must end when it is closed.
 
-    amplifiers: one unless more are named; refuses: whether it refuses all requests at first.
+    amplifiers: one unless more are named; refuses: whether it refuses all requests at first; wire:
+    the kind of their lines.
     """
-    bench = make_bench(*amplifiers)
+    bench = make_bench(*amplifiers, wire=wire)
     loop = asyncio.get_running_loop()
 
     def heard(name: str, value: object) -> None:
@@ -324,11 +327,12 @@ def courses(path: Path) -> dict[str, Mapping[str, Any]]:
 def follow(course: Mapping[str, Any]) -> None:
     """Take all steps of a course, in virtual time."""
 
+    given = {**course}
+
     async def run() -> None:
-        async with watched(
-            *course.get("amplifiers", ()), refuses=course.get("refuses", False)
-        ) as daemon:
-            for step in course["steps"]:
+        steps, amplifiers = given.pop("steps"), given.pop("amplifiers", ())
+        async with watched(*amplifiers, **given) as daemon:
+            for step in steps:
                 await daemon.take(step)
 
     run_virtual(run())

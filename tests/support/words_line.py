@@ -120,9 +120,10 @@ class MemoryLine:
         self._sending = self._handling = ""
         self._due: dict[str, float] = {}  # s; of what was handed over last, by who takes it
         self._end = self.kind.far_end(dict(enumerate(self.far.values(), 1)), self._send)
-        self._start_host()
+        self.start_host()
 
-    def _start_host(self) -> None:
+    def start_host(self) -> None:
+        """Have a host with a new line."""
         self.line = Line(self.kind.wire(), self, "line")
         self.hosts = {
             each: Host(self.line, address, LIMITS, name=each)
@@ -132,7 +133,7 @@ class MemoryLine:
     def kill_host(self) -> None:
         """Have another host in place of this one, which sends nothing any more."""
         self.line.lose("its host was killed")
-        self._start_host()
+        self.start_host()
 
     @property
     def retries(self) -> int:
@@ -172,9 +173,9 @@ class MemoryLine:
         for delay, altered in self.outward(self._handling, data):
             self.later(delay, self.line.received, altered)
 
-    def levels(self, name: str) -> list[float]:
-        """What the channels of an amplifier play now."""
-        far = self.far[name]
+    def levels(self, name: str = "") -> list[float]:
+        """What the channels of an amplifier play now, of the first without a name."""
+        far = self.far[name or next(iter(self.far))]
         far.tick(self.loop.time())
         return [
             round(far.playback.level(channel, self.loop.time()), 6)

@@ -274,9 +274,9 @@ async def test_unforeseen_exception_in_the_control_loop_is_a_fault(
             await asyncio.sleep(0.1)
         assert daemon.state is DaemonState.FAULT
         assert "a bug" in daemon.supervisor.operation.cause
-        assert (daemon.far_end.state, {*daemon.far_end.levels}) == (STOPPED, {0})
+        assert (daemon.far_end.state, {*daemon.far_end.levels()}) == (STOPPED, {0})
         await daemon.handle(CLEAR)
         await daemon.handle(ARM)
         daemon.touch_elsewhere()
         await asyncio.sleep(0.1)
-        assert (daemon.state, any(daemon.far_end.levels)) == (ENABLED, True)
+        assert (daemon.state, any(daemon.far_end.levels())) == (ENABLED, True)

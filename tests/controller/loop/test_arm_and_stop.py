@@ -292,14 +292,13 @@ async def test_open_refuses_a_table_without_playable_frequencies() -> None:
 @in_virtual_time
 async def test_mute_amplifier_is_lost_though_the_finger_was_lifted() -> None:
     """Silence that it does not hear, repeated, does not put off when it must have fallen silent."""
-    local = [FarEnd(baud=921_600), FarEnd(baud=921_600)]
-    async with running("a", "b", far_ends=local) as bench:
+    async with running("a", "b") as bench:
         await bench.hold(FINGER, seconds=0.2)
         bench.far_ends[1].is_deaf = True
         await bench.touches(rest=0.6)
         assert bench.reports.lost
         assert bench.controller.group.state is GroupState.LOST
-        assert not any(bench.far_ends[0].levels)
+        assert not any(bench.far_ends[0].levels())
 
 
 @pytest.mark.parametrize("is_armed", [False, True])

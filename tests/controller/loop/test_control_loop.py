@@ -256,9 +256,9 @@ async def test_controller_retries_a_pattern_when_the_rate_limit_permits(
         (refusal,) = bench.reports.refused
         assert "2 command sets" in refusal
         assert bench.reports.silenced[-1].reason == refusal
-        assert not any(bench.far_end.levels)
+        assert not any(bench.far_end.levels())
         await bench.hold(FINGER, seconds=0.2)
-        assert any(bench.far_end.levels)
+        assert any(bench.far_end.levels())
         assert len(bench.reports.refused) == 1
         assert len(bench.table.asked) == asked + 1
         assert bench.reports.applied[-1].time == pytest.approx(begin + 1.1, abs=1e-3)
@@ -267,7 +267,7 @@ async def test_controller_retries_a_pattern_when_the_rate_limit_permits(
             await bench.touches(FINGER, rest=0.010)
             assert len(bench.reports.refused) == refused
         await bench.touches(rest=2)
-        assert not any(bench.far_end.levels)
+        assert not any(bench.far_end.levels())
         assert len(bench.reports.applied) == 4
 
 

@@ -21,5 +21,4 @@ def calibrate(rig: Rig, measured: Path | str, *, all_scales: bool = False) -> Ca
     """
     expect_rig(rig)
     responses = responses_of(read_measured(expect_path(measured, what="measured")), rig)
-    check_consistency(rig, responses)
-    return fit(rig, responses, all_scales=all_scales)
+    return fit(rig, responses, check_consistency(rig, responses), all_scales=all_scales)

@@ -2,15 +2,17 @@
 
 Solved with finite elements of fourth order (Q4, strips along the edges) and a sparse solve for each
 frequency, where the product uses modes of polynomials; with form errors that the rig's description
-cannot express.
+cannot express. Their standard deviations are those that a fit allows for, or a share of them: an
+interval of 90 % is one over plates such as it assumes.
 
-    python -m benchmarks.calibration.hidden_plates FOLDER FIRST COUNT FORM
+    python -m benchmarks.calibration.hidden_plates FOLDER FIRST COUNT SHARE
 
 writes what sensors read of each plate as CSV, three, four, six and twelve of them in turn, and its
 true values as JSON: calibration runs in another process and has the CSV alone.
 """
 
 import json
+import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +26,8 @@ from model.calibration.responses import Responses
 from model.calibration.responses_file import write_responses_csv
 from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import PlateMatrices, assemble
+from model.identification.form_errors import MASS_CELLS
+from model.identification.parameters import KINDS
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
@@ -42,32 +46,6 @@ SENSORS = np.array(
 
 CHOSEN = {3: [0, 6, 9], 4: [0, 3, 5, 10], 6: [0, 2, 4, 7, 9, 10], 12: list(range(12))}
 """Sensors of those above, by their number."""
-
-
-@dataclass(frozen=True)
-class FormErrors:
-    """Standard deviations of what a rig file does not say.
-
-    place [m]: of an ERA, along each side; mass [kg]: of one foreign mass anywhere; side [m]: of
-    length and width; poisson: of Poisson's ratio; sensor_place [m]; sensor_scale: relative.
-    """
-
-    place: float = 0.0
-    mass: float = 0.0
-    side: float = 0.0
-    poisson: float = 0.0
-    sensor_place: float = 0.0
-    sensor_scale: float = 0.0
-
-
-FORMS = {
-    "none": FormErrors(),
-    "usual": FormErrors(1.5e-3, 3e-3, 0.5e-3, 0.01, 0.3e-3, 0.005),
-    # Those of `model.identification.parameters.KINDS`; the mass is 1 % of the plate's in the root
-    # mean square.
-    "assumed": FormErrors(1.5e-3, 3.57e-3, 0.5e-3, 0.015, 0.5e-3, 0.01),
-}
-"""Usual ones, and those that a fit assumes, which are up to twice as large."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,20 +67,27 @@ class HiddenPlate:
 
 def draw_plate(
     rig: Rig,
-    form: FormErrors,
+    share: float = 1.0,
     *,
     seed: int,
     sensors: FloatArray = SENSORS,
     frequencies: FloatArray = FREQUENCIES,
 ) -> HiddenPlate:
-    """Draw a plate within a builder's tolerances of a rig, with form errors."""
+    """Draw a plate within a builder's tolerances of a rig, with form errors.
+
+    share: of the standard deviations of `model.identification.parameters.KINDS`, 0 for none.
+    """
     rng = np.random.default_rng([seed, 50])
     plate = rig.plate
-    sides = np.array([plate.length, plate.width]) + form.side * rng.standard_normal(2)
+
+    def error(kind: str, *shape: int) -> FloatArray:
+        return np.asarray(share * KINDS[kind].std * rng.standard_normal(shape))
+
+    sides = np.array([plate.length, plate.width]) + error("side", 2)
     material = replace(
         plate.material,
         E=float(plate.material.E * np.exp(0.05 * rng.standard_normal())),
-        nu=float(plate.material.nu + form.poisson * rng.standard_normal()),
+        nu=float(plate.material.nu + error("poisson")),
     )
     loss_factor = plate.loss_factor * np.exp(0.35 * rng.standard_normal())
     real = replace(
@@ -117,7 +102,7 @@ def draw_plate(
         # Bolts of an edge can only be off inwards.
         at = np.array([era.x, era.y]) / [plate.length, plate.width]
         inwards = np.where(at > 0.5, -1.0, 1.0)
-        place = at * sides + inwards * np.abs(form.place * rng.standard_normal(2))
+        place = at * sides + inwards * np.abs(error("place", 2))
         size = 1 + 0.05 * rng.standard_normal(len(frequencies))
         phase = np.radians(5.0) * rng.standard_normal(len(frequencies))
         eras.append(
@@ -132,16 +117,17 @@ def draw_plate(
             )
         )
     x, y = (rng.uniform(0.05, 0.95, 2) * sides).tolist()
-    hidden = PointLoad(x, y, mass=float(form.mass * rng.choice([0.5, 1.0])))
+    # One mass, of the standard deviation of all that a fit allows for in its cells.
+    mass = plate.mass * math.sqrt(MASS_CELLS.cell_count) * abs(float(error("foreign_mass")))
     points = sensors * [plate.length, plate.width]
-    points = points + form.sensor_place * rng.standard_normal(points.shape)
+    points = points + error("sensor_place", *points.shape)
     grid = Mesh(*MESH, real.length, real.width, ELEMENTS["Q4"], STRIP)
     return HiddenPlate(
         replace(rig, plate=real, eras=tuple(eras), mesh=grid),
-        (hidden,) if form.mass else (),
+        (PointLoad(x, y, mass=mass),) if mass else (),
         assemble(real, grid),
         np.clip(points, 0, sides),
-        1 + form.sensor_scale * rng.standard_normal(len(points)),
+        1 + error("sensor_scale", len(points)),
     )
 
 
@@ -205,7 +191,7 @@ def main() -> None:
     folder, first, count = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
     rig = load_rig(RIG)
     for seed in range(first, first + count):
-        hidden = draw_plate(rig, FORMS[sys.argv[4]], seed=seed)
+        hidden = draw_plate(rig, float(sys.argv[4]), seed=seed)
         responses = measure(hidden, rig, seed=seed, count=sensors_of(seed))
         write_responses_csv(folder / f"{seed}.csv", responses, rig)
         gains = true_gains(hidden)

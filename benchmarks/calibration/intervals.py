@@ -32,8 +32,7 @@ def deviations(
     rig: Rig, responses: Responses, truth: dict[str, list[float]]
 ) -> dict[str, tuple[FloatArray, float]]:
     """Errors in standard errors by kind of value, and the standard error, relative."""
-    check_consistency(rig, responses)
-    found = calibrate(rig, responses)
+    found = calibrate(rig, responses, check_consistency(rig, responses))
     real, imaginary = np.array(truth["gains"])
     gains, phases = gain_deviations(found.rig, real + 1j * imaginary)
     known = found.rig.uncertainty
@@ -52,7 +51,7 @@ def deviations(
     return by_kind
 
 
-def main(count: int, form: str) -> None:
+def main(count: int, share: float) -> None:
     """Print tables of kinds of values by the number of sensors, of more and more plates."""
     rig = load_rig(RIG)
     held: dict[tuple[str, int], list[float]] = defaultdict(list)
@@ -62,7 +61,7 @@ def main(count: int, form: str) -> None:
         some = min(_CHUNK, count - first)
         with tempfile.TemporaryDirectory() as name:
             program = [sys.executable, "-m", "benchmarks.calibration.hidden_plates"]
-            subprocess.run([*program, name, str(first), str(some), form], check=True)
+            subprocess.run([*program, name, str(first), str(some), str(share)], check=True)
             for seed in range(first, first + some):
                 measured = read_measured(Path(name) / f"{seed}.csv")
                 truth = json.loads((Path(name) / f"{seed}.json").read_text())
@@ -75,7 +74,7 @@ def main(count: int, form: str) -> None:
                 for kind, (off, size) in found.items():
                     held[kind, sensors_of(seed)] += (off < _NORMAL).tolist()
                     sizes[kind, sensors_of(seed)].append(size)
-        print(f"form errors {form}: {first + some} plates, {refused} refused")
+        print(f"form errors {share:g} of those assumed: {first + some} plates, {refused} refused")
         show(held, sizes)
 
 

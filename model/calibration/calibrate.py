@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import FloatArray
 from model.calibration.calibration_result import (
     MAX_FIT_ERROR,
     MAX_OUTLIERS,
@@ -13,12 +13,7 @@ from model.calibration.calibration_result import (
     FittedParameter,
     SensorScale,
 )
-from model.calibration.calibration_screening import (
-    check_enough_sensors,
-    sensors_off_model,
-    silent_eras,
-    silent_sensors,
-)
+from model.calibration.calibration_screening import Screened, check_enough_sensors
 from model.calibration.fit import Fit, Problem, first_fit, solve
 from model.calibration.fitted_rig import (
     gain_rows,
@@ -30,42 +25,37 @@ from model.calibration.fitted_rig import (
 )
 from model.calibration.held_out import hold_out, initial_responses, relative_error
 from model.calibration.responses import Responses
-from model.calibration.sensed_plate import STARTS, sensed_plate
-from model.calibration.variable_projection import modal_assurance, row_rms
-from model.choice import best_by, best_of, ranked_by
+from model.calibration.sensed_plate import sensed_plate
+from model.calibration.variable_projection import row_rms
+from model.choice import best_of
 from model.errors import InputError
 from model.identification.parameters import KINDS
 from model.rig.rig import Rig
 
-_STARTS = 2  # those with the least misfit of shapes
 _WRONG_SCALE = 0.02  # common tolerance of sensors
 _SIGNIFICANCE = 4.0  # standard errors
 _MAX_SIDE = 4.0  # tolerances by which a side of the plate may be off
 
 
-def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Calibration:
-    """Fit a rig to responses measured on it.
+def calibrate(
+    rig: Rig, responses: Responses, screened: Screened, *, all_scales: bool = False
+) -> Calibration:
+    """Fit a rig to responses measured on it, as `check_consistency` has found them.
 
     all_scales: estimate the scale of every sensor, not only of wrong ones. Raises InputError if
-    fewer than three sensors have a signal or nothing was driven.
+    fewer than three sensors have a signal, and for a plate of another size.
     """
-    alive, dead_eras = ~silent_sensors(responses), silent_eras(responses)
-    values = responses.values.copy()
-    values[:, dead_eras] = np.nan
+    alive, dead_eras = ~screened.dead_sensors, screened.dead_eras
     check_enough_sensors(alive, responses)
-    plate = sensed_plate(rig, responses.points, responses.frequencies, has_form=True)
-    problem = Problem.of(plate, values)
+    values = responses.values[:, :, alive].copy()
+    values[:, dead_eras] = np.nan
+    points = responses.points[alive]
+    plate = sensed_plate(rig, points, responses.frequencies, has_form=True)
+    part, start = Problem.of(plate, values), np.zeros(plate.model.space.size)
+    start[plate.numbers] = screened.start
 
     # All scales are free at first, so that a wrong one does not bias the fit.
-    part = problem.at(alive)
-    fit = _first_fit(part)
-    unlike = sensors_off_model(part, fit)
-    if unlike.any():
-        alive[alive] = ~unlike
-        check_enough_sensors(alive, responses)
-        fit = fit.at(~unlike, part.plate.model.space)
-        part = problem.at(alive)
-        fit = first_fit(part, fit.z)
+    fit = first_fit(part, start)
     fit = solve(part, replace(fit, z=part.at_scales(fit.z, _relative(part.scales(fit.z)))))
     free_scales = part.free_scales
     if not all_scales:
@@ -73,7 +63,6 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
         error = part.scale_errors(fit) / np.abs(np.median(part.scales(fit.z)))
         free_scales = np.abs(scales - 1) > np.maximum(_WRONG_SCALE, _SIGNIFICANCE * error)
         fit = replace(fit, z=part.at_scales(fit.z, np.where(free_scales, scales, 1.0)))
-    points = responses.points[alive]
     problem, found = _identified(replace(part, free_scales=free_scales), fit)
     if all_scales:
         found = _with_median_scale_one(problem, found)
@@ -96,19 +85,6 @@ def calibrate(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Ca
 def _relative(scales: FloatArray) -> FloatArray:
     """Scales of sensors to their median."""
     return np.asarray(scales / np.median(scales))
-
-
-def _first_fit(problem: Problem) -> Fit:
-    """Fit from several starts, since a fit finds only the nearest minimum; return the best."""
-    plate = problem.plate
-
-    def misfit(model: ComplexArray) -> float:
-        return float(np.nanmedian(1 - modal_assurance(problem.values, model)))
-
-    starts = [plate.moved(*start) for start in STARTS]
-    nearest = ranked_by(starts, lambda z: -misfit(plate.responses(z)))
-    fits = [first_fit(problem, z) for z in nearest[:_STARTS]]
-    return best_by(fits, lambda fit: -misfit(fit.predicted))
 
 
 def _identified(problem: Problem, start: Fit) -> tuple[Problem, Fit]:

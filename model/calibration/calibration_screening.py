@@ -1,28 +1,30 @@
-"""Detection of sensors without a usable signal and of ERAs that do not move the plate."""
+"""What of measured responses can be used: sensors with a signal, and enough of them."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.calibration.fit import Fit, Problem
+from model.arrays import FloatArray
 from model.calibration.responses import Responses
 from model.errors import InputError
 
-_SILENT_ERA = 0.02  # of what the others do
 _SILENT_SENSOR = 0.005  # of the loudest sensor, in the median over frequencies and ERAs
-_DEAD_SCALE = 0.1  # of the others' scale
 LEAST_SENSORS = 3
-_DEAD_COHERENCE = 0.5  # with what the fitted plate does at the sensor
 
 
-def silent_eras(responses: Responses) -> NDArray[np.bool_]:
-    """Mask of driven ERAs without a response (eras,).
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """What a check of responses has found.
 
-    Raises InputError if there is no response at all.
+    dead_eras (e,), dead_sensors (s,): masks of those that do not move the plate, and that hear next
+    to nothing; start (n,): the fitted values of the most likely plate, as `SensedPlate.numbers` are
+    in its space.
     """
-    typical = np.array([_median(responses.values[:, e]) for e in range(responses.values.shape[1])])
-    if not np.nanmax(typical) > 0:
-        raise InputError("measured responses must not all be zero; check that ERAs were driven")
-    return np.asarray(typical < _SILENT_ERA * np.nanmedian(typical))
+
+    dead_eras: NDArray[np.bool_]
+    dead_sensors: NDArray[np.bool_]
+    start: FloatArray
 
 
 def silent_sensors(responses: Responses) -> NDArray[np.bool_]:
@@ -49,16 +51,3 @@ def _median(values: NDArray[np.inexact]) -> float:
     """Median magnitude of finite values; NaN without any."""
     finite = np.abs(values)[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else float("nan")
-
-
-def sensors_off_model(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
-    """Mask of sensors whose response is not that of the fitted plate (s,)."""
-    weight = fit.used / fit.noise[:, :, None]
-    model = weight * np.nan_to_num(fit.predicted)
-    values = weight * np.where(fit.used, problem.values, 0)
-    inner = np.abs((model.conj() * values).sum(axis=(0, 1)))
-    power = (np.abs(model) ** 2).sum(axis=(0, 1)) * (np.abs(values) ** 2).sum(axis=(0, 1))
-    coherence = inner / np.sqrt(np.maximum(power, 1e-300))
-    scales = problem.scales(fit.z)
-    relative = np.abs(scales / np.median(scales))
-    return np.asarray((relative < _DEAD_SCALE) | (coherence < _DEAD_COHERENCE))

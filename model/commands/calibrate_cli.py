@@ -54,8 +54,8 @@ def calibrate(
     rig = rig_of(document, mesh=mesh)
     responses = responses_of(read_measured(measured_file), rig)
     started = time.perf_counter()
-    check_consistency(rig, responses)
-    calibration = fit(rig, responses, all_scales=all_scales)
+    screened = check_consistency(rig, responses)
+    calibration = fit(rig, responses, screened, all_scales=all_scales)
     elapsed = time.perf_counter() - started
     rows = calibration_report.change_rows(calibration)
     notes = [

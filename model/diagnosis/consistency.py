@@ -15,8 +15,8 @@ from scipy.optimize import linear_sum_assignment
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_screening import (
+    Screened,
     check_enough_sensors,
-    silent_eras,
     silent_sensors,
 )
 from model.calibration.responses import Responses
@@ -65,8 +65,8 @@ _QUANTITIES = (
 )
 
 
-def check_consistency(rig: Rig, responses: Responses) -> Verdict:
-    """Refuse responses that are not what they claim; return the diagnosis of the rig.
+def check_consistency(rig: Rig, responses: Responses) -> Screened:
+    """Refuse responses that are not what they claim; return what of them a fit can use.
 
     Raises InputError that names the cause: too few sensors or frequencies, another quantity or
     unit, conjugated phases, sensors at swapped places, swapped or inverted channels.
@@ -77,9 +77,6 @@ def check_consistency(rig: Rig, responses: Responses) -> Verdict:
     observation = replace(
         responses, frequencies=responses.frequencies[rows], values=responses.values[rows]
     )
-    if not observation.measured.any():
-        raise InputError("no channel was driven; drive each in turn and measure again")
-    silent_eras(responses)
     silent = silent_sensors(responses)
     check_enough_sensors(~silent, responses)
     heard = observation.without(silent)
@@ -91,7 +88,12 @@ def check_consistency(rig: Rig, responses: Responses) -> Verdict:
     verdict = diagnose(rig, observation, max_deviation=math.inf)
     _check_wiring(verdict)
     _check_size(verdict)
-    return verdict
+    assert verdict.match is not None  # noqa: S101  some channels have the rig's gain
+    return Screened(
+        np.array(["dead" in channel.states for channel in verdict.channels]),
+        np.isin(responses.sensors, [each.name for each in verdict.bad_sensors if each.is_mute]),
+        verdict.match.z,
+    )
 
 
 def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, observation: Responses) -> None:

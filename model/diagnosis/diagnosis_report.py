@@ -48,7 +48,7 @@ def verdict_rows(verdict: Verdict) -> list[str]:
     inverted = [c for c in verdict.channels if "inverted" in c.states]
     if len(inverted) > 1 and len(inverted) == sum(c.drives is not None for c in verdict.channels):
         rows.append("all of them: check mounting of sensors and sign convention of phases")
-    rows += [f"SENSOR {name} {why}: left out" for name, why in verdict.bad_sensors]
+    rows += [f"SENSOR {each.name} {each.why}: left out" for each in verdict.bad_sensors]
     if not verdict.plate_matches:
         rows += _plate_rows(verdict)
     if rows:
@@ -185,7 +185,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
                 for each in verdict.explanations
             ],
         },
-        "bad_sensors": [{"sensor": name, "problem": why} for name, why in verdict.bad_sensors],
+        "bad_sensors": [{"sensor": each.name, "problem": each.why} for each in verdict.bad_sensors],
         "sensor_count": verdict.sensor_count,
         "drive_frequencies_hz": verdict.frequencies.tolist(),
         "findings": verdict_rows(verdict),

@@ -1,6 +1,6 @@
 """Detection of dead channels and unusable sensors."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,25 @@ _DEAD = 0.03  # of the response that the rig predicts
 _FAINT = 0.3  # of it: dead if its shape is not that of an ERA either
 _NO_SHAPE = 0.6  # MAC
 _SENSOR_SCALE = (0.7, 1.4)
+_MUTE = 0.1  # of the others' scale
+
+
+@dataclass(frozen=True)
+class BadSensor:
+    """A sensor that is left out, by what it reads of what the others say, 0 for nothing."""
+
+    name: str
+    scale: float
+
+    @property
+    def is_mute(self) -> bool:
+        """Whether it hears next to nothing, so that no scale makes use of it."""
+        return abs(self.scale) < _MUTE
+
+    @property
+    def why(self) -> str:
+        """What is wrong with it."""
+        return f"reads {self.scale:.2f} of what the others say" if self.scale else "reads nothing"
 
 
 def dead_channels(plate: SensedPlate, observation: Responses) -> NDArray[np.bool_]:
@@ -40,8 +59,8 @@ def shapeless_channels(plate: SensedPlate, observation: Responses) -> NDArray[np
 
 def usable_sensors(
     observation: Responses, dead: NDArray[np.bool_]
-) -> tuple[Responses, tuple[tuple[str, str], ...]]:
-    """Remove sensors without a signal from any live channel; return their names, too.
+) -> tuple[Responses, tuple[BadSensor, ...]]:
+    """Remove sensors without a signal from any live channel; return them, too.
 
     Raises InputError if too few are left.
     """
@@ -52,11 +71,11 @@ def usable_sensors(
     silent = silent_sensors(replace(observation, values=values))
     check_enough_sensors(~silent, observation)
     names = [name for name, out in zip(observation.sensors, silent, strict=True) if out]
-    return observation.without(silent), tuple((name, "reads nothing") for name in names)
+    return observation.without(silent), tuple(BadSensor(name, 0.0) for name in names)
 
 
-def off_scale(observation: Responses, values: ComplexArray, match: Match) -> list[tuple[str, str]]:
-    """Sensors with a scale unlike that of the others, and why, if the plate fits."""
+def off_scale(observation: Responses, values: ComplexArray, match: Match) -> list[BadSensor]:
+    """Sensors with a scale unlike that of the others, if the plate fits."""
     if match.median_error > MAX_FIT_ERROR:
         return []
     finite = np.isfinite(values) & np.isfinite(match.predicted)
@@ -68,7 +87,7 @@ def off_scale(observation: Responses, values: ComplexArray, match: Match) -> lis
     scale = scale / np.median(scale)
     low, high = _SENSOR_SCALE
     return [
-        (name, f"reads {value:.2f} of what the others say")
+        BadSensor(name, float(value))
         for name, value in zip(observation.sensors, scale, strict=True)
         if not low <= value <= high
     ]

@@ -15,6 +15,7 @@ from model.choice import best_by
 from model.diagnosis.assignment import ShapeMatch, match_responses, match_shapes
 from model.diagnosis.causes import Explanation, explain
 from model.diagnosis.diagnosis_screening import (
+    BadSensor,
     dead_channels,
     off_scale,
     shapeless_channels,
@@ -65,7 +66,7 @@ class Verdict:
 
     plate_matches: whether the rig's plate within its priors explains the measurement; match: that
     plate; explanations: other plates that do, most likely first, if it does not; bad_sensors: left
-    out, and why; swapped: cycles of channels by their ERAs; difference: of that plate from the
+    out; swapped: cycles of channels by their ERAs; difference: of that plate from the
     rig's, None without a plate that fits.
     """
 
@@ -73,7 +74,7 @@ class Verdict:
     plate_matches: bool
     match: Match | None
     explanations: tuple[Explanation, ...]
-    bad_sensors: tuple[tuple[str, str], ...]
+    bad_sensors: tuple[BadSensor, ...]
     swapped: tuple[tuple[str, ...], ...]
     difference: PlateDifference | None
     sensor_count: int
@@ -131,7 +132,7 @@ def diagnose(rig: Rig, observation: Responses, *, max_deviation: float = MAX_DEV
     match, drives, error = _best_match(plate, values, shape_match)
     off = off_scale(observation, values, match)
     if off and len(observation.sensors) - len(off) >= LEAST_SENSORS:
-        wrong = np.isin(observation.sensors, [name for name, _ in off])
+        wrong = np.isin(observation.sensors, [each.name for each in off])
         again = diagnose(rig, observation.without(wrong), max_deviation=max_deviation)
         return replace(again, bad_sensors=(*removed, *off, *again.bad_sensors))
     matches = match.error <= MAX_FIT_ERROR and match.worst <= max_deviation

@@ -121,7 +121,7 @@ def test_diagnose_passes_a_plate_within_tolerance_and_finds_a_swap(coarse_rig, s
     broken[:, :, 2] *= -0.5
     well = diagnose(coarse_rig, observe(places, broken))
     assert well.is_well
-    assert [name for name, _ in well.bad_sensors] == ["P6", "P3"]
+    assert [each.name for each in well.bad_sensors] == ["P6", "P3"]
     one, other = rng.choice(4, size=2, replace=False)
     values[:, [one, other]] = values[:, [other, one]]
     swapped = diagnose(coarse_rig, observe(places, values))

@@ -285,8 +285,11 @@ class Controller:
                     await self._send(decider, decision, now)
                 # Not after a set that was given up: the next cycle silences it first.
                 if self._is_heartbeat_due:
+                    began = clock.now()
                     await self.group.beat()
-                    self._heartbeat_due = clock.now() + HEARTBEAT
+                    # From its beginning: the watchdog has run since its request was sent.
+                    rest = HEARTBEAT / 2  # on a slow wire
+                    self._heartbeat_due = max(began + HEARTBEAT, clock.now() + rest)
         except (Preempted, LinkDegraded):
             pass  # what plays is unknown, and decided anew
         except LinkError as error:

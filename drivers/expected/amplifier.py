@@ -333,7 +333,8 @@ class ExpectedAmplifier:
         since = min(self.last_status, when[1]), when[1]
         if fault == FAULTS["WATCHDOG"]:
             early, late = self.expiry
-            if not self.is_enabled or when[1] < early - self.slack:
+            enabled_until = when[1] if self.is_enabled else self.outputs.began[1]
+            if enabled_until < early - self.slack:
                 what = f"time of the watchdog ({self.outputs.cause})"
                 must = f"from {early:.4f} to {late:.4f} s"
                 self.report("watchdog", when[1], what, must=must, seen=f"{when[1]:.4f} s")

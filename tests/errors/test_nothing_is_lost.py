@@ -28,7 +28,7 @@ WRITING = {
     ),
     "table export table.npz --format csv -o out.csv": "model.table.export.export_csv",
     "table export table.npz --format mat -o out.mat": "model.table.export.export_mat",
-    "plate map rig.yaml --drive SW=110 -o out.png": "model.vibration.excitation.plate_map",
+    "plate map rig.yaml --drive SW=110 -o out.png": "model.vibration.maps.plate_map",
     "calibrate rig.yaml measured.csv -o out.yaml": "model.calibration.calibrate.calibrate",
     "figure 10 rig.yaml -o figures": "model.figures.paper.paper_figures",
     "design rig.yaml -o design --layouts random:2": "model.design.run.rank_layouts",

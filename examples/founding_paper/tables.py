@@ -81,27 +81,30 @@ def tables(rig: Rig) -> Iterator[tuple[str, dict[str, Floats]]]:
         yield name, columns
 
 
-def claims(figures: dict[str, PaperFigure]) -> Iterator[tuple[str, object]]:
+def claims(figures: dict[str, PaperFigure]) -> dict[str, object]:
     """What the paper says of its Figures 10 to 13, as numbers of the figures' tables."""
-    medians = [_medians(figures[name]) for name in ("figure_10", "figure_11_boxplots")]
-    yield "Figure 10: median / g", {name: value / G for name, value in medians[0].items()}
-    yield "Figure 11: median / g", {name: value / G for name, value in medians[1].items()}
-    yield "best pair to best single ERA", {n: medians[1][n] / medians[0][n] for n in medians[0]}
+    single, pairs = (_medians(figures[name]) for name in ("figure_10", "figure_11_boxplots"))
     edge, diagonal = _maps(figures["figure_11_maps"])
-    yield "Figure 11, maps: maxima / g", [edge.max() / G, diagonal.max() / G]
-    yield "their ratio", edge.max() / diagonal.max()
-    yield "nulls of the edge kept on the diagonal", _kept(figures["figure_11_maps"], edge, diagonal)
     switched = _maps(figures["figure_12"])
-    yield "Figure 12: maxima / g", [each.max() / G for each in switched]
-    kept = [_kept(figures["figure_12"], now, then) for now, then in pairwise(switched)]
-    yield "nulls kept by the next", kept
     still = np.array([each < NEARLY_STILL * each.max() for each in switched])
-    yield "nearly still in each", still.mean(axis=1)
-    yield "nearly still in all", still.all(axis=0).mean()
     soft, stiff = _maps(figures["figure_13_maps"])
-    yield "Figure 13: maxima / g", [soft.max() / G, stiff.max() / G]
-    yield "stiff to soft", stiff.max() / soft.max()
-    yield "correlation of the two", np.corrcoef(soft, stiff)[0, 1]
+    return {
+        "Figure 10: median / g": {name: value / G for name, value in single.items()},
+        "Figure 11: median / g": {name: value / G for name, value in pairs.items()},
+        "best pair to best single ERA": {n: pairs[n] / single[n] for n in single},
+        "Figure 11, maps: maxima / g": [edge.max() / G, diagonal.max() / G],
+        "their ratio": edge.max() / diagonal.max(),
+        "nulls of the edge kept on the diagonal": _kept(figures["figure_11_maps"], edge, diagonal),
+        "Figure 12: maxima / g": [each.max() / G for each in switched],
+        "nulls kept by the next": [
+            _kept(figures["figure_12"], now, then) for now, then in pairwise(switched)
+        ],
+        "nearly still in each": still.mean(axis=1),
+        "nearly still in all": still.all(axis=0).mean(),
+        "Figure 13: maxima / g": [soft.max() / G, stiff.max() / G],
+        "stiff to soft": stiff.max() / soft.max(),
+        "correlation of the two": np.corrcoef(soft, stiff)[0, 1],
+    }
 
 
 def stiffness_study(rig: Rig) -> dict[str, Floats]:
@@ -113,8 +116,8 @@ def stiffness_study(rig: Rig) -> dict[str, Floats]:
 
     def peak(stiffness: float) -> Floats:
         on_springs = replace(rig, eras=with_stiffness(rig.eras, stiffness))
-        pair = diagonal_pair(rig.eras)
-        return pair_map(on_springs, free, pair, (250.0, 250.0), "").plate_map.peak.ravel()
+        solved = pair_map(on_springs, free, diagonal_pair(rig.eras), (250.0, 250.0), "")
+        return solved.plate_map.peak.ravel()
 
     reference, peaks = peak(PAPER_STIFFNESS), [peak(each) for each in STIFFNESSES.tolist()]
     return {
@@ -136,8 +139,11 @@ def _medians(figure: PaperFigure) -> dict[str, float]:
 
 def _maps(figure: PaperFigure) -> list[Floats]:
     """The maps of a figure [m/s²]."""
-    table = figure.tables[""]
-    return [np.asarray(table[key], float) for key in table if key.startswith("peak_")]
+    return [
+        np.asarray(column, float)
+        for name, column in figure.tables[""].items()
+        if name.startswith("peak_")
+    ]
 
 
 def _kept(figure: PaperFigure, now: Floats, then: Floats) -> float:
@@ -172,7 +178,7 @@ def main() -> None:
     for name, columns in tables(rig):
         print(f"{name}: natural frequencies / Hz")
         _print_columns(columns, 2)
-    for text, value in claims({made.name: made for made in paper_figures(rig, "all")}):
+    for text, value in claims({each.name: each for each in paper_figures(rig, "all")}).items():
         print(f"{text}: {_shown(value)}")
     study = stiffness_study(rig)
     print("Diagonal pair at 250 Hz by ERA stiffness")

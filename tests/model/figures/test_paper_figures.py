@@ -65,7 +65,7 @@ def test_figure_6_shapes_are_half_waves(figures):
 
 def test_figure_11_best_pair_exceeds_best_single_era(figures):
     """Section 3.2: the best pair has a higher median than the best single ERA, in each layout."""
-    gain = dict(claims(figures))["best pair to best single ERA"]
+    gain = claims(figures)["best pair to best single ERA"]
     assert len(gain) >= 5
     assert all(ratio > 1 for ratio in gain.values())
 
@@ -89,7 +89,7 @@ def test_figure_11_edge_and_diagonal_maxima_agree(figures):
     """Section 3.2, 110 Hz: a negligible change in maximum, about 1 %, but other nulls."""
     edge, diagonal = peaks(figures["figure_11_maps"]).values()
     assert edge.max() / diagonal.max() == pytest.approx(1.0, abs=0.015)
-    assert dict(claims(figures))["nulls of the edge kept on the diagonal"] < 0.6
+    assert claims(figures)["nulls of the edge kept on the diagonal"] < 0.6
     assert np.corrcoef(edge, diagonal)[0, 1] < 0.99
 
 

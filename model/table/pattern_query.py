@@ -40,8 +40,8 @@ from model.table.short_effects import best_over_effect, forms_during, forms_over
 if TYPE_CHECKING:
     from model.table.table import LocalizationTable
 
-MAX_SWITCHED, MAX_DURING_EFFECT = 4, 3
-"""Candidates of mode `switched`; of a short effect, and as many at their frequencies."""
+MAX_DURING_EFFECT, MAX_ALONE = 3, 4
+"""Candidates of a short effect, and as many at their frequencies; without a quiet finger."""
 
 _SHORT_OF = 0.05  # dB; a level closer to the wanted one is reached
 
@@ -132,8 +132,7 @@ def _switched_drives(
     if not found:
         raise UnreachableLevel(question, "switched", float(decibels(max_sensation_switched(forms))))
     return [
-        (score, [(int(rows[row]), weights) for row, weights in drive])
-        for score, drive in found[:MAX_SWITCHED]
+        (score, [(int(rows[row]), weights) for row, weights in drive]) for score, drive in found
     ]
 
 
@@ -147,7 +146,8 @@ def _effect_drives(
     formed = fingers.forms(contents.rows, with_fine=False)
     steady = _steady_forms(formed, contents)
     found, _ = search_to_level(_over_effect(steady, formed, contents, over_effect))
-    best = _drives_of(found, contents.rows, best_first(found.score)[:MAX_DURING_EFFECT])
+    count = MAX_DURING_EFFECT if contents.quiet else MAX_ALONE
+    best = _drives_of(found, contents.rows, best_first(found.score)[:count])
     if over_effect is None or not contents.quiet:
         return best
     rows = np.unique([row for _, ((row, _),) in best])

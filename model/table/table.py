@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
-from model.drive_modes.switched import amplitude_powers, members_of, sums_of_sources
+from model.drive_modes.switched import highest_levels
 from model.ensemble.attached_plate import AttachedPlate, attach
 from model.ensemble.plate_on_eras import PlateOnEras
 from model.ensemble.touched_by_kernel import touch
@@ -207,12 +207,8 @@ class LocalizationTable:
     @cached_property
     def available_level_db_sl(self) -> FloatArray:
         """Highest level [dB SL] of any `switched` pattern at the centre of each cell, (cells,)."""
-        eras = len(self.eras)
-        powers = amplitude_powers(self._cell_fields.transpose(2, 0, 1), members_of(eras))
-        powers /= self.thresholds**2
-        # Cell by cell, since fine frequency steps make millions of patterns.
-        maxima = [sums_of_sources(cell[None], eras).max() for cell in powers]
-        return decibels(np.sqrt(np.array(maxima, dtype=float)))
+        fields = self._cell_fields.transpose(2, 0, 1) / self.thresholds[:, None]
+        return decibels(highest_levels(fields[:, None]).astype(float))
 
     @cached_property
     def cell_centres(self) -> FloatArray:

@@ -168,9 +168,9 @@ def test_best_drives_come_first(mode):
 
 def test_a_level_margin_asks_for_more_level():
     """A target whose amplitude 2 has a standard deviation of 1 has one of them in reserve."""
-    target = np.full((1, 1, 1), 2, dtype=np.complex64)
-    power = np.full((1, 1, 1, 1), 5, dtype=np.complex64)  # 2² + 1²
-    quiet = np.ones((1, 1, 1, 1), dtype=np.complex64)
+    first = np.array([[1, 0], [0, 0]], dtype=np.complex64)  # of two ERAs
+    target, power = 2 * first[:1, None], 5 * first[None, None]  # 2² + 1²
+    quiet = np.eye(2, dtype=np.complex64)[None, None]
     for wanted, mode in ((0.99, "phased"), (0.99, "switched")):
         given = Forms(target, power, quiet, np.ones(1, np.float32), wanted, level_margin=1.0)
         assert found_in(mode, given)

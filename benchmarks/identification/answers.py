@@ -68,8 +68,9 @@ def known_table(table: LocalizationTable, truth: Truth, factors: Reals) -> Local
     )
     # Its loss is not hysteretic, and its fingers are not multiples of one.
     stiffness = [[finger_stiffness(float(f), each) for each in factors] for f in table.frequencies]
+    square = (2 * np.pi * table.frequencies[:, None]) ** 2
     known.__dict__["attached"] = _UnderKnownFingers(
-        **(vars(known.attached) | {"receptance": truth.receptance.astype(np.complex64)}),
+        **(vars(known.attached) | {"modal": 1 / truth.receptance + square}),
         fingers=np.array(stiffness, dtype=np.complex64),
     )
     return known

@@ -2,15 +2,15 @@
 
 Free plate in reduced coordinates: A(x, y) = phi_x diag(g) phi_y^T with g = 1 / (s lambda - w²),
 s lambda = (1 + i eta) lambda + i loss. A plate thicker by a factor has modal masses larger by it
-and frequencies higher by it (as in `model.reduction.receptance`), so that of one h times
-as thick
+and frequencies higher by it (as in `model.reduction.receptance`): of one h times as thick
 
     g = 1 / (h (h² s lambda - w²)),    dg / d ln loss = -i h³ Im(s lambda) g².
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -66,77 +66,57 @@ def mounts_of(
 class AttachedPlate(Mounts):
     """The plate with its attachments.
 
-    All in single precision: accelerations are within 1e-5 of their largest.
+    What answers read is in single precision: accelerations are within 1e-5 of their largest.
 
-    - receptance: (f, r) g; by_loss: (f, r) its change by one standard deviation of the loss factor
+    - modal: (f, r) s lambda of the coordinates [rad²/s²], with all that they lose
     - shapes: (b, r) of the attachments
-    - fingertip: of the rig, None for weightless ones; finger: (f,) its dynamic stiffness [N/m];
-      omega: (f,) [rad/s]; load_std: standard deviation of the logarithm of its load
-    - gain, phase: standard deviations of an ERA's amplitude and of its phase [rad]; gain_variance:
-      mean square of both together; common_gain: standard deviation of that of all ERAs
-    - thickness: its standard deviation, relative
+    - omega: (f,) [rad/s]
+    - fingertip: of the rig, None for weightless ones
+    - uncertainty: of the rig's parameters
     """
 
-    receptance: Complex64Array
-    by_loss: Complex64Array
+    modal: ComplexArray
     shapes: Float32Array
     omega: FloatArray
-    finger: ComplexArray
     fingertip: Fingertip | None
-    load_std: float
-    gain: float
-    phase: float
-    gain_variance: float
-    common_gain: float
-    thickness: float
+    uncertainty: Uncertainty
 
     @property
     def era_count(self) -> int:
         """Number of ERAs."""
         return int(self.forces.shape[1])
 
-    def of_thicknesses(self, deviations: FloatArray, frequency: int) -> "AttachedPlate":
-        """Plates of known thicknesses at a frequency by index, in place of several frequencies.
+    def of_thicknesses(
+        self, deviations: FloatArray, row: int
+    ) -> tuple[Complex64Array, Complex64Array]:
+        """g of plates of known thicknesses at a frequency by its row, (d, r) [s²/kg].
 
-        deviations (d,): in standard deviations.
+        And its change by one standard deviation of the loss factor. deviations (d,): in standard
+        deviations.
         """
-        each = {name: getattr(self, name)[[frequency] * len(deviations)] for name in _BY_FREQUENCY}
-        g, w2 = each["receptance"], -each["minus_omega2"].astype(float)[:, None]
-        factor = np.maximum(1 + self.thickness * deviations, LEAST_THICKNESS)
-        stiffness = (1 / g.astype(complex) + w2)[:, None]
-        at = self.omega[[frequency]]
-        receptance = modal_receptance(stiffness, at, factor)[:, 0].astype(np.complex64)
-        by_loss = (
-            each["by_loss"] * (factor[:, None] ** 3).astype(np.float32) * (receptance / g) ** 2
-        )
-        each |= {"receptance": receptance, "by_loss": by_loss}
-        return replace(self, **each, thickness=0.0)
+        factor = np.maximum(1 + self.uncertainty.thickness * deviations, LEAST_THICKNESS)
+        receptance = modal_receptance(self.modal[[row]], self.omega[[row]], factor)[:, 0]
+        lost = -1j * math.log(self.uncertainty.damping) * self.modal[row].imag
+        by_loss = lost * factor[:, None] ** 3 * receptance**2
+        return receptance.astype(np.complex64), by_loss.astype(np.complex64)
 
     def finger_stiffness(self, count: int, loads: Sequence[float] = ()) -> Complex64Array:
-        """Dynamic stiffness of a number of fingers [N/m], (f, count).
+        """Dynamic stiffness of a number of fingers [N/m], (f, count), of 0 for weightless ones.
 
         loads (count,): of each relative to the rig's fingertip, empty for 1.
         """
-        found = np.repeat(self.finger[:, None], count, axis=1)
+        found = np.repeat(self._finger[:, None], count, axis=1)
         if self.fingertip is not None:
             for number, load in enumerate(loads):
                 if load != 1:
                     found[:, number] = self.fingertip.scaled(load).dynamic_stiffness(self.omega)
         return found.astype(np.complex64)
 
-
-_BY_FREQUENCY = (
-    "minus_omega2",
-    "receptance",
-    "by_loss",
-    "stiffness",
-    "forces",
-    "strokes",
-    "by_stiffness",
-    "by_damping",
-    "finger",
-    "omega",
-)
+    @cached_property
+    def _finger(self) -> ComplexArray:
+        if self.fingertip is None:
+            return np.zeros(len(self.omega), dtype=complex)
+        return self.fingertip.dynamic_stiffness(self.omega)
 
 
 def attach(
@@ -159,21 +139,11 @@ def attach(
     """
     w = 2 * np.pi * frequencies
     elasticity = ModalElasticity.of(plate, omega**2, losses, dispersion)
-    stiffness = elasticity.stiffness(w)
-    g = modal_receptance(stiffness, w)
-    by_loss = -1j * stiffness.imag * g**2
     return AttachedPlate(
         **vars(mounts_of(eras, masses, w, uncertainty)),
-        receptance=g.astype(np.complex64),
-        by_loss=(math.log(uncertainty.damping) * by_loss).astype(np.complex64),
+        modal=elasticity.stiffness(w),
         shapes=shapes.astype(np.float32),
-        finger=fingertip.dynamic_stiffness(w) if fingertip else np.zeros(len(w), dtype=complex),
         omega=w,
         fingertip=fingertip,
-        load_std=uncertainty.fingertip,
-        gain=uncertainty.gain,
-        phase=math.radians(uncertainty.phase_deg),
-        gain_variance=uncertainty.gain_variance,
-        common_gain=uncertainty.common_gain,
-        thickness=uncertainty.thickness,
+        uncertainty=uncertainty,
     )

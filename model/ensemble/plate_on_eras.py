@@ -46,7 +46,7 @@ def thickness_nodes(count: int) -> FloatArray:
 class PlateOnEras:
     """The plate on its b attachments, without fingers, at f frequencies and t thicknesses.
 
-    - plate: at the frequencies; finger (f,): dynamic stiffness of a finger
+    - plate: at the frequencies
     - first: index of the first thickness of as many `thickness_nodes`, by their number
     - receptance: (f, t, r) g of the free plate; by_loss: (f, t, r) its change by one standard
       deviation of the loss factor
@@ -69,7 +69,7 @@ class PlateOnEras:
         Where its thickness is certain there is the nominal one alone.
         """
         deviations, first = [np.zeros(1)], {}
-        if plate.thickness > 0:
+        if plate.uncertainty.thickness > 0:
             deviations.append(np.array([1.0, -1.0]))
             for count in node_counts:
                 first[count] = sum(map(len, deviations))
@@ -80,7 +80,8 @@ class PlateOnEras:
         sizes = ((f, t, r), (f, t, r), (f, t, b, r), (f, t, b, b), (f, t, b, n))
         found = [np.empty(size, dtype=single) for size in sizes]
         for row in range(f):
-            parts = _eliminated(plate.of_thicknesses(every, row))
+            receptance, by_loss = plate.of_thicknesses(every, row)
+            parts = receptance, by_loss, *_eliminated(plate, row, receptance)
             for to, part in zip(found, parts, strict=True):
                 to[row] = part
         return cls(plate, first, *found)
@@ -97,21 +98,23 @@ class PlateOnEras:
         return self.by_force[:, MODELLED, : plate.era_count] * plate.forces[:, :, None]
 
 
-def _eliminated(plate: AttachedPlate) -> tuple[Complex64Array, ...]:
-    """Arrays of `PlateOnEras` for plates of known thicknesses, (t, ...)."""
-    Z, w2 = plate.stiffness, plate.minus_omega2[:, None, None]
-    modal = plate.shapes * plate.receptance[:, None]
+def _eliminated(
+    plate: AttachedPlate, row: int, receptance: Complex64Array
+) -> tuple[Complex64Array, ...]:
+    """T, Y and motion at a row of the frequencies for plates of receptances g (t, r), (t, ...)."""
+    Z, w2, n = plate.stiffness[row], plate.minus_omega2[row], plate.era_count
+    modal = plate.shapes * receptance[:, None]
     A = modal @ plate.shapes.T
-    system = np.asarray(Z[:, :, None] * A, dtype=np.complex64)
+    system = np.asarray(Z[:, None] * A, dtype=np.complex64)
     _add_diagonal(system, np.float32(1))
     K = np.linalg.inv(system)
-    coupling = np.asarray(Z[:, :, None] * A * Z[:, None], dtype=np.complex64)
+    coupling = np.asarray(Z[:, None] * A * Z, dtype=np.complex64)
     _add_diagonal(coupling, Z)
-    moved = np.asarray(A @ (K[:, :, : plate.era_count] * plate.forces[:, None]))
+    moved = np.asarray(A @ (K[:, :, :n] * plate.forces[row]))
     by_force = np.asarray(w2 * (K.swapaxes(1, 2) @ modal), dtype=np.complex64)
-    return plate.receptance, plate.by_loss, by_force, np.asarray(-coupling / w2**2), moved
+    return by_force, np.asarray(-coupling / w2**2), moved
 
 
 def _add_diagonal(matrices: Complex64Array, values: Complex64Array | np.float32) -> None:
-    """Add values (c, n) to the diagonals of matrices (c, n, n)."""
+    """Add values (n,) to the diagonals of matrices (t, n, n)."""
     matrices.reshape(len(matrices), -1)[:, :: matrices.shape[1] + 1] += values

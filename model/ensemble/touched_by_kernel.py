@@ -55,7 +55,9 @@ class TouchedByKernel(TouchedPlate):
         """As of `TouchedPlate`."""
         plate, n, f, (g, p, _) = self.on.plate, self.on.plate.era_count, len(rows), points.shape
         fine_count = 0 if fine is None else fine.shape[1]
-        of = Grouped(g, p, g * fine_count, plate.thickness > 0, plate.gain_variance, RIDGE)
+        known = plate.uncertainty
+        rules = known.thickness > 0, known.gain_variance, RIDGE
+        of = Grouped(g, p, g * fine_count, *rules)
         of.point(points=points, fine_points=fine, weights=weights, error=error_power)
         sizes = ((f, g, p, n), (f, g, fine_count, n), (f, g, n, n), (f, g, n, n))
         found = [np.empty(size, dtype=np.complex64) for size in sizes]
@@ -100,7 +102,7 @@ def plates_structure(on: PlateOnEras) -> Plates:
         return kept
     plate = on.plate
     (b, r), t = plate.shapes.shape, on.thickness_count
-    found = Plates(plate.era_count, b, 0, r, t, plate.load_std)
+    found = Plates(plate.era_count, b, 0, r, t, plate.uncertainty.fingertip)
     found.point(
         **{name: getattr(on, name) for name in _OF_CASES},
         **{name: getattr(plate, name) for name in _OF_ROWS},

@@ -143,7 +143,7 @@ class TouchedPlate:
         stretched = -moved
         stretched.reshape(f, -1)[:, : n * n : n + 1] += plate.strokes[rows]
         changes = [h, by_force[:, :, :n] @ (plate.by_damping[rows, :, None] * stretched[:, :n])]
-        if plate.thickness > 0:
+        if plate.uncertainty.thickness > 0:
             for node in (THICKER, THINNER):
                 other, _ = self.sources(rows, np.full(f, node), every)
                 changes.append((other[:, :, :n] * forces - h) * np.float32(math.sqrt(0.5)))
@@ -151,7 +151,7 @@ class TouchedPlate:
         power = gram((each * np.sqrt(weights)[:, None, :, None]).reshape(f, g, -1, n))
         a, k = moved.shape[1], len(self.centres)
         uncertain = np.concatenate([np.arange(n), np.arange(a - k, a)])
-        load = np.float32(plate.load_std) * self.stiffness[rows]
+        load = np.float32(plate.uncertainty.fingertip) * self.stiffness[rows]
         by_one = np.concatenate([plate.by_stiffness[rows], load], axis=1)
         deformed = stretched[:, uncertain] * by_one[:, :, None]
         reach = power_of(by_force[:, :, uncertain]).reshape(f, g, p, -1)
@@ -160,7 +160,7 @@ class TouchedPlate:
         power += ((mean @ reach)[:, :, 0] @ by_attachment).reshape(f, g, n, n)
         size = (mean @ power_of(h).reshape(f, g, p, n))[:, :, 0]
         diagonal = power.reshape(f, g, -1)[..., :: n + 1]
-        values = diagonal.real + plate.gain_variance * size + error_power[rows, None]
+        values = diagonal.real + plate.uncertainty.gain_variance * size + error_power[rows, None]
         diagonal[:] = values + RIDGE / n * values.sum(axis=-1, keepdims=True)
         found = h.reshape(f, g, p, n)
         uncertain = power - gram(found * np.sqrt(weights)[:, :, None])
@@ -189,7 +189,8 @@ class TouchedPlate:
         damping[:, :n] = plate.by_damping[rows] * stretched[:, :n]
         own[:, :n] = plate.by_stiffness[rows] * stretched[:, :n]
         b = plate.stiffness.shape[1]
-        own[:, b:] = np.float32(plate.load_std) * self.stiffness[rows] * stretched[:, b:]
+        by_load = np.float32(plate.uncertainty.fingertip) * self.stiffness[rows]
+        own[:, b:] = by_load * stretched[:, b:]
         held = np.asarray(drives - stiffness * moved, dtype=np.complex64)
         by_loss = self.on.by_loss[rows, nodes]
         lost = np.asarray(by_loss * (held @ shapes), dtype=np.complex64)
@@ -293,9 +294,9 @@ def drawn_on(
         masses=plate.stiffness.shape[1] - plate.era_count,
         count=by.count,
         seed=by.seed,
-        gain=plate.gain,
-        phase=plate.phase,
-        common_gain=plate.common_gain,
+        gain=plate.uncertainty.gain,
+        phase=math.radians(plate.uncertainty.phase_deg),
+        common_gain=plate.uncertainty.common_gain,
         thicknesses=nodes,
     )
     first_base = on.first.get(by.bases, MODELLED)

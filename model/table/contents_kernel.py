@@ -127,7 +127,8 @@ def _with(table: "LocalizationTable", fingers: int) -> _Fingers:
 
 def _kept_of(table: "LocalizationTable") -> _Kept:
     """The plate, its raster, and how tones are chosen on a table, as kernels read them."""
-    plate, raster = table.attached, table.raster
+    uncertainty, raster = table.uncertainty, table.raster
+    variance = uncertainty.gain_variance
     few, fine = len(FIVE_POINTS.points), len(FINE_POINTS.points)
     read = GivenRaster(raster.nx, raster.ny, *raster.patch, table.shapes.shape[1], few, fine)
     read.length, read.width, read.radius = raster.length, raster.width, FINGERTIP_RADIUS
@@ -139,8 +140,8 @@ def _kept_of(table: "LocalizationTable") -> _Kept:
     )
     rules = Rules(
         *(KEPT, MISSING, MAX_FINGERS_BY_POINT, MIN_CANDIDATES, MAX_COMBINATIONS, PRUNING_STEP),
-        *(len(CENTRE_AND_RIM), plate.gain_variance < MAX_VARIANCE_FINE, plate.thickness > 0),
-        *(plate.gain_variance, RIDGE, LEVEL_MARGIN, coherent.NEARLY_HIGHEST, REACHED),
+        *(len(CENTRE_AND_RIM), variance < MAX_VARIANCE_FINE, uncertainty.thickness > 0),
+        *(variance, RIDGE, LEVEL_MARGIN, coherent.NEARLY_HIGHEST, REACHED),
         *(PERCENTILE, PROMISED_PERCENTILE),
         *(coherent.TARGET_STARTS, coherent.ALIGNMENTS),
         *(_method(coherent.ONE_FINGER), _method(coherent.SEVERAL)),

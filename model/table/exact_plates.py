@@ -22,7 +22,7 @@ from model.structure.attachments import (
     dynamic_stiffness,
     fingertip_loads,
 )
-from model.structure.modal_elasticity import ModalElasticity, modal_receptance
+from model.structure.modal_elasticity import modal_receptance
 from model.table.question import Point, Question
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
@@ -191,12 +191,8 @@ def _response(
         ]
     )
     shapes = np.vstack([table.attachment_shapes, discs[:, 0]])
-    elasticity = ModalElasticity.of(
-        table.plate, table.omega**2, table.losses, table.modal_dispersion
-    )
-    stiffness_of_modes = elasticity.stiffness(np.array([omega]))
-    lost = 1j * plates.loss[:, None] * stiffness_of_modes.imag
-    exact = (stiffness_of_modes.real + lost)[:, None]
+    nominal = table.attached.modal[row]
+    exact = (nominal.real + 1j * plates.loss[:, None] * nominal.imag)[:, None]
     modal = modal_receptance(exact, np.array([omega]), plates.thickness)[:, 0]
     receptance = np.asarray((modal[:, None, :] * shapes) @ shapes.T, dtype=complex)
     applied = np.zeros((*stiffness.shape, 1), dtype=complex)

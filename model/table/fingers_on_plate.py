@@ -138,7 +138,7 @@ class FingerForms:
             table.thresholds.take(self.rows),
             10 ** (level_db_sl / 20),
         )
-        variance = table.attached.gain_variance
+        variance = table.uncertainty.gain_variance
         if background is not None:
             rest = background.copy()
             rest.reshape(len(rest), -1)[:, :: rest.shape[1] + 1] *= 1 + np.float32(variance)

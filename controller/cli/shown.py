@@ -4,7 +4,7 @@ from datetime import datetime
 
 from controller.api.client_protocol import Notification
 from controller.api.methods import StatusResult
-from controller.api.schema import LearningSummary, headline
+from controller.api.schema import AmplifierStatus, ContactStatus, LearningSummary, headline
 from drivers.by_hand.cli import in_words
 from model.counting import counted
 
@@ -16,87 +16,26 @@ def show_event(event: Notification, *, ahead: float) -> str:
     return f"{at}  {event.topic:10s} {in_words(event.data)}{lost}"
 
 
-def _show_learning(learning: LearningSummary) -> list[str]:
-    """Format what is learned of the plate."""
-    state = learning.state.replace("_", " ")
-    lines = [f"  plate {state.upper() if learning.robust else state}: {learning.cause}"]
-    if learning.robust:
-        lines.append("    answers promise what a plate that is not known gives")
-    if learning.remedy:
-        lines.append(f"    remedy: {learning.remedy}")
-    if learning.readings:
-        last = learning.last_estimate_s
-        ago = "" if last is None else f", last estimated {last:.0f} s ago"
-        took = learning.latency_ms.median
-        within = "" if took is None else f", median {took:.0f} ms after a measurement"
-        lines.append(
-            f"    {counted(learning.readings, 'pattern')} measured{ago}; "
-            f"{counted(learning.corrections, 'correction')} of answers{within}"
-        )
-    return lines
-
-
 def show_status(status: StatusResult) -> str:
     """Format a status."""
-    lines = [headline(status.state, status.cause)]
-    if status.remedy:
-        lines.append(f"  remedy: {status.remedy}")
-    if status.lost_for_s is not None:
-        watchdog = (
-            "one without a watchdog plays on until it is switched off"
-            if status.watchdog_s is None
-            else f"its watchdog silences it after {status.watchdog_s:g} s without heartbeats"
-        )
-        lines.append(
-            f"  ASSUME ENERGISED: a lost amplifier may still be playing; {watchdog}"
-            if status.assume_energised
-            else f"  unreachable for {status.lost_for_s:.1f} s: {watchdog}, unconfirmed"
-        )
-    if status.armed_by is not None and status.lease_left_s is not None:
-        lines.append(f"  armed by {status.armed_by}, {status.lease_left_s:.1f} s left")
-    for contact in status.contacts:
-        level = "" if contact.level_db_sl is None else f" {contact.level_db_sl:.1f} dB SL"
-        promised = contact.robust_felt_contrast_db
-        contrast = "" if promised is None else f", at least {promised:.1f} dB over the others"
-        effect = "" if contact.effect is None else f", effect {contact.effect}"
-        if contact.feels not in (None, contact.effect):
-            effect += f", feels {contact.feels}"
-        others = contact.foreign_level_db_sl
-        effect += "" if others is None else f", others at most {others:.1f} dB SL"
-        verdict = "" if contact.verdict in (None, "own") else f", {contact.verdict}"
-        held_back = verdict if contact.held_back is None else f"{verdict}: {contact.held_back}"
-        load = "" if contact.load == 1 else f", load {contact.load:.1f}"
-        lines.append(
-            f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "
-            f"{contact.role or 'not driven'}{level}{contrast}{effect}{held_back}{load}"
-        )
-    if status.silence_reason is not None and status.contacts:
-        lines.append(f"  silent: {status.silence_reason}")
-    elif status.contacts and status.state == "READY_TO_SWITCH_ON":
-        lines.append("  silent: not armed; arm with era arm")
-    if status.learning is not None:
-        lines += _show_learning(status.learning)
+    silent = status.silence_reason
+    if silent is None and status.state == "READY_TO_SWITCH_ON":
+        silent = "not armed; arm with era arm"
+    left = status.lease_left_s
+    armed = None if left is None else f"{status.armed_by}, {left:.1f} s left"
+    lines = [
+        headline(status.state, status.cause),
+        *_told(("  remedy: {}", status.remedy), ("  {}", _loss(status))),
+        *_told(("  armed by {}", armed)),
+        *map(_contact, status.contacts),
+        *_told(("  silent: {}", silent if status.contacts else None)),
+        *([] if status.learning is None else _learning(status.learning)),
+    ]
     for era, tone in status.drive.items():
         lines.append(
             f"  ERA {era}: {tone.frequency_hz:g} Hz, level {tone.level:.3f}, {tone.phase_deg:g} deg"
         )
-    for amplifier in status.amplifiers:
-        parts = [amplifier.state] if amplifier.state else []
-        if amplifier.degraded:
-            parts.append("does not reply, may play")
-        if amplifier.lost:
-            parts.append("LOST")
-        if amplifier.closed_with_lost:
-            parts.append("closed because another was lost")
-        if amplifier.fault not in (None, "NONE"):
-            parts.append(f"fault {amplifier.fault}")
-        if amplifier.temperature_c is not None:
-            parts.append(f"{amplifier.temperature_c:.1f} degC")
-        if amplifier.reply_age_s is not None:
-            parts.append(f"last reply {amplifier.reply_age_s:.2f} s ago")
-        else:
-            parts.append("no reply yet")
-        lines.append(f"  amplifier {amplifier.name} ({amplifier.url}): {', '.join(parts)}")
+    lines += map(_amplifier, status.amplifiers)
     latency = status.latency_ms
     if latency.median is not None:
         lines.append(
@@ -105,5 +44,74 @@ def show_status(status: StatusResult) -> str:
         )
     for reason, count in status.rejected_touches.items():
         lines.append(f"  rejected touches, {reason.replace('_', ' ')}: {count}")
-    lines.append(f"  state {status.state}, up for {status.uptime_s:.0f} s")
-    return "\n".join(lines)
+    return "\n".join([*lines, f"  state {status.state}, up for {status.uptime_s:.0f} s"])
+
+
+def _told(*texts: tuple[str, object]) -> list[str]:
+    """Texts with their values, but for those whose value is None or False."""
+    return [text.format(value) for text, value in texts if value is not None and value is not False]
+
+
+def _loss(status: StatusResult) -> str | None:
+    """What is to be assumed of amplifiers that are lost, if any are."""
+    if status.lost_for_s is None:
+        return None
+    watchdog = (
+        "one without a watchdog plays on until it is switched off"
+        if status.watchdog_s is None
+        else f"its watchdog silences it after {status.watchdog_s:g} s without heartbeats"
+    )
+    if status.assume_energised:
+        return f"ASSUME ENERGISED: a lost amplifier may still be playing; {watchdog}"
+    return f"unreachable for {status.lost_for_s:.1f} s: {watchdog}, unconfirmed"
+
+
+def _contact(contact: ContactStatus) -> str:
+    """Format a finger and what it feels."""
+    details = _told(
+        (" {:.1f} dB SL", contact.level_db_sl),
+        (", at least {:.1f} dB over the others", contact.robust_felt_contrast_db),
+        (", effect {}", contact.effect),
+        (", feels {}", None if contact.feels == contact.effect else contact.feels),
+        (", others at most {:.1f} dB SL", contact.foreign_level_db_sl),
+        (", {}", None if contact.verdict == "own" else contact.verdict),
+        (": {}", contact.held_back),
+        (", load {:.1f}", None if contact.load == 1 else contact.load),
+    )
+    return (
+        f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "
+        f"{contact.role or 'not driven'}{''.join(details)}"
+    )
+
+
+def _learning(learning: LearningSummary) -> list[str]:
+    """Format what is learned of the plate."""
+    state = learning.state.replace("_", " ")
+    last, took = learning.last_estimate_s, learning.latency_ms.median
+    within = "".join(_told((", median {:.0f} ms after a measurement", took)))
+    ago = "".join(_told((", last estimated {:.0f} s ago", last)))
+    measured = (
+        f"{counted(learning.readings, 'pattern')} measured{ago}; "
+        f"{counted(learning.corrections, 'correction')} of answers{within}"
+    )
+    return [
+        f"  plate {state.upper() if learning.robust else state}: {learning.cause}",
+        *_told(("    answers promise what a plate that is not known gives", learning.robust)),
+        *_told(("    remedy: {}", learning.remedy)),
+        *_told(("    {}", measured if learning.readings else None)),
+    ]
+
+
+def _amplifier(amplifier: AmplifierStatus) -> str:
+    """Format an amplifier's last status."""
+    details = _told(
+        ("{}", amplifier.state),
+        ("does not reply, may play", amplifier.degraded),
+        ("LOST", amplifier.lost),
+        ("closed because another was lost", amplifier.closed_with_lost),
+        ("fault {}", None if amplifier.fault == "NONE" else amplifier.fault),
+        ("{:.1f} degC", amplifier.temperature_c),
+        ("last reply {:.2f} s ago", amplifier.reply_age_s),
+        ("no reply yet", amplifier.reply_age_s is None),
+    )
+    return f"  amplifier {amplifier.name} ({amplifier.url}): {', '.join(details)}"

@@ -2,10 +2,10 @@
 
 import asyncio
 import math
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any
+from typing import TypeAlias, cast
 
 from controller.demo.far_end import SimulatedPlate
 from controller.demo.touch_row import (
@@ -22,7 +22,6 @@ from controller.loop.observer import Applied, Observer, Silenced
 from controller.loop.playing import PlayedContent
 from controller.sources.contacts import Change, Contact, ContactKey
 from drivers import clock
-from drivers.errors import LinkError
 from model.transients.measures import ONSET_WINDOW
 
 STEADY_WINDOW = 0.25
@@ -36,6 +35,11 @@ MARGIN = 0.005
 
 STEADY_DURATION = 0.4
 """Shortest pattern [s] that counts as steady; the plate rings for 50 ms to 1 s."""
+
+MAX_ONSET_AGE = 9.0
+"""Longest pattern [s] whose onset the plate still has when it ends; it keeps ten seconds."""
+
+Measured: TypeAlias = asyncio.Task[dict[str, FingerVibration]]
 
 _NOT_THE_TARGET = "another finger came down at the same moment and was the target"
 
@@ -58,15 +62,15 @@ class _Touch:
 class _Playing:
     """What plays from its commit to the next command [s], with its measurements.
 
-    touches: those that feel a content; steady, onset: vibration by finger over its end and its
-    first 100 ms.
+    touches: those that feel a content; steady, onset: vibration by finger over the longest rest of
+    the fingers and over its first 100 ms.
     """
 
     applied: Applied
     touches: Sequence[_Touch]
     until: float = math.inf
-    steady: asyncio.Task[dict[str, FingerVibration]] | None = None
-    onset: asyncio.Task[dict[str, FingerVibration]] | None = None
+    steady: Measured | None = None
+    onset: Measured | None = None
 
     @property
     def duration(self) -> float:
@@ -74,28 +78,33 @@ class _Playing:
 
 
 class TouchRecorder:
-    """Collects a row per touch: pass `observer` to the daemon and await `finish` at the end.
+    """Collects a row per touch: pass `observer` to the daemon.
 
-    Times of rows count from `start`. on_row is called with each row once the touch was lifted and
-    its pattern measured. failure: the error of a plate that does not reply.
+    tasks: measure and make rows; all are made once it has ended. Times of rows count from `start`.
+    on_row is called with each row once the touch was lifted and its pattern measured.
     """
 
-    def __init__(self, plate: SimulatedPlate, *, on_row: Callable[[TouchRow], None]) -> None:
+    def __init__(
+        self,
+        plate: SimulatedPlate,
+        tasks: asyncio.TaskGroup,
+        *,
+        on_row: Callable[[TouchRow], None],
+    ) -> None:
         self.rows: list[TouchRow] = []
-        self.failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._fault: str | None = None
+        self.touches: dict[ContactKey, _Touch] = {}
+        """Those that are down."""
+        self.fault: str | None = None
+        """Why the plate is armed no longer; None while it is, and before."""
         self._is_armed = asyncio.Event()
         self._plate = plate
+        self._tasks = tasks
         self._on_row = on_row
         self._start = clock.now()
-        self._touches: dict[ContactKey, _Touch] = {}
         self._playing: _Playing | None = None
         self._changes: list[float] = []  # when fingers landed, moved or lifted
         self._sensors: dict[str, Position] = {}
         self._loads: dict[str, float] = {}
-        self._tasks: set[asyncio.Task[Any]] = set()
-        self._lifted = asyncio.Event()
-        self._lifted.set()
 
     @property
     def observer(self) -> Observer:
@@ -106,10 +115,6 @@ class TouchRecorder:
             silenced=self._silenced,
         )
 
-    async def all_lifted(self) -> None:
-        """Wait until no finger is on the plate."""
-        await self._lifted.wait()
-
     async def start(self) -> None:
         """Wait until the plate is armed, and set the start of the recording to then."""
         await self._is_armed.wait()
@@ -117,27 +122,17 @@ class TouchRecorder:
 
     def armed(self) -> None:
         """Note that the plate is armed, again after a fault."""
-        self._fault = None
+        self.fault = None
         self._is_armed.set()
 
     def failed(self, cause: str) -> None:
         """Note that the plate is armed no longer; rows of touches that this spoils say so."""
-        self._fault = cause.partition("; ")[0]  # without its remedy
+        self.fault = cause.partition("; ")[0]  # without its remedy
         since = -math.inf if self._playing is None else self._playing.applied.time
         self._end_pattern(clock.now(), is_measured=False)  # silent since a time that is not known
-        for touch in self._touches.values():
+        for touch in self.touches.values():
             if touch.contact.since > since:
-                touch.reason = self._fault
-
-    async def finish(self) -> None:
-        """Wait for the rows of all lifted touches; raises LinkError after a fault that lasts."""
-        while self._tasks:
-            await asyncio.wait(self._tasks)
-        if self.failure.done():
-            self.failure.result()
-        if self._fault is not None:
-            raise LinkError(f"demonstration aborted: {self._fault}")
-        self.rows.sort(key=lambda row: row.time_s)
+                touch.reason = self.fault
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         self._move_sensors(contacts)
@@ -145,67 +140,60 @@ class TouchRecorder:
             self._changes.append(clock.now())
         for contact in change.down:
             others = {_id(other): _place(other) for other in contacts if other != contact}
-            self._touches[contact.key] = _Touch(contact, others, reason=self._fault)
-        if contacts:
-            self._lifted.clear()
-        else:
-            self._lifted.set()
+            self.touches[contact.key] = _Touch(contact, others, reason=self.fault)
         for contact in change.up:
-            touch = self._touches.pop(contact.key)
+            touch = self.touches.pop(contact.key)
             touch.until = clock.now()
-            if self._playing is None or touch not in self._playing.touches:
-                self._run(self._add_row(touch))
+            self._complete(touch)
 
     def _pattern_applied(self, applied: Applied) -> None:
         self._end_pattern(applied.time)
-        for each in self._touches.values():
+        for each in self.touches.values():
             each.reason = each.reason or _NOT_THE_TARGET
         touches = []
         for felt in applied.targets:
-            touch = self._touches.get(felt.contact.key)
+            touch = self.touches.get(felt.contact.key)
             if touch is not None and felt.verdict == HELD_BACK:
                 touch.reason = felt.held_back
             elif touch is not None:  # not lifted meanwhile
                 touches.append(touch)
-        if not touches:
-            return
-        self._playing = _Playing(applied, touches)
+        if touches:
+            self._playing = _Playing(applied, touches)
         for touch in touches:
-            touch.patterns.append(self._playing)
-        if applied.from_rest and applied.quiet:
-            self._playing.onset = self._run(self._measure_onset(self._playing))
+            touch.patterns.append(cast(_Playing, self._playing))
 
     def _silenced(self, silenced: Silenced) -> None:
         self._end_pattern(silenced.time)
         for each in silenced.targets:
-            if touch := self._touches.get(each.contact.key):
+            if touch := self.touches.get(each.contact.key):
                 touch.reason = silenced.reason
 
     def _end_pattern(self, now: float, *, is_measured: bool = True) -> None:
-        """Close the playing pattern and measure its end."""
+        """Close the playing pattern and measure its end, and its onset beside quiet fingers."""
         ended, self._playing = self._playing, None
         if ended is None:
             return
         ended.until = now
         # Its end is reported with the reply to what ended it, some time after the fingers changed.
-        settled = ended.applied.time + ended.applied.pattern.ramp
+        began, settled = ended.applied.time, ended.applied.time + ended.applied.pattern.ramp
         changes = [each for each in self._changes if settled < each < now]
         start, end = max(pairwise([settled, *changes, now]), key=lambda rest: rest[1] - rest[0])
         since, until = max(start, end - STEADY_WINDOW) + MARGIN, end - MARGIN
         self._changes = changes
         if is_measured and since < until:
-            ended.steady = self._run(self._plate.vibration(since, until))
+            ended.steady = self._tasks.create_task(self._plate.vibration(since, until))
+        is_whole = ONSET_WINDOW <= ended.duration < MAX_ONSET_AGE
+        if is_measured and is_whole and ended.applied.from_rest and ended.applied.quiet:
+            onset = self._plate.vibration(began, began + ONSET_WINDOW)
+            ended.onset = self._tasks.create_task(onset)
         for touch in ended.touches:
-            if touch.until < math.inf:
-                self._run(self._add_row(touch))
+            self._complete(touch)
 
-    async def _measure_onset(self, playing: _Playing) -> dict[str, FingerVibration]:
-        """Vibration over the first 100 ms of a pattern; empty if it ended earlier."""
-        since = playing.applied.time
-        await asyncio.sleep(max(0.0, since + ONSET_WINDOW + MARGIN - clock.now()))
-        if playing.until < since + ONSET_WINDOW:
-            return {}
-        return await self._plate.vibration(since, since + ONSET_WINDOW)
+    def _complete(self, touch: _Touch) -> None:
+        """Make the row of a touch once it is lifted and nothing plays for it."""
+        is_playing = self._playing is not None and touch in self._playing.touches
+        if touch.until < math.inf and not is_playing:
+            self._tasks.create_task(self._add_row(touch))
 
     def _move_sensors(self, contacts: tuple[Contact, ...]) -> None:
         """Make the plate's sensors follow the fingers."""
@@ -220,7 +208,7 @@ class TouchRecorder:
         loads = {_id(contact): contact.load for contact in contacts}
         if sensors != self._sensors or loads != self._loads:
             self._sensors, self._loads = sensors, loads
-            self._run(self._plate.place_fingers(sensors, loads))
+            self._tasks.create_task(self._plate.place_fingers(sensors, loads))
 
     async def _add_row(self, touch: _Touch) -> None:
         """Make the row of a lifted touch from the pattern that played longest for it."""
@@ -237,18 +225,6 @@ class TouchRecorder:
             row = await _played(touch, row)
         self.rows.append(row)
         self._on_row(row)
-
-    def _run(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
-        task = asyncio.create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._task_done)
-        return task
-
-    def _task_done(self, task: asyncio.Task[Any]) -> None:
-        self._tasks.discard(task)
-        error = None if task.cancelled() else task.exception()
-        if error is not None and not self.failure.done():
-            self.failure.set_exception(error)
 
 
 async def _played(touch: _Touch, row: TouchRow) -> TouchRow:

@@ -69,33 +69,29 @@ async def run_demo(
     async with _on_simulated_plate(
         rig_file, more, layout=scenes[0].layout, wire=wire, seed=seed
     ) as (config, lock, plate):
-        recorder = TouchRecorder(plate, on_row=on_row)
-        daemon = Daemon(
-            config,
-            table,
-            log=LogThread(None),  # nothing is logged: rows and causes tell it
-            manager=ServiceManager({}),
-            dashboard=None,
-            observer=recorder.observer,
-            watchdog=WATCHDOG,
-        )
-        serving = asyncio.create_task(daemon.run(lock))
-        arming = asyncio.create_task(_keep_armed(daemon, config.socket, recorder))
-        playing = asyncio.create_task(_play(scenes, port, recorder, daemon, config))
-        tasks = (serving, arming, playing, recorder.failure)
         try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in tasks:
-                if task.done():
-                    task.result()
-            if not playing.done():  # a signal has ended the daemon
-                raise KeyboardInterrupt
-        finally:
-            arming.cancel()
-            playing.cancel()
-            daemon.shut_down("the demonstration is over")
-            await asyncio.gather(serving, arming, playing, return_exceptions=True)
-    return recorder.rows
+            async with asyncio.TaskGroup() as tasks:
+                recorder = TouchRecorder(plate, tasks, on_row=on_row)
+                daemon = Daemon(
+                    config,
+                    table,
+                    log=LogThread(None),  # nothing is logged: rows and causes tell it
+                    manager=ServiceManager({}),
+                    dashboard=None,
+                    observer=recorder.observer,
+                    watchdog=WATCHDOG,
+                )
+                serving = tasks.create_task(daemon.run(lock))
+                arming = tasks.create_task(_keep_armed(daemon, config.socket, recorder))
+                playing = tasks.create_task(_play(scenes, port, recorder, daemon, config))
+                await asyncio.wait({serving, playing}, return_when=asyncio.FIRST_COMPLETED)
+                if not playing.done():  # a signal has ended the daemon
+                    raise KeyboardInterrupt
+                arming.cancel()
+                daemon.shut_down("the demonstration is over")
+        except BaseExceptionGroup as failures:
+            raise failures.exceptions[0] from None
+    return sorted(recorder.rows, key=lambda row: row.time_s)
 
 
 async def run_live(
@@ -211,7 +207,10 @@ async def _play(
     daemon: Daemon,
     config: DaemonConfig,
 ) -> None:
-    """Play the scenes; wait until all touches are lifted, or count as such, and have their rows."""
+    """Play the scenes; wait until all touches are lifted, or count as such.
+
+    Raises LinkError after a fault that lasts.
+    """
     await recorder.start()
     for scene in scenes:
         if scene.layout != scenes[0].layout:
@@ -219,9 +218,11 @@ async def _play(
             await daemon.reload()
         await replay_capture(scene.touches, _HOST, port)
         await asyncio.sleep(DECAY)  # the last datagrams arrive
-        await recorder.all_lifted()
+        while recorder.touches:  # noqa: ASYNC110  nobody else waits for this
+            await asyncio.sleep(DECAY)
     await asyncio.sleep(DECAY)
-    await recorder.finish()
+    if recorder.fault is not None:
+        raise LinkError(f"demonstration aborted: {recorder.fault}")
 
 
 def _write_layout(folder: Path, layout: Mapping[str, Any]) -> None:

@@ -141,11 +141,6 @@ class ApiService:
     async def _arm(self, client: Connection, params: ArmParams) -> ArmResult:
         if self._supervisor.operation.is_lease_over(clock.now()):  # what plays is not inherited
             await self._supervisor.handle(LEASE_OVER)
-        operation = self._supervisor.operation
-        if operation.state in ENERGISED:
-            raise _armed_already(operation)
-        if operation.state is not DaemonState.READY_TO_SWITCH_ON:
-            raise _wrong_state(operation)
         lease = Lease(params.owner, params.lease_s)
         cause = f"armed by {params.owner!a}"
         try:
@@ -153,10 +148,11 @@ class ApiService:
                 DaemonEvent(Trigger.ARM, cause, "era disarm, or era stop", lease)
             )
             operation = self._supervisor.operation
-            if operation.state is not _ENABLED or operation.lease is None:
-                raise _wrong_state(operation)
-            if operation.lease.token != lease.token:
+            is_own = operation.lease is not None and operation.lease.token == lease.token
+            if operation.state in ENERGISED and not is_own:
                 raise _armed_already(operation)
+            if operation.state is not _ENABLED:
+                raise _wrong_state(operation)
         except BaseException:
             self._supervisor.withdraw(lease.token, "arming failed")
             raise
@@ -171,13 +167,11 @@ class ApiService:
         return RenewResult(lease_s=lease.duration)
 
     async def _disarm(self, client: Connection, params: DisarmParams) -> Empty:
-        operation = self._supervisor.operation
         if params.lease is not None:
-            check_lease(operation.lease, params.lease, clock.now())
-        if operation.state in ENERGISED:
-            cause = f"disarmed by {params.client or client.name!a}"
-            await self._supervisor.handle(DaemonEvent(Trigger.DISARM, cause))
-            operation = self._supervisor.operation
+            check_lease(self._supervisor.operation.lease, params.lease, clock.now())
+        cause = f"disarmed by {params.client or client.name!a}"
+        await self._supervisor.handle(DaemonEvent(Trigger.DISARM, cause))
+        operation = self._supervisor.operation
         if operation.state is not DaemonState.READY_TO_SWITCH_ON:  # disarmed and read back
             raise _wrong_state(operation)
         return Empty()

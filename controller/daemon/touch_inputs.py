@@ -5,9 +5,11 @@ import logging
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 from controller.api.methods import TouchParams
 from controller.daemon.config import API_SOURCES, TouchInput
+from controller.daemon.deferred_calls import call_guarded
 from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
 from drivers.pauses import Backoff
@@ -112,6 +114,6 @@ class ApiTouches:
         self._deliver(TouchFrame(source, now, touches, origin=f"{API_SOURCES}:{client_name}"))
 
     def lift_all(self, client: object, *, now: float) -> None:
-        """Lift all fingers of a client at a time [s]."""
+        """Lift all fingers of a client at a time [s], whatever fails at one of its sources."""
         for source in self._sources.pop(client, ()):
-            self._deliver(TouchFrame(source, now, ()))
+            call_guarded(partial(self._deliver, TouchFrame(source, now, ())))

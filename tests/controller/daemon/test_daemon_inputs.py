@@ -63,6 +63,22 @@ def test_touches_of_leaving_client_are_lifted() -> None:
     assert frames == [TouchFrame("api:1:me", 2, ())]
 
 
+def test_leaving_client_is_lifted_though_one_of_its_sources_fails() -> None:
+    """The fingers of its other sources would stay until they time out."""
+    lifted: list[str] = []
+
+    def deliver(frame: TouchFrame) -> None:
+        if not frame.touches:
+            lifted.append(frame.source)
+            raise ZeroDivisionError
+
+    touches = ApiTouches(PLATE, deliver)
+    for source in ("one", "other"):
+        touches.add("a", params(source, (0.1, 0.1)), client_name="1", now=1)
+    touches.lift_all("a", now=2)
+    assert lifted == ["api:1:one", "api:1:other"]
+
+
 def test_sources_of_client_are_bounded() -> None:
     """64 with fingers down; lifting those of one source permits another, as does its silence."""
     touches = ApiTouches(PLATE, lambda frame: None)

@@ -25,10 +25,10 @@ def show_status(status: StatusResult) -> str:
     armed = None if left is None else f"{status.armed_by}, {left:.1f} s left"
     lines = [
         headline(status.state, status.cause),
-        *_told(("  remedy: {}", status.remedy), ("  {}", _loss(status))),
-        *_told(("  armed by {}", armed)),
+        *_given(("  remedy: {}", status.remedy), ("  {}", _loss(status))),
+        *_given(("  armed by {}", armed)),
         *map(_contact, status.contacts),
-        *_told(("  silent: {}", silent if status.contacts else None)),
+        *_given(("  silent: {}", silent if status.contacts else None)),
         *([] if status.learning is None else _learning(status.learning)),
     ]
     for era, tone in status.drive.items():
@@ -47,7 +47,7 @@ def show_status(status: StatusResult) -> str:
     return "\n".join([*lines, f"  state {status.state}, up for {status.uptime_s:.0f} s"])
 
 
-def _told(*texts: tuple[str, object]) -> list[str]:
+def _given(*texts: tuple[str, object]) -> list[str]:
     """Texts with their values, but for those whose value is None or False."""
     return [text.format(value) for text, value in texts if value is not None and value is not False]
 
@@ -68,7 +68,7 @@ def _loss(status: StatusResult) -> str | None:
 
 def _contact(contact: ContactStatus) -> str:
     """Format a finger and what it feels."""
-    details = _told(
+    details = _given(
         (" {:.1f} dB SL", contact.level_db_sl),
         (", at least {:.1f} dB over the others", contact.robust_felt_contrast_db),
         (", effect {}", contact.effect),
@@ -88,23 +88,23 @@ def _learning(learning: LearningSummary) -> list[str]:
     """Format what is learned of the plate."""
     state = learning.state.replace("_", " ")
     last, took = learning.last_estimate_s, learning.latency_ms.median
-    within = "".join(_told((", median {:.0f} ms after a measurement", took)))
-    ago = "".join(_told((", last estimated {:.0f} s ago", last)))
+    within = "".join(_given((", median {:.0f} ms after a measurement", took)))
+    ago = "".join(_given((", last estimated {:.0f} s ago", last)))
     measured = (
         f"{counted(learning.readings, 'pattern')} measured{ago}; "
         f"{counted(learning.corrections, 'correction')} of answers{within}"
     )
     return [
         f"  plate {state.upper() if learning.robust else state}: {learning.cause}",
-        *_told(("    answers promise what a plate that is not known gives", learning.robust)),
-        *_told(("    remedy: {}", learning.remedy)),
-        *_told(("    {}", measured if learning.readings else None)),
+        *_given(("    answers promise what a plate that is not known gives", learning.robust)),
+        *_given(("    remedy: {}", learning.remedy)),
+        *_given(("    {}", measured if learning.readings else None)),
     ]
 
 
 def _amplifier(amplifier: AmplifierStatus) -> str:
     """Format an amplifier's last status."""
-    details = _told(
+    details = _given(
         ("{}", amplifier.state),
         ("does not reply, may play", amplifier.degraded),
         ("LOST", amplifier.lost),

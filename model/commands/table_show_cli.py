@@ -85,7 +85,7 @@ def verify(
 ) -> None:
     """Recompute a sample by other methods, or measure it.
 
-    Solve the plate anew, and in time; with --device play patterns and compare what
+    Solve the plate at each frequency, and in time; with --device play patterns and compare what
     accelerometers measure with what nine of ten plates promise. Exit with 1 if a check fails.
     """
     from model.table.file import ZIP
@@ -227,7 +227,7 @@ def _show_map(cells: "WeakCells", *, listed: bool) -> None:
 def _show_verification(found: "Verification") -> None:
     for check in found.content:
         print(
-            f"{check.name:24s} {check.error:8.1e} relative L2 to the plate anew  "
+            f"{check.name:24s} {check.error:8.1e} relative L2 to the reference  "
             f"{'passed' if check.is_passed else 'FAILED'}"
         )
     print()

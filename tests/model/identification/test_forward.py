@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.direct_plate import direct_spectral_acceleration
 from model.arrays import ComplexArray, FloatArray
 from model.identification.derivatives import by_mass_at, jacobian
 from model.identification.forward import ForwardModel, RestingFinger, Sensor
@@ -14,6 +13,7 @@ from model.reduction.free_plate import solve_free_plate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
+from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import Fingertip, FingertipLoad, Load, PointLoad
 from model.structure.laminate_section import equivalent_plate

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.direct_plate import direct_spectral_acceleration
 from model.arrays import lattice
 from model.config.document import ConfigError
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
 from model.rig.file import example_rig_path, load_rig, parse_rig
 from model.rig.rig import Rig
+from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import footprints_of
 from model.structure.plate import LOSS_FREQUENCY

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from benchmarks.direct_plate import AtOneFrequency, direct_responder
+from benchmarks.direct_plate import direct_responder
 from benchmarks.layers.elasticity import strip_frequencies
 from model.errors import InputError
 from model.fem.mesh import Mesh
@@ -15,6 +15,7 @@ from model.fem.plate import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.file import load_rig
+from model.spectral.direct import AtOneFrequency
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import Band, SpectralPlate
 from model.structure.attachments import Era, footprints_of

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from benchmarks.direct_plate import direct_spectral_acceleration
 from long_form import in_turn
 from model.errors import InputError
 from model.fem.mesh import Q5, Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.spectral_modes import SpectralModes
 from model.rig.meshes import mesh_of
+from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.functions import CLASSES
 from model.spectral.local_compliance import local_compliance
 from model.spectral.mesh import SpectralMesh

@@ -107,11 +107,11 @@ def measured_line(rig: "Rig", measured: "MeasuredPlate") -> str:
     from model.counting import counted
 
     measurement = measured.measurement
-    low, high = measurement.tones[0], measurement.tones[-1]
+    low, high = measurement.frequencies[0], measurement.frequencies[-1]
     return (
         f"{counted(len(rig.eras), 'ERA')}, {counted(len(measurement.sensors), 'sensor')}, "
-        f"{counted(len(measurement.tones), 'tone')} from {low:g} to {high:g} Hz at a level of "
-        f"{measured.level:.3g}, {counted(len(measurement.values), 'response')} in "
+        f"{counted(len(measurement.frequencies), 'tone')} from {low:g} to {high:g} Hz at a level "
+        f"of {measured.level:.3g}, {counted(measurement.count, 'response')} in "
         f"{measured.duration:.1f} s"
     )
 
@@ -122,9 +122,9 @@ def measured_json(measured: "MeasuredPlate") -> dict[str, object]:
     return {
         "sensors": list(measured.sensors),
         "sensors_unused": list(measured.notes),
-        "frequencies_hz": measurement.tones.tolist(),
+        "frequencies_hz": measurement.frequencies.tolist(),
         "level": measured.level,
-        "responses": len(measurement.values),
+        "responses": measurement.count,
         "measure_time_s": measured.duration,
         **measured.details,
     }

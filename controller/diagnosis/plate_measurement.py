@@ -300,14 +300,11 @@ def observation_of(measurement: Measurement, rig: Rig) -> Responses:
     """
     measurement.check()
     sensors = measurement.sensors
-    shape = len(measurement.tones), len(rig.eras), len(sensors)
-    values = np.full(shape, np.nan, dtype=complex)
-    values[measurement.rows, measurement.eras, measurement.at] = measurement.values
     places = [rig.era(each.era) if each.era else each for each in sensors]
     return Responses(
         tuple(each.name for each in sensors),
         np.array([(each.x, each.y) for each in places]),
-        measurement.tones,
-        values,
+        measurement.frequencies,
+        measurement.values.swapaxes(1, 2),
         has_phases=not measurement.drives_lag,
     )

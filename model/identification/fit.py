@@ -43,7 +43,7 @@ class Linearised:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A model of the tones of a measurement; extra_noise (n,): of each part beside its error."""
+    """A model of a measurement; extra_noise (f, 1, 1): of each part beside its error."""
 
     model: ForwardModel
     measurement: Measurement
@@ -51,16 +51,15 @@ class Problem:
 
     @cached_property
     def std(self) -> FloatArray:
-        """Error of each part (n,)."""
-        own = self.measurement.std
-        return own if self.extra_noise is None else np.hypot(own, self.extra_noise)
+        """Error of each part of the values that were measured (n,)."""
+        std = np.hypot(self.measurement.std, 0.0 if self.extra_noise is None else self.extra_noise)
+        return std[self.measurement.known]
 
     def residuals(self, x: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Residuals in standard deviations (n,) and their derivatives (n, p)."""
-        m = self.measurement
-        plate = self.model.at(x)
-        J = jacobian(plate)[m.rows, m.at, m.eras] / self.std[:, None]
-        return (plate.responses[m.rows, m.at, m.eras] - m.values) / self.std, J
+        measurement, plate = self.measurement, self.model.at(x)
+        J = jacobian(plate)[measurement.known] / self.std[:, None]
+        return (plate.responses - measurement.values)[measurement.known] / self.std, J
 
     def linearised(self, x: FloatArray) -> Linearised:
         """The same in real and imaginary parts."""

@@ -44,25 +44,27 @@ class HeldOut:
 def hold_out(fitted: Fitted) -> HeldOut | None:
     """Predict paths from a fit to the others; None where these do not tell enough of them."""
     measurement, model = fitted.problem.measurement, fitted.problem.model
-    folds = (model.observed[measurement.at] + measurement.eras) % SHARE
-    squares, variance = np.empty((2, len(folds)))
+    folds = (model.observed[:, None] + np.arange(len(model.rig.eras))) % SHARE
+    squares, variance = np.full((2, *measurement.values.shape), np.nan)
     free, fits = np.flatnonzero(fitted.space.uncertain), []
     noise = min(chi2(fitted), 1.0)  # readings may be better than they are stated
-    for fold in np.unique(folds):
-        unseen = folds == fold
-        if unseen.all():
+    for fold in range(SHARE):
+        unseen = measurement.known & (folds == fold)
+        if not unseen.any():
+            continue
+        part = measurement.part(folds != fold)
+        if not part.known.any():
             return None
-        part, rest = measurement.part(~unseen), measurement.part(unseen)
-        shown = Problem(model.with_frequencies(part.tones), part)
+        shown = Problem(model, part)
         found = solve(shown, fitted.best.x, fitted.space.uncertain, evaluations=_EVALUATIONS)
         fits.append(found.x)
-        plate = model.with_frequencies(rest.tones).at(found.x)
-        error = plate.responses[rest.rows, rest.at, rest.eras] - rest.values
-        squares[unseen] = np.abs(error) ** 2 - 2 * noise * rest.std**2
-        J = jacobian(plate)[rest.rows, rest.at, rest.eras][:, free]
+        plate = model.at(found.x)
+        error = (plate.responses - measurement.values)[unseen]
+        squares[unseen] = np.abs(error) ** 2 - 2 * noise * measurement.std[unseen] ** 2
+        J = jacobian(plate)[unseen][:, free]
         covariance = linalg.inv(found.information[np.ix_(free, free)])
         variance[unseen] = ((J @ covariance) * J.conj()).sum(axis=1).real
-    mean_square = measurement.tone_rms**2
+    mean_square = np.broadcast_to(measurement.tone_rms**2, variance.shape)
     predicted = variance < _PREDICTED**2 * mean_square
     if predicted.sum() < _LEAST_VALUES:
         return None

@@ -67,7 +67,7 @@ def identify(
     on, with the tone and the sensor that would show it.
     """
     _check(rig, measurement)
-    setting = Setting(rig, solved_for(rig, float(measurement.tones[-1])), measurement)
+    setting = Setting(rig, solved_for(rig, float(measurement.frequencies[-1])), measurement)
     fitted = fit_in_stages(setting)
     values = Values.of(rig, fitted.space, fitted.best.x)
     misfit = chi2(fitted)
@@ -111,12 +111,12 @@ def _check(rig: Rig, measurement: Measurement) -> None:
             raise InputError(
                 f"sensor {sensor.name} must be on the plate, got ({sensor.x:g}, {sensor.y:g}) m"
             )
-    if len(measurement.values) < _LEAST_VALUES:
+    if measurement.count < _LEAST_VALUES:
         raise InputError(
-            f"a measurement must have at least {_LEAST_VALUES} values, got "
-            f"{len(measurement.values)}; play more tones"
+            f"a measurement must have at least {_LEAST_VALUES} values, got {measurement.count}; "
+            "play more tones"
         )
-    limits, tones = rig.limits, measurement.tones
+    limits, tones = rig.limits, measurement.frequencies
     if tones[0] < limits.frequency_min or tones[-1] > limits.frequency_max:
         raise InputError(
             "tones must be within the rig's limits.frequency of "

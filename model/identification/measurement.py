@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import ComplexArray, FloatArray, IntArray
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.identification.forward import Sensor
 
@@ -36,38 +36,23 @@ class Repeat:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Values measured one by one, n of them.
+    """Responses of s sensors to n ERAs, at some of their paths and frequencies.
 
-    sensors: s of them; frequencies (n,) [Hz]; eras (n,): number of the driven ERA in the rig;
-    at (n,): number of the sensor; values (n,): acceleration per base displacement at full gain
-    [1/s²], phases as exp(+i omega t); std (n,): of the real and of the imaginary part. half_level:
-    tones repeated at half the level, per base displacement as well; at_end: the first tones, played
-    last again; of both those that are loud beside noise, which nothing is allowed for. drives_lag:
-    whether bases follow what was played with an unknown lag, as actuators do behind an amplifier of
-    voltage.
+    frequencies (f,) [Hz], ascending; values (f, s, n): acceleration per base displacement at full
+    gain [1/s²], phases as exp(+i omega t), NaN where not measured; std (f, s, n): of the real and
+    of the imaginary part. half_level: tones repeated at half the level, per base displacement as
+    well; at_end: the first tones, played last again; of both those that are loud beside noise,
+    which nothing is allowed for. drives_lag: whether bases follow what was played with an unknown
+    lag, as actuators do behind an amplifier of voltage.
     """
 
     sensors: tuple[Sensor, ...]
     frequencies: FloatArray
-    eras: IntArray
-    at: IntArray
     values: ComplexArray
     std: FloatArray
     half_level: tuple[Repeat, ...] = ()
     at_end: tuple[Repeat, ...] = ()
     drives_lag: bool = False
-
-    def __post_init__(self) -> None:
-        """Refuse values that are not finite, without an error or of different count."""
-        count = len(self.values)
-        if count == 0:
-            raise InputError("a measurement must have values, got none")
-        for name in ("frequencies", "eras", "at", "values", "std"):
-            column = getattr(self, name)
-            if len(column) != count or not np.isfinite(column).all():
-                raise InputError(f"measurement: {name} must be {count} finite numbers")
-        if not (self.std > 0).all():
-            raise InputError(f"measurement: std must be above zero, got {self.std.min():g}")
 
     @classmethod
     def of(
@@ -78,38 +63,37 @@ class Measurement:
         *,
         noise: float = 0.01,
     ) -> Self:
-        """Of responses (f, s, eras) [1/s²] at frequencies (f,) [Hz], NaN where not measured.
+        """Of responses (f, s, n) [1/s²] at frequencies (f,) [Hz], NaN where not measured.
 
         noise: error of each part, relative to a response and to a tenth of its sensor's root mean
         square together: never relative alone, since a response may vanish.
         """
-        known = np.isfinite(values)
-        squares = np.where(known, np.abs(values), 0.0) ** 2
-        rms2 = squares.sum(axis=(0, 2)) / np.maximum(known.sum(axis=(0, 2)), 1)
-        std = noise * np.sqrt(squares + _FLOOR**2 * rms2[:, None])
-        row, at, era = np.nonzero(known)
-        return cls(tuple(sensors), np.asarray(frequencies)[row], era, at, values[known], std[known])
+        squares = np.where(np.isfinite(values), np.abs(values), 0.0) ** 2
+        count = np.isfinite(values).sum(axis=(0, 2))[:, None]
+        rms2 = squares.sum(axis=(0, 2))[:, None] / np.maximum(count, 1)
+        std = noise * np.sqrt(squares + _FLOOR**2 * rms2)
+        return cls(tuple(sensors), np.asarray(frequencies), np.asarray(values), std)
 
     @cached_property
-    def tones(self) -> FloatArray:
-        """Frequencies without repetition, ascending (f,) [Hz]."""
-        return np.unique(self.frequencies)
+    def known(self) -> NDArray[np.bool_]:
+        """Which responses were measured, (f, s, n)."""
+        return np.isfinite(self.values) & (self.std > 0)
 
-    @cached_property
-    def rows(self) -> IntArray:
-        """Which of the tones each value is of, (n,)."""
-        return np.searchsorted(self.tones, self.frequencies)
+    @property
+    def count(self) -> int:
+        """Number of values."""
+        return int(self.known.sum())
 
     @cached_property
     def tone_rms(self) -> FloatArray:
-        """Root mean square of the values at the tone of each value, (n,) [1/s²]."""
-        squares = np.bincount(self.rows, np.abs(self.values) ** 2)
-        return np.sqrt(squares / np.bincount(self.rows))[self.rows]
+        """Root mean square of the values at each tone, (f, 1, 1) [1/s²]."""
+        squares = np.where(self.known, np.abs(self.values) ** 2, 0.0)
+        count = self.known.sum(axis=(1, 2), keepdims=True)
+        return np.asarray(np.sqrt(squares.sum(axis=(1, 2), keepdims=True) / np.maximum(count, 1)))
 
     def part(self, kept: NDArray[np.bool_]) -> Self:
-        """Some of the values (n,)."""
-        columns = ("frequencies", "eras", "at", "values", "std")
-        return replace(self, **{name: getattr(self, name)[kept] for name in columns})
+        """Some of the values (f, s, n)."""
+        return replace(self, values=np.where(kept, self.values, np.nan))
 
     def check(self) -> None:
         """Raise InputError for a plate that was not linear or has changed meanwhile."""

@@ -74,7 +74,7 @@ class Setting:
             masses=masses,
             mode_count=len(lowest_elastic(self.free.modes.eigenvalues, MODE_SHIFTS)),
         )
-        return ForwardModel(self.rig, sensors, self.measurement.tones, space, self.free)
+        return ForwardModel(self.rig, sensors, self.measurement.frequencies, space, self.free)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +165,7 @@ def _with_mass(problem: Problem, x: FloatArray, *, number: int) -> list[Linearis
 
 def _scan(problem: Problem, x: FloatArray, own: int) -> list[tuple[FloatArray, float]]:
     """Places and sizes of x at which an additional mass would explain most, all else linear."""
-    model, m = problem.model, problem.measurement
+    model = problem.model
     space = model.space
     now = problem.linearised(x)
     kinds = [
@@ -176,7 +176,7 @@ def _scan(problem: Problem, x: FloatArray, own: int) -> list[tuple[FloatArray, f
     others = np.flatnonzero(space.of(*kinds))
     J = now.jacobian[:, others]
     plate, points = model.rig.plate, _SCANNED.centres(model.rig.plate)
-    by_mass = by_mass_at(model.at(x), points)[m.rows, m.at, m.eras] / problem.std[:, None]
+    by_mass = by_mass_at(model.at(x), points)[problem.measurement.known] / problem.std[:, None]
     columns = np.concatenate([by_mass.real, by_mass.imag]) * space.std[own]
     H = linalg.cho_factor(now.information[np.ix_(others, others)])
     # Of the residuals that the other parameters leave after one step of theirs.

@@ -87,7 +87,7 @@ def _measurement(desk: Desk, found: Measured) -> Measurement:
         values,
     )
     rms = np.sqrt((np.abs(values) ** 2).mean(axis=(0, 2)))
-    noise = (found.std * rms)[plain.rows, plain.at] / np.sqrt(2)  # of each part
+    noise = (found.std * rms)[:, :, None] / np.sqrt(2)  # of each part
     return replace(plain, std=np.hypot(plain.std, noise))
 
 

@@ -14,16 +14,12 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.calibration_screening import (
-    Screened,
-    check_enough_sensors,
-    silent_sensors,
-)
+from model.calibration.calibration_screening import Screened
 from model.calibration.responses import Responses
-from model.calibration.sensed_plate import SensedPlate, sensed_plate
+from model.calibration.sensed_plate import SensedPlate
 from model.calibration.variable_projection import project_gains, row_rms
 from model.choice import best_by
-from model.diagnosis.assignment import ShapeMatch, match_shapes
+from model.diagnosis.assignment import ShapeMatch
 from model.diagnosis.plate_match import MAX_FIT_ERROR, Match, match_plate
 from model.diagnosis.verdict import Verdict, diagnose
 from model.errors import InputError
@@ -77,15 +73,10 @@ def check_consistency(rig: Rig, responses: Responses) -> Screened:
     observation = replace(
         responses, frequencies=responses.frequencies[rows], values=responses.values[rows]
     )
-    silent = silent_sensors(responses)
-    check_enough_sensors(~silent, responses)
-    heard = observation.without(silent)
-    plate = sensed_plate(rig, heard.points, heard.frequencies)
-    shapes = match_shapes(plate, heard.values)
-    _check_quantity(plate, shapes, heard)
-    _check_phases_and_places(plate, shapes, heard)
+    if not (np.abs(observation.values) > 0).any():
+        raise InputError("measured responses must not all be zero; check that ERAs were driven")
     # Values of the plate that are off are what a calibration is for.
-    verdict = diagnose(rig, observation, max_deviation=math.inf)
+    verdict = diagnose(rig, observation, max_deviation=math.inf, check=_check_claims)
     _check_wiring(verdict)
     _check_size(verdict)
     assert verdict.match is not None  # noqa: S101  some channels have the rig's gain
@@ -94,6 +85,12 @@ def check_consistency(rig: Rig, responses: Responses) -> Screened:
         np.isin(responses.sensors, [each.name for each in verdict.bad_sensors if each.is_mute]),
         verdict.match.z,
     )
+
+
+def _check_claims(plate: SensedPlate, shapes: ShapeMatch, observation: Responses) -> None:
+    """Raise InputError where responses are of another quantity, conjugated, or of other places."""
+    _check_quantity(plate, shapes, observation)
+    _check_phases_and_places(plate, shapes, observation)
 
 
 def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, observation: Responses) -> None:

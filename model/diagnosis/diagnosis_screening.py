@@ -9,7 +9,7 @@ from model.arrays import ComplexArray
 from model.calibration.calibration_screening import check_enough_sensors, silent_sensors
 from model.calibration.responses import Responses
 from model.calibration.sensed_plate import SensedPlate
-from model.diagnosis.assignment import match_shapes
+from model.diagnosis.assignment import ShapeMatch
 from model.diagnosis.plate_match import MAX_FIT_ERROR, Match
 
 _DEAD = 0.03  # of the response that the rig predicts
@@ -37,24 +37,22 @@ class BadSensor:
         return f"reads {self.scale:.2f} of what the others say" if self.scale else "reads nothing"
 
 
-def dead_channels(plate: SensedPlate, observation: Responses) -> NDArray[np.bool_]:
-    """Mask (e,) of driven channels with a response far below the model's."""
+def dead_channels(
+    plate: SensedPlate, observation: Responses, shapes: ShapeMatch | None = None
+) -> NDArray[np.bool_]:
+    """Mask (e,) of driven channels with a response far below the model's.
+
+    shapes: with these also of weak channels without the shape of an ERA, whose response is noise.
+    """
     share = np.abs(observation.values / plate.responses())
     dead = np.zeros(observation.values.shape[1], dtype=bool)
     for channel in np.flatnonzero(observation.measured):
-        dead[channel] = np.nanmedian(share[:, channel]) < _DEAD
+        typical = np.nanmedian(share[:, channel])
+        dead[channel] = typical < _DEAD
+        if shapes is not None and typical < _FAINT:
+            mac = np.nanmedian(shapes.mac[:, channel], axis=0)
+            dead[channel] |= np.nanmax(mac) < _NO_SHAPE
     return dead
-
-
-def shapeless_channels(plate: SensedPlate, observation: Responses) -> NDArray[np.bool_]:
-    """Mask of weak channels without the shape of an ERA, whose response is noise (e,)."""
-    share = np.abs(observation.values / plate.responses())
-    mac = match_shapes(plate, observation.values).mac
-    found = np.zeros(observation.values.shape[1], dtype=bool)
-    for channel in np.flatnonzero(observation.measured):
-        faint = np.nanmedian(share[:, channel]) < _FAINT
-        found[channel] = faint and np.nanmax(np.nanmedian(mac[:, channel], axis=0)) < _NO_SHAPE
-    return found
 
 
 def usable_sensors(

@@ -1,6 +1,6 @@
 """Diagnosis of a rig's plate and channels by measured responses."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
@@ -18,7 +18,6 @@ from model.diagnosis.diagnosis_screening import (
     BadSensor,
     dead_channels,
     off_scale,
-    shapeless_channels,
     usable_sensors,
 )
 from model.diagnosis.plate_difference import PlateDifference, plate_difference
@@ -33,6 +32,9 @@ _LEAST_FREQUENCIES = 4
 _MIN_CONFIDENCE = 0.99  # in another ERA than the rig's
 _MIN_COST_REDUCTION = 20.0  # by another wiring than the rig's
 _MAX_PHASE_ERROR = 45.0  # degrees
+
+Check: TypeAlias = Callable[[SensedPlate, ShapeMatch, Responses], None]
+"""Of responses at usable sensors, by the plate there and what its shapes are most like."""
 
 ChannelState: TypeAlias = Literal[
     "well", "dead", "weak", "strong", "other ERA", "inverted", "out of phase", "not driven"
@@ -91,10 +93,17 @@ class Verdict:
         return self.plate_matches and self.wiring_matches
 
 
-def diagnose(rig: Rig, observation: Responses, *, max_deviation: float = MAX_DEVIATION) -> Verdict:
+def diagnose(
+    rig: Rig,
+    observation: Responses,
+    *,
+    max_deviation: float = MAX_DEVIATION,
+    check: Check | None = None,
+) -> Verdict:
     """Compare a measurement with the rig's prediction.
 
-    max_deviation: of a parameter of the plate, in standard deviations of its prior.
+    max_deviation: of a parameter of the plate, in standard deviations of its prior; check: that
+    responses are what they claim, before channels are judged by their size.
     Raises InputError for fewer than three usable sensors or four frequencies.
     """
     if not observation.measured.any():
@@ -109,9 +118,12 @@ def diagnose(rig: Rig, observation: Responses, *, max_deviation: float = MAX_DEV
     sensors = observation.sensors
     observation, removed = usable_sensors(observation, dead)
     plate = plate.at_some(np.isin(sensors, observation.sensors))
-    values = observation.values.copy()
-    dead = dead | shapeless_channels(plate, observation)
-    values[:, dead] = np.nan
+    shapes = match_shapes(plate, observation.values)
+    if check is not None:
+        check(plate, shapes, observation)
+    dead |= dead_channels(plate, observation, shapes)
+    values = np.where(dead[:, None], np.nan, observation.values)
+    shapes = replace(shapes, mac=np.where(dead[:, None], np.nan, shapes.mac))
     if not np.isfinite(values).any():
         channels = tuple(
             _without_response(rig, number, is_dead=bool(dead[number]))
@@ -128,8 +140,7 @@ def diagnose(rig: Rig, observation: Responses, *, max_deviation: float = MAX_DEV
             len(observation.sensors),
             observation.frequencies,
         )
-    shape_match = match_shapes(plate, values)
-    match, drives, error = _best_match(plate, values, shape_match)
+    match, drives, error = _best_match(plate, values, shapes)
     off = off_scale(observation, values, match)
     if off and len(observation.sensors) - len(off) >= LEAST_SENSORS:
         wrong = np.isin(observation.sensors, [each.name for each in off])

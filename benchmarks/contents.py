@@ -151,9 +151,7 @@ def _print_modulated(
         requests = [Request(at) for at in places[:contents]]
         fingers = [Finger(at) for at in places[contents:]]
         plain = answer(table, requests, fingers)
-        found = with_modulation(
-            table, requests, fingers, plain, [modulation, *[None] * (contents - 1)]
-        )
+        found = with_modulation(table, plain, [modulation, *[None] * (contents - 1)])
         before, after = plain.promised_worst_db, found.promised_worst_db
         if found.layers[0].side_bands and before is not None and after is not None:
             steady.append(before)

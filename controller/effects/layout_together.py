@@ -278,4 +278,4 @@ def _answered(
     least = -math.inf if protected is None else MIN_CONTRAST_DB
     found = answer(table, requests, others, min_contrast_db=least)
     modulations = [target.modulation_hz for _, target in fingers]
-    return with_modulation(table, requests, others, found, modulations, playable=playable)
+    return with_modulation(table, found, modulations, playable=playable)

@@ -65,20 +65,18 @@ def query_jointly(
     kept = _kept(requests, targets, before)
     found = _answer(table, requests, fingers, kept, math.inf if is_moving else KEPT_WITHIN)
     modulations, playable = _modulations(targets, capabilities.layers), capabilities.frequencies
-    found = with_modulation(table, requests, fingers, found, modulations, playable=playable)
+    found = with_modulation(table, found, modulations, playable=playable)
     strokes = {era.name: era.stroke for era in table.eras}
     free, factor = found, _factor_within(found, capabilities, strokes)
     if factor < 1 - NEARLY:
         gains_db = _gains_db(requests, found, capabilities, strokes)
-        lowered = with_gains(table, requests, fingers, found, gains_db)
+        lowered = with_gains(table, found, gains_db)
         if lowered is None:  # who is lowered is not served any more: by the rule, then
             softer = [
                 _at_gain(*each) for each in zip(requests, found.layers, gains_db, strict=True)
             ]
             lowered = answer(table, softer, fingers)
-            lowered = with_modulation(
-                table, softer, fingers, lowered, modulations, playable=playable
-            )
+            lowered = with_modulation(table, lowered, modulations, playable=playable)
         found = lowered
         factor = _factor_within(found, capabilities, strokes)
     change = float(decibels(factor))

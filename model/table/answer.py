@@ -12,11 +12,9 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 from model.arguments import expect_at_least
 from model.choice import best_by, best_of
-from model.drive_modes.tones import excitation_of
 from model.errors import InputError
 from model.table.contents import Contents, Stream, Tones
 from model.table.contents_kernel import choose_tones
@@ -25,11 +23,8 @@ from model.table.request import (
     MIN_CONTRAST_DB,
     Answer,
     Finger,
-    Layer,
-    QuietFinger,
     Request,
     check_requests,
-    verdict_of,
 )
 from model.table.table import LocalizationTable
 
@@ -90,36 +85,16 @@ class _Answering:
         quiet = range(count, count + len(self.fingers))
         plan = _Plan(tuple(zip(range(count), strict=True)), tuple(quiet))
         tried = [self._measure(plan)]
-        while self._is_out_of_bounds(tried[-1]) or (
+        while is_out_of_bounds(tried[-1]) or (
             _worst_of(tried[-1]) < min_contrast_db and len(plan.contents) > 1
         ):
             plan = self._with_less(plan, tried[-1])
             tried.append(self._measure(plan))
         if _worst_of(tried[-1]) >= min_contrast_db:
             return tried[-1]
-        best = best_by([each for each in tried if not self._is_out_of_bounds(each)], _worst_of)
+        best = best_by([each for each in tried if not is_out_of_bounds(each)], _worst_of)
         below = f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served"
         return replace(best, applied=(*best.applied, below))
-
-    def _is_out_of_bounds(self, found: Answer) -> bool:
-        """Whether a finger has less contrast, or more of others' contents, than it allows."""
-        served = [layer for layer in found.layers if layer.verdict != "held back"]
-        if [layer.verdict != "shared" for layer in served].count(True) > 1:
-            for layer in served:
-                contrast = layer.promised_contrast_db
-                if contrast is not None and contrast < layer.request.min_contrast_db:
-                    return True
-        return bool(self._disturbed(found))
-
-    def _disturbed(self, found: Answer) -> list[int]:
-        """Fingers that would feel more of others' contents than they allow."""
-        levels = [layer.foreign_level_db_sl for layer in found.layers]
-        levels += [finger.level_db_sl for finger in found.quiet]
-        return [
-            finger
-            for finger, level in enumerate(levels)
-            if level is not None and not level <= self._every[finger].max_foreign_db_sl
-        ]
 
     def _with_less(self, plan: _Plan, found: Answer) -> _Plan:
         """The plan after the next step of the rule."""
@@ -145,7 +120,7 @@ class _Answering:
                 applied=(*plan.applied, f"{_at(requests[other[0]])} shares the content of "
                          f"{_at(requests[one[0]])}"),
             )  # fmt: skip
-        disturbed = self._disturbed(found)[:1]
+        disturbed = disturbed_fingers(found)[:1]
         others = [each for each in contents if not {*disturbed}.intersection(each)]
         least = min(requests[each[0]].priority for each in others)
         lowest = [each for each in others if requests[each[0]].priority == least]
@@ -153,14 +128,17 @@ class _Answering:
             each for each in lowest if not any(requests[finger].is_protected for finger in each)
         ]
         given_up = (open_ or lowest)[-1]
-        figures = [(finger, found.layers[finger].promised_contrast_db) for finger in given_up]
+        had = [found.tones.contrast_db[finger][2] for finger in given_up]
         verb = "is neither served nor protected" if open_ else "is held back"
         return _Plan(
             tuple(each for each in contents if each != given_up),
             plan.quiet if open_ else (*plan.quiet, *given_up),
             (
                 *plan.held,
-                *((n, -math.inf if c is None else c, bool(disturbed)) for n, c in figures),
+                *(
+                    (finger, -math.inf if math.isnan(each) else each, bool(disturbed))
+                    for finger, each in zip(given_up, had, strict=True)
+                ),
             ),
             (*plan.applied, f"content of {_at(requests[given_up[0]])} {verb}"),
         )
@@ -212,61 +190,30 @@ class _Answering:
 
     def _measure(self, plan: _Plan) -> Answer:
         """What fingers feel of a plan's contents."""
-        contents = self._contents(plan)
-        found = choose_tones(self.table, contents) if contents.streams else None
-        layers: list[Layer | None] = [None] * len(self.requests)
-        for number, stream in enumerate(contents.streams):
-            assert found is not None  # noqa: S101  there are contents
-            weights = [(found.rows[number], found.weights[number])]
-            excitation = excitation_of(
-                weights, self.table.eras, self.table.frequencies, gain=found.gains[number]
-            )
-            for finger in stream.targets:
-                figures = figures_of(found, finger)
-                is_shared = finger != stream.targets[0]
-                verdict = "shared" if is_shared else verdict_of(figures["promised_contrast_db"])
-                layers[finger] = Layer(self.requests[finger], excitation, verdict, **figures)
-        heard = [-math.inf] * len(self._every) if found is None else found.foreign_db_sl
-        for finger, contrast, is_disturbing in plan.held:
-            layers[finger] = Layer(
-                self.requests[finger],
-                {},
-                "held back",
-                promised_contrast_db=contrast,
-                foreign_level_db_sl=heard[finger] if finger in plan.quiet else None,
-                is_disturbing=is_disturbing,
-            )
-        quiet = []
-        for number, each in enumerate(self.fingers, start=len(layers)):
-            felt = promised_felt = math.inf
-            if found is not None:
-                felt, _, promised_felt = found.contrast_db[number]
-            quiet.append(QuietFinger(each.at, felt, promised_felt, heard[number]))
-        applied = plan.applied
-        if found is not None and not found.is_apart:
+        contents, applied = self._contents(plan), plan.applied
+        tones = Tones.none(len(contents.places))
+        if contents.streams:
+            tones = choose_tones(self.table, contents)
+        if not tones.is_apart:
             applied += (f"frequencies are nearer than {self.apart_hz:g} Hz",)
-        return Answer(
-            tuple(layer for layer in layers if layer),
-            tuple(quiet),
-            None if found is None or math.isnan(found.worst_db) else found.worst_db,
-            1.0 if found is None else found.stroke_factor,
-            applied,
-        )
+        given = self.requests, self.fingers, contents, tones, plan.held, applied
+        return Answer(*given, self.table.eras, self.table.frequencies)
 
 
-def figures_of(tones: Tones, finger: int) -> dict[str, Any]:
-    """What a finger feels of the tones of all contents, by fields of `Layer`."""
-    level, promised_level = tones.level_db_sl[finger]
-    figures = *tones.contrast_db[finger], tones.foreign_db_sl[finger]
-    nominal, median, promised, of_others = [None if math.isnan(each) else each for each in figures]
-    return {
-        "level_db_sl": level,
-        "promised_level_db_sl": promised_level,
-        "felt_contrast_db": nominal,
-        "median_felt_contrast_db": median,
-        "promised_contrast_db": promised,
-        "foreign_level_db_sl": of_others,
-    }
+def is_out_of_bounds(found: Answer) -> bool:
+    """Whether a finger has less contrast, or more of others' contents, than it allows."""
+    streams, contrast = found.contents.streams, found.tones.contrast_db
+    targets = [finger for stream in streams for finger in stream.targets]
+    is_low = [contrast[each][2] < found.requests[each].min_contrast_db for each in targets]
+    return (len(streams) > 1 and any(is_low)) or bool(disturbed_fingers(found))
+
+
+def disturbed_fingers(found: Answer) -> list[int]:
+    """Fingers that would feel more of others' contents than they allow."""
+    bounds = [each.max_foreign_db_sl for each in found.requests]
+    bounds += [each.max_foreign_db_sl for each in found.fingers]
+    levels = enumerate(zip(found.tones.foreign_db_sl, bounds, strict=True))
+    return [finger for finger, (level, bound) in levels if level > bound]
 
 
 def _worst_of(found: Answer) -> float:

@@ -13,6 +13,7 @@ of the highest contrast at its level.
 `model.table.contents_kernel` finds them in C, `model.table.contents_numpy` in numpy.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -107,20 +108,22 @@ class Contents:
 
 @dataclass(frozen=True, eq=False)
 class Tones:
-    """Tones of K contents, and what k fingers feel of them.
+    """Tones of K contents, one of each or more, and what k fingers feel of them.
 
-    rows (K,): of the table's frequencies; weights (K, n): up to full stroke; gains (K,): to the
-    levels, within the stroke; contrast_db (k, 3): nominal, of half of the drawn plates and
-    promised, NaN without other contents or fingers; level_db_sl (k, 2): of a finger's own content,
-    nominal and promised; foreign_db_sl (k,): of other contents, which nine of ten plates do not
-    exceed; worst_db: contrast of all fingers that is promised, NaN for one alone; loudest_db_sl: at
-    quiet fingers; stroke_factor: least factor on the gains for the stroke; is_apart: whether the
+    rows (m,): of the table's frequencies; weights (m, n): up to full stroke; gains (m,): to the
+    levels, within the stroke; owners (m,): the content of each tone; contrast_db (k, 3): nominal,
+    of half of the drawn plates and promised, NaN without other contents or fingers; level_db_sl
+    (k, 2): of a finger's own content, nominal and promised; foreign_db_sl (k,): of other contents,
+    which nine of ten plates do not exceed, NaN at fingers that are neither felt nor quiet;
+    worst_db: contrast of all fingers that is promised, NaN for one alone; loudest_db_sl: at quiet
+    fingers; stroke_factor: least factor on the gains for the stroke; is_apart: whether the
     frequencies are.
     """
 
     rows: list[int]
     weights: Sequence[Sequence[complex]]
     gains: list[float]
+    owners: Sequence[int]
     contrast_db: Sequence[Sequence[float]]
     level_db_sl: Sequence[Sequence[float]]
     foreign_db_sl: list[float]
@@ -128,3 +131,10 @@ class Tones:
     loudest_db_sl: float
     stroke_factor: float
     is_apart: bool
+
+    @classmethod
+    def none(cls, fingers: int) -> "Tones":
+        """Nothing that plays at so many fingers."""
+        contrast, level = [(math.inf,) * 3] * fingers, [(-math.inf,) * 2] * fingers
+        heard = [-math.inf] * fingers
+        return cls([], [], [], [], contrast, level, heard, math.nan, -math.inf, 1.0, is_apart=True)

@@ -99,6 +99,7 @@ def choose_tones(table: "LocalizationTable", contents: Contents) -> Tones:
         rows=rows.tolist(),
         weights=list(zip(*[weights] * n, strict=True)),
         gains=found[size:contrast],
+        owners=range(count),
         contrast_db=list(zip(*[iter(found[contrast:level])] * 3, strict=True)),
         level_db_sl=list(zip(*[iter(found[level:of_others])] * 2, strict=True)),
         foreign_db_sl=found[of_others:-3],

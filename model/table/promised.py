@@ -24,18 +24,18 @@ def promised(
     owners: IntArray,
     *,
     is_apart: bool = True,
-    at_levels: bool = True,
+    gains: FloatArray | None = None,
 ) -> Tones:
-    """What fingers feel of tones at rows (m,) of weights (m, n), brought to their levels.
+    """What fingers feel of tones at rows (m,) of weights (m, n), at gains (m,).
 
-    owners (m,): the content of each tone; at_levels: False for tones as they are.
+    owners (m,): the content of each tone; gains: None for those to the contents' levels.
     """
     shares, streams, k = fingers.tips.fine_weights, contents.streams, len(contents.places)
     power = fingers.powers(PROMISED_DRAWS, rows, weights)
-    gains, factor = np.ones(len(streams)), 1.0
-    if at_levels:
-        gains, factor = _gains_to_levels(contents, power, shares, weights, owners)
-    by_tone = gains[owners]
+    by_tone, factor = gains, 1.0
+    if by_tone is None:
+        of_contents, factor = _gains_to_levels(contents, power, shares, weights, owners)
+        by_tone = of_contents[owners]
     power = power * np.square(by_tone, dtype=np.float32)[:, None, None, None]
     contrast, level, of_others = (np.full(size, np.nan) for size in ((k, 3), (k, 2), k))
     each_own = [
@@ -67,6 +67,7 @@ def promised(
         rows=rows.tolist(),
         weights=weights.tolist(),
         gains=by_tone.tolist(),
+        owners=owners.tolist(),
         contrast_db=decibels(contrast).tolist(),
         level_db_sl=decibels(level).tolist(),
         foreign_db_sl=decibels(of_others).tolist(),

@@ -2,20 +2,24 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from numbers import Real
 from typing import Any
 
 import numpy as np
 
 from model.arguments import expect_number, shown
+from model.arrays import FloatArray
+from model.drive_modes.tones import excitation_of
 from model.errors import InputError
 from model.files.csv_file import as_frame
 from model.finger import MAX_CONTACTS
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import STRONG_DB_SL
-from model.structure.attachments import check_loads
+from model.structure.attachments import Era, check_loads
 from model.structure.plate import Plate
+from model.table.contents import Contents, Tones
 from model.table.question import MAX_LEVEL_DB_SL, MIN_LEVEL_DB_SL, Point, check_on_plate
 from model.vibration.excitation import Excitation
 
@@ -159,20 +163,87 @@ class QuietFinger:
     level_db_sl: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Answer:
-    """Layers of all requests, in their order, and what is promised of all together.
+    """What is played for the requests of all fingers, and what is promised of all together.
 
-    quiet: what quiet fingers feel; promised_worst_db: the least contrast of all fingers, on nine of
-    ten plates, None for one finger alone; stroke_factor: of the requested levels that the ERAs'
-    stroke allows, 1 for all; applied: what was changed in the requests, in words.
+    fingers: those that are to feel nothing, numbered after the requests; contents: that are played,
+    and who is kept quiet; tones: of these; held: contents given up, by request, with the contrast
+    that they would have had, and whether they would disturb a finger; applied: what was changed in
+    the requests, in words; eras, frequencies [Hz]: of the table.
     """
 
-    layers: tuple[Layer, ...]
-    quiet: tuple[QuietFinger, ...]
-    promised_worst_db: float | None
-    stroke_factor: float
-    applied: tuple[str, ...] = field(default=())
+    requests: tuple[Request, ...]
+    fingers: tuple[Finger, ...]
+    contents: Contents
+    tones: Tones
+    held: tuple[tuple[int, float, bool], ...]
+    applied: tuple[str, ...]
+    eras: tuple[Era, ...]
+    frequencies: FloatArray
+
+    @cached_property
+    def layers(self) -> tuple[Layer, ...]:
+        """What is played for each request, with what its finger feels."""
+        found, tones = dict[int, Layer](), self.tones
+        for number, stream in enumerate(self.contents.streams):
+            carrier, *sides = self._excitations(number)
+            for finger in stream.targets:
+                felt, median, promised = map(_known, tones.contrast_db[finger])
+                level, promised_level = tones.level_db_sl[finger]
+                is_shared = finger != stream.targets[0]
+                found[finger] = Layer(
+                    self.requests[finger],
+                    carrier,
+                    "shared" if is_shared else verdict_of(promised),
+                    level,
+                    promised_level,
+                    felt,
+                    median,
+                    promised,
+                    _known(tones.foreign_db_sl[finger]),
+                    side_bands=tuple(sides),
+                )
+        for finger, had, is_disturbing in self.held:
+            found[finger] = Layer(
+                self.requests[finger],
+                {},
+                "held back",
+                promised_contrast_db=had,
+                foreign_level_db_sl=_known(tones.foreign_db_sl[finger]),
+                is_disturbing=is_disturbing,
+            )
+        return tuple(found[number] for number in range(len(self.requests)))
+
+    @property
+    def quiet(self) -> tuple[QuietFinger, ...]:
+        """What quiet fingers feel."""
+        figures = zip(self.tones.contrast_db, self.tones.foreign_db_sl, strict=True)
+        felt = [*figures][len(self.requests) :]
+        return tuple(
+            QuietFinger(each.at, contrast[0], contrast[2], level)
+            for each, (contrast, level) in zip(self.fingers, felt, strict=True)
+        )
+
+    @property
+    def promised_worst_db(self) -> float | None:
+        """The least contrast of all fingers, on nine of ten plates; None for one finger alone."""
+        return _known(self.tones.worst_db)
+
+    @property
+    def stroke_factor(self) -> float:
+        """Of the requested levels what the ERAs' stroke allows, 1 for all."""
+        return self.tones.stroke_factor
+
+    def _excitations(self, content: int) -> list[Excitation]:
+        """The tones of a content, its carrier first."""
+        tones, on = self.tones, (self.eras, self.frequencies)
+        every = zip(tones.rows, tones.weights, tones.gains, tones.owners, strict=True)
+        return [
+            excitation_of([(row, weights)], *on, gain=gain)
+            for row, weights, gain, owner in every
+            if owner == content
+        ]
 
     def to_frame(self) -> Any:
         """What each request's finger feels as a pandas DataFrame, a row a finger; needs pandas."""
@@ -189,6 +260,11 @@ class Answer:
                 "foreign_level_db_sl": [layer.foreign_level_db_sl for layer in self.layers],
             }
         )
+
+
+def _known(figure: float) -> float | None:
+    """A figure, None for one that there is not."""
+    return None if math.isnan(figure) else figure
 
 
 def verdict_of(promised_contrast_db: float | None) -> str:

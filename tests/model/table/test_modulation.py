@@ -42,7 +42,7 @@ def test_promise_of_a_modulated_content_is_kept(table, modulation):
         requests = [Request(at, level_db_sl=12.0) for at in places[:2]]
         fingers = [Finger(places[2])]
         plain = answer(table, requests, fingers)
-        found = with_modulation(table, requests, fingers, plain, [modulation, modulation])
+        found = with_modulation(table, plain, [modulation, modulation])
         plates = draw_plates(
             np.random.default_rng(number),
             table.uncertainty,
@@ -76,7 +76,7 @@ def test_side_bands_lie_evenly_about_the_carrier_at_half_its_amplitude(table):
     """Full modulation: half of the carrier's amplitude at the finger each, 1.8 dB more in all."""
     requests = [Request((0.126, 0.081), level_db_sl=14.0), Request((0.234, 0.049))]
     plain = answer(table, requests)
-    found = with_modulation(table, requests, [], plain, [20.0, None])
+    found = with_modulation(table, plain, [20.0, None])
     layer = found.layers[0]
     carrier = frequency_of(layer)
     sides = sides_of(layer)
@@ -104,7 +104,7 @@ def test_side_bands_of_their_own_leak_less_than_those_of_the_carrier(table):
     for places in contact_sets(6, fingers=2, seed=7):
         requests = [Request(at, level_db_sl=12.0) for at in places]
         plain = answer(table, requests)
-        found = with_modulation(table, requests, [], plain, [20.0, None])
+        found = with_modulation(table, plain, [20.0, None])
         if found.layers[0].side_bands:
             lost.append(plain.promised_worst_db - found.promised_worst_db)
     assert len(lost) >= 4
@@ -116,14 +116,14 @@ def test_a_modulation_is_left_out_where_a_finger_would_feel_too_much(table):
     quiet = Finger((0.16, 0.20))
     requests = [Request((0.09, 0.07), level_db_sl=12.0)]
     plain = answer(table, requests, [quiet])
-    modulated = with_modulation(table, requests, [quiet], plain, [30.0])
+    modulated = with_modulation(table, plain, [30.0])
     leak = modulated.quiet[0].level_db_sl
-    bounded = [Finger(quiet.at, max_foreign_db_sl=leak - 0.1)]
+    bounded = (Finger(quiet.at, max_foreign_db_sl=leak - 0.1),)
     assert modulated.layers[0].side_bands
-    assert not with_modulation(table, requests, bounded, plain, [30.0]).layers[0].side_bands
+    assert not with_modulation(table, replace(plain, fingers=bounded), [30.0]).layers[0].side_bands
     low = [Request((0.09, 0.07), (40.0, 50.0), level_db_sl=12.0)]
     found = answer(table, low, [quiet])
-    assert with_modulation(table, low, [quiet], found, [30.0]) == found
+    assert with_modulation(table, found, [30.0]) == found
 
 
 def test_fingers_that_share_or_are_held_back_feel_side_bands_too(table):
@@ -147,7 +147,7 @@ def test_fingers_that_share_or_are_held_back_feel_side_bands_too(table):
             if each.excitation and each.excitation != plain.layers[finger].excitation
         )
         modulations = [20.0 if n == other else None for n in range(len(requests))]
-        found = with_modulation(table, requests, [], plain, modulations)
+        found = with_modulation(table, plain, modulations)
         said = found.layers[finger].foreign_level_db_sl
         assert found.layers[finger].verdict == verdict
         assert found.layers[other].side_bands
@@ -164,19 +164,17 @@ def test_fingers_that_share_or_are_held_back_feel_side_bands_too(table):
         power = sum(powers(table, each, places, plates)[0][finger] for each in tones)
         level = 10 * np.log10(power.max(axis=0))
         assert 0.82 <= (level <= said).mean() <= 0.97
-        bounded = [*plain.layers]
-        bounded[finger] = replace(
-            bounded[finger], request=replace(requests[finger], max_foreign_db_sl=said - 0.1)
-        )
-        steady = replace(plain, layers=tuple(bounded))
-        assert with_modulation(table, requests, [], steady, modulations) == steady
+        bounded = [*requests]
+        bounded[finger] = replace(requests[finger], max_foreign_db_sl=said - 0.1)
+        steady = replace(plain, requests=tuple(bounded))
+        assert with_modulation(table, steady, modulations) == steady
 
 
 @pytest.mark.parametrize("modulation", [15.0, 25.0])
 def test_a_modulation_between_two_steps_of_the_table_plays_the_nearest(table, modulation):
     """At steps of 10 Hz 15 are 10 or 20 and 25 are 20 or 30, the same on both sides."""
     requests = [Request((0.126, 0.081), (150.0, 200.0)), Request((0.234, 0.049), (290.0, 320.0))]
-    found = with_modulation(table, requests, [], answer(table, requests), [modulation, None])
+    found = with_modulation(table, answer(table, requests), [modulation, None])
     carrier, (low, high) = frequency_of(found.layers[0]), sides_of(found.layers[0])
     assert carrier - low == pytest.approx(high - carrier)
     assert abs(high - carrier - modulation) == pytest.approx(5.0)
@@ -187,8 +185,8 @@ def test_side_bands_stay_within_what_amplifiers_play(table):
     requests = [Request((0.126, 0.081), (100.0, 110.0))]
     fingers = [Finger((0.234, 0.049))]
     plain = answer(table, requests, fingers)
-    assert with_modulation(table, requests, fingers, plain, [20.0]).layers[0].side_bands
-    found = with_modulation(table, requests, fingers, plain, [20.0], playable=(100.0, 300.0))
+    assert with_modulation(table, plain, [20.0]).layers[0].side_bands
+    found = with_modulation(table, plain, [20.0], playable=(100.0, 300.0))
     assert found == plain
 
 
@@ -199,7 +197,7 @@ def test_all_tones_of_two_contents_are_apart(table, modulation):
     for places in contact_sets(8, fingers=2, seed=7):
         requests = [Request(at) for at in places]
         plain = answer(table, requests)
-        found = with_modulation(table, requests, [], plain, [modulation, modulation])
+        found = with_modulation(table, plain, [modulation, modulation])
         if any(each.side_bands for each in found.layers):
             one, other = ([frequency_of(each), *sides_of(each)] for each in found.layers)
             gaps.append(min(abs(a - b) for a in one for b in other))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from drivers.contents import Layer
 from drivers.errors import CommandRefused
-from drivers.host.bounds import all_bounds, worst
+from drivers.host.bounds import Bounds
 from drivers.host.limits import COMMIT_DELAY, TOLERANCE, Budget, Rounding, Vibration, wire_limits
 from drivers.playback import playback_of
 from drivers.protocol.records import Values
@@ -230,14 +230,15 @@ class Ledger:
         self, layers: Sequence[LayerSet], late: float, until: float
     ) -> CommandRefused | None:
         """Return why layers must not play from a time between two on [s]; None if they may."""
-        bounds = all_bounds(self.playback, layers, late, until=until)
-        levels, power = worst(bounds)
+        bounds = Bounds(self.playback, layers, late, until)
+        levels, power = bounds.worst()
         highest = self.limits.level / _LEVEL.per_unit
-        for channel, (bound, level) in enumerate(zip(bounds, levels, strict=True)):
-            if bound.rise > self.limits.slew * TOLERANCE:
+        for channel, level in enumerate(levels):
+            rise = 0.0 if self.limits.slew == math.inf else bounds.rise(channel)
+            if rise > self.limits.slew * TOLERANCE:
                 text = (
                     f"level must rise by at most {self.limits.slew:g} per second, got "
-                    f"{bound.rise:g} per second; use a longer ramp"
+                    f"{rise:g} per second; use a longer ramp"
                 )
                 return CommandRefused(f"channel {channel}: {text}", channel=channel)
             if level > highest * TOLERANCE:

@@ -187,6 +187,9 @@ class ExpectedAmplifier:
         """Apply a request carried out between two times, as its reply or a later status shows."""
         ramp = min(values.get("ramp", 0), self.can.get("ramp_max", math.inf)) / 1000
         cause = f"{name} {values}"
+        has_expired = self.is_enabled and shown.get("fault") == FAULTS["WATCHDOG"]
+        if name in ("Stop", "Disarm") and has_expired and when[1] >= self.expiry[0]:
+            self._trip(FAULTS["WATCHDOG"], (self.expiry[0], when[1]), "the watchdog")  # first
         if name == "Arm":
             if not self.is_enabled or values["session"] != self.session:
                 self._fall_silent(ENABLED, when, FADE, cause, has_floor=False)

@@ -118,6 +118,14 @@ def test_reply_that_is_delayed_beyond_newer_ones_says_nothing_of_now() -> None:
     assert late.found == []
 
 
+@pytest.mark.parametrize(("kind", "latch"), [(hand.STOP, 2), (hand.DISARM, 1)])
+def test_watchdog_may_be_sooner_than_what_is_on_its_way(kind: int, latch: int) -> None:
+    """It expires 250 ms after Arm, in the 4 ms that the request and its reply take."""
+    talk = Talk().armed().rest(0.246).sends(kind, (5,)).rest(0.004)
+    talk.replies(kind, hand.status(hand.FAULT, fault=hand.WATCHDOG, latch=latch))
+    assert talk.found == []
+
+
 def test_fault_that_came_before_the_watchdog_may_show_afterwards() -> None:
     """Nothing was asked for 0.4 s, in which an arc was sooner than the watchdog of 0.25 s."""
     talk = Talk().armed().rest(0.4)

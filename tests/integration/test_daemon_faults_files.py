@@ -15,7 +15,7 @@ from controller.daemon.run import check_daemon
 from daemon_bench import ENABLED, daemon_table, holding, ready_daemon, write_daemon
 from model.errors import InputError
 from model.table.file import save_table
-from virtual_sockets import in_virtual_time_on_sockets
+from virtual_loop import in_virtual_time
 
 MAX_TIME = 5.0  # s; expanded aliases would take minutes, and gigabytes
 
@@ -84,7 +84,7 @@ def test_daemon_refuses_the_table_of_another_plate(tmp_path: Path) -> None:
         check_daemon(path)
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_running_daemon_keeps_configuration_when_reload_is_invalid(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

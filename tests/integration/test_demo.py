@@ -27,7 +27,7 @@ from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from patient_daemon import wait_long
 from tuio_messages import write_schedule
-from virtual_sockets import run_virtual_on_sockets
+from virtual_loop import run_virtual
 
 ERA_NAMES = {"SW", "SE", "NE", "NW"}
 
@@ -74,7 +74,7 @@ def test_demo_contacts_feel_the_prediction(capture, demo, monkeypatch):
     by a layout that the daemon has reloaded: both that are down together have a content each.
     In virtual time; what differs on wires is a far end of its own, see below.
     """
-    monkeypatch.setattr(asyncio, "run", run_virtual_on_sockets)
+    monkeypatch.setattr(asyncio, "run", run_virtual)
     plate = load_rig(example_rig_path()).plate
     layout = layout_of_people(plate, {"left": None, "right": None})
     recorded = read_capture(capture)

@@ -15,7 +15,7 @@ from long_form import shortly
 from model.rig.file import load_rig
 from model.table.build import build_table
 from tuio_messages import write_schedule
-from virtual_sockets import run_virtual_on_sockets
+from virtual_loop import run_virtual
 
 EXAMPLES = Path(model.__file__).parents[1] / "examples"
 CHANNELS = {"eight_eras": [4, 4], "car_display": [4, 4, 4], "table": [4, 4, 4, 4]}
@@ -41,7 +41,7 @@ def test_finger_feels_what_many_eras_promise(name: str, capture: Path) -> None:
     counts = Counter(wire.amplifier for wire in rig.wiring.values())
     assert [counts[amplifier] for amplifier in rig.amplifiers] == CHANNELS[name]
     table = build_table(rig, frequencies=np.array([120.0, 160.0, 200.0]), drive_mode="phased")
-    rows = run_virtual_on_sockets(
+    rows = run_virtual(
         run_demo(
             file,
             table,
@@ -71,9 +71,7 @@ def test_three_people_each_feel_their_own_content_while_one_slides_and_one_leave
     rig = load_rig(file)
     table = build_table(rig, frequencies=np.arange(60.0, 281.0, 10.0), drive_mode="phased")
     scene = example_scenes(rig)[-1]
-    rows = run_virtual_on_sockets(
-        run_demo(file, table, wire="sim", scenes=[scene], on_row=lambda row: None)
-    )
+    rows = run_virtual(run_demo(file, table, wire="sim", scenes=[scene], on_row=lambda row: None))
     slid, stayed, left = rows
     assert [len(row.fingers) for row in rows] == [2, 2, 3]
     assert slid.targets_m == [pytest.approx((0.15 * 0.53, 0.65 * 0.30), abs=0.008)]

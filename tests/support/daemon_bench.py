@@ -35,7 +35,7 @@ from rig_files import write_rig
 from rig_on_wire import WIRES, FarSide, far_side
 from sim.witness.witness import OperatorCommand, Witness
 from small_table import small_table
-from virtual_sockets import VirtualSocketsLoop
+from virtual_loop import VirtualLoop
 from witness_config import tell_first, witness_config
 
 PATIENCE = 180.0  # s; generous, for a loaded machine
@@ -112,7 +112,7 @@ async def far_end(
 ) -> AsyncIterator[FarSide]:
     """The example's amplifier on a serial line; changes: replacements in the rig's text."""
     rig = load_rig(write_rig(folder / "bench.yaml", *changes))
-    if isinstance(asyncio.get_running_loop(), VirtualSocketsLoop):
+    if isinstance(asyncio.get_running_loop(), VirtualLoop):
         live_in_memory()
     async with far_side(WIRES["serial"], rig) as far:
         yield far
@@ -137,7 +137,7 @@ async def daemon_at(
     lock, log = SocketLock(config.socket), LogThread(folder / "log")
     manager = ServiceManager(environment or {})
     loop = asyncio.get_running_loop()
-    is_virtual = isinstance(loop, VirtualSocketsLoop)
+    is_virtual = isinstance(loop, VirtualLoop)
     # Daemon, amplifier and test share a process, which a busy machine delays; in real time the
     # watchdog is the longest of the protocol, since no test of this bench lets it expire.
     daemon = Daemon(
@@ -174,7 +174,7 @@ async def daemon_at(
 def judged(daemon: Daemon, far: FarSide) -> Witness:
     """A witness of a daemon's lines in virtual time, which is told of commands, fingers, faults."""
     loop = asyncio.get_running_loop()
-    assert isinstance(loop, VirtualSocketsLoop)
+    assert isinstance(loop, VirtualLoop)
     witness = Witness(witness_config(far.urls))
     loop.seen = lambda link, toward, data: witness.record_bytes(
         link,

@@ -29,7 +29,7 @@ from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from rig_on_wire import FarSide
-from virtual_sockets import VirtualSocketsLoop
+from virtual_loop import VirtualLoop
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -169,7 +169,7 @@ def _never() -> bool:
     return False
 
 
-class _StandingLoop(VirtualSocketsLoop):
+class _StandingLoop(VirtualLoop):
     """Virtual time that stands still while `stands` says so; sockets and pipes are served."""
 
     def __init__(self) -> None:

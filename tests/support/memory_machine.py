@@ -12,7 +12,6 @@ from drivers.errors import LinkError
 from drivers.hardware import PORT_OPENER
 from sim.transport.pseudo_terminal import TERMINAL_MAKER, PseudoTerminal
 from virtual_loop import VirtualLoop
-from virtual_sockets import VirtualSocketsLoop
 
 _PASSING = (50e-6, 900e-6)  # s; through driver and adapter
 _SPLIT = 0.1  # share of pieces that arrive in two
@@ -22,7 +21,7 @@ _NOTICED = 0.002  # s; until the host notices a hang-up
 class MemoryMachine:
     """Ports by name; `make_terminal` is for far ends, the rest for hosts."""
 
-    def __init__(self, loop: VirtualLoop | VirtualSocketsLoop) -> None:
+    def __init__(self, loop: VirtualLoop) -> None:
         self._loop = loop
         self._terminals: dict[str, MemoryTerminal] = {}
         self._open: dict[str, MemoryPort] = {}
@@ -78,7 +77,7 @@ class MemoryMachine:
 def live_in_memory() -> MemoryMachine:
     """Connect hosts and far ends of the running virtual loop in memory."""
     loop = asyncio.get_running_loop()
-    assert isinstance(loop, VirtualLoop | VirtualSocketsLoop)
+    assert isinstance(loop, VirtualLoop)
     machine = MemoryMachine(loop)
     random.seed(loop.rng.random())  # of tokens, and of numbers on wires
     PORT_OPENER.set(machine.open_port)

@@ -1,14 +1,16 @@
-"""An event loop without threads, files and sockets, on a clock that jumps to the next timer.
+"""An event loop on a clock that jumps to the next timer, with a TCP network of its own.
 
-It has its own network: TCP connections between listeners and clients of the same loop. Runs with
-the same random seed are identical, byte for byte.
+Connections of that network are between listeners and clients of the same loop; all else has the
+machine's sockets and pipes, and costs no time. Runs without those and with the same random seed are
+identical, byte for byte.
 """
 
 import asyncio
 import functools
 import math
 import random
-from asyncio.base_events import BaseEventLoop
+import selectors
+import threading
 from collections.abc import Callable, Coroutine
 from typing import Any, ParamSpec, TypeVar
 
@@ -18,6 +20,8 @@ T = TypeVar("T")
 START = 1000.0  # s; not zero, which code could take for "never"
 _FIRST_PORT = 20_000
 _TURNS_MAX = 20_000  # at one moment; more are an endless loop
+_REAL_WAIT = 0.001  # s; for a thread that works
+_AWAITED = ("reload", "dump")  # names of threads for which time stands still
 _LATENCY = (50e-6, 400e-6)  # s; of a loopback connection
 
 Seen = Callable[[str, str, bytes], None]
@@ -28,17 +32,44 @@ class Stuck(Exception):
     """Deadlock: no timer and no ready task, or no progress of time."""
 
 
-class VirtualLoop(BaseEventLoop):
+class _Selector(selectors.DefaultSelector):
+    """Waiting for a timer costs no time, waiting for the machine does: the clock jumps.
+
+    It stands still while a daemon's threads work with files.
+    """
+
+    def __init__(self, loop: "VirtualLoop") -> None:
+        super().__init__()
+        self._loop = loop
+        self._turns = 0
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        self._turns += 1
+        if self._turns > _TURNS_MAX:
+            self._turns = 0
+            raise Stuck(f"{_TURNS_MAX} turns at one moment: a task reschedules itself endlessly")
+        ready = super().select(0)
+        if ready or timeout == 0:
+            return ready
+        self._turns = 0
+        if timeout is None:
+            if len(self.get_map()) == 1 == threading.active_count():  # nothing but the loop's own
+                raise Stuck("deadlock: no timer and no ready task")
+            return super().select(timeout)
+        if any(each.name in _AWAITED for each in threading.enumerate()):
+            return super().select(_REAL_WAIT)
+        self._loop.now = max(self._loop.now, self._loop._scheduled[0].when())
+        return ready
+
+
+class VirtualLoop(asyncio.SelectorEventLoop):
     """The loop; rng: of the latencies of connections; seen: observer of their bytes."""
 
     def __init__(self, rng: random.Random | None = None, seen: Seen | None = None) -> None:
         self.now = START
-        self.ends = math.inf  # s; afterwards it is stuck
-        super().__init__()
-        self._turns = 0
+        super().__init__(_Selector(self))
         self.rng = rng or random.Random(0)
         self.seen: Seen = seen or (lambda link, toward, data: None)
-        self._selector = self
         self._servers: dict[int, _Server] = {}
         self._hosts: list[MemoryTransport] = []
 
@@ -55,31 +86,11 @@ class VirtualLoop(BaseEventLoop):
     def _clock_resolution(self, of_the_machine: float) -> None:
         """Ignore the resolution of the machine's clock."""
 
-    def select(self, timeout: float | None) -> list[Any]:
-        """There is no external input: advance to the next timer."""
-        self._turns += 1
-        if self._turns > _TURNS_MAX:
-            self._turns = 0
-            raise Stuck(f"{_TURNS_MAX} turns at one moment: a task reschedules itself endlessly")
-        if timeout is None:
-            raise Stuck("deadlock: no timer and no ready task")
-        if self.now > self.ends:
-            self.ends = math.inf
-            raise Stuck("tasks that do not end although they were cancelled")
-        if timeout > 0:
-            self._turns = 0
-            self.now = max(self.now, self._scheduled[0].when())
-        return []
-
-    def _process_events(self, event_list: list[Any]) -> None:
-        """No I/O events."""
-
-    def _write_to_self(self) -> None:
-        """Do nothing: there are no other threads."""
-
-    def run_in_executor(self, executor: Any, func: Callable[..., T], *args: Any) -> Any:
+    def run_in_executor(  # type: ignore[override]
+        self, executor: Any, func: Callable[..., T], *args: Any
+    ) -> "asyncio.Future[T]":
         """Run at once: there are no threads."""
-        future = self.create_future()
+        future: asyncio.Future[T] = self.create_future()
         try:
             future.set_result(func(*args))
         except Exception as error:

@@ -5,7 +5,7 @@ import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -13,119 +13,80 @@ import can
 
 from drivers.codec.can_bus.canopen import CanFrame
 from drivers.codec.can_bus.segments import pack_frames, unpack_frames
+from model.rig.rig import Channel
+from registry.limits import GuardLimits
+from rig_on_wire import make_bench
+from set_table import make_rig
 from sim.amplifier.contract import Amplifier
+from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.can_bus.adapters import SlcanAdapter, SocketcandClient
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
-from sim.far_ends.can_bus.bus import CanBus
+from sim.far_ends.can_bus.bus import BusNodes, CanBus
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from sim.transport.far_end import FarEnd
-from sim.transport.pseudo_terminal import make_terminal
+from sim.transport.far_end import TcpEnd, TerminalEnd
 
 _READ_TIMEOUT = 0.02  # s; after which the thread of a bus notices its end
+Numbered = Mapping[int, AmplifierDevice]
 
 
 @dataclass
 class FarSide:
-    """Amplifiers by number on a wire; url: of one of them; unplug: cut the wire."""
+    """Amplifiers by number on a wire; url: of one of them."""
 
     amplifiers: Mapping[int, Amplifier]
+    devices: Numbered
     url: Callable[[int], str]
-    unplug: Callable[[], None] = lambda: None
+
+    def unplug(self) -> None:
+        """Cut the wire."""
+        for plug in self.devices[1].plug_listeners:
+            plug(False)
 
     def level(self, number: int) -> float:
         """What channel 0 of an amplifier plays now."""
         now = asyncio.get_running_loop().time()
-        self.amplifiers[number].tick(now)
+        self.devices[number].tick(now)
         return self.amplifiers[number].playback.level(0, now)
 
 
-def _amplifiers(count: int) -> dict[int, Amplifier]:
-    return {number: Amplifier(str(number), channels=1) for number in range(1, count + 1)}
+def _far_side(count: int, url: Callable[[int], str]) -> FarSide:
+    """So many of three amplifiers, with one channel each."""
+    rig = make_rig("123", GuardLimits(20.0, 1000.0, 1.0))
+    wiring = {era: Channel(name, 0) for era, name in zip(rig.wiring, "123", strict=True)}
+    bench, devices = make_bench(replace(rig, wiring=wiring))
+    shown = {int(name): name for name in "123"[:count]}
+    return FarSide(
+        {number: bench.amplifiers[name] for number, name in shown.items()},
+        {number: devices[name] for number, name in shown.items()},
+        url,
+    )
+
+
+def _on_bus(
+    make_adapter: Callable[..., Any], devices: Numbered, send: Callable[[bytes], None]
+) -> Any:
+    """The adapter of a bus of its own, with these amplifiers on it."""
+    bus = CanBus()
+    BusNodes(bus, [*devices.values()])
+    return make_adapter(bus, send)
 
 
 @asynccontextmanager
-async def _terminal(
-    count: int, make_end: Callable[..., Any], url: Callable[[str, int], str]
+async def _served(
+    end: Callable[..., Any],
+    make_end: Callable[..., Any],
+    url: Callable[[Any, int], str],
+    count: int,
 ) -> AsyncIterator[FarSide]:
-    """Serve amplifiers on a pseudo-terminal."""
-    loop = asyncio.get_running_loop()
-    terminal = make_terminal(lambda data: end.receive(data, loop.time()))
-    far = FarSide(_amplifiers(count), partial(url, terminal.port), terminal.unplug)
-    end = make_end(far.amplifiers, terminal.write)
-    terminal.listen()
-    try:
+    """Serve amplifiers on a pseudo-terminal or a TCP port, to one host after another."""
+    far = _far_side(count, lambda number: url(served.port, number))
+    async with end(far.devices[1], partial(make_end, far.devices)) as served:
         yield far
-    finally:
-        terminal.close()
 
 
-@asynccontextmanager
-async def _server(
-    count: int, make_end: Callable[..., Any], url: Callable[[int, int], str]
-) -> AsyncIterator[FarSide]:
-    """Serve amplifiers on a TCP port, to one host after another."""
-    loop = asyncio.get_running_loop()
-    amplifiers = _amplifiers(count)
-    open_now: set[asyncio.StreamWriter] = set()
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        open_now.add(writer)
-        end = make_end(amplifiers, writer.write)
-        try:
-            while data := await reader.read(4096):
-                end.receive(data, loop.time())
-        except ConnectionError:
-            pass
-        finally:
-            open_now.discard(writer)
-            writer.close()
-
-    server = await asyncio.start_server(serve, "127.0.0.1", 0)
-    port = server.sockets[0].getsockname()[1]
-
-    def unplug() -> None:
-        for writer in open_now:
-            writer.transport.abort()
-
-    try:
-        yield FarSide(amplifiers, partial(url, port), unplug)
-    finally:
-        server.close()
-        unplug()
-        await asyncio.sleep(0)  # the connections end
-
-
-class _Nodes:
-    """Amplifiers on a simulated bus, booted."""
-
-    def __init__(self, bus: CanBus, amplifiers: Mapping[int, Amplifier]) -> None:
-        self._bus, self._loop = bus, asyncio.get_running_loop()
-        self._listener = self._hear
-        self._end = CanAmplifiers(amplifiers, self._send)
-        bus.join(self._listener)
-        self._end.start(self._loop.time())
-
-    def _hear(self, frame: CanFrame) -> None:
-        self._end.receive(pack_frames([frame]), self._loop.time())
-
-    def _send(self, data: bytes) -> None:
-        for frame in unpack_frames(data):
-            self._bus.send(frame, sender=self._listener)
-
-
-class _BusServer:
-    """Amplifiers on a bus of a connection, behind its adapter, as a far end of bytes."""
-
-    def __init__(
-        self,
-        make_adapter: Callable[..., FarEnd],
-        amplifiers: Mapping[int, Amplifier],
-        send: Callable[[bytes], None],
-    ) -> None:
-        bus = CanBus()
-        _Nodes(bus, amplifiers)
-        self.receive = make_adapter(bus, send).receive
+_terminal = partial(_served, partial(TerminalEnd, unpluggable=True))
+_server = partial(_served, TcpEnd)
 
 
 @asynccontextmanager
@@ -133,7 +94,7 @@ async def _python_can(
     count: int, interface: str, channel: str, **options: int
 ) -> AsyncIterator[FarSide]:
     """Serve amplifiers on a bus of python-can, which a thread reads."""
-    loop, amplifiers = asyncio.get_running_loop(), _amplifiers(count)
+    loop = asyncio.get_running_loop()
     adapter = can.Bus(interface=interface, channel=channel, **options)
     query = "".join(f"?{name}={value}" for name, value in options.items())
     ending = threading.Event()
@@ -156,13 +117,13 @@ async def _python_can(
             if (message := adapter.recv(timeout=_READ_TIMEOUT)) is not None:
                 loop.call_soon_threadsafe(received, message)
 
-    end = CanAmplifiers(amplifiers, send)
+    url = f"can+python-can://{interface}/{channel}{query}#"
+    far = _far_side(count, lambda node: f"{url}{node}")
+    end = CanAmplifiers(far.devices, send)
     thread = threading.Thread(target=read)
     thread.start()
     try:
-        yield FarSide(
-            amplifiers, lambda node: f"can+python-can://{interface}/{channel}{query}#{node}"
-        )
+        yield far
     finally:
         ending.set()
         thread.join()
@@ -177,42 +138,42 @@ def _free_port() -> int:
 
 
 WORD_WIRES: Mapping[str, Callable[[int], Any]] = {
-    "serial": lambda count: _terminal(
-        count, SerialAmplifiers, lambda port, number: f"serial://{port}?address={number}"
+    "serial": partial(
+        _terminal, SerialAmplifiers, lambda port, number: f"serial://{port}?address={number}"
     ),
-    "serial+tcp": lambda count: _server(
-        count,
+    "serial+tcp": partial(
+        _server,
         SerialAmplifiers,
         lambda port, number: f"serial+tcp://127.0.0.1:{port}?address={number}",
     ),
-    "modbus+rtu": lambda count: _terminal(
-        count,
+    "modbus+rtu": partial(
+        _terminal,
         partial(ModbusAmplifiers, is_rtu=True),
         lambda port, number: f"modbus+rtu://{port}?baud=19200#{number}",
     ),
-    "modbus+tcp": lambda count: _server(
-        count,
+    "modbus+tcp": partial(
+        _server,
         partial(ModbusAmplifiers, is_rtu=False),
         lambda port, number: f"modbus+tcp://127.0.0.1:{port}/{number}",
     ),
-    "modbus+rtu server": lambda count: _server(
-        count,
+    "modbus+rtu server": partial(
+        _server,
         partial(ModbusAmplifiers, is_rtu=True),
         lambda port, number: f"modbus+rtu://127.0.0.1:{port}#{number}",
     ),
-    "can+slcan": lambda count: _terminal(
-        count,
-        partial(_BusServer, SlcanAdapter),
+    "can+slcan": partial(
+        _terminal,
+        partial(_on_bus, SlcanAdapter),
         lambda port, node: f"can+slcan://{port}?bitrate=500000#{node}",
     ),
-    "can+slcan server": lambda count: _server(
-        count,
-        partial(_BusServer, SlcanAdapter),
+    "can+slcan server": partial(
+        _server,
+        partial(_on_bus, SlcanAdapter),
         lambda port, node: f"can+slcan://127.0.0.1:{port}#{node}",
     ),
-    "can+socketcand": lambda count: _server(
-        count,
-        partial(_BusServer, SocketcandClient),
+    "can+socketcand": partial(
+        _server,
+        partial(_on_bus, SocketcandClient),
         lambda port, node: f"can+socketcand://127.0.0.1:{port}/can0#{node}",
     ),
     "can+python-can virtual": lambda count: _python_can(count, "virtual", "plate"),

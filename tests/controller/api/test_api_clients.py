@@ -28,7 +28,7 @@ from controller.api.place import SYSTEM_SOCKET, check_peer, find_socket
 from daemon_bench import PLACE, next_event, ready_daemon, running_daemon, until_state
 from model.errors import InputError
 from served_api import request
-from virtual_sockets import in_virtual_time_on_sockets
+from virtual_loop import in_virtual_time
 
 PAGE = Path(controller.__file__).parent.parent / "docs" / "reference" / "api.md"
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
@@ -66,7 +66,7 @@ async def test_client_keeps_its_lease_and_receives_events(tmp_path: Path) -> Non
         assert seen.count("state") >= 6
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_client_connects_again_with_subscriptions_and_lease(tmp_path: Path) -> None:
     """The server drops its connections twice: a call, `events` and the lease outlive it."""
     async with ready_daemon(tmp_path) as (bench, era):
@@ -125,7 +125,7 @@ async def test_lease_lost_within_armed_raises_at_the_next_call_and_at_the_end(
             await async_study(KeyError())
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_client_raises_when_the_daemon_has_ended(tmp_path: Path) -> None:
     """Calls and `events`, after the attempts to connect again; at once when it was closed."""
     async with ready_daemon(tmp_path) as (bench, _):
@@ -285,7 +285,7 @@ def test_request_is_repeated_when_the_connection_is_lost_if_that_is_harmless(
     assert (sent.count(method) > 1) is is_repeated
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_stop_is_repeated_while_no_daemon_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,7 +13,7 @@ from controller.api.methods import METHODS
 from controller.api.topics import TOPICS, EventParams
 from controller.gateway.field import DrawnField
 from daemon_bench import PLACE, holding, running_daemon, until_state
-from virtual_sockets import in_virtual_time_on_sockets
+from virtual_loop import in_virtual_time
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 # keyed by name, not messages: so many levels deep
@@ -97,7 +97,7 @@ async def test_extra_keys_of_a_later_minor_version_are_ignored(tmp_path: Path) -
         await asyncio.wait({drawing})
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_daemon_sends_exactly_the_documented_keys(tmp_path: Path) -> None:
     """Results and notifications read strictly by the models of the reference page."""
     down = [{"id": 1, "x_m": PLACE[0], "y_m": PLACE[1]}]

@@ -39,7 +39,7 @@ from daemon_bench import (
     until_state,
 )
 from drivers.errors import LinkError
-from virtual_sockets import in_virtual_time_on_sockets
+from virtual_loop import in_virtual_time
 
 
 def delay_arming(
@@ -57,7 +57,7 @@ def delay_arming(
     return released
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_clear_acknowledges_no_stop_that_its_client_has_not_seen(tmp_path: Path) -> None:
     """Another client's after its own, until it has read the status; its own it has seen."""
     async with ready_daemon(tmp_path) as (bench, era), await bench.client() as other:
@@ -70,7 +70,7 @@ async def test_clear_acknowledges_no_stop_that_its_client_has_not_seen(tmp_path:
         assert (await other.status()).state == READY
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_client_that_follows_events_may_clear_after_a_second_stop(tmp_path: Path) -> None:
     """Which changes no state, but what an acknowledgement must name."""
     async with ready_daemon(tmp_path) as (bench, era), await bench.client() as other:
@@ -83,7 +83,7 @@ async def test_client_that_follows_events_may_clear_after_a_second_stop(tmp_path
         assert (await other.status()).state == READY
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_event_read_late_takes_nothing_back_that_was_seen(tmp_path: Path) -> None:
     """Of this connection or one before, even if this daemon counts from less."""
     async with ready_daemon(tmp_path) as (bench, era):
@@ -102,7 +102,7 @@ async def test_event_read_late_takes_nothing_back_that_was_seen(tmp_path: Path) 
         assert (await era.status()).state == READY
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_lease_lasts_from_armed_state_when_arming_takes_longer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -126,7 +126,7 @@ async def test_lease_lasts_from_armed_state_when_arming_takes_longer(
 
 
 @pytest.mark.parametrize("is_cancelled", [False, True])
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_daemon_disarms_when_arming_client_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_cancelled: bool
 ) -> None:
@@ -155,7 +155,7 @@ async def test_daemon_disarms_when_arming_client_left(
 
 
 @pytest.mark.parametrize("latches", [True, False])
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_stop_that_fails_on_its_way_stops_all_and_ends_the_lease(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, latches: bool
 ) -> None:
@@ -184,7 +184,7 @@ async def test_stop_that_fails_on_its_way_stops_all_and_ends_the_lease(
         assert (operation.lease is None) is latches
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_reload_ends_after_unexpected_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -208,7 +208,7 @@ async def test_reload_ends_after_unexpected_error(
         assert notices == ["reloading", "ready"] * 2
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_shutdown_cancels_reload(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One whose configuration is still being read applies nothing."""
     async with running_daemon(tmp_path) as bench:
@@ -251,7 +251,7 @@ async def test_shutdown_while_a_port_is_opened_leaves_none_open(
             pass
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_log_event_escapes_bytes_that_are_not_text(tmp_path: Path) -> None:
     """A file name that is not UTF-8 reaches subscribers."""
     async with running_daemon(tmp_path) as bench, await bench.client() as era:
@@ -271,7 +271,7 @@ def expire(supervisor: Supervisor) -> None:
     supervisor.operation = replace(supervisor.operation, lease=lease)
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_client_that_arms_after_the_end_of_a_lease_inherits_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -291,7 +291,7 @@ async def test_client_that_arms_after_the_end_of_a_lease_inherits_nothing(
         assert "READY_TO_SWITCH_ON" in states
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_arming_that_is_cancelled_leaves_nothing_armed_without_a_lease(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,13 +25,13 @@ from drivers import clock
 from drivers.host.amplifier import WATCHDOG
 from rig_files import TWO_AMPLIFIERS
 from sim.faults.fault_window import FaultWindow
-from virtual_sockets import in_virtual_time_on_sockets
+from virtual_loop import in_virtual_time
 
 JUMPS = (86_400.0, -86_400.0, 0.4, -0.4, 3e8, -1.7e9, 0.0)
 """How far [s] the wall clock is from the real one: days, less than a lease, decades."""
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_daemon_ignores_jumps_of_wall_clock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -58,7 +58,7 @@ async def test_daemon_ignores_jumps_of_wall_clock(
 @pytest.mark.parametrize(
     ("number", "changes"), [(signal.SIGTERM, ()), (signal.SIGINT, TWO_AMPLIFIERS)]
 )
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_daemon_ramps_down_reads_back_and_disarms_when_terminated(
     tmp_path: Path, number: signal.Signals, changes: Sequence[tuple[str, str]]
 ) -> None:
@@ -86,7 +86,7 @@ async def test_daemon_ramps_down_reads_back_and_disarms_when_terminated(
             assert far.summary(name).state == "SWITCH_ON_DISABLED"
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_daemon_ends_when_terminated_over_dead_link(tmp_path: Path) -> None:
     """It does not wait for a hung amplifier, which silences itself in time."""
     async with ready_daemon(tmp_path) as (bench, era):
@@ -103,7 +103,7 @@ async def test_daemon_ends_when_terminated_over_dead_link(tmp_path: Path) -> Non
         assert silent_from(bench.far) - journal.last_fed("main") <= WATCHDOG + 0.005 + 1e-9
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_daemon_notifies_systemd(tmp_path: Path) -> None:
     """READY=1, WATCHDOG=1, RELOADING=1 and STOPPING=1."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:

@@ -24,7 +24,7 @@ from examples.make_touches import tuio_datagram
 from model.errors import InputError
 from model.structure.plate import Material, Plate
 from tuio_messages import free_port, panel
-from virtual_sockets import in_virtual_time_on_sockets
+from virtual_loop import in_virtual_time
 
 PLATE = Plate(0.4, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
 
@@ -197,7 +197,7 @@ async def test_failed_input_is_restarted_after_growing_pauses(
     await inputs.close()
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_daemon_combines_contacts_of_panels_and_clients(tmp_path: Path) -> None:
     """One is the target, two are quiet; each lies where its source's calibration puts it.
 
@@ -233,7 +233,7 @@ async def test_daemon_combines_contacts_of_panels_and_clients(tmp_path: Path) ->
         }
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_touch_that_came_and_went_during_a_pause_plays_nothing(tmp_path: Path) -> None:
     """Its frames are read together, 120 ms and 60 ms after they came."""
     async with ready_daemon(tmp_path) as (bench, era):
@@ -246,7 +246,7 @@ async def test_touch_that_came_and_went_during_a_pause_plays_nothing(tmp_path: P
         assert not journal.raising_since(begin)
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_few_of_a_flood_of_touches_become_sets(tmp_path: Path) -> None:
     """Of three fingers that jump at 10 kHz fewer than a quarter; silent once they lift."""
     port, chance, count = free_port(), random.Random(3), 1000

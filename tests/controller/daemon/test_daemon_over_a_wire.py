@@ -26,10 +26,10 @@ from daemon_bench import (
 )
 from rig_files import TWO_AMPLIFIERS
 from sim.faults.fault_window import FaultWindow
-from virtual_sockets import in_virtual_time_on_sockets
+from virtual_loop import in_virtual_time
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_daemon_stays_disarmed_and_latched_after_link_loss_while_armed(
     tmp_path: Path,
 ) -> None:
@@ -66,7 +66,7 @@ async def test_daemon_stays_disarmed_and_latched_after_link_loss_while_armed(
         await era.arm("me")
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_status_tells_lost_amplifier_from_one_closed_with_it(tmp_path: Path) -> None:
     """Of two amplifiers: while one is lost, during all attempts; and once both are."""
     present, lost, closed = (False, False), (True, False), (False, True)
@@ -106,7 +106,7 @@ async def test_status_tells_lost_amplifier_from_one_closed_with_it(tmp_path: Pat
         await until_losses(main=lost, side=closed)
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_fault_stops_is_dumped_and_must_be_cleared(tmp_path: Path) -> None:
     """Over-voltage: silent, latched, and the last messages in a file in order of time."""
     async with ready_daemon(tmp_path, "dumps: {folder: dumps}\n") as (bench, era):
@@ -128,7 +128,7 @@ async def test_fault_stops_is_dumped_and_must_be_cleared(tmp_path: Path) -> None
         assert times == sorted(times)
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_reload_applies_a_layout_alone(tmp_path: Path) -> None:
     """While armed a lower level; no higher one, invalid one or one beside another change."""
     async with ready_daemon(tmp_path, "level_db_sl: 20\n# more\n") as (bench, era):
@@ -168,7 +168,7 @@ def test_gateway_keeps_its_token_out_of_a_log(tmp_path: Path) -> None:
     assert len(read_token(Path(file))) >= 32  # which refuses a file that others may read
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_daemon_refuses_amplifier_with_another_serial_number(tmp_path: Path) -> None:
     """It searches for the other one; the cause names both serial numbers."""
     more = "serial_numbers: {main: A1}\n"
@@ -189,7 +189,7 @@ elsewhere: null
 ON_PAD, ON_QUIET = (0.1, 0.1), (0.25, 0.1)
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_daemon_plays_effects_by_region_and_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -24,7 +24,7 @@ from controller.daemon.config_reader import read_in_child
 from daemon_bench import ENABLED, ready_daemon
 from model.errors import InputError
 from model.rig.file import example_rig_path
-from virtual_sockets import in_virtual_time_on_sockets
+from virtual_loop import in_virtual_time
 
 MAX_CALLS = 2000
 """Most calls of a callback that handles input of clients or files: about 1 ms."""
@@ -165,7 +165,7 @@ def write_layout(path: Path) -> None:
     path.write_text("\n".join([*lines, "elsewhere: null", ""]), encoding="utf-8")
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_reload_costs_the_loop_nothing(tmp_path: Path) -> None:
     """A large layout, added while armed and subscribed."""
     write_layout(tmp_path / "large.yaml")
@@ -183,7 +183,7 @@ async def test_reload_costs_the_loop_nothing(tmp_path: Path) -> None:
         assert (await era.status()).state == ENABLED
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_reload_reads_its_files_in_another_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -23,7 +23,6 @@ from drivers.errors import LinkError
 from model.rig.file import example_rig_path
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
-from virtual_sockets import in_virtual_time_on_sockets
 
 FAULT = "amplifier d: state must be OPERATION_ENABLED, got FAULT with fault WATCHDOG"
 
@@ -111,7 +110,7 @@ async def test_pattern_is_measured_while_no_finger_moves(monkeypatch: pytest.Mon
     ]
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,7 +25,7 @@ from model.calibration.responses_file import read_measured
 from model.errors import InputError
 from model.rig.file import load_rig
 from model.table.file import load_table
-from virtual_sockets import in_virtual_time_on_sockets
+from virtual_loop import in_virtual_time
 
 
 @given(
@@ -81,7 +81,7 @@ def test_read_capture_names_file_and_line(tmp_path: Path, text: str | None, plac
     assert str(caught.value).startswith(str(path))
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_replay_capture_keeps_times_over_udp() -> None:
     """Datagrams arrive unchanged, each at its own time."""
     loop = asyncio.get_running_loop()
@@ -101,7 +101,7 @@ async def test_replay_capture_keeps_times_over_udp() -> None:
     assert received == [(b"one", 0.0), (b"two", 0.25), (b"three", 1.0)]
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_replay_capture_raises_when_the_port_is_closed() -> None:
     """The refusal of one datagram is raised at the next."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
@@ -113,7 +113,7 @@ async def test_replay_capture_raises_when_the_port_is_closed() -> None:
         )
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_replay_capture_raises_when_the_system_refuses() -> None:
     """An address to which the system may not send is reported at once."""
     with pytest.raises(LinkError, match=r"255\.255\.255\.255:3333 \(Perm"):

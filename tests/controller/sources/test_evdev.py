@@ -24,7 +24,7 @@ from controller.sources.registry import open_source
 from controller.sources.slots import SlotState
 from controller.sources.touch import TouchFrame
 from model.errors import InputError
-from virtual_sockets import run_virtual_on_sockets
+from virtual_loop import run_virtual
 
 EMPTY = SlotState(-1, 0, 0)
 KINDS = {
@@ -119,7 +119,7 @@ def touches_of(
     panels: list[PipePanel], play: Callable[[], Coroutine[Any, Any, None]]
 ) -> list[dict[int, tuple[float, float]]]:
     """The touches of each frame that a source delivers while something plays."""
-    return [touches for _, touches in run_virtual_on_sockets(follow(panels, play))]
+    return [touches for _, touches in run_virtual(follow(panels, play))]
 
 
 def test_evdev_source_follows_fingers() -> None:
@@ -164,7 +164,7 @@ def test_evdev_source_repeats_resting_fingers() -> None:
         panel.state = {0: EMPTY, 1: EMPTY}
         await asyncio.sleep(0.2)
 
-    seen = run_virtual_on_sockets(follow([panel], play))
+    seen = run_virtual(follow([panel], play))
     assert seen == [
         (0.0, {}),
         (0.0, {7: (0.0, 0.0)}),
@@ -234,7 +234,7 @@ def test_evdev_source_reports_loads(
         await asyncio.sleep(0.01)
         running.cancel()
 
-    run_virtual_on_sockets(play())
+    run_virtual(play())
     (touch,) = seen[-1].touches
     assert touch.load == (None if load is None else pytest.approx(load, rel=2e-3))
 
@@ -257,7 +257,7 @@ def test_evdev_source_reopens_an_unplugged_panel(notices: str) -> None:
         os.write(second.into, raw("id 8 x 1000 y 0"))
         await asyncio.sleep(0.01)
 
-    seen = run_virtual_on_sockets(follow(panels, play))
+    seen = run_virtual(follow(panels, play))
     assert [touches for _, touches in seen] == [{7: (0.0, 0.0)}, {}, {}, {8: (1.0, 0.0)}]
     assert seen[1][0] <= 0.06
 

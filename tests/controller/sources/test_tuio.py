@@ -19,7 +19,7 @@ from controller.sources.tuio import TuioReader, TuioSource
 from examples.make_touches import tuio_datagram
 from model.errors import InputError
 from tuio_messages import bundle, cursor, frame, message
-from virtual_sockets import in_virtual_time_on_sockets
+from virtual_loop import in_virtual_time
 
 PEER = ("192.0.2.7", 50000)
 
@@ -283,7 +283,7 @@ def test_tuio_datagram_round_trip(places: dict[int, tuple[float, float]]) -> Non
     assert (result.source, result.time, result.touches) == ("tuio:192.0.2.7/table@a", 2.0, wanted)
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_tuio_source_delivers_over_udp() -> None:
     """A datagram to the bound port becomes a frame at the loop's time; port 0 takes a free one."""
     source = TuioSource("tuio:127.0.0.1:0")
@@ -303,7 +303,7 @@ async def test_tuio_source_delivers_over_udp() -> None:
     assert touches(received) == [(1, 0.25, 0.5)]
 
 
-@in_virtual_time_on_sockets
+@in_virtual_time
 async def test_tuio_source_reports_a_taken_port() -> None:
     """The error names the port and what to do."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:

@@ -5,6 +5,7 @@ Of several contents each has a colour of its own.
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ BRIGHTEST_DB_SL = 30.0
 """Level from which a colour is at its brightest; the threshold of feeling is black."""
 
 _GREY = 0.62
+_RADIUS = 100 * FINGERTIP_RADIUS  # cm
 
 
 def write_pictures(table: LocalizationTable, rows: list[TouchRow], folder: Path) -> list[Path]:
@@ -62,12 +64,9 @@ def choose_rows(rows: Sequence[TouchRow]) -> list[TouchRow]:
     for row in ranked_by(rows, _contrast):
         if row.measured_level_db_sl is not None:
             by_count.setdefault(len(row.quiet), []).append(row)
-    chosen = by_count.pop(0, [])[:1]
-    while by_count and len(chosen) < MAX_PANELS:
-        for count in sorted(by_count):
-            chosen.append(by_count[count].pop(0))
-            if not by_count[count]:
-                del by_count[count]
+    by_count[0] = by_count.get(0, [])[:1]
+    in_turn = zip_longest(*(by_count[count] for count in sorted(by_count)))
+    chosen = [row for each in in_turn for row in each if row is not None]
     return sorted(chosen[:MAX_PANELS], key=lambda row: len(row.quiet))
 
 
@@ -118,18 +117,14 @@ def contents_figure(table: LocalizationTable, row: TouchRow) -> Figure:
     panels = figure.subplot_mosaic(
         [["all", f"{number}"] for number in range(count)], width_ratios=[count, 1]
     )
-    _draw(panels["all"], table, levels, colors)
+    title = "Coloured where a finger feels its own content, grey where contents mix"
+    _draw(panels["all"], table, levels, colors, row.fingers)
+    panels["all"].set_title(title, fontsize=13)
     for finger in row.fingers:
-        _draw_finger(panels["all"], finger, colors)
         _label_finger(panels["all"], finger, colors)
-    panels["all"].set_title(
-        "Coloured where a finger feels its own content, grey where contents mix", fontsize=13
-    )
     for number, (frequency, level) in enumerate(levels.items()):
         axes = panels[f"{number}"]
-        _draw(axes, table, {frequency: level}, colors)
-        for finger in row.fingers:
-            _draw_finger(axes, finger, colors)
+        _draw(axes, table, {frequency: level}, colors, row.fingers)
         axes.set_title(f"{frequency:g} Hz alone", fontsize=11)
         axes.set_axis_off()
     return figure
@@ -154,8 +149,9 @@ def _draw(
     table: LocalizationTable,
     levels: Mapping[float, FloatArray],
     colors: Mapping[float, str],
+    fingers: Sequence[FingerRow],
 ) -> None:
-    """Draw the loudest content in its colour, paler the less it is above all others."""
+    """Draw fingers, and the loudest content in its colour, paler the less it is above others."""
     plate = table.plate
     powers = np.array([10 ** (level / 10) for level in levels.values()])
     loudest = powers.argmax(axis=0)
@@ -174,30 +170,25 @@ def _draw(
     places = [(100 * era.x, 100 * era.y) for era in table.eras]
     axes.plot(*zip(*places, strict=True), "o", ms=8, color="0.9", mec="black", clip_on=False)
     label_plate(axes)
-
-
-def _draw_finger(axes: Axes, finger: FingerRow, colors: Mapping[float, str]) -> None:
-    place = 100 * finger.at_m[0], 100 * finger.at_m[1]
-    for width, color in ((5.5, "white"), (2.6, _color_of(finger, colors))):
-        radius = 100 * FINGERTIP_RADIUS
-        axes.add_patch(Circle(place, radius, fill=False, ec=color, lw=width, clip_on=False))
+    for finger in fingers:
+        place = 100 * finger.at_m[0], 100 * finger.at_m[1]
+        for width, hue in ((5.5, "white"), (2.6, _color_of(finger, colors))):
+            axes.add_patch(Circle(place, _RADIUS, fill=False, ec=hue, lw=width, clip_on=False))
 
 
 def _label_finger(axes: Axes, finger: FingerRow, colors: Mapping[float, str]) -> None:
     """Write verdict, level and contrast beside a finger, on the side towards the middle."""
-    lines = [finger.verdict]
-    if finger.frequency_hz is not None:
-        lines = [f"{finger.frequency_hz:g} Hz, {finger.verdict}"]
-    if finger.measured_level_db_sl is not None:
-        lines.append(f"{finger.measured_level_db_sl:.0f} dB SL")
-    if finger.measured_contrast_db is not None:
-        lines.append(f"{finger.measured_contrast_db:.0f} dB above the others")
+    lines = (
+        ("{:g} Hz, " + finger.verdict, finger.frequency_hz),
+        (finger.verdict, finger.frequency_hz is None or None),
+        ("{:.0f} dB SL", finger.measured_level_db_sl),
+        ("{:.0f} dB above the others", finger.measured_contrast_db),
+    )
     x, y = (100 * value for value in finger.at_m)
     is_high = y > sum(axes.get_ylim()) / 2
-    radius = 100 * FINGERTIP_RADIUS
     axes.annotate(
-        "\n".join(lines),
-        (x, y - radius if is_high else y + radius),
+        "\n".join(text.format(value) for text, value in lines if value is not None),
+        (x, y - _RADIUS if is_high else y + _RADIUS),
         xytext=(0, -10 if is_high else 10),
         textcoords="offset points",
         ha="center",

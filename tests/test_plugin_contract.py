@@ -17,7 +17,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.registry import effect_kind, effect_kinds
 from controller.sources.contacts import Contact, ContactKey
-from controller.sources.registry import open_source
+from controller.sources.touch import open_source
 from controller.sources.tuio import TuioSource
 from drivers.errors import CommandError
 from drivers.wires.known import address_of

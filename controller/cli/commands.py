@@ -1,15 +1,113 @@
-"""The commands of this package, of its share of the `era` command."""
+"""The commands of this package, of its share of the `era` command; here `report` and `gateway`."""
+
+import os
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from controller.cli.daemon import DashboardCommand, arm, daemon, of_method, status, touch, watch
 from controller.cli.demo import demo
-from controller.cli.gateway import gateway
 from controller.cli.layout import layout_app
-from controller.cli.report import report
 from controller.cli.rig import rig_app
 from drivers.by_hand import cli as by_hand
 from model.errors import InputError
+
+
+def gateway(
+    listen: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Address to listen on; port 0: any free one.")
+    ] = "127.0.0.1:8137",
+    socket: Annotated[
+        Path | None, typer.Option(help="The daemon's socket (default: the usual one).")
+    ] = None,
+    token_file: Annotated[
+        Path | None,
+        typer.Option(help="File (mode 600) with the token (default: a random one)."),
+    ] = None,
+    certificate: Annotated[Path | None, typer.Option(help="TLS certificate chain, PEM.")] = None,
+    key: Annotated[Path | None, typer.Option(help="TLS key of the certificate, PEM.")] = None,
+    allow_host: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Further allowed host name."),
+    ] = None,
+    allow_origin: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ORIGIN", help="Further allowed origin: https://HOST[:PORT]"),
+    ] = None,
+) -> None:
+    """Serve the daemon's API and the dashboard to browsers.
+
+    Prints the URL to open, with the token. An operational interface, not an emergency stop.
+    """
+    import asyncio
+
+    from controller.gateway.settings import Settings, read_token, require_gateway
+
+    require_gateway()
+    from controller.api.place import find_socket
+    from controller.gateway.serving import serve
+
+    host, port = _host_and_port(listen)
+    chosen = {} if token_file is None else {"token": read_token(token_file)}
+    settings = Settings(
+        socket=find_socket(socket),
+        host=host,
+        port=port,
+        certificate=certificate,
+        key=key,
+        extra_hosts=tuple(allow_host or ()),
+        origins=tuple(allow_origin or ()),
+        is_token_user_supplied=token_file is not None,
+        **chosen,
+    )
+
+    def announce(port: int) -> None:
+        scheme = "https" if settings.is_encrypted else "http"
+        token = "" if settings.is_token_user_supplied else f"#token={settings.token}"
+        print(f"dashboard: {scheme}://{settings.shown_host}:{port}/{token}", flush=True)
+
+    asyncio.run(serve(settings, announce=announce))
+    os._exit(0)  # Python would abort in the thread that draws the field
+
+
+def _host_and_port(text: str) -> tuple[str, int]:
+    """Host and port of HOST:PORT, [HOST]:PORT or PORT alone."""
+    host, _, port = text.rpartition(":")
+    if not (port.isascii() and port.isdecimal()):
+        raise InputError(f"--listen must be HOST:PORT, such as 127.0.0.1:8137, got {text}")
+    return host.strip("[]") or "127.0.0.1", int(port)
+
+
+def report(
+    configs: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[CONFIG]...", help="Rig, layout and daemon files to include."),
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="File to write.")] = Path(
+        "era-report.zip"
+    ),
+    socket: Annotated[
+        Path | None, typer.Option("--socket", help="Socket of the daemon; default: the usual path.")
+    ] = None,
+) -> None:
+    """Collect versions, files and daemon state for a bug report.
+
+    Values of unknown keys, hosts, serial numbers and comments are hidden; look before you send it.
+    """
+    from controller.report.collect import collect, write_zip
+
+    for path in configs or ():
+        if not path.exists():
+            raise InputError(f"{path}: no such file; check its name and folder")
+    collected = collect(configs or [], socket=socket, home=Path.home())
+    write_zip(output, collected)
+    for name, text in collected.files.items():
+        print(f"  {name}: {len(text)} characters")
+    for what in collected.missing:
+        print(f"  skipped: {what}")
+    print(f"Wrote {output}\nNext: look before you send: names and causes are not hidden")
+
 
 EXIT_STATUS = {**by_hand.EXIT_STATUS, InputError: 2}
 

@@ -56,8 +56,7 @@ def demo(
     import time
 
     from controller.demo.pictures import write_pictures
-    from controller.demo.run import WIRES, run_demo, run_live
-    from controller.demo.scene import Scene, example_scenes
+    from controller.demo.run import WIRES, Scene, example_scenes, run_demo, run_live
     from controller.sources.capture import read_capture
     from model.rig.file import example_rig_path, load_rig
     from model.table.table_cache import cached_table
@@ -74,7 +73,7 @@ def demo(
     table, _ = cached_table(rig)
     if dashboard:
         from controller.cli.daemon import DASHBOARD
-        from controller.gateway.installed import require_gateway
+        from controller.gateway.settings import require_gateway
 
         require_gateway()
         print("Open the URL below, press Arm, and touch the plate; Ctrl-C ends it.", flush=True)

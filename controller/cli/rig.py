@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from controller.cli.identify import identify
-from controller.cli.plate_by_amplifiers import (
+from controller.cli.identify import (
+    identify,
     measured_by_amplifiers,
     measured_json,
     measured_line,

@@ -11,8 +11,7 @@ from controller.daemon.config_sections import CalibrationSection, DaemonSection,
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
 from controller.sources.calibration import CalibratedSource, TouchCalibration, fitted, turned
-from controller.sources.registry import open_source
-from controller.sources.touch import TouchSource
+from controller.sources.touch import TouchSource, open_source
 from drivers.errors import CommandError
 from drivers.garbage_collection import without_collections
 from drivers.wires.known import address_of

@@ -11,9 +11,8 @@ from controller.api.server import ApiServer
 from controller.daemon.active_layout import ActiveLayout
 from controller.daemon.api_service import ApiService
 from controller.daemon.api_views import amplifier_statuses
+from controller.daemon.children import gateway_options, keep_gateway, read_in_child
 from controller.daemon.config import DaemonConfig, changed_keys, reload_problem
-from controller.daemon.config_reader import read_in_child
-from controller.daemon.dashboard_process import gateway_options, keep_gateway
 from controller.daemon.fault_dumps import FaultDumps
 from controller.daemon.log import LogThread
 from controller.daemon.publisher import EventPublisher

@@ -16,7 +16,7 @@ from controller.daemon.daemon import Daemon
 from controller.daemon.log import LogThread, open_log_file, start_log
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
-from controller.gateway.installed import require_gateway
+from controller.gateway.settings import require_gateway
 from drivers.errors import DriverError
 from drivers.trace import tracing
 from model.compiled.kernels import kernels

@@ -1,4 +1,4 @@
-"""Runs the demonstration: a daemon over simulated amplifiers, recorded touches, rows, picture."""
+"""Runs the demonstration: a daemon over simulated amplifiers, scenes of recorded touches, rows."""
 
 import asyncio
 import contextlib
@@ -6,7 +6,7 @@ import json
 import socket
 import tempfile
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,84 @@ from controller.daemon.socket_lock import SocketLock
 from controller.daemon.states import DaemonState
 from controller.demo.far_end import SIM_OPTIONS, WATCHDOG, SimulatedPlate, simulated_plate
 from controller.demo.recorder import TouchRecorder
-from controller.demo.scene import Scene, example_layout
 from controller.demo.touch_row import TouchRow
-from controller.sources.capture import replay_capture
+from controller.effects.layout import BUZZ
+from controller.sources.capture import RecordedDatagram, read_capture, replay_capture
 from drivers import clock
 from drivers.errors import LinkError
 from model.rig.file import load_rig
+from model.rig.rig import Rig
+from model.structure.plate import Plate
 from model.table.table import LocalizationTable
+
+MIN_ERAS_FOR_THREE = 8
+"""Number of ERAs from which three people have contents of their own, else two."""
+
+SILENT_SHARE = 0.2
+"""Share of the plate's length between the strips of several people."""
+
+_TWO = {"left": None, "right": None}
+_THREE = {"left": (60, 110), "middle": (130, 180), "right": (220, 280)}  # Hz
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Recorded touches, whose places are shares of the plate.
+
+    layout: as in a layout's file; by default the newest finger feels a vibration and no other.
+    """
+
+    touches: Sequence[RecordedDatagram]
+    layout: Mapping[str, Any] = field(default_factory=lambda: {"elsewhere": BUZZ})
+
+
+def example_scenes(rig: Rig) -> list[Scene]:
+    """The recorded touches of the demonstration of a rig: one person, then two or three."""
+    name = "three_people" if _is_for_three(rig) else "two_people"
+    return [
+        Scene(read_capture(example_touches_path("touches"))),
+        Scene(read_capture(example_touches_path(name)), example_layout(rig)),
+    ]
+
+
+def example_layout(rig: Rig) -> dict[str, Any]:
+    """The layout for two or three people at a rig's plate."""
+    return layout_of_people(rig.plate, _THREE if _is_for_three(rig) else _TWO)
+
+
+def _is_for_three(rig: Rig) -> bool:
+    return len(rig.eras) >= MIN_ERAS_FOR_THREE
+
+
+def layout_of_people(
+    plate: Plate, bands: Mapping[str, tuple[float, float] | None]
+) -> dict[str, Any]:
+    """Return a layout of upright strips, from west to east, each with a vibration of its own.
+
+    bands: lowest and highest frequency [Hz] by name, None for any. Between the strips, on a fifth
+    of the plate, a finger feels nothing.
+    """
+    width = (1 - SILENT_SHARE) / len(bands)
+    pitch = width + SILENT_SHARE / (len(bands) - 1)
+    regions = {}
+    for number, (name, band) in enumerate(bands.items()):
+        west, east = (plate.length * (number * pitch + side) for side in (0, width))
+        regions[name] = {
+            "rectangle": {"start": [west, 0], "end": [east, plate.width]},
+            "on_press": name,
+            **({} if band is None else {"band": [*band]}),
+        }
+    effects = {name: {"kind": "buzz"} for name in bands}
+    return {"effects": effects, "regions": regions, "elsewhere": None}
+
+
+def example_touches_path(name: str) -> Path:
+    """A recording of the demonstration: installed with this package, or in a checkout."""
+    file = f"{name}.tuio"
+    package = Path(__file__).parents[1]
+    installed = package / "data" / file
+    return installed if installed.exists() else package.parent / "examples" / file
+
 
 WIRES = (*SIM_OPTIONS, "sim")
 

@@ -1,4 +1,7 @@
-"""One browser on a WebSocket: its frames are lines of the API to the daemon, and the other way."""
+"""Clients' connections to the daemon: of a browser on a WebSocket, and those that HTTP keeps.
+
+On a WebSocket frames are lines of the API to the daemon, and the other way.
+"""
 
 import asyncio
 import contextlib
@@ -8,7 +11,7 @@ from pathlib import Path
 from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from controller.api.client_protocol import Unreachable
+from controller.api.client_protocol import RESPONSE_TIMEOUT, Unreachable
 from controller.api.jsonrpc import RpcError, read_request
 from controller.api.link import DaemonLink
 from controller.api.methods import SILENCING
@@ -102,3 +105,69 @@ def client_name(name: str, connection: HTTPConnection) -> str:
     """A client's name for the daemon's log, with its address."""
     address = connection.client
     return name if address is None else f"{name} {address.host}:{address.port}"[:_MAX_NAME]
+
+
+MAX_KEPT = 8  # connections; the daemon has 32
+
+
+class HttpLinks:
+    """Bounds the connections to the daemon of all HTTP connections, which has some for others."""
+
+    def __init__(self) -> None:
+        self.places = asyncio.Semaphore(MAX_KEPT)
+        self.busy = 0
+        self.idle: dict[KeptLink, None] = {}  # longest idle first
+
+
+class KeptLink:
+    """The connection to the daemon that an HTTP connection keeps, from its first request on.
+
+    Unless another one needs its place: who is idle longest loses its own.
+    """
+
+    def __init__(self, links: HttpLinks) -> None:
+        self._links = links
+        self._link: DaemonLink | None = None
+        self._is_over = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is one now."""
+        return self._link is not None and self._link.is_open
+
+    async def request(self, path: Path, name: str, method: str, params: bytes) -> bytes:
+        """Send a request of a client by its name, and return the response.
+
+        Raises RpcError and Unreachable.
+        """
+        links = self._links
+        try:
+            async with asyncio.timeout(RESPONSE_TIMEOUT), links.places:
+                links.idle.pop(self, None)
+                links.busy += 1
+                try:
+                    if links.busy + len(links.idle) > MAX_KEPT:
+                        next(iter(links.idle)).drop()
+                    if self._link is None or not self._link.is_open:
+                        self._link = await DaemonLink.open(path, name)
+                    if self._is_over:  # sent all the same
+                        asyncio.get_running_loop().call_soon(self.drop)
+                    return await self._link.request(method, params, id=name)
+                finally:
+                    links.busy -= 1
+                    if self.is_open:
+                        links.idle[self] = None
+        except TimeoutError as error:
+            self.drop()
+            raise Unreachable.at(path, error) from error
+
+    def drop(self) -> None:
+        """Close it; a further request opens another."""
+        self._links.idle.pop(self, None)
+        if self._link is not None and self._link.is_open:
+            self._link.close()
+
+    def close(self) -> None:
+        """Close it: the HTTP connection is over."""
+        self._is_over = True
+        self.drop()

@@ -14,7 +14,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import CloseCode, Frame
 
 from controller.api.rate_limit import RateLimiter
-from controller.gateway.kept_links import HttpLinks, KeptLink
+from controller.gateway.bridge import HttpLinks, KeptLink
 
 MAX_IDLE = 128  # connections that have not sent a complete request
 REQUEST_TIMEOUT = 5.0  # s; for a complete request

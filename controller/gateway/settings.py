@@ -6,6 +6,7 @@ import re
 import secrets
 import stat
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 from model.errors import InputError
@@ -124,3 +125,16 @@ def read_token(path: Path) -> str:
     if status.st_uid not in (0, os.geteuid()):
         raise InputError(f"{path}: belongs to another user; give a file of your own")
     return content.decode().strip()
+
+
+_LIBRARIES = ("prometheus_client", "starlette", "uvicorn", "websockets")
+
+
+def require_gateway() -> None:
+    """Raise InputError if a library of the gateway is missing."""
+    for name in _LIBRARIES:
+        if find_spec(name) is None:
+            raise InputError(
+                f"the gateway needs {name}, which is not installed; "
+                "install it in a checkout with  pip install -e '.[gateway]'"
+            )

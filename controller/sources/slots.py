@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-from controller.sources.contact_load import LIGHT_FORCE, LIGHT_MAJOR, LightPress
+from controller.sources.contacts import LIGHT_FORCE, LIGHT_MAJOR, LightPress
 from controller.sources.touch import Touch
 
 EV_SYN, EV_ABS = 0x00, 0x03

@@ -1,8 +1,13 @@
-"""Interface of touch sources: frames of all touches at one moment."""
+"""Touch sources: frames of all touches at one moment, and sources by the scheme of their URL."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from urllib.parse import parse_qsl
+
+from model.errors import InputError
+from registry.plugins import Derived, PluginRegistry
 
 
 @dataclass(frozen=True, slots=True)
@@ -11,7 +16,7 @@ class Touch:
 
     id: constant from down to up; x, y: 0..1 across the sensor from its top left corner, y downwards
     (the convention of TUIO and most panels). Not validated: may be NaN. load: on the plate relative
-    to the rig's fingertip, not bounded (`contact_load`); None where nothing is reported.
+    to the rig's fingertip, not bounded (`contacts`); None where nothing is reported.
     """
 
     id: int
@@ -48,3 +53,31 @@ class TouchSource(ABC):
 
         Malformed input must be counted and logged, not raised.
         """
+
+
+def number_option(options: str, name: str, *, default: float) -> float:
+    """Return the number of the only option that there may be; NaN for anything else."""
+    given = dict(parse_qsl(options, keep_blank_values=True))
+    text = given.pop(name, str(default))
+    try:
+        return math.nan if given else float(text)
+    except ValueError:
+        return math.nan
+
+
+_SOURCES: PluginRegistry[Callable[[str], TouchSource]] = PluginRegistry(
+    "touch source",
+    "era_haptics.touch_sources",
+    Derived(TouchSource),
+    error=InputError,
+    ending=":",
+    example="tuio:127.0.0.1:3333",
+)
+
+
+def open_source(url: str) -> TouchSource:
+    """Create the touch source of a URL such as `tuio:127.0.0.1:3333` or `evdev:/dev/input/event5`.
+
+    Raises InputError for an unknown scheme, a failing plug-in or a URL that it refuses.
+    """
+    return _SOURCES.make(url)

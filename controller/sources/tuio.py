@@ -16,8 +16,7 @@ from controller.sources.contacts import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
 from controller.sources.datagrams import Datagram, Datagrams, Peer, listen
 from controller.sources.osc import OscError, osc_messages
 from controller.sources.reject_counter import RejectCounter
-from controller.sources.touch import Touch, TouchFrame, TouchSource
-from controller.sources.url_options import number_option
+from controller.sources.touch import Touch, TouchFrame, TouchSource, number_option
 from model.errors import InputError
 
 ADDRESS = "/tuio/2Dcur"

@@ -5,9 +5,8 @@
 
 from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
 from controller.sources.datagrams import Datagram, Datagrams, listen
-from controller.sources.registry import open_source
 from controller.sources.reject_counter import RejectCounter
-from controller.sources.touch import Touch, TouchFrame, TouchSource
+from controller.sources.touch import Touch, TouchFrame, TouchSource, open_source
 from drivers.clock import now
 from model.errors import InputError
 

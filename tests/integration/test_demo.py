@@ -14,13 +14,12 @@ from typer.testing import CliRunner
 
 import controller.demo.far_end
 import controller.demo.run
-import controller.demo.scene
 import live_demonstration
 from controller.api.client import Client
 from controller.cli.commands import app
 from controller.cli.main import run
 from controller.demo.recorder import TouchRecorder
-from controller.demo.scene import Scene, layout_of_people
+from controller.demo.run import Scene, layout_of_people
 from controller.sources.capture import read_capture
 from installed_program import ERA
 from model.errors import InputError
@@ -79,7 +78,7 @@ def test_demo_contacts_feel_the_prediction(capture, demo, monkeypatch):
     layout = layout_of_people(plate, {"left": None, "right": None})
     recorded = read_capture(capture)
     scenes = [Scene(recorded), Scene(recorded, layout)]
-    monkeypatch.setattr(controller.demo.scene, "example_scenes", lambda rig: scenes)
+    monkeypatch.setattr(controller.demo.run, "example_scenes", lambda rig: scenes)
     status, out, said = demo("--wire", "sim")
     assert status == 0, said
     result = json.loads(out)

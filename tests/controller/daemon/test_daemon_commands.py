@@ -83,7 +83,7 @@ def test_dashboard_is_refused_before_anything_starts_when_not_installed(
     monkeypatch: pytest.MonkeyPatch, command: list[str]
 ) -> None:
     """Nothing is printed, and no daemon runs without the page that was asked for."""
-    monkeypatch.setattr("controller.gateway.installed.find_spec", lambda name: None)
+    monkeypatch.setattr("controller.gateway.settings.find_spec", lambda name: None)
     result = CliRunner().invoke(app, [*command, "--dashboard"])
     assert isinstance(result.exception, InputError)
     assert "pip install -e '.[gateway]'" in str(result.exception)
@@ -95,7 +95,7 @@ def test_daemon_goes_on_without_the_page_of_its_file_when_not_installed(
 ) -> None:
     """It says once what to install, and starts no gateway that could only end."""
     pages: list[str | None] = []
-    monkeypatch.setattr("controller.gateway.installed.find_spec", lambda name: None)
+    monkeypatch.setattr("controller.gateway.settings.find_spec", lambda name: None)
     monkeypatch.setattr(
         "controller.daemon.run._run",
         lambda config, lock, *, log, dashboard: pages.append(dashboard),

@@ -21,8 +21,8 @@ from controller.daemon.fault_dumps import (
     MessageRecord,
     write_dump,
 )
-from controller.daemon.latency import LatencyStatistics
 from controller.daemon.log import JsonFormatter, LogThread, RateLimitFilter
+from controller.daemon.publisher import LatencyStatistics
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.states import DaemonState, Operation
 from controller_bench import BenchLines, FarEnd

@@ -9,7 +9,7 @@ import pytest
 
 from controller.api.jsonrpc import ErrorCode
 from controller.cli.shown import show_status
-from controller.daemon.dashboard_process import gateway_options
+from controller.daemon.children import gateway_options
 from controller.gateway.settings import read_token
 from daemon_bench import (
     ENABLED,

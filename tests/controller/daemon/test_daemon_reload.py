@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 
 from controller.child import child_command
+from controller.daemon.children import read_in_child
 from controller.daemon.config import (
     DaemonConfig,
     changed_keys,
     load_daemon_config,
     reload_problem,
 )
-from controller.daemon.config_reader import read_in_child
 from daemon_bench import ENABLED, ready_daemon
 from model.errors import InputError
 from model.rig.file import example_rig_path
@@ -211,7 +211,7 @@ def test_reading_a_configuration_in_a_child_is_bounded_in_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An error of the system, as if the child had failed; a child cannot start in no time."""
-    monkeypatch.setattr("controller.daemon.config_reader._TIMEOUT", 0.0)
+    monkeypatch.setattr("controller.daemon.children._TIMEOUT", 0.0)
     with pytest.raises(OSError, match="took longer"):
         read_in_child(tmp_path / "daemon.yaml")
 

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from controller.report.collect import MAX_DUMPS, collect, versions
-from controller.report.shown import shown
+from controller.report.collect import MAX_DUMPS, collect, shown, versions
 from model.rig.file import example_rig_path
 
 HOME = Path("/home/user")

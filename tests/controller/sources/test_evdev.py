@@ -11,18 +11,17 @@ from typing import Any
 
 import pytest
 
-from controller.sources.evdev import EvdevSource
-from controller.sources.input_device import (
+from controller.sources.evdev import (
     GRAB,
+    EvdevSource,
     InputDevice,
     InputEvent,
     eviocgabs,
     eviocgmtslots,
     parse_events,
 )
-from controller.sources.registry import open_source
 from controller.sources.slots import SlotState
-from controller.sources.touch import TouchFrame
+from controller.sources.touch import TouchFrame, open_source
 from model.errors import InputError
 from virtual_loop import run_virtual
 
@@ -292,7 +291,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch, *, width: int, grab: OSError | None 
         resolution = {eviocgabs(0x35): 12, eviocgabs(0x3A): 3}.get(request, 0)
         return struct.pack("6i", 0, 0, highs.get(request, width), 0, 0, resolution)
 
-    monkeypatch.setattr("controller.sources.input_device.fcntl.ioctl", ioctl)
+    monkeypatch.setattr("controller.sources.evdev.fcntl.ioctl", ioctl)
 
 
 BUSY = OSError(errno.EBUSY, "Device or resource busy")

@@ -1,18 +1,26 @@
-"""The gateway as a child process of the daemon that must not disturb its loop.
+"""Child processes of the daemon that must not disturb its loop: the gateway, a reader of its files.
 
-It is an ordinary API client. One that exits is restarted after a growing pause; it ends with the
-daemon, even if that is killed.
+The gateway is an ordinary API client. One that exits is restarted after a growing pause; it ends
+with the daemon, even if that is killed.
+
+A configuration is read by `python -m controller.daemon.children FILE`, which writes it, or the text
+of its problems, in Python's pickle format: a thread that parses for a second holds the
+interpreter's lock up to 5 ms at a time, and for as long as another program has its processor, so
+that the loop and its heartbeats would wait for it.
 """
 
 import asyncio
 import contextlib
 import logging
 import os
+import pickle
 import secrets
+import subprocess
 import sys
 from pathlib import Path
 
 from controller.child import child_command, ended
+from controller.daemon.config import DaemonConfig, load_daemon_config
 from drivers import clock
 from drivers.pauses import Backoff
 from model.errors import InputError
@@ -68,3 +76,49 @@ async def keep_gateway(options: list[str]) -> None:
         pause = backoff.pause(ran_for=clock.now() - started_at)
         _logger.info("gateway: restarting in %g s", pause)
         await asyncio.sleep(pause)
+
+
+_TIMEOUT = 60.0  # s; a plug-in or a file on a lost network folder may hang
+_NICE = 10  # above that of the daemon, whose loop comes first
+
+
+def read_in_child(file: Path) -> DaemonConfig:
+    """Read a configuration in a child process; blocks, InputError with all problems.
+
+    Raises OSError if the process cannot be started or fails.
+    """
+    try:
+        done = subprocess.run(  # noqa: S603  our own module
+            child_command("controller.daemon.children", str(file)),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is handled by the daemon
+            timeout=_TIMEOUT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise TimeoutError(f"reading {file} took longer than {_TIMEOUT:g} s") from error
+    if done.returncode != 0:
+        raise OSError(f"reading {file} failed with status {done.returncode}")
+    read = pickle.loads(done.stdout)  # noqa: S301  of our own process
+    if isinstance(read, DaemonConfig):
+        return read
+    raise InputError(str(read))
+
+
+def _main() -> None:
+    with contextlib.suppress(OSError):
+        os.nice(_NICE)
+    output = sys.stdout.buffer
+    sys.stdout = sys.stderr  # for what a plugin prints
+    read: DaemonConfig | str
+    try:
+        read = load_daemon_config(Path(sys.argv[1]))
+    except InputError as error:
+        read = str(error)
+    pickle.dump(read, output)
+    output.flush()
+
+
+if __name__ == "__main__":
+    _main()

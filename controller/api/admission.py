@@ -14,6 +14,7 @@ first, but none whose first bytes have arrived unread.
 import asyncio
 import contextlib
 import os
+import resource
 import socket
 from collections import Counter
 from collections.abc import Callable
@@ -176,3 +177,17 @@ def _spare_descriptor() -> int | None:
         return os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
         return None
+
+
+MIN_DESCRIPTORS = 64
+_MAX_DESCRIPTORS = 65_536
+
+
+def allow_many_descriptors() -> int:
+    """Raise the limit, so that idle connections do not use it up; return it."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    limit = _MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else hard
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
+        return limit
+    return soft

@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from controller.api.hub import Hub
 from controller.api.schema import AmplifierStatus, LatencySummary, LearningSummary, PlateEvent
 from controller.api.topics import (
     AmplifiersEvent,
+    Hub,
     LatencyEvent,
     LayoutEvent,
     LinkEvent,

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 import uvicorn
 
-from controller.api.descriptors import allow_many_descriptors
+from controller.api.admission import allow_many_descriptors
 from controller.gateway.app import Gateway
 from controller.gateway.connections import HttpConnection, WebSocketConnection
 from controller.gateway.settings import Settings

@@ -12,10 +12,9 @@ import pytest_asyncio
 
 import dashboard_pictures
 from chromium import Browser, Page, open_browser
-from controller.api.hub import Hub
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import DaemonStateName
-from controller.api.topics import LayoutEvent, StateEvent
+from controller.api.topics import Hub, LayoutEvent, StateEvent
 from controller.gateway.app import MAX_SESSIONS
 from daemon_bench import PATIENCE, ready, running_daemon
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard

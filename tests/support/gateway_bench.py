@@ -19,7 +19,6 @@ from pathlib import Path
 
 from controller.api.client import Client
 from controller.api.connection import Connection
-from controller.api.hub import Hub
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 from controller.api.methods import (
     METHODS,
@@ -45,7 +44,7 @@ from controller.api.schema import (
     Topic,
 )
 from controller.api.server import ApiServer
-from controller.api.topics import StateEvent
+from controller.api.topics import Hub, StateEvent
 from daemon_bench import PATIENCE, daemon_table, write_daemon
 from installed_program import ERA
 from model.rig.file import parse_rig

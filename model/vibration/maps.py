@@ -16,6 +16,8 @@ from model.vibration.excitation import Excitation, find_nulls, peak_acceleration
 MAX_POINTS = 1_000_000
 """More would be finer than any screen, at some hundred bytes of memory each."""
 
+_AT_ONCE = 10_000  # points that are solved together, at some kilobytes each
+
 
 @dataclass(frozen=True)
 class PlateMap:
@@ -72,7 +74,9 @@ def plate_map(
     def respond(driven: FloatArray) -> ComplexArray:
         highest = max(rig.limits.frequency_max, float(driven.max()))
         solved = free or solve_free_plate(rig.plate, mesh, frequency_max=highest)
-        return solved.acceleration(rig.eras, driven, points, loads=rig.masses)
+        parts = np.array_split(points, 1 + len(points) // _AT_ONCE)
+        found = [solved.acceleration(rig.eras, driven, part, loads=rig.masses) for part in parts]
+        return np.concatenate(found, axis=2)
 
     frequencies, field = tone_fields(excitation, rig.eras, respond)
     peak = peak_acceleration(np.abs(field)).reshape(rows, columns)

@@ -230,13 +230,6 @@ class Mesh(Discretisation):
         return lattice(*(line.nodes for line in self.along))
 
     @property
-    def pins(self) -> FloatArray:
-        """Nodes on its edges [m] (n, 2): with none of them the edges deflect nowhere."""
-        inner = np.zeros((self.rows, self.columns), dtype=bool)
-        inner[1:-1, 1:-1] = True
-        return np.asarray(self.nodes[~inner.ravel()])
-
-    @property
     def raster(self) -> tuple[int, int]:
         """Numbers of evenly spaced points along x and y that show what the mesh resolves.
 

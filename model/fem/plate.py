@@ -7,7 +7,7 @@ damping is hysteretic: ((1 + i eta) K - omega² M) u = F.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,7 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem.mesh import DOF_PER_NODE, Mesh
+from model.structure.attachments import PointLoad, footprints_of
 from model.structure.plate import Plate
 
 RIGID_BODY_MODES = 3  # of a free plate: up and down, and two tilts
@@ -64,7 +65,7 @@ class PlateMatrices:
     @property
     def dof(self) -> int:
         """Number of degrees of freedom."""
-        return self.mesh.dof
+        return DOF_PER_NODE * self.mesh.node_count
 
     def deflection_at(self, points: FloatArray) -> sparse.csr_array:
         """Map of the degrees of freedom to deflections at points [m] (n, 2), sparse (n, dof)."""
@@ -121,6 +122,33 @@ def _stiffness(
         whole = sparse.kron(block, place, format="csc")
         found = found + (whole if of[0] == of[1] else whole + whole.T)
     return sparse.csc_array(found)
+
+
+def simply_supported_modes(
+    matrices: PlateMatrices, count: int, loads: Sequence[PointLoad] = ()
+) -> tuple[FloatArray, FloatArray]:
+    """Natural frequencies (n,) [Hz], ascending, and undamped modes (dof, n) of modal mass 1.
+
+    Without deflection on all four edges, where rotations are free. Raises InputError for a count
+    above what the mesh has.
+    """
+    mesh, touch = matrices.mesh, matrices.deflection_at(footprints_of(loads))
+    springs = sparse.diags_array(np.array([load.stiffness for load in loads], dtype=float))
+    masses = sparse.diags_array(np.array([load.mass for load in loads], dtype=float))
+    is_free = np.ones((mesh.rows, mesh.columns, DOF_PER_NODE), dtype=bool)
+    is_free[[0, -1], :, 0] = is_free[:, [0, -1], 0] = False
+    free = np.flatnonzero(is_free)
+    eigenvalues, vectors = lowest_modes(
+        sparse.csc_array(
+            sparse.csc_array(matrices.stiffness + touch.T @ springs @ touch)[free][:, free]
+        ),
+        sparse.csc_array(sparse.csc_array(matrices.mass + touch.T @ masses @ touch)[free][:, free]),
+        count,
+        shift=(2 * np.pi * matrices.plate.lowest_bending_frequency) ** 2,
+    )
+    whole = np.zeros((matrices.dof, count))
+    whole[free] = vectors
+    return np.sqrt(np.maximum(eigenvalues, 0)) / (2 * np.pi), whole
 
 
 def lowest_modes(

@@ -75,18 +75,12 @@ class SpectralModes:
         self._powers = (u / u.max()) ** np.arange(1, 2 * RESIDUAL_ORDER + 1)[:, None]
         # By shape and content, of which either alone may be those of others.
         self._known: dict[tuple[tuple[int, ...], bytes], _Observed] = {}
-        self._is_softer, self._dents = False, True
+        self._is_softer = False
 
     def softer(self) -> "SpectralModes":
         """The plate as soft under every force as its polynomials leave possible."""
         found = copy(self)
         found._is_softer = True
-        return found
-
-    def along_lines(self) -> "SpectralModes":
-        """The plate under forces that stand for some along a line, which dent it nowhere."""
-        found = copy(self)
-        found._dents = False
         return found
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
@@ -126,8 +120,6 @@ class SpectralModes:
 
     def _local(self, own: _Observed, other: _Observed) -> FloatArray:
         """Compliance in waves that the polynomials do not resolve, in units of u_c."""
-        if not self._dents:
-            return np.zeros((len(own.shapes), len(other.shapes)))
         places = self._local_plate, own.unresolved, other.unresolved
         missing = compliance_between(*places)
         if self._is_softer:

@@ -5,9 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Self, TypeAlias
 
 import numpy as np
-from numpy.polynomial.legendre import leggauss
 
-from model.arrays import FloatArray, lattice
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.spectral.local_compliance import edge_compliance
@@ -114,16 +112,6 @@ class SpectralMesh(Discretisation):
         """Number of degrees of freedom: polynomials of w, and of the rotations with edge layers."""
         w = (self.nx + 1) * (self.ny + 1)
         return w + 2 * (self.nx + 3) * (self.ny + 3)
-
-    @property
-    def pins(self) -> FloatArray:
-        """Points on its edges [m] (n, 2): polynomials that are zero there are zero all along."""
-        x, y = (
-            side * (1 + leggauss(degree + 1)[0]) / 2
-            for side, degree in ((self.length, self.nx), (self.width, self.ny))
-        )
-        ends = np.array([0.0, self.length]), np.array([0.0, self.width])
-        return np.vstack([lattice(x, ends[1]), lattice(ends[0], y)])
 
     @property
     def raster(self) -> tuple[int, int]:

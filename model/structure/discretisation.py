@@ -25,11 +25,6 @@ class Discretisation(ABC):
     def shortest_wavelength(self) -> float:
         """The shortest bending wavelength [m] that it resolves."""
 
-    @property
-    @abstractmethod
-    def pins(self) -> FloatArray:
-        """Points [m] (n, 2) that hold the edges of a simply supported plate."""
-
     @abstractmethod
     def resolving(self, plate: Plate, frequency: float) -> Self:
         """The coarsest of its kind that resolves a frequency [Hz]."""

@@ -10,15 +10,16 @@ from scipy import linalg
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem.mesh import Mesh
-from model.fem.plate import RIGID_BODY_MODES
+from model.fem.plate import (
+    RIGID_BODY_MODES,
+    assemble,
+    simply_supported_modes,
+)
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import contribution, reduce_free_plate
-from model.reduction.spectral_modes import SpectralModes
-from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
-from model.spectral.mesh import PlateMesh
+from model.spectral.mesh import PlateMesh, SpectralMesh
 from model.structure.attachments import PointLoad, footprints_of
-from model.structure.footprint import as_footprints
 from model.structure.modal_elasticity import ModalElasticity
 
 
@@ -48,7 +49,6 @@ class NaturalModes:
         )
 
 
-_HELD = 1e-9  # share of the largest motion of the edges that is none
 _BEYOND = 4.0  # times what a mesh resolves: coarse ones are compared with others, too
 
 
@@ -62,27 +62,26 @@ def natural_modes(
 ) -> NaturalModes:
     """Solve for the lowest modes of a rig, on a mesh, by default its own.
 
-    support: free (elastic modes only), eras or simply-supported, without deflection on the edges,
-    for which elements of higher order give way to polynomials; free: its plate where it has been
-    solved on the mesh. Raises InputError for a count below 1 or above what the mesh has.
+    support: free (elastic modes only), eras or simply-supported, for which polynomials over the
+    plate give way to finite elements; free: its plate where it has been solved on the mesh. Raises
+    InputError for a count below 1 or above what the mesh has, and for a simply supported plate of
+    layers.
     """
     if count < 1:
         raise InputError(f"modes must be 1 or more, got {count}")
-    chosen, highest = mesh or rig.mesh, rig.limits.frequency_max
-    pins = np.empty((0, 2))
+    chosen = mesh or rig.mesh
     if support == "simply-supported":
-        if isinstance(chosen, Mesh) and chosen.element.order > 1:
-            chosen = mesh_of("auto", rig.plate, frequency_max=highest)
-        pins = chosen.pins
+        return _simply_supported(rig, count, chosen)
     attached = list(rig.masses)
     if support == "eras":
         attached += [PointLoad.of_era(era) for era in rig.eras]
     gap = rig.plate.air_gap
     # Air sealed in resists motion up and down; it only flows to and fro under tilts.
     rigid = RIGID_BODY_MODES - (gap is not None and gap.closed) if support == "free" else 0
+    highest = rig.limits.frequency_max
     while True:
         solved = free or solve_free_plate(rig.plate, chosen, frequency_max=highest)
-        modes = _modes_with(solved, attached, pins)
+        modes = _modes_with(solved, attached)
         found = int((modes.frequencies <= highest).sum()) - rigid
         if found >= count:
             break
@@ -95,21 +94,25 @@ def natural_modes(
     return modes.only(slice(rigid, rigid + count))
 
 
-def _modes_with(free: FreePlate, attached: list[PointLoad], pins: FloatArray) -> NaturalModes:
-    """All modes of the undamped plate with attachments, of the truncated ones some mixtures.
-
-    pins (n, 2) [m]: where it does not deflect.
-    """
-    if len(pins) and isinstance(free.modes, SpectralModes):
-        free = replace(free, modes=free.modes.along_lines())
-    reduced = reduce_free_plate(free, np.vstack([footprints_of(attached), as_footprints(pins)]))
+def _modes_with(free: FreePlate, attached: list[PointLoad]) -> NaturalModes:
+    """All modes of the undamped plate with attachments, of the truncated ones some mixtures."""
+    reduced = reduce_free_plate(free, footprints_of(attached))
     M, _, K = contribution(reduced.at(footprints_of(attached)), attached)
     elastic = ModalElasticity.of(reduced.plate, reduced.omega**2, reduced.losses).eigenvalues
-    moving = np.eye(len(M))
-    if len(pins):
-        moving = linalg.null_space(reduced.at(pins), rcond=_HELD)
-    squares, coordinates = linalg.eigh(
-        moving.T @ (K + np.diag(elastic)) @ moving, moving.T @ (M + np.eye(len(M))) @ moving
-    )
+    squares, coordinates = linalg.eigh(K + np.diag(elastic), M + np.eye(len(M)))
     frequencies = np.sqrt(np.maximum(squares, 0)) / (2 * np.pi)
-    return NaturalModes(frequencies, reduced.at, moving @ coordinates, free.mesh)
+    return NaturalModes(frequencies, reduced.at, coordinates, free.mesh)
+
+
+def _simply_supported(rig: Rig, count: int, mesh: PlateMesh) -> NaturalModes:
+    """Modes of finite elements, whose shapes are those of the nodes."""
+    if rig.plate.is_layered:
+        raise InputError(
+            "support must be free or eras for a plate of layers or with an air gap, got "
+            "simply-supported: finite elements of it are not solved"
+        )
+    if isinstance(mesh, SpectralMesh):
+        mesh = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
+    matrices = assemble(rig.plate, mesh)
+    frequencies, unknowns = simply_supported_modes(matrices, count, rig.masses)
+    return NaturalModes(frequencies, matrices.deflection_at, unknowns, mesh)

@@ -21,6 +21,7 @@ from model.spectral.modes import Band, SpectralPlate
 from model.structure.attachments import Era, footprints_of
 from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import Bond, Laminate, Layer, Material, Plate
+from model.vibration.natural_modes import natural_modes
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "glass_panel.yaml"
 COVER = Material("cover", E=71.5e9, rho=2420.0, nu=0.21)
@@ -154,7 +155,9 @@ def test_lossy_layers_damp_in_time_as_at_each_frequency():
 
 
 def test_finite_elements_refuse_layers():
-    """They would solve another plate."""
+    """They would solve another plate, also for a simple support."""
     plate = panel(PANEL)
+    with pytest.raises(InputError, match=r"^support must be free or eras"):
+        natural_modes(load_rig(EXAMPLE), 3, support="simply-supported")
     with pytest.raises(InputError, match=r"^mesh: must be of polynomials"):
         assemble(plate, Mesh(12, 9, 0.375, 0.225))

@@ -11,7 +11,7 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import islice
 
 import numpy as np
 
@@ -108,20 +108,23 @@ def thinned(envelopes: Envelopes, *, knots: int) -> Envelopes:
     }
 
 
-def on_wire(envelopes: Envelopes | None, strokes: Mapping[str, float]) -> dict[str, Envelope]:
+def on_wire(strokes: Mapping[str, float], *several: Envelopes | None) -> list[dict[str, Envelope]]:
     """Return envelopes in integers of the wire; strokes [m]: by ERA, as envelopes are."""
-    if not envelopes:
-        return {}
-    counts = [len(each.knots) - 1 for each in envelopes.values()]
-    motions = np.array([*chain.from_iterable([each.knots[:-1] for each in envelopes.values()])])
-    each = motions.astype(complex) / np.repeat([strokes[name] for name in envelopes], counts)
+    motions: list[complex] = []
+    units: list[float] = []
+    for envelopes in several:
+        for name, one in envelopes.items() if envelopes else ():
+            motions += one.knots[:-1]
+            units += [strokes[name]] * (len(one.knots) - 1)
+    each = np.array(motions, dtype=complex) / units
     levels = np.rint(np.abs(each) * _LEVEL.per_unit).astype(int)
     phases = np.rint(np.degrees(np.angle(each)) * _PHASE.per_unit).astype(int)
     phases[phases > _PHASE.maximum] = _PHASE.minimum  # half a turn
     knots = zip(levels.tolist(), phases.tolist(), strict=True)
-    return {
-        name: Envelope(
-            math.ceil(round(one.step * _STEP.per_unit, _DIGITS)), tuple(islice(knots, count))
-        )
-        for (name, one), count in zip(envelopes.items(), counts, strict=True)
-    }
+    found: list[dict[str, Envelope]] = []
+    for envelopes in several:
+        found.append({})
+        for name, one in envelopes.items() if envelopes else ():
+            step = math.ceil(round(one.step * _STEP.per_unit, _DIGITS))
+            found[-1][name] = Envelope(step, tuple(islice(knots, len(one.knots) - 1)))
+    return found

@@ -53,7 +53,7 @@ def route(
     before: Drive = playing or {}
     restarted = restarted_by(excitation, {} if restarts else before)
     strokes = {era.name: era.stroke for era in rig.eras}
-    onsets, endings = on_wire(onset, strokes), on_wire(ending, strokes)
+    onsets, endings = on_wire(strokes, onset, ending)
     wired: dict[str, list[Tone]] = {name: [] for name in rig.amplifiers}
     for name, channel in rig.wiring.items():
         driven, was, shape = excitation.get(name), before.get(name), onsets.get(name)

@@ -200,7 +200,7 @@ class Rounding:
                 text = f"knots of an envelope must be at most {limit}, got {count}"
                 raise _refused(tone.channel, text)
             try:
-                KNOT.append_rows([], envelope.knots)
+                KNOT.check_rows(envelope.knots)
             except (TypeError, ValueError) as error:
                 raise _refused(tone.channel, f"knot of an envelope: {error}") from error
             if (peak := envelope.peak) > self._limits.level:

@@ -256,7 +256,15 @@ class Members:
         staging: list[Awaitable[Staged]] = []
         for name, of_one in layers.items():
             staging.append(self.amplifiers[name].stage(token, of_one, now=is_silent))
-        results = await asyncio.gather(*staging, return_exceptions=True)
+        results: list[Staged | BaseException] = []
+        if len(staging) > 1:
+            results = await asyncio.gather(*staging, return_exceptions=True)
+        else:  # without a further iteration of the event loop
+            for each in staging:
+                try:
+                    results.append(await each)
+                except DriverError as error:
+                    results.append(error)
         refusals: dict[str, CommandRefused] = {}
         has_failed = is_silent
         for name, result in zip(layers, results, strict=True):

@@ -7,11 +7,11 @@ many or out of range. Replies may grow, so what follows their fields is ignored.
 
 import math
 import struct
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain, product, repeat
-from operator import and_
+from itertools import accumulate, product
 from typing import Any
 
 from drivers.errors import CommandError, FrameError
@@ -112,6 +112,11 @@ class Bits:
     """Unsigned numbers that share a word, the first in the highest bits; unused bits are 0."""
 
     parts: tuple[tuple[str, int], ...]
+
+    @property
+    def shifts(self) -> list[int]:
+        """By how much each is shifted."""
+        return [*accumulate((bits for _, bits in self.parts[:0:-1]), initial=0)][::-1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,6 +250,8 @@ class Record:
         self.names: list[str] = []
         for field in fields:
             self.names += dict(field.parts) if isinstance(field, Bits) else [field.name]
+        self.shifts = [shift for each in fields if isinstance(each, Bits) for shift in each.shifts]
+        """Of the numbers that share a word."""
 
     def append(self, words: list[int], *rows: Mapping[str, Any]) -> list[int]:
         """Append the words of values, by row, and return all.
@@ -277,14 +284,13 @@ class Record:
         """Return the words of values."""
         return self.append([], values)
 
-    def append_rows(self, words: list[int], rows: Sequence[Sequence[int]]) -> None:
-        """Append rows of numbers, a word each in the order of the fields; raises as `append`."""
+    def check_rows(self, rows: Sequence[Sequence[int]]) -> None:
+        """Raise TypeError or ValueError for a number of rows, in the order of the fields."""
         for field, column in zip(self.fields, zip(*rows, strict=True), strict=False):
             if isinstance(field, Number):
-                for number in (min(column), max(column)):
+                for number in (min(column), max(array("q", column))):
                     if not field.quantity.minimum <= number <= field.quantity.maximum:
                         raise ValueError(_out_of_range(field.name, field.quantity, number))
-        words.extend(map(and_, chain.from_iterable(rows), repeat(WORD - 1)))  # without a call
 
     def read_rows(
         self, words: Sequence[int], at: int, count: int

@@ -168,23 +168,21 @@ def test_envelopes_on_the_wire_by_hand() -> None:
 
     Half a turn is the lowest phase that the wire has.
     """
-    found = on_wire(
-        {
-            "B": BaseEnvelope(110.0, 0, (1e-4j, -2e-4, 0), 0.01),
-            "A": BaseEnvelope(110.0, 0, (2e-5, 5e-5)),
-            "C": BaseEnvelope(110.0, 0, (5e-5,)),
-        },
-        STROKES,
-    )
+    onset = {
+        "B": BaseEnvelope(110.0, 0, (1e-4j, -2e-4, 0), 0.01),
+        "A": BaseEnvelope(110.0, 0, (2e-5, 5e-5)),
+    }
+    found, none, ending = on_wire(STROKES, onset, None, {"C": BaseEnvelope(110.0, 0, (5e-5,))})
+    assert (none, ending) == ({}, {"C": Envelope(50, ())})
     assert found["A"] == Envelope(50, ((2000, 0),))
     assert found["B"] == Envelope(100, ((5000, 9000), (10000, -18000)))
-    assert found["C"] == Envelope(50, ())
 
 
 def test_envelopes_round_full_stroke_to_one() -> None:
     """A rounding error above it would be refused by the ledger."""
     full = cmath.rect(1e-4 * (1 + 1e-12), 1.0)
-    ((level, _),) = on_wire({"A": BaseEnvelope(110.0, 0, (full, 0))}, STROKES)["A"].knots
+    (found,) = on_wire(STROKES, {"A": BaseEnvelope(110.0, 0, (full, 0))})
+    ((level, _),) = found["A"].knots
     assert level == 10000
 
 

@@ -197,7 +197,7 @@ def convergence(
                 "mesh": [error.mesh.nx, error.mesh.ny],
                 "element": error.mesh.element_name,
                 "strip_m": error.mesh.strip,
-                "dof": error.dof,
+                "dof": error.mesh.dof,
                 "is_the_rigs": error.mesh == rig.mesh,
                 "natural_frequency_error_percent": (100 * error.frequency).tolist(),
                 "response_error_percent": (100 * error.response).tolist(),
@@ -234,7 +234,9 @@ def convergence(
         errors = [100 * abs(error.frequency).max(), *(100 * error.response)]
         columns = "".join(f"{value:10.3f} %" for value in errors)
         mine = "  <- the rig's" if error.mesh == rig.mesh else ""
-        print(f"{mesh_text:>9}{error.mesh.element_name:>9}{strip:>8}{error.dof:>8}{columns}{mine}")
+        print(
+            f"{mesh_text:>9}{error.mesh.element_name:>9}{strip:>8}{error.mesh.dof:>8}{columns}{mine}"
+        )
         if error.estimate is not None:
             columns = "".join(f"{value:10.3f} %" for value in 100 * error.estimate)
             print(f"{'estimated without the reference':>46}{columns}")

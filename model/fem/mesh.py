@@ -130,9 +130,6 @@ def element_of(name: str) -> Element:
     return ELEMENTS[name]
 
 
-PAPER_ELEMENT = MITC4
-"""The default element of a mesh."""
-
 # An accurate mesh. The lowest twelve natural frequencies of the paper's plate are then within
 # 0.01 % of converged, and its accelerations (relative L2) within 0.1 % with ERAs at the corners,
 # 0.2 % with ERAs elsewhere and 0.6 % there at a resonance: a point force bends the plate more
@@ -154,7 +151,7 @@ class Mesh(Discretisation):
     is the i-th along x and the j-th along y.
     """
 
-    element: Element = PAPER_ELEMENT
+    element: Element = MITC4
     strip: float = 0.0
 
     def __post_init__(self) -> None:
@@ -187,7 +184,7 @@ class Mesh(Discretisation):
 
     def __str__(self) -> str:
         text = f"{self.nx}x{self.ny}"
-        if self.element != PAPER_ELEMENT:
+        if self.element != MITC4:
             text += f" {self.element.name}"
         if self.strip:
             text += f" with strips of {1000 * self.strip:.3g} mm"
@@ -246,7 +243,7 @@ class Mesh(Discretisation):
     @property
     def dof(self) -> int:
         """Number of degrees of freedom: w, beta_x, beta_y at each node."""
-        return 3 * self.node_count
+        return DOF_PER_NODE * self.node_count
 
     @property
     def shortest_wavelength(self) -> float:

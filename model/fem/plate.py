@@ -1,10 +1,4 @@
-"""The plate in finite elements: its matrices, natural modes, and response frequency by frequency.
-
-An ERA is a spring k_b and a damper c between the plate and a base that moves y exp(i omega t), with
-a bolt of mass m_b on the plate. Its force on the plate is (k_b + i omega c) y minus its dynamic
-stiffness k_b + i omega c - omega² m_b times the deflection (paper Eq. 21 and 25). The plate's own
-damping is hysteretic: ((1 + i eta) K - omega² M) u = F.
-"""
+"""The plate in finite elements: its matrices, and natural modes of them."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -61,11 +55,6 @@ class PlateMatrices:
     mesh: Mesh
     stiffness: sparse.csc_array
     mass: sparse.csc_array
-
-    @property
-    def dof(self) -> int:
-        """Number of degrees of freedom."""
-        return DOF_PER_NODE * self.mesh.node_count
 
     def deflection_at(self, points: FloatArray) -> sparse.csr_array:
         """Map of the degrees of freedom to deflections at points [m] (n, 2), sparse (n, dof)."""
@@ -146,7 +135,7 @@ def simply_supported_modes(
         count,
         shift=(2 * np.pi * matrices.plate.lowest_bending_frequency) ** 2,
     )
-    whole = np.zeros((matrices.dof, count))
+    whole = np.zeros((mesh.dof, count))
     whole[free] = vectors
     return np.sqrt(np.maximum(eigenvalues, 0)) / (2 * np.pi), whole
 

@@ -28,11 +28,11 @@ class FiniteElementModes:
         cut = (2 * math.pi * cutoff_frequency) ** 2
         count = plate.modes_below(cutoff_frequency) + RIGID_BODY_MODES + 4
         while True:
-            count = min(count, matrices.dof)
+            count = min(count, mesh.dof)
             eigenvalues, vectors = lowest_modes(
                 matrices.stiffness, matrices.mass, count, shift=shift
             )
-            if eigenvalues[-1] >= cut or count == matrices.dof:
+            if eigenvalues[-1] >= cut or count == mesh.dof:
                 break
             count += count // 3 + 1
         eigenvalues[:RIGID_BODY_MODES] = 0.0
@@ -67,7 +67,7 @@ class FiniteElementModes:
 
     def unknowns(self, points: FloatArray) -> tuple[FloatArray, ...]:
         """The columns of `basis` in degrees of freedom, in one part."""
-        residuals = self._residuals(points).reshape(-1, self._matrices.dof)
+        residuals = self._residuals(points).reshape(-1, self._matrices.mesh.dof)
         return (np.hstack([self._vectors, residuals.T]),)
 
     def _residuals(self, points: FloatArray) -> FloatArray:
@@ -100,5 +100,5 @@ def _rigid_modes(matrices: PlateMatrices) -> FloatArray:
     modes[:, 0, 0] = 1
     modes[:, 0, 1:] = nodes - [plate.length / 2, plate.width / 2]
     modes[:, 1, 1] = modes[:, 2, 2] = 1
-    found = modes.reshape(matrices.dof, RIGID_BODY_MODES)
+    found = modes.reshape(matrices.mesh.dof, RIGID_BODY_MODES)
     return np.asarray(found / np.sqrt((found * (matrices.mass @ found)).sum(axis=0)))

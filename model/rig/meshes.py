@@ -6,7 +6,7 @@ from typing import Any
 
 from model.config.units import LENGTH, quantity
 from model.errors import InputError
-from model.fem.mesh import PAPER_ELEMENT, Mesh, element_of
+from model.fem.mesh import MITC4, Mesh, element_of
 from model.spectral.mesh import MAX_DEGREE, MAX_POLYNOMIALS, POLYNOMIALS, PlateMesh, SpectralMesh
 from model.structure.plate import Plate
 
@@ -80,7 +80,7 @@ def parse_mesh(text: str, plate: Plate) -> PlateMesh:
         raise InputError(
             f"mesh must have 1 to {_MAX_ELEMENTS_PER_SIDE} elements a side, got {nx}x{ny}"
         )
-    element = element_of(match[3]) if match[3] else PAPER_ELEMENT
+    element = element_of(match[3]) if match[3] else MITC4
     mesh = Mesh(nx=nx, ny=ny, length=plate.length, width=plate.width, element=element, strip=strip)
     if mesh.node_count > _MAX_NODES:
         raise InputError(f"mesh must have at most {_MAX_NODES} nodes, got {mesh}")

@@ -59,7 +59,6 @@ class MeshError:
     """
 
     mesh: PlateMesh
-    dof: int
     frequency: FloatArray
     response: FloatArray
     estimate: FloatArray | None
@@ -145,7 +144,7 @@ def study_convergence(
             ).max(axis=1)
         found = _relative_error(response(free, rig.eras), exact_response).max(axis=1)
         of_frequencies = _natural_frequencies(rig, free)[supported] / exact[supported] - 1
-        errors.append(MeshError(mesh, mesh.dof, of_frequencies, found, estimate))
+        errors.append(MeshError(mesh, of_frequencies, found, estimate))
     progress(1 + len(meshes), 1 + len(meshes))
     accurate = rig.mesh if rig.plate.is_layered else Mesh.accurate(rig.plate, frequency_max=high)
     plain = _solved(rig, accurate)

@@ -105,7 +105,7 @@ def frequency_error(element: Element, count: int) -> float:
     node = np.arange(mesh.node_count).reshape(mesh.rows, mesh.columns)
     sides, ends = node[:, [0, -1]].ravel(), node[[0, -1]].ravel()
     fixed = np.concatenate([3 * sides, 3 * sides + 2, 3 * ends, 3 * ends + 1])
-    free = np.setdiff1d(np.arange(assembled.dof), fixed)
+    free = np.setdiff1d(np.arange(mesh.dof), fixed)
     a, b = np.pi / THIN.length, np.pi / THIN.width
     S = rigidities(THIN)["shear"]
     D, nu = THIN.flexural_rigidity, THIN.material.nu

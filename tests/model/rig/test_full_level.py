@@ -137,15 +137,11 @@ def test_era_gain_is_interpolated_and_held_beyond_its_frequencies(uneven: Rig) -
 
 
 def test_acceleration_is_scaled_by_the_gain_of_its_era(coarse_rig: Rig, uneven: Rig) -> None:
-    """In direct solve and free plate the ERA's own response is multiplied, not its neighbours'."""
+    """The ERA's own response is multiplied, not its neighbours'."""
     points = np.array([[0.1, 0.05], [0.2, 0.2]])
     frequencies = np.array([100.0, 150.0, 200.0])
     factor = np.ones((3, 4, 1), dtype=complex)
     factor[:, 1, 0] = uneven.eras[1].gain(frequencies)
-    matrices = assemble(coarse_rig.plate, coarse_rig.mesh)
-    before = direct_acceleration(matrices, coarse_rig.eras, frequencies, points)
-    after = direct_acceleration(matrices, uneven.eras, frequencies, points)
-    np.testing.assert_allclose(after, factor * before, rtol=1e-12)
     free = solve_free_plate(coarse_rig.plate, coarse_rig.mesh)
     np.testing.assert_allclose(
         free.acceleration(uneven.eras, frequencies, points),

@@ -61,7 +61,7 @@ def test_auto_mesh_has_the_stated_accuracy(study):
     automatic = study.errors[-1]
     assert np.abs(automatic.frequency).max() < 1e-3
     assert automatic.response.max() < 1e-2
-    assert automatic.dof < Mesh(24, 18, LENGTH, WIDTH).dof
+    assert automatic.mesh.dof < Mesh(24, 18, LENGTH, WIDTH).dof
 
 
 @pytest.mark.long

@@ -305,7 +305,6 @@ class _Run:
         elif action.what == "stall":
             self._stall(action.lasts)
         elif action.what == "ready":
-            await self.turning.wait()  # as in a process, whose stall also keeps requests waiting
             if not self._is_armed:
                 if not await self._request("clear"):  # what no client had seen yet
                     await self._request("clear")
@@ -318,11 +317,15 @@ class _Run:
             await self._request(action.what)
 
     async def _request(self, what: str) -> bool:
-        """Carry out a request of an operator; a refusal is a valid outcome, False."""
+        """Carry out a request of an operator; a refusal is a valid outcome, False.
+
+        It waits while the loop stalls, as in a process, but for a stop.
+        """
         try:
             if what == "stop":
                 await self.supervisor.stop("as told")
             else:
+                await self.turning.wait()
                 await self.supervisor.handle(DaemonEvent(Trigger[what.upper()], "as told"))
         except (DriverError, RpcError) as problem:
             self.note("refused", what, type(problem).__name__, problem)

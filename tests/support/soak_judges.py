@@ -46,7 +46,8 @@ class SourceContacts:
             for number, (x, y) in last.items()
             if 0 <= x <= 1 and 0 <= y <= 1  # NaN is not
         )
-        _, were = self._now.get(source, (0.0, frozenset[tuple[str, int]]()))
+        ended, were = self._now.get(source, (-math.inf, frozenset[tuple[str, int]]()))
+        were = were if now < ended else frozenset()
         for key in were - numbers:
             if stamp - self._since[key] < _GLIMPSE:
                 self._taps[key] = self._since[key] + _TAP
@@ -240,7 +241,7 @@ class Checks:
             self._faulted.pop(name, None)
         if MESSAGES[request].feeds or request in _SILENCING_REQUESTS:
             self._fed[name] = now
-        if self._plays() and self._next.when() > now + STEP:
+        if self._due() < self._next.when():
             self._watch()
 
     def close(self) -> None:
@@ -251,16 +252,18 @@ class Checks:
         """Check periodically, more often while a channel vibrates."""
         self._next.cancel()
         self.check()
-        self._next = self._loop.call_later(STEP if self._plays() else IDLE_STEP, self._watch)
+        self._next = self._loop.call_at(self._due(), self._watch)
 
-    def _plays(self) -> bool:
-        now = self._loop.time()
-        return any(
+    def _due(self) -> float:
+        """When to check next: the amplifiers have nothing to wake them but this."""
+        now, amplifiers = self._loop.time(), self._bench.amplifiers.values()
+        plays = any(
             tone.silent_from > now
-            for amplifier in self._bench.amplifiers.values()
-            for output in amplifier.outputs
+            for each in amplifiers
+            for output in each.outputs
             for tone in output
         )
+        return min(now + (STEP if plays else IDLE_STEP), *(each.next_event for each in amplifiers))
 
     def _received(self, name: str, event: Values, at: float) -> None:
         if event["state"] in _FAULTED:

@@ -27,7 +27,7 @@ from controller.api.client_protocol import (
     touches_at,
 )
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.link import Channel, DaemonLink
+from controller.api.link import DaemonLink
 from controller.api.methods import (
     DEFAULT_LEASE,
     METHODS,
@@ -63,7 +63,8 @@ class AsyncClient(AsyncCalls):
         self.path = path
         self._name = name
         self._timeout = timeout
-        self._channel: Channel | None = None
+        self._link: DaemonLink | None = None
+        self._following: asyncio.Task[None] | None = None
         self._connecting = asyncio.Lock()
         self._is_closed = False
         self._rates: dict[Topic, float | None] = {}  # of the subscriptions
@@ -104,8 +105,8 @@ class AsyncClient(AsyncCalls):
         self._changed.set()
         if self._renewing is not None:
             self._renewing.cancel()
-        if self._channel is not None:
-            self._channel.close()
+        if self._link is not None:
+            self._link.abort()
         await asyncio.sleep(0)
 
     async def touch(
@@ -194,7 +195,7 @@ class AsyncClient(AsyncCalls):
             async with asyncio.timeout(timeout):
                 while not self._events and not self._is_closed:
                     self._changed.clear()
-                    if self._channel is None or not self._channel.is_open:
+                    if self._link is None or not self._link.is_open:
                         await self._within_timeout(
                             self._repeated(
                                 self._connected,
@@ -239,11 +240,10 @@ class AsyncClient(AsyncCalls):
         """Send a request, again over new connections if that is harmless."""
 
         async def attempt() -> Any:
-            return await (await self._connected()).request(method, params)
+            return await (await self._connected()).call(method, params)
 
         if method in METHODS and not METHODS[method].is_repeated:
-            channel = await self._repeated(self._connected)
-            return await channel.request(method, params)
+            return await (await self._repeated(self._connected)).call(method, params)
         after = Unreachable if method == "stop" else ConnectionLost
         return await self._repeated(attempt, after=after)
 
@@ -272,32 +272,33 @@ class AsyncClient(AsyncCalls):
             async with asyncio.timeout(self._timeout):
                 return await work
         except TimeoutError as error:
-            if self._channel is not None:  # else what waits in it would grow without bounds
-                self._channel.close()
+            if self._link is not None:  # else what waits in it would grow without bounds
+                self._link.abort()
             raise Unreachable.at(self.path, error) from error
 
-    async def _connected(self) -> Channel:
+    async def _connected(self) -> DaemonLink:
         """The connection, made again if it was lost; raises RpcError and Unreachable."""
         async with self._connecting:
             if self._is_closed:
                 raise Unreachable(f"this client of the daemon at {self.path} is closed")
-            if self._channel is None or not self._channel.is_open:
-                connection = self._connections + 1
-                channel = Channel(
+            if self._link is None or not self._link.is_open:
+                link, connection = (
                     await DaemonLink.open(self.path, self._name),
-                    on_event=partial(self._received, connection),
-                    on_lost=self._changed.set,
+                    self._connections + 1,
                 )
+                following = link.follow(partial(self._received, connection))
+                self._following = asyncio.create_task(following, name="API")
+                self._following.add_done_callback(lambda _: self._changed.set())
                 try:
                     for rate in dict.fromkeys(self._rates.values()):
                         topics = [topic for topic, each in self._rates.items() if each == rate]
                         params = make_params("subscribe", topics=topics, rate_hz=rate)
-                        await channel.request("subscribe", params)
+                        await link.call("subscribe", params)
                 except BaseException:
-                    channel.close()
+                    link.abort()
                     raise
-                self._channel, self._connections = channel, connection
-            return self._channel
+                self._link, self._connections = link, connection
+            return self._link
 
     def _received(self, connection: int, event: Notification) -> None:
         self._events.append((connection, event))

@@ -1,4 +1,4 @@
-"""A client's connection to the daemon: lines, passed on as they are, or requests over them."""
+"""A client's connection to the daemon: lines, passed on as they are, or calls over them."""
 
 import asyncio
 import itertools
@@ -27,7 +27,9 @@ _READ = 1 << 16  # bytes; read ahead, and the rest of a line that is incomplete
 class DaemonLink:
     """A connection to the daemon in the name of a client, made by `open`.
 
-    hello: the daemon's reply to the hello of that name, whose id it is; without its line feed.
+    Its lines are for who awaits `next_line`, or for any number of calls and events once it is
+    followed. hello: the daemon's reply to the hello of that name, whose id it is; without its line
+    feed.
     """
 
     def __init__(
@@ -39,6 +41,9 @@ class DaemonLink:
         self._writer = writer
         self._received = b""
         self._is_closed = False
+        self._lost: Unreachable | None = None
+        self._pending: dict[int, asyncio.Future[Any]] = {}
+        self._ids = itertools.count(1)
 
     @classmethod
     async def open(cls, path: Path, name: str) -> Self:
@@ -64,7 +69,7 @@ class DaemonLink:
     @property
     def is_open(self) -> bool:
         """Whether neither side has closed it."""
-        is_lost = self._reader.at_eof() or self._reader.exception() is not None
+        is_lost = self._reader.at_eof() or self._reader.exception() or self._lost
         return not (self._is_closed or is_lost)
 
     async def request(self, method: str, params: bytes, *, id: str) -> bytes:
@@ -102,6 +107,40 @@ class DaemonLink:
         line, _, self._received = self._received.partition(b"\n")
         return line
 
+    async def call(self, method: str, params: Message) -> Any:
+        """Call a method and return its result as parsed JSON, while it is followed.
+
+        Raises RpcError and Unreachable.
+        """
+        if self._lost is not None:
+            raise self._lost.with_traceback(None)
+        id = next(self._ids)
+        response = self._pending[id] = asyncio.get_running_loop().create_future()
+        try:
+            content = params.model_dump_json(exclude_none=True)
+            self.write(request_line(id, method, content.encode()))
+            return result_of(await response)
+        finally:
+            del self._pending[id]
+
+    async def follow(self, on_event: Callable[[Notification], None]) -> None:
+        """Hand out responses and notifications until it is lost; then fail all pending calls."""
+        try:
+            while True:
+                received = read_line(await self.next_line())
+                if isinstance(received, Notification):
+                    on_event(received)
+                    continue
+                for id, pending in self._pending.items():  # without an id, of all of them
+                    if received["id"] in (id, None) and not pending.done():
+                        pending.set_result(received)
+        except Unreachable as error:
+            self._lost = error
+            self.abort()
+            for pending in self._pending.values():
+                if not pending.done():
+                    pending.set_exception(error)
+
     def close(self) -> None:
         """Close once the daemon has carried out what it was sent, at the latest after a while.
 
@@ -115,69 +154,6 @@ class DaemonLink:
         """Close at once; the daemon lifts this client's fingers."""
         self._is_closed = True
         self._writer.transport.abort()
-
-
-class Channel:
-    """Any number of requests over a link, each with an id of its own.
-
-    on_event: called with each notification; on_lost: called once, when the link is lost or closed.
-    """
-
-    def __init__(
-        self,
-        link: DaemonLink,
-        *,
-        on_event: Callable[[Notification], None],
-        on_lost: Callable[[], object],
-    ) -> None:
-        self._link = link
-        self._on_event = on_event
-        self._on_lost = on_lost
-        self._lost: Unreachable | None = None
-        self._pending: dict[int, asyncio.Future[Any]] = {}
-        self._ids = itertools.count(1)
-        self._reading = asyncio.create_task(self._read(), name="API")
-
-    @property
-    def is_open(self) -> bool:
-        """Whether neither side has closed it."""
-        return self._link.is_open and self._lost is None
-
-    async def request(self, method: str, params: Message) -> Any:
-        """Call a method and return its result as parsed JSON; raises RpcError and Unreachable."""
-        if self._lost is not None:
-            raise self._lost.with_traceback(None)
-        id = next(self._ids)
-        response = self._pending[id] = asyncio.get_running_loop().create_future()
-        try:
-            content = params.model_dump_json(exclude_none=True)
-            self._link.write(request_line(id, method, content.encode()))
-            return result_of(await response)
-        finally:
-            del self._pending[id]
-
-    def close(self) -> None:
-        """Close at once; the daemon lifts this client's fingers."""
-        self._link.abort()
-
-    async def _read(self) -> None:
-        """Hand out responses and notifications; at the end fail all pending requests."""
-        try:
-            while True:
-                received = read_line(await self._link.next_line())
-                if isinstance(received, Notification):
-                    self._on_event(received)
-                    continue
-                for id, pending in self._pending.items():  # without an id, of all of them
-                    if received["id"] in (id, None) and not pending.done():
-                        pending.set_result(received)
-        except Unreachable as error:
-            self._lost = error
-            self._link.abort()
-            for pending in self._pending.values():
-                if not pending.done():
-                    pending.set_exception(error)
-            self._on_lost()
 
 
 async def connected_socket(path: Path) -> socket.socket:

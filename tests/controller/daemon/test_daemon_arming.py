@@ -94,8 +94,8 @@ async def test_event_read_late_takes_nothing_back_that_was_seen(tmp_path: Path) 
         await era.clear()
         supervisor = bench.daemon._supervisor
         supervisor.operation = replace(supervisor.operation, epoch=0)
-        assert era._channel is not None
-        era._channel.close()
+        assert era._link is not None
+        era._link.abort()
         await era.stop()
         assert (await next_event(era, "state")).data["epoch"] >= epoch - 1
         await era.clear()

@@ -3,6 +3,7 @@
 import asyncio
 import itertools
 import logging
+import math
 import time
 from collections.abc import Awaitable, Mapping
 
@@ -29,8 +30,12 @@ from controller.api.methods import (
 )
 from controller.api.schema import Empty, headline
 from controller.api.server import Handler
-from controller.daemon.active_layout import ActiveLayout
-from controller.daemon.api_views import amplifier_silence, hello_result, predicted_of
+from controller.daemon.api_views import (
+    amplifier_silence,
+    effects_result,
+    hello_result,
+    predicted_of,
+)
 from controller.daemon.config import DaemonConfig
 from controller.daemon.operation import LEASE_OVER
 from controller.daemon.publisher import EventPublisher
@@ -45,13 +50,18 @@ from controller.daemon.states import (
 )
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches
+from controller.effects.player import EffectPlayer
 from controller.learning.learning import Learning
 from controller.loop.loop import Controller
+from controller.loop.table_query import MAX_DB_SL
 from drivers import clock
 from drivers.host.stop import Stopped
 from model.table.table import LocalizationTable
 
 _logger = logging.getLogger(__name__)
+
+PLAY_RADIUS = 0.020
+"""Largest distance [m] from the position of a requested effect to the finger that feels it."""
 
 _ENABLED = DaemonState.OPERATION_ENABLED
 _REMEDIES = {
@@ -73,7 +83,7 @@ class ApiService:
         *,
         publisher: EventPublisher,
         touches: ApiTouches,
-        layout: ActiveLayout,
+        layout: EffectPlayer,
         learning: Learning | None,
     ) -> None:
         self._config = config
@@ -221,13 +231,44 @@ class ApiService:
         return Empty()
 
     def _effects(self, client: Connection, params: Empty) -> EffectsResult:
-        return self._layout.effects()
+        return effects_result(self._layout.layout)
 
     def _play(self, client: Connection, params: PlayParams) -> Empty:
+        """Start an effect at the contact nearest to a position, at its own level or below."""
         operation = self._supervisor.operation
         if operation.state is not _ENABLED or self._controller.degraded:
             raise _wrong_state(operation)
-        self._layout.play_nearest(params, self._publisher.view.contacts, now=clock.now())
+        effects = self._layout.layout.effects
+        effect = effects.get(params.effect)
+        if effect is None:
+            raise RpcError(
+                ErrorCode.REFUSED,
+                f"unknown effect {params.effect!a}",
+                where="effect",
+                remedy=f"choose one of {', '.join(sorted(effects))}",
+            )
+        level_max = MAX_DB_SL if effect.level_db_sl is None else effect.level_db_sl
+        if params.level_db_sl is not None and params.level_db_sl > level_max:
+            raise RpcError(
+                ErrorCode.REFUSED,
+                f"level of effect {params.effect!a} must be at most {level_max:g} dB SL, got "
+                f"{params.level_db_sl:g}",
+                where="level_db_sl",
+                remedy="raise its level in the surface layout",
+            )
+        place = params.x_m, params.y_m
+        near = {math.dist((each.x, each.y), place): each for each in self._publisher.view.contacts}
+        distance = min(near, default=math.inf)
+        if distance > PLAY_RADIUS:
+            raise RpcError(
+                ErrorCode.REFUSED,
+                f"no finger within {1e3 * PLAY_RADIUS:g} mm of ({params.x_m:g}, {params.y_m:g}) m",
+                where="x_m",
+                remedy="touch the plate there, or send a touch over the API",
+            )
+        self._layout.play(
+            params.effect, near[distance], clock.now(), level_db_sl=params.level_db_sl
+        )
         self._controller.request_update()
         return Empty()
 

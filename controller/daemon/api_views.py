@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
-from controller.api.methods import HelloResult
+from controller.api.methods import EffectsResult, HelloResult
 from controller.api.schema import (
     API_VERSION,
     AmplifierSilence,
     AmplifierStatus,
     ContactStatus,
+    EffectDescription,
     EraPosition,
     LatencySummary,
     LearningSummary,
@@ -23,6 +24,7 @@ from controller.api.schema import (
 )
 from controller.api.topics import ContactsEvent, PatternEvent, SilenceEvent
 from controller.daemon.config import DaemonConfig
+from controller.effects.layout import SurfaceLayout
 from controller.learning.learning_status import LearningStatus
 from controller.loop.leak import leaks_db_sl
 from controller.loop.observer import Applied, Silenced
@@ -194,6 +196,21 @@ def hello_result(
         ),
         rig_text=config.rig_text,
         layout=layout,
+    )
+
+
+def effects_result(layout: SurfaceLayout) -> EffectsResult:
+    """Describe the effects of a layout that can be requested by name."""
+    return EffectsResult(
+        effects=[
+            EffectDescription(
+                name=name,
+                kind=effect.kind,
+                description=(type(effect).__doc__ or "").partition("\n")[0],
+                parameters=effect.model_dump(mode="json"),
+            )
+            for name, effect in sorted(layout.effects.items())
+        ]
     )
 
 

@@ -8,7 +8,6 @@ from functools import partial
 
 from controller.api.schema import headline
 from controller.api.server import ApiServer
-from controller.daemon.active_layout import ActiveLayout
 from controller.daemon.api_service import ApiService
 from controller.daemon.api_views import amplifier_statuses
 from controller.daemon.children import gateway_options, keep_gateway, read_in_child
@@ -21,6 +20,7 @@ from controller.daemon.socket_lock import SocketLock
 from controller.daemon.states import ENERGISED, DaemonState, Operation
 from controller.daemon.supervisor import Supervisor
 from controller.daemon.touch_inputs import ApiTouches, TouchInputs
+from controller.effects.player import EffectPlayer
 from controller.learning.learning import Learning
 from controller.loop.loop import Controller
 from controller.loop.observer import Observer
@@ -78,7 +78,7 @@ class Daemon:
         )
         self.started = self._supervisor.started
         """Set once it serves, and its amplifiers are open or searched for."""
-        self._layout = ActiveLayout(config.effective_layout)
+        self._layout = EffectPlayer(config.effective_layout)
         self._frequencies = table.frequencies
         self._warn_of_bands(config)
         self._publisher = EventPublisher(

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.daemon.active_layout import ActiveLayout
+from controller.daemon.api_views import effects_result
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.detents import Detents
@@ -520,9 +520,7 @@ def test_effect_kinds_include_plug_ins() -> None:
         beats: tuple[float, ...] = (0.1, 0.2)
         count: int = 3
 
-    listed = (
-        ActiveLayout(SurfaceLayout(effects={"buzz": Buzz(), "rhythm": Rhythm()})).effects().effects
-    )
+    listed = effects_result(SurfaceLayout(effects={"buzz": Buzz(), "rhythm": Rhythm()})).effects
     (_, rhythm) = (each.model_dump(mode="json") for each in listed)
     assert rhythm["description"] == "Beats of one's own."
     assert (rhythm["parameters"]["beats"], rhythm["parameters"]["count"]) == ([0.1, 0.2], 3)

@@ -13,7 +13,6 @@ from controller.effects.layout_file import is_layout_document, load_layout
 from controller.sources.calibration import CalibratedSource, TouchCalibration, fitted, turned
 from controller.sources.touch import TouchSource, open_source
 from drivers.errors import CommandError
-from drivers.garbage_collection import without_collections
 from drivers.wires.known import address_of
 from model.config.document import ConfigError, Document, read_document
 from model.config.sections import Validation
@@ -40,8 +39,7 @@ class TouchInput:
 
     def make(self) -> TouchSource:
         """Create the source, in plate coordinates; raises InputError."""
-        with without_collections():  # of a long recording
-            return CalibratedSource(open_source(self.url), self.calibration)
+        return CalibratedSource(open_source(self.url), self.calibration)
 
 
 @dataclass(frozen=True)

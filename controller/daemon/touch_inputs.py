@@ -68,7 +68,9 @@ class TouchInputs:
         while True:
             started_at = clock.now()
             try:
-                source = await in_thread(touch_input.make, name="touch source")  # reads recordings
+                source = await in_thread(
+                    touch_input.make, name="touch source"
+                )  # a plug-in may block
                 await source.run(deliver)
             except Exception as error:
                 is_expected = isinstance(error, InputError | OSError)

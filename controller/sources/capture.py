@@ -21,7 +21,6 @@ from model.files.regular_file import regular_file
 HEADER = "# era-haptics TUIO capture 1"
 _LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII)
 MAX_BYTES = 16 << 20  # 100 s of ten fingers at 100 Hz; of one finger a quarter of an hour
-_MAX_LINE = 1 << 18  # bytes; a datagram of the largest size takes half of it
 _MAX_DATAGRAM = 65_507  # bytes; UDP over IPv4
 
 
@@ -37,7 +36,7 @@ def read_capture(path: Path | str) -> list[RecordedDatagram]:
     """Read a capture; raises InputError with file and line."""
     path = Path(path)
     lines = _lines(path)
-    if not lines or lines[0] != HEADER:
+    if lines[0] != HEADER:
         raise InputError(f"{path}, line 1: must be {HEADER!r} for a TUIO capture")
     datagrams: list[RecordedDatagram] = []
     for number, line in enumerate(lines[1:], start=2):
@@ -65,17 +64,14 @@ def read_capture(path: Path | str) -> list[RecordedDatagram]:
 
 def _lines(path: Path) -> list[str]:
     """Read the lines of a capture; raises InputError."""
-    lines: list[str] = []
-    left = MAX_BYTES
     try:
         with open(path, "rb", opener=regular_file) as stream:
-            while line := stream.readline(_MAX_LINE):
-                left -= len(line)
-                if left < 0:
-                    raise InputError(
-                        f"{path}: must have at most {MAX_BYTES >> 20} MiB; record a shorter time"
-                    )
-                lines.append(line.decode("utf-8").removesuffix("\n").removesuffix("\r"))
+            content = stream.read(MAX_BYTES + 1)
+        if len(content) > MAX_BYTES:
+            raise InputError(
+                f"{path}: must have at most {MAX_BYTES >> 20} MiB; record a shorter time"
+            )
+        return content.decode("utf-8").replace("\r\n", "\n").removesuffix("\n").split("\n")
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); check the path, which is relative to the "
@@ -83,7 +79,6 @@ def _lines(path: Path) -> list[str]:
         ) from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: must be a TUIO capture, got a binary file") from error
-    return lines
 
 
 async def replay_capture(datagrams: Sequence[RecordedDatagram], host: str, port: int) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from controller.sources.contacts import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
-from controller.sources.datagrams import Datagram, Datagrams, Peer, listen
+from controller.sources.datagrams import Datagram, Peer, listen
 from controller.sources.osc import OscError, osc_messages
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame, TouchSource, number_option
@@ -215,65 +215,43 @@ def _is_complete_bundle(datagram: bytes) -> bool:
 class TuioSource(TouchSource):
     """Listens for TUIO at `tuio:HOST:PORT`, `tuio:PORT` or `tuio:` (127.0.0.1:3333).
 
-    Port 0 selects a free port. A touch table on another machine needs an explicit HOST, because
-    TUIO has no authentication. `?timeout=SECONDS`: how long a resting finger stays without a
-    bundle. Raises InputError for any other URL.
+    A touch table on another machine needs an explicit HOST, because TUIO has no authentication.
+    `?timeout=SECONDS`: how long a resting finger stays without a bundle. Raises InputError for any
+    other URL, and in `run` if the port is taken.
     """
 
     def __init__(self, url: str) -> None:
         address, _, options = url.partition("?")
-        self.host, self._port = _host_and_port(address)
+        self.host, self.port = _host_and_port(address)
         self.rejects = RejectCounter(_logger)
         self._url = url
-        self._endpoint: Datagrams | None = None
         self._reader = TuioReader(self.rejects, timeout=_timeout(url, options))
-        self._deliver: Callable[[TouchFrame], None] | None = None
 
-    @property
-    def port(self) -> int:
-        """The UDP port: the bound one, before `open` the requested one."""
-        return self._port if self._endpoint is None else self._endpoint.port
+    async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
+        """Deliver a frame per bundle until cancelled."""
 
-    async def open(self) -> None:
-        """Bind the port if it is not bound; `run` does so too. Raises InputError if it is taken.
+        def received(datagram: bytes, peer: Peer, arrived: float) -> None:
+            frame = self._reader.read(datagram, peer, now=arrived)
+            if frame is not None:
+                deliver(frame)
 
-        Datagrams are dropped until `run`.
-        """
-        if self._endpoint is not None:
-            return
         try:
-            self._endpoint = await listen(
+            endpoint = await listen(
                 self.host,
-                self._port,
-                self._received,
+                self.port,
+                received,
                 max_size=_MAX_DATAGRAM,
                 drop_superseded=without_superseded,
             )
         except OSError as error:
             raise InputError(
-                f"touch source {self._url}: cannot bind UDP {self.host}:{self._port} "
+                f"touch source {self._url}: cannot bind UDP {self.host}:{self.port} "
                 f"({error.strerror}); stop the program that uses it, or choose another port"
             ) from error
-
-    async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-        """Deliver a frame per bundle until cancelled."""
-        await self.open()
-        self._deliver = deliver
         try:
             await asyncio.get_running_loop().create_future()
         finally:
-            self._deliver = None
-            if self._endpoint is not None:
-                self._endpoint.close()
-                self._endpoint = None
-
-    def _received(self, datagram: bytes, peer: Peer, arrived: float) -> None:
-        """Decode a datagram and deliver its frame with the time of arrival."""
-        if self._deliver is None:
-            return
-        frame = self._reader.read(datagram, peer, now=arrived)
-        if frame is not None:
-            self._deliver(frame)
+            endpoint.close()
 
 
 def _timeout(url: str, options: str) -> float:

@@ -18,7 +18,7 @@ from controller.sources.touch import Touch, TouchFrame
 from controller.sources.tuio import TuioReader, TuioSource
 from examples.make_touches import tuio_datagram
 from model.errors import InputError
-from tuio_messages import bundle, cursor, frame, message
+from tuio_messages import bundle, cursor, frame, free_port, message
 from virtual_loop import in_virtual_time
 
 PEER = ("192.0.2.7", 50000)
@@ -285,13 +285,11 @@ def test_tuio_datagram_round_trip(places: dict[int, tuple[float, float]]) -> Non
 
 @in_virtual_time
 async def test_tuio_source_delivers_over_udp() -> None:
-    """A datagram to the bound port becomes a frame at the loop's time; port 0 takes a free one."""
-    source = TuioSource("tuio:127.0.0.1:0")
-    await source.open()
-    assert source.port > 0
+    """A datagram to the bound port becomes a frame at the loop's time."""
+    source = TuioSource(f"tuio:127.0.0.1:{free_port()}")
     delivered: asyncio.Queue[TouchFrame] = asyncio.Queue()
     running = asyncio.create_task(source.run(delivered.put_nowait))
-    await asyncio.sleep(0)
+    await asyncio.sleep(0.1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.sendto(b"noise", ("127.0.0.1", source.port))
         sender.sendto(frame((1, 0.25, 0.5)), ("127.0.0.1", source.port))
@@ -299,7 +297,7 @@ async def test_tuio_source_delivers_over_udp() -> None:
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
     assert source.rejects.counts == {"malformed": 1}
-    assert received.time == asyncio.get_running_loop().time()
+    assert received.time == pytest.approx(asyncio.get_running_loop().time(), abs=0.01)
     assert touches(received) == [(1, 0.25, 0.5)]
 
 
@@ -310,7 +308,7 @@ async def test_tuio_source_reports_a_taken_port() -> None:
         other.bind(("127.0.0.1", 0))
         port = other.getsockname()[1]
         with pytest.raises(InputError, match=f"127.0.0.1:{port}.*another port"):
-            await TuioSource(f"tuio:127.0.0.1:{port}").open()
+            await TuioSource(f"tuio:127.0.0.1:{port}").run(lambda frame: None)
 
 
 @pytest.mark.parametrize(

@@ -29,9 +29,9 @@ from model.reduction.receptance import TERMS, combined
 from model.structure.attachments import coupled_forces
 from model.structure.plate import Plate
 
-# m, of slopes by places (no closed form: `model.reduction.place_slopes`): right to 0.1 %, and
-# rounding stays below 1e-6 of them.
-_STEP = 1e-5
+# Of parameters, for slopes (by places no closed form: `model.reduction.place_slopes`): right to
+# 0.1 %, and rounding stays below 1e-6 of them.
+_STEP = 1e-4
 _MIN_STENCIL = 0.004  # m
 _MIN_SIZE = 0.2  # to start from, of the usual one
 _LEAST = -6.0  # of logarithms
@@ -40,13 +40,12 @@ _LEAST = -6.0  # of logarithms
 class Alteration(ABC):
     """A kind of what may have come; parameters (e,) are x, y in thirds of the sides, then its own.
 
-    own: names of its own parameters, logarithms of parts of its stiffness over usual ones, of which
-    the number lead is looked for; is_of_modes: whether truncated modes are left out.
+    own: names of its own parameters, logarithms of parts of its stiffness over usual ones;
+    is_of_modes: whether truncated modes are left out.
     """
 
     name: ClassVar[str]
     own: ClassVar[tuple[str, ...]]
-    lead: ClassVar[int]
     is_of_modes: ClassVar[bool] = False
 
     @property
@@ -59,21 +58,16 @@ class Alteration(ABC):
         """Points (m, 2) [m] about a place [m], and its coordinates by their deflections (c, m)."""
 
     @abstractmethod
-    def parts(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
-        """Parts of its dynamic stiffness at omega [rad/s] for its own parameters, (c, e - 2).
-
-        They are its derivatives, too.
-        """
+    def stiffness(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
+        """Its dynamic stiffness at omega [rad/s] for its own parameters, (c,)."""
 
     @abstractmethod
     def described(self, theta: FloatArray) -> str:
         """What its own parameters say."""
 
     def start(self, size: float) -> FloatArray:
-        """Its own parameters (e - 2,) for a size of the leading one, all else as usual."""
-        theta = np.zeros(len(self.own))
-        theta[self.lead] = np.log(max(size, _MIN_SIZE))
-        return theta
+        """Its own parameters (e - 2,) for so many usual ones."""
+        return np.full(len(self.own), np.log(max(size, _MIN_SIZE)))
 
 
 class Hand(Alteration):
@@ -85,17 +79,16 @@ class Hand(Alteration):
 
     name = "a hand"
     own = ("mass", "damping", "stiffness")
-    lead = 1
     units: ClassVar[FloatArray] = np.array([1e-3, 5.0, 1000.0])  # kg, N s/m, N/m
 
     def stencil(self, plate: Plate, place: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The place itself."""
         return place[None], np.ones((1, 1))
 
-    def parts(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
-        """-omega² m, i omega c and k."""
+    def stiffness(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
+        """-omega² m + i omega c + k."""
         mass, damping, spring = self.units * np.exp(theta)
-        return np.array([[-(omega**2) * mass, 1j * omega * damping, spring]])
+        return np.array([spring - omega**2 * mass + 1j * omega * damping])
 
     def described(self, theta: FloatArray) -> str:
         """Its damping."""
@@ -107,7 +100,7 @@ class Crack(Alteration):
 
     name = "a crack"
     own = ("area",)
-    lead, is_of_modes = 0, True
+    is_of_modes = True
     unit: ClassVar[float] = 3e-4  # m²
 
     def stencil(self, plate: Plate, place: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -122,11 +115,11 @@ class Crack(Alteration):
         coordinates = [(xx + yy) / np.sqrt(2), (xx - yy) / np.sqrt(2), np.sqrt(2) * xy]
         return middle + h * steps, np.array([each.ravel() for each in coordinates])
 
-    def parts(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
+    def stiffness(self, plate: Plate, theta: FloatArray, omega: float) -> ComplexArray:
         """Less than none, of each of the three coordinates."""
         nu = plate.material.nu
-        lost = self.unit * np.exp(theta) * plate.flexural_rigidity
-        return np.asarray(np.outer([1 + nu, 1 - nu, 1 - nu], -lost), dtype=complex)
+        lost = self.unit * np.exp(theta[0]) * plate.flexural_rigidity
+        return np.asarray(-lost * np.array([1 + nu, 1 - nu, 1 - nu]), dtype=complex)
 
     def described(self, theta: FloatArray) -> str:
         """The area."""
@@ -166,21 +159,18 @@ class Altered(Touched):
 
         Derivatives by plate and fingers are those without the alteration.
         """
-        p = self.space.size - self.alteration.size
-        plate = self.touched.at(np.concatenate([x[:p], fingers]))
-        place, own, bases = self.place(x[p:]), x[p + 2 :], self.pattern.bases
-        here = AlteredPlate(plate, self.alteration, place, own)
-        values = here.responses @ bases
-        by_place = []
-        for axis in range(2):
-            step = np.zeros(2)
-            step[axis] = -_STEP if place[axis] > self._sides[axis] / 2 else _STEP
-            moved = AlteredPlate(plate, self.alteration, place + step, own).responses @ bases
-            by_place.append((moved - values) / step[axis] * self._sides[axis] / 3)
-        by_own = np.einsum("sne,n->se", here.by_own, bases)
+        p, bases = self.space.size - self.alteration.size, self.pattern.bases
+        plate, theta = self.touched.at(np.concatenate([x[:p], fingers])), x[p:]
+
+        def accelerations(theta: FloatArray) -> ComplexArray:
+            return altered(plate, self.alteration, self.place(theta), theta[2:]) @ bases
+
+        values, inwards = accelerations(theta), np.where(theta > 0, -_STEP, _STEP)
+        by_theta = [
+            (accelerations(theta + step) - values) / step.sum() for step in np.diag(inwards)
+        ]
         J = np.einsum("snp,n->sp", jacobian(plate)[0], bases)
-        columns = np.column_stack([J[:, :p], *by_place, by_own, J[:, p:]])
-        return self.as_numbers(values, columns)
+        return self.as_numbers(values, np.column_stack([J[:, :p], *by_theta, J[:, p:]]))
 
 
 def scores(
@@ -193,37 +183,30 @@ def scores(
     reach = reach.reshape(len(reach), len(places), -1)
     coordinates = np.array([each for _, each in stencils])
     columns = np.einsum("amk,mck->amc", reach, coordinates)
-    slopes = alteration.parts(plate.model.rig.plate, alteration.start(1.0), plate.model.omega[0])
+    Z = alteration.stiffness(plate.model.rig.plate, alteration.start(1.0), plate.model.omega[0])
     n, observed, bases = plate.base.shape[1], plate.model.observed, touched.pattern.bases
-    left, right = columns[observed] * slopes[:, alteration.lead], columns[:n]
+    left, right = columns[observed] * Z, columns[:n]
     changes = -np.einsum("smc,nmc,sn,n->sm", left, right, plate.scale[0], bases)
     return touched.as_numbers(plate.responses[0] @ bases, changes)[1]
 
 
-class AlteredPlate:
-    """A plate at one frequency that is altered at a place [m], by own parameters of its alteration.
+def altered(
+    plate: PlateAt, alteration: Alteration, place: FloatArray, own: FloatArray
+) -> ComplexArray:
+    """Responses of a plate at one frequency that is altered at a place [m], (s, n) [1/s²].
 
-    responses: acceleration at each sensor per base displacement of each ERA (s, n) [1/s²]; by_own:
-    their derivatives by the alteration's own parameters, (s, n, e - 2).
+    own: parameters of its alteration.
     """
-
-    def __init__(
-        self, plate: PlateAt, alteration: Alteration, place: FloatArray, own: FloatArray
-    ) -> None:
-        theory = plate.model.rig.plate
-        points, coordinates = alteration.stencil(theory, place)
-        parts = alteration.parts(theory, own, plate.model.omega[0])
-        Z = parts.sum(axis=1)
-        A = _receptance(plate, alteration, plate.located.footprints, points) @ coordinates.T
-        within = coordinates @ _receptance(plate, alteration, points, points) @ coordinates.T
-        T = plate.left[0] @ A
-        within = within - A.T @ (plate.stiffness[0][:, None] * T)
-        columns = T @ coupled_forces(within, Z, np.eye(len(Z), dtype=complex))
-        n, seen = plate.base.shape[1], plate.model.observed
-        by_parts = np.einsum("sc,ce,nc->sne", columns[seen], parts, columns[:n])
-        self.by_own: ComplexArray = np.asarray(-plate.scale[0][..., None] * by_parts)
-        change = (columns[seen] * Z) @ T[:n].T
-        self.responses: ComplexArray = plate.responses[0] - plate.scale[0] * change
+    theory = plate.model.rig.plate
+    points, coordinates = alteration.stencil(theory, place)
+    Z = alteration.stiffness(theory, own, plate.model.omega[0])
+    A = _receptance(plate, alteration, plate.located.footprints, points) @ coordinates.T
+    within = coordinates @ _receptance(plate, alteration, points, points) @ coordinates.T
+    T = plate.left[0] @ A
+    within = within - A.T @ (plate.stiffness[0][:, None] * T)
+    columns = T @ coupled_forces(within, Z, np.eye(len(Z), dtype=complex))
+    change = (columns[plate.model.observed] * Z) @ T[: plate.base.shape[1]].T
+    return np.asarray(plate.responses[0] - plate.scale[0] * change)
 
 
 def _receptance(

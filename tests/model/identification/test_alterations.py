@@ -9,7 +9,7 @@ import pytest
 from benchmarks.identification.hidden import Hidden, finger_stiffness
 from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
 from extrapolated import extrapolated_slopes
-from model.identification.alterations import Alteration, Altered, AlteredPlate, Crack, Hand
+from model.identification.alterations import Alteration, Altered, Crack, Hand, altered
 from model.identification.identify import Identification
 from model.identification.in_service import Known, LivePlate, Report
 from model.identification.settled import Touched
@@ -104,14 +104,14 @@ def test_responses_change_as_on_finite_elements(
         plate = model.with_frequencies(np.array([tone])).at(found.posterior.x)
         before, w = mounted.accelerations(tone, mounted.at), 2 * np.pi * tone
         if kind == "crack":
-            now = AlteredPlate(plate, Crack(), middle, np.log([area / Crack.unit]))
+            now = altered(plate, Crack(), middle, np.log([area / Crack.unit]))
             after = cracked.accelerations(tone, mounted.at)
         else:
             parts = np.array([1e-3, 8.0, 500.0])  # kg, N s/m, N/m
-            now = AlteredPlate(plate, Hand(), HAND, np.log(parts / Hand.units))
+            now = altered(plate, Hand(), HAND, np.log(parts / Hand.units))
             load = np.array([[-(w**2), 1j * w, 1]]) @ parts
             after = mounted.accelerations(tone, mounted.at, fingers=HAND[None], loads=load)
-        ours.append(now.responses - plate.responses[0])
+        ours.append(now - plate.responses[0])
         true.append(hidden.sensor_gain[:, None] * (after - before))
     assert np.linalg.norm(np.subtract(ours, true)) < error * np.linalg.norm(true)
 
@@ -123,14 +123,14 @@ def test_numbers_change_with_place_and_values_of_an_alteration(
     """As extrapolated differences of the numbers, to 0.2 % of each column's largest."""
     model = found.fitted.problem.model
     (pattern,) = settled_patterns(hidden, hidden.mounted, count=1, start=0)
-    altered = Altered.by(alteration, Touched.of(model, pattern, 0.5))
+    touched = Altered.by(alteration, Touched.of(model, pattern, 0.5))
     p, fingers = model.space.size, np.zeros(4 * len(pattern.fingers))
     start = np.array([0.3, -0.4, *alteration.start(1.0)])
 
     def numbers(theta: Reals) -> Reals:
-        return altered.predicted(np.concatenate([found.posterior.x, theta]), fingers)[0]
+        return touched.predicted(np.concatenate([found.posterior.x, theta]), fingers)[0]
 
-    _, columns = altered.predicted(np.concatenate([found.posterior.x, start]), fingers)
+    _, columns = touched.predicted(np.concatenate([found.posterior.x, start]), fingers)
     exact = extrapolated_slopes(numbers, start, step=1e-2)
     for own, true in zip(columns[:, p : p + alteration.size].T, exact, strict=True):
         np.testing.assert_allclose(own, true, atol=2e-3 * np.abs(true).max())

@@ -14,7 +14,7 @@ from model.calibration.calibration_result import (
     SensorScale,
 )
 from model.calibration.calibration_screening import Screened, check_enough_sensors
-from model.calibration.fit import Fit, Problem, first_fit, solve
+from model.calibration.fit import Fit, Problem, solve, start_at
 from model.calibration.fitted_rig import (
     gain_rows,
     moved_eras,
@@ -55,8 +55,7 @@ def calibrate(
     start[plate.numbers] = screened.start
 
     # All scales are free at first, so that a wrong one does not bias the fit.
-    fit = first_fit(part, start)
-    fit = solve(part, replace(fit, z=part.at_scales(fit.z, _relative(part.scales(fit.z)))))
+    fit = solve(part, start_at(part, start))
     free_scales = part.free_scales
     if not all_scales:
         scales = _relative(part.scales(fit.z))

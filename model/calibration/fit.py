@@ -7,8 +7,8 @@ and ERA. Gains are projected out (`model.calibration.variable_projection`); z is
 rig's values, which no prior holds, scales of sensors and form errors, which tolerances hold.
 
 Noise has a constant part and a part in proportion to the response, both estimated from the
-residuals. A first fit has no form errors and leaves outliers out, the worst of a row first, since
-one pulls the gain of its row. What tolerances leave undetermined is part of the standard errors:
+residuals. What a check's plate leaves shows the outliers, the worst of a row first, since one pulls
+the gain of its row. What tolerances leave undetermined is part of the standard errors:
 C = (J^T J)^-1 with the tolerances as rows of J, times chi² per degree of freedom where that is
 above 1. With gains projected out of J this is the Schur complement, so that of a gain
 
@@ -35,11 +35,9 @@ from model.calibration.variable_projection import (
     row_rms,
 )
 from model.identification.least_squares import Found
-from model.identification.parameters import FORM, Space
+from model.identification.parameters import Space
 
 _MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
-_PEAK = 3.0  # times the median of a row; twice that is rare on a plate
-_ROBUST = math.sqrt(2)  # one standard deviation of each part
 _ROUNDS = 8
 _SETTLED = 0.1  # of the noise between two rounds
 _LEAST_LEFT = 0.1  # of a value's noise: residuals with less tell nothing of it
@@ -75,12 +73,6 @@ class Problem:
             self.searched[_of_sensors(self.plate.model.space, kept)],
             self.free_scales[kept],
         )
-
-    @property
-    def without_form(self) -> "Problem":
-        """The same with form errors held at zero, but for scales."""
-        form = self.plate.model.space.of("place", "mode_shifts", *{*FORM} - {"sensor_scale"})
-        return replace(self, searched=self.searched & ~form)
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -131,54 +123,61 @@ def _of_sensors(space: Space, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
-    """Result of a fit.
+class Start:
+    """Where a fit begins.
 
-    z, error (p,): parameters with their standard errors; gains, gains_error (f, e), NaN where
-    unmeasured, the latter of magnitudes, phases_error (f, e) [rad]; predicted (f, e, s): with gains
-    and scales; noise (f, e): standard deviation of a value; used (f, e, s): mask of values without
-    outliers; chi2: sum of squares per degree of freedom.
+    z (p,): parameters; noise (f, e): standard deviation of a value; used (f, e, s): mask of values
+    without outliers.
     """
 
     z: FloatArray
+    noise: FloatArray
+    used: NDArray[np.bool_]
+
+    def at(self, kept: NDArray[np.bool_], space: Space) -> Self:
+        """Select some of the sensors (s,) of a space."""
+        return replace(self, z=self.z[_of_sensors(space, kept)], used=self.used[:, :, kept])
+
+
+@dataclass(frozen=True, eq=False)
+class Fit(Start):
+    """Result of a fit.
+
+    error (p,): standard errors of the parameters; gains, gains_error (f, e), NaN where unmeasured,
+    the latter of magnitudes, phases_error (f, e) [rad]; predicted (f, e, s): with gains and scales;
+    chi2: sum of squares per degree of freedom.
+    """
+
     error: FloatArray
     gains: ComplexArray
     gains_error: FloatArray
     phases_error: FloatArray
     predicted: ComplexArray
-    noise: FloatArray
-    used: NDArray[np.bool_]
     chi2: float
 
-    def at(self, kept: NDArray[np.bool_], space: Space) -> "Fit":
-        """Select some of the sensors (s,) of a space as the start of another fit."""
-        return replace(self, z=self.z[_of_sensors(space, kept)], used=self.used[:, :, kept])
 
-
-def first_fit(problem: Problem, z: FloatArray) -> Fit:
-    """Fit from starting values z (p,), all scales free and no form errors, despite outliers."""
-    free = np.ones(len(problem.free_scales), dtype=bool)
-    problem = replace(problem.without_form, free_scales=free)
-    used = np.isfinite(problem.values)
-    # Without residuals to judge by, peaks of a row are clipped at first.
-    clipped = replace(problem, values=_without_peaks(problem.values, used))
-    noise = 0.05 * row_rms(clipped.values, used)
-    z, found = _search(clipped, z, used / noise[:, :, None], robust=_ROBUST)
-    for number in range(_ROUNDS):
-        raw = _deviation(problem, z, used / noise[:, :, None])
-        noise = _noise_of(problem.values, raw, used)
+def start_at(problem: Problem, z: FloatArray) -> Start:
+    """Scales of sensors, outliers and noise by the plate at z (p,)."""
+    values, model = problem.values, problem.plate.responses(z)
+    used, scales = np.isfinite(values), np.ones(values.shape[2])
+    for _ in range(_ROUNDS):
+        weight = used / row_rms(values, used)[:, :, None]
+        gains, _ = project_gains(scales * model, values, weight)
+        predicted = np.nan_to_num(gains)[:, :, None] * model
+        share = np.divide(values, predicted, out=np.full_like(values, np.nan), where=used)
+        scales = np.nanmedian(share.real, axis=(0, 1))
+        scales = scales / np.median(scales)
+        raw = np.abs(values - scales * predicted)
+        noise = _noise_of(values, raw, used)
         kept = _without_worst(raw / noise[:, :, None], used)
-        is_settled = number > 0 and bool((kept == used).all())
-        used = kept
-        robust = None if is_settled else _ROBUST
-        z, found = _search(problem, z, used / noise[:, :, None], robust=robust)
-        if is_settled:
+        if (kept == used).all():
             break
-    return _result(problem, z, found, noise, used)
+        used = kept
+    return Start(problem.at_scales(z, scales), noise, used)
 
 
-def solve(problem: Problem, start: Fit) -> Fit:
-    """Fit parameters, scales and form errors, from those of another fit."""
+def solve(problem: Problem, start: Start) -> Fit:
+    """Fit parameters, scales and form errors."""
     z, noise, used = start.z, start.noise, start.used
     finite = np.isfinite(problem.values)
     for _ in range(_ROUNDS):
@@ -195,9 +194,7 @@ def solve(problem: Problem, start: Fit) -> Fit:
     return _result(problem, *_search(problem, z, used / noise[:, :, None]), noise, used)
 
 
-def _search(
-    problem: Problem, start: FloatArray, weight: FloatArray, *, robust: float | None = None
-) -> tuple[FloatArray, Found]:
+def _search(problem: Problem, start: FloatArray, weight: FloatArray) -> tuple[FloatArray, Found]:
     """Parameters (p,), and what the search of some of them ended with."""
     return fit_with_gains(
         problem.plate.model,
@@ -206,7 +203,6 @@ def _search(
         start,
         problem.searched,
         prior=problem.tolerances(start),
-        robust=robust,
     )
 
 
@@ -269,24 +265,15 @@ def _result(
     )
     return Fit(
         z,
+        noise,
+        used,
         error,
         gains,
         np.abs(gains) * magnitude,
         phase,
         gains[:, :, None] * model,
-        noise,
-        used,
         chi2,
     )
-
-
-def _without_peaks(values: ComplexArray, used: NDArray[np.bool_]) -> ComplexArray:
-    """Values cut down to a few times the median magnitude of their row, their phases kept."""
-    size = np.where(used, np.abs(values), np.nan)
-    rows = used.any(axis=2)
-    limit = np.full(size.shape[:2], np.inf)
-    limit[rows] = _PEAK * np.nanmedian(size[rows], axis=1)
-    return np.asarray(values * np.minimum(1, limit[:, :, None] / np.maximum(size, 1e-300)))
 
 
 def _noise_of(

@@ -73,13 +73,30 @@ SHARED int best_tone(const candidates *from, const float *own, const float *loud
     return chosen_tone;
 }
 
+/* What tones do on some of the plates that judge: (count, draws), (count, k, draws). */
+typedef struct {
+    size_t draws;
+    const float *own, *loudest;
+} judged;
+
+/* The same on every so many of the plates only. */
+SHARED judged some_of(const judged *every, size_t count, size_t fingers, size_t step, arena *memory) {
+    const size_t draws = (every->draws + step - 1) / step;
+    float *own = floats(memory, count * draws + LANES), *loudest = floats(memory, count * fingers * draws + LANES);
+    for (size_t d = 0; d < draws; d++) {
+        for (size_t i = 0; i < count; i++) own[i * draws + d] = every->own[i * every->draws + d * step];
+        for (size_t i = 0; i < count * fingers; i++) loudest[i * draws + d] = every->loudest[i * every->draws + d * step];
+    }
+    return (judged){draws, own, loudest};
+}
+
 /* worst (count): percentile of the least power ratio of combinations (count, contents) of the first contents. */
-SHARED void worst_ratios(float *worst, const int *combinations, int count, size_t contents, int step, const float *own,
-                         const float *loudest, const int *content_of, size_t fingers, const rules *by, const question *of,
-                         arena *memory) {
-    const size_t draws = of->judging->count;
+SHARED void worst_ratios(float *worst, const int *combinations, int count, size_t contents, const judged *on,
+                         const int *content_of, size_t fingers, const rules *by, const question *of, arena *memory) {
+    const size_t draws = on->draws;
+    const float *own = on->own, *loudest = on->loudest;
     const arena mark = *memory;
-    float *ratios = floats(memory, draws + LANES), *part = floats(memory, draws);
+    float *ratios = floats(memory, draws + LANES);
     for (int each = 0; each < count; each++) {
         const int *tone = combinations + (size_t)each * of->contents;
         for (size_t from = 0; from < draws; from += LANES) {
@@ -103,16 +120,14 @@ SHARED void worst_ratios(float *worst, const int *combinations, int count, size_
             }
             memcpy(ratios + from, &least, sizeof least);
         }
-        int kept = 0;
-        for (size_t d = 0; d < draws; d += step) part[kept++] = ratios[d];
-        worst[each] = percentile(part, kept, by->judged);
+        worst[each] = percentile(ratios, (int)draws, by->judged);
     }
     release(memory, mark);
 }
 
 /* A tone of each content, of all combinations that exchange bands and are apart, else of all that exchange bands. */
-SHARED int best_combination(int *chosen_tones, const candidates *from, const float *own, const float *loudest,
-                            const plates *on, const rules *by, const question *of, arena *memory) {
+SHARED int best_combination(int *chosen_tones, const candidates *from, const judged *every, const plates *on,
+                            const rules *by, const question *of, arena *memory) {
     const int contents = of->contents, most = by->max_combinations;
     const size_t each = (size_t)of->bands * 2 * (by->candidates + contents / 2); /* tones of a content */
     const size_t room = each > (size_t)most ? each : (size_t)most;
@@ -124,6 +139,7 @@ SHARED int best_combination(int *chosen_tones, const candidates *from, const flo
         for (int t = of->starts[j]; t < of->starts[j + 1]; t++) content_of[of->targets[t]] = j;
     int *tried = integers(memory, room * each * contents), *order = integers(memory, room * each);
     float *worst = floats(memory, room * each);
+    const judged few = some_of(every, from->count, on->k, by->pruning_step, memory);
     for (int pass = 0; pass < 2; pass++) {
         const float gap = pass ? 0 : of->apart - SAME_FREQUENCY;
         int count = 1, found = 0;
@@ -143,7 +159,7 @@ SHARED int best_combination(int *chosen_tones, const candidates *from, const flo
                 }
             count = found;
             if (j && count > most) { /* a content alone has no ratio to others */
-                worst_ratios(worst, tried, count, j + 1, by->pruning_step, own, loudest, content_of, on->k, by, of, memory);
+                worst_ratios(worst, tried, count, j + 1, &few, content_of, on->k, by, of, memory);
                 best_first(order, worst, count, memory);
                 count = most;
             } else
@@ -152,7 +168,7 @@ SHARED int best_combination(int *chosen_tones, const candidates *from, const flo
                 memcpy(kept + i * contents, tried + (size_t)order[i] * contents, contents * sizeof(int));
         }
         if (!count) continue;
-        worst_ratios(worst, kept, count, contents, 1, own, loudest, content_of, on->k, by, of, memory);
+        worst_ratios(worst, kept, count, contents, every, content_of, on->k, by, of, memory);
         memcpy(chosen_tones, kept + best_of(worst, count) * contents, contents * sizeof(int));
         release(memory, mark);
         return !pass;
@@ -202,7 +218,7 @@ static int answer_from(answered *to, const plates *on, const rules *by, const qu
     if (contents == 1 && from.count > 1) best_tones[0] = best_tone(&from, own, loudest, on, by, of, memory);
     if (contents > 1) {
         bring_to_level(own, loudest, &from, k, by, of, memory);
-        to->is_apart = best_combination(best_tones, &from, own, loudest, on, by, of, memory);
+        to->is_apart = best_combination(best_tones, &from, &(judged){draws, own, loudest}, on, by, of, memory);
         if (to->is_apart < 0) return NOT_REACHED;
     }
     for (size_t j = 0; j < contents; j++) {

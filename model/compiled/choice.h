@@ -47,6 +47,8 @@ INLINE int best_of(const float *scores, int count) {
     return 0;
 }
 
+enum { FEW = 24 };
+
 /* The value of a rank of values (count), whose order is lost; those before it are no larger. */
 SHARED float of_rank(float *values, int count, int rank) {
     int low = 0, high = count - 1;
@@ -68,12 +70,31 @@ SHARED float of_rank(float *values, int count, int rank) {
     return values[rank];
 }
 
+/* The value of a low rank of values (count), and the next one, of the few lowest, kept in order. */
+INLINE void of_low_rank(float *below, float *above, const float *values, int count, int rank) {
+    float lowest[FEW + 1];
+    const int kept = rank + 2 < count ? rank + 2 : count;
+    int found = 0;
+    for (int i = 0; i < count; i++) {
+        if (found == kept && !(values[i] < lowest[kept - 1])) continue;
+        int place = found < kept ? found++ : kept - 1;
+        for (; place && values[i] < lowest[place - 1]; place--) lowest[place] = lowest[place - 1];
+        lowest[place] = values[i];
+    }
+    *below = lowest[rank], *above = lowest[rank + 1 < kept ? rank + 1 : rank];
+}
+
 /* Percentile of values (count), linear between them; their order is lost. */
 SHARED float percentile(float *values, int count, float percent) {
     double place = (double)percent / 100 * (count - 1);
     int low = (int)place;
-    float below = of_rank(values, count, low), above = low + 1 < count ? INFINITY : below;
-    for (int i = low + 1; i < count; i++) above = values[i] < above ? values[i] : above;
+    float below, above;
+    if (low + 2 <= FEW)
+        of_low_rank(&below, &above, values, count, low);
+    else {
+        below = of_rank(values, count, low), above = low + 1 < count ? INFINITY : below;
+        for (int i = low + 1; i < count; i++) above = values[i] < above ? values[i] : above;
+    }
     return (float)(below + (place - low) * ((double)above - below));
 }
 

@@ -84,14 +84,14 @@ class _Answering:
         count = len(self.requests)
         quiet = range(count, count + len(self.fingers))
         plan = _Plan(tuple(zip(range(count), strict=True)), tuple(quiet))
-        tried = [self._measure(plan)]
-        while is_out_of_bounds(tried[-1]) or (
-            _worst_of(tried[-1]) < min_contrast_db and len(plan.contents) > 1
+        tried = [found := self._measure(plan)]
+        while is_out_of_bounds(found) or (
+            found.tones.worst_db < min_contrast_db and len(plan.contents) > 1
         ):
-            plan = self._with_less(plan, tried[-1])
-            tried.append(self._measure(plan))
-        if _worst_of(tried[-1]) >= min_contrast_db:
-            return tried[-1]
+            plan = self._with_less(plan, found)
+            tried.append(found := self._measure(plan))
+        if not found.tones.worst_db < min_contrast_db:  # NaN where nobody else is there
+            return found
         best = best_by([each for each in tried if not is_out_of_bounds(each)], _worst_of)
         below = f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served"
         return replace(best, applied=(*best.applied, below))
@@ -191,9 +191,10 @@ class _Answering:
     def _measure(self, plan: _Plan) -> Answer:
         """What fingers feel of a plan's contents."""
         contents, applied = self._contents(plan), plan.applied
-        tones = Tones.none(len(contents.places))
         if contents.streams:
             tones = choose_tones(self.table, contents)
+        else:
+            tones = Tones.none(len(contents.places))
         if not tones.is_apart:
             applied += (f"frequencies are nearer than {self.apart_hz:g} Hz",)
         given = self.requests, self.fingers, contents, tones, plan.held, applied

@@ -6,37 +6,59 @@ from pathlib import Path
 
 import pytest
 
+from drivers import clock
 from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
+from drivers.host.line import Line
+from drivers.host.serial_wire import SerialWire
 from drivers.opening import Lines
 from drivers.protocol.table import FAULTS
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
 from rig_files import TWO_AMPLIFIERS, write_rig
-from rig_on_wire import LIMITS, layer, memory_line, rig_in_memory
+from rig_on_wire import LIMITS, layer, make_bench
+from sim.bench.amplifier_device import AmplifierDevice
 from sim.faults.fault_window import FaultWindow
+from sim.memory_line import MemoryPort
 from virtual_loop import in_virtual_time
+
+
+def line_to(device: AmplifierDevice) -> Line:
+    """The host's line to a device of this process."""
+    lines: list[Line] = []
+    port = MemoryPort(
+        [device], lambda data: lines[0].received(data), lambda why: lines[0].lose(why)
+    )
+    lines.append(Line(SerialWire(0, sequence=0), port, "main"))
+    return lines[0]
 
 
 @in_virtual_time
 async def test_unplugged_line_is_lost_and_opens_again_once_plugged_in(coarse_rig: Rig) -> None:
     """Requests fail at once, the watchdog silences; no line while it is out, a new one after."""
-    async with rig_in_memory(coarse_rig) as rig:
-        device = rig.devices["main"]
-        await rig.group.arm()
-        await rig.group.apply({"main": [layer((0, 110.0, 1.0))]})
-        device.inject_fault(FaultWindow("unplug", lasts=1.0))
-        with pytest.raises(LinkError, match="unplugged"):
-            await rig.group.beat()
-        with pytest.raises(LinkError, match="unplugged"):
-            memory_line([device], "main")
-        await asyncio.sleep(1.01)
-        assert not any(rig.levels("main"))
-        line = memory_line([device], "main")
-        host = Host(line, device.address, LIMITS, name="main")
-        await host.open()
-        assert (await host.read_status())["fault"] == FAULTS["WATCHDOG"]
+    bench, devices = make_bench(coarse_rig)
+    device = devices["main"]
+    group = await opened_group(line_to(device))
+    await group.arm()
+    await group.apply({"main": [layer((0, 110.0, 1.0))]})
+    device.inject_fault(FaultWindow("unplug", lasts=1.0))
+    with pytest.raises(LinkError, match="unplugged"):
+        await group.beat()
+    with pytest.raises(LinkError, match="unplugged"):
+        line_to(device)
+    await asyncio.sleep(1.01)
+    bench.advance(clock.now())
+    assert not any(bench.amplifiers["main"].summary(bench.time).levels)
+    again = await opened_group(line_to(device))
+    assert (await again.amplifiers["main"].read_status())["fault"] == FAULTS["WATCHDOG"]
+
+
+async def opened_group(line: Line) -> Group:
+    """The group of the only amplifier of a line, open."""
+    group = Group({"main": Host(line, 1, LIMITS, name="main")})
+    await group.open()
+    return group
 
 
 async def test_amplifiers_of_one_rig_share_its_simulation(tmp_path: Path) -> None:

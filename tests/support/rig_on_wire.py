@@ -2,19 +2,16 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import cast
 
 from drivers import clock
 from drivers.contents import Layer, Tone
 from drivers.errors import LinkDegraded, LinkError
 from drivers.host.amplifier import WATCHDOG
-from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
-from drivers.host.line import Line
-from drivers.host.serial_wire import SerialWire
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from model.rig.rig import Channel, Rig
@@ -25,11 +22,10 @@ from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.wires import Wire, open_wires
 from sim.faults.fault_window import Faults
-from sim.memory_line import MemoryPort
 from sim.plant.imperfections import Imperfections
 
 
-@dataclass(frozen=True)
+@dataclass
 class FarSide:
     """The far side of a wire: URLs and devices by the amplifiers' names, and the bench behind."""
 
@@ -143,38 +139,29 @@ LIMITS = GuardLimits(20.0, 1000.0, 1.0)
 
 
 @dataclass
-class HostedRig:
-    """The bench, its devices, and the group of their hosts.
+class HostedRig(FarSide):
+    """The far side of a wire, and the group of its hosts.
 
-    urls: on real wires, by name; watchdog [s]: of the group, also when it is opened again.
+    watchdog [s]: of the group, also when it is opened again.
     """
 
-    bench: Bench
-    devices: Mapping[str, AmplifierDevice]
+    lines: Lines
     group: Group
-    urls: Mapping[str, str] = field(default_factory=dict)
-    opened: Lines = field(default_factory=Lines)
-    watchdog: float = WATCHDOG
-
-    @property
-    def lines(self) -> Mapping[str, Line]:
-        """The line of each amplifier."""
-        return {name: each.line for name, each in self.group.amplifiers.items()}
+    watchdog: float
 
     def levels(self, name: str) -> tuple[float, ...]:
         """What the channels of an amplifier play now."""
-        self.bench.advance(clock.now())
-        return self.bench.amplifiers[name].summary(self.bench.time).levels
+        return self.summary(name).levels
 
     async def reopen(self, *, within: float) -> None:
         """Close the lines, and open them again once they are there, within so many seconds."""
-        await self.opened.close()
+        await self.lines.close()
         async with asyncio.timeout(within):
             while True:
                 with contextlib.suppress(LinkError):
-                    self.group = await _opened_group(self.opened, self.urls, self.watchdog)
+                    self.group = await _opened_group(self.lines, self.urls, self.watchdog)
                     return
-                await self.opened.close()
+                await self.lines.close()
                 await asyncio.sleep(0.05)
 
     async def beat_until(self, time: float) -> None:
@@ -185,45 +172,18 @@ class HostedRig:
                 await self.group.beat()
 
 
-def memory_line(devices: Sequence[AmplifierDevice], name: str) -> Line:
-    """The host's line to devices of a bench."""
-    lines: list[Line] = []
-    port = MemoryPort(devices, lambda data: lines[0].received(data), lambda why: lines[0].lose(why))
-    lines.append(Line(SerialWire(0, sequence=0), port, name))
-    return lines[0]
-
-
-@asynccontextmanager
-async def rig_in_memory(rig: Rig, *, watchdog: float = WATCHDOG) -> AsyncIterator[HostedRig]:
-    """The amplifiers of a rig, each on a line of its own, identified and disarmed; watchdog [s]."""
-    bench, devices = make_bench(rig)
-    hosts = {
-        name: Host(memory_line([each], name), each.address, LIMITS, name=name)
-        for name, each in devices.items()
-    }
-    group = Group(hosts, watchdog=watchdog)
-    await group.open()
-    try:
-        yield HostedRig(bench, devices, group)
-    finally:
-        for name, device in devices.items():
-            device.close()
-            if hosts[name].line.loss is None:
-                hosts[name].line.lose("closed")
-
-
 @asynccontextmanager
 async def rig_on_wire(
     rig: Rig, wire: Wire, *, watchdog: float = WATCHDOG
 ) -> AsyncIterator[HostedRig]:
     """The amplifiers of a rig on a wire, identified and disarmed; watchdog [s]."""
     async with far_side(wire, rig) as far:
-        opened = Lines()
+        lines = Lines()
         try:
-            group = await _opened_group(opened, far.urls, watchdog)
-            yield HostedRig(far.bench, far.devices, group, far.urls, opened, watchdog)
+            group = await _opened_group(lines, far.urls, watchdog)
+            yield HostedRig(far.urls, far.devices, far.bench, lines, group, watchdog)
         finally:
-            await opened.close()
+            await lines.close()
 
 
 async def _opened_group(lines: Lines, urls: Mapping[str, str], watchdog: float) -> Group:

@@ -190,8 +190,11 @@ class HostRules:
     def _check_stop(self, session: AmplifierSession, time: float, request: Request) -> None:
         requested_at = session.stop_requested_at
         is_other = request.name != "Stop" and request.name not in _UNORDERED
-        # Requests written at the same moment as the stop may precede it.
-        if requested_at is None or time <= requested_at + _IN_FLIGHT or not is_other:
+        if requested_at is None or not is_other:
+            return
+        # Requests written at the same moment as the stop may precede it, and with a broadcast the
+        # status that is read behind it.
+        if time <= requested_at + _IN_FLIGHT * (2 if request.name == "GetStatus" else 1):
             return
         if request.name == "Disarm" and requested_at < self._last_disarm + _REORDER_WINDOW:
             return  # silences as well

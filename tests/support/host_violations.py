@@ -120,7 +120,7 @@ BROKEN: Broken = {
             Talk()
             .armed()
             .told("operator_command", "stop")
-            .rest(0.005)
+            .rest(0.007)
             .says(kind=hand.GET_STATUS)
             .exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
         ),

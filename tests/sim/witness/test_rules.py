@@ -150,6 +150,15 @@ def test_arm_may_be_withdrawn_before_its_reply() -> None:
     assert "token" not in talk.found
 
 
+def test_status_behind_a_broadcast_may_precede_a_stop() -> None:
+    """It was written with it, and on Modbus RTU each frame waits for the silence before it."""
+    talk = Talk().armed().playing().told("operator_command", "stop").rest(0.005)
+    playing: dict[str, Any] = {"token": 5, "levels": (5000, 0)}
+    talk.says(kind=hand.GET_STATUS, left=213, tokens=(5, 0, 0, 0), **playing)
+    talk.exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1, **playing))
+    assert talk.found == []
+
+
 @pytest.mark.parametrize("later", [0.0, 0.003])
 def test_stop_is_not_awaited_again_while_its_reply_is(later: float) -> None:
     """The host had begun to stop by itself, of which its operator's stop takes part."""

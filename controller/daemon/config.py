@@ -10,8 +10,14 @@ from controller.api.place import default_socket
 from controller.daemon.config_sections import CalibrationSection, DaemonSection, TouchSection
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
-from controller.sources.calibration import CalibratedSource, TouchCalibration, fitted, turned
-from controller.sources.touch import TouchSource, open_source
+from controller.sources.touch import (
+    CalibratedSource,
+    TouchCalibration,
+    TouchSource,
+    fitted,
+    open_source,
+    turned,
+)
 from drivers.errors import CommandError
 from drivers.wires.known import address_of
 from model.config.document import ConfigError, Document, read_document

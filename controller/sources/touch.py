@@ -1,12 +1,21 @@
-"""Touch sources: frames of all touches at one moment, and sources by the scheme of their URL."""
+"""Touch sources: frames of all touches at one moment, by the scheme of a URL, mapped to the plate.
 
+A calibration is an affine map from coordinates of a sensor to those of the plate: x' = a x + b y +
+c, y' = d x + e y + f on coordinates 0..1 from the top left corner.
+"""
+
+import asyncio
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
 from urllib.parse import parse_qsl
 
+import numpy as np
+
 from model.errors import InputError
+from model.structure.plate import Plate
 from registry.plugins import Derived, PluginRegistry
 
 
@@ -81,3 +90,116 @@ def open_source(url: str) -> TouchSource:
     Raises InputError for an unknown scheme, a failing plug-in or a URL that it refuses.
     """
     return _SOURCES.make(url)
+
+
+Row: TypeAlias = tuple[float, float, float]
+Point: TypeAlias = tuple[float, float]
+
+# m; with a larger residual a point was not touched where it should be (a fingertip's radius is
+# 6.5 mm).
+MAX_RESIDUAL = 0.005
+# Below this determinant the plate's points lie on a line for practical purposes.
+_MIN_DETERMINANT = 1e-3
+
+_ROTATIONS: dict[int, tuple[Row, Row]] = {
+    0: ((1, 0, 0), (0, 1, 0)),
+    90: ((0, -1, 1), (1, 0, 0)),
+    180: ((-1, 0, 1), (0, -1, 1)),
+    270: ((0, 1, 0), (-1, 0, 1)),
+}
+
+
+@dataclass(frozen=True)
+class TouchCalibration:
+    """Map from sensor to plate: the rows of x' and y'."""
+
+    matrix: tuple[Row, Row] = _ROTATIONS[0]
+
+    def apply(self, touch: Touch) -> Touch:
+        """Map a touch to coordinates 0..1 across the plate; NaN stays NaN."""
+        (a, b, c), (d, e, f) = self.matrix
+        return replace(
+            touch,
+            x=a * touch.x + b * touch.y + c,
+            y=d * touch.x + e * touch.y + f,
+        )
+
+
+_ALIGNED = TouchCalibration()
+
+
+def turned(degrees: int = 0, *, mirror: str | None = None) -> TouchCalibration:
+    """Return the calibration of a sensor mounted turned clockwise by 0, 90, 180 or 270 degrees.
+
+    mirror: "x" to swap left and right after that, "y" for top and bottom.
+    """
+    x_row, y_row = _ROTATIONS[degrees]
+    if mirror == "x":
+        x_row = _reversed(x_row)
+    if mirror == "y":
+        y_row = _reversed(y_row)
+    return TouchCalibration((x_row, y_row))
+
+
+def fitted(touched: Sequence[Point], positions: Sequence[Point], plate: Plate) -> TouchCalibration:
+    """Fit a calibration by least squares to at least three points.
+
+    touched: sensor coordinates 0..1; positions: on the plate [m] from its south-west corner, y
+    upwards. Raises InputError for points on a line or residuals above 5 mm.
+    """
+    expected = np.array([(x / plate.length, 1 - y / plate.width) for x, y in positions])
+    measured = np.column_stack((np.array(touched, dtype=float), np.ones(len(touched))))
+    solution = np.linalg.lstsq(measured, expected, rcond=None)[0]
+    is_invertible = abs(np.linalg.det(solution[:2])) >= _MIN_DETERMINANT
+    if np.linalg.matrix_rank(measured, tol=0.05) < 3 or not is_invertible:
+        raise InputError(
+            "points of the touch calibration must not lie on a line; touch three corners"
+        )
+    error = (measured @ solution - expected) * (plate.length, plate.width)
+    distances = np.hypot(error[:, 0], error[:, 1])
+    worst = int(np.argmax(distances))
+    if distances[worst] > MAX_RESIDUAL:
+        raise InputError(
+            f"residual of touch calibration point {worst + 1} must be at most "
+            f"{MAX_RESIDUAL * 1e3:g} mm, got {distances[worst] * 1e3:.1f} mm; check where it was "
+            "touched, and whether the panel is curved"
+        )
+    (a, d), (b, e), (c, f) = solution.tolist()
+    return TouchCalibration(((a, b, c), (d, e, f)))
+
+
+class CalibratedSource(TouchSource):
+    """A touch source mapped to the coordinates of the plate; fingers are lifted when it ends."""
+
+    def __init__(self, source: TouchSource, calibration: TouchCalibration) -> None:
+        self._source = source
+        self._calibration = calibration
+
+    async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
+        """Run the source and deliver its frames with mapped touches.
+
+        Its fingers are lifted as soon as it ends, fails or is cancelled.
+        """
+        apply = None if self._calibration == _ALIGNED else self._calibration.apply
+        touched: dict[str, TouchFrame] = {}
+
+        def placed(frame: TouchFrame) -> None:
+            touched.pop(frame.source, None)
+            if frame.touches:
+                touched[frame.source] = frame
+            if apply is not None:
+                frame = replace(frame, touches=tuple(map(apply, frame.touches)))
+            deliver(frame)
+
+        try:
+            await self._source.run(placed)
+        finally:
+            now = asyncio.get_running_loop().time()
+            for frame in touched.values():
+                deliver(replace(frame, time=now, touches=()))
+
+
+def _reversed(row: Row) -> Row:
+    """Return the row of 1 - x' for the row of x'."""
+    a, b, c = row
+    return (-a, -b, 1 - c)

@@ -15,8 +15,7 @@ from controller.api.methods import TouchParams
 from controller.api.schema import TouchPoint
 from controller.daemon.config import TouchInput
 from controller.daemon.touch_inputs import MAX_SOURCES_PER_CLIENT, ApiTouches, TouchInputs
-from controller.sources.calibration import TouchCalibration
-from controller.sources.touch import Touch, TouchFrame, TouchSource
+from controller.sources.touch import Touch, TouchCalibration, TouchFrame, TouchSource
 from daemon_bench import ready_daemon, until
 from daemon_process import Journal
 from drivers import clock

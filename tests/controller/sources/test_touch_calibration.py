@@ -8,8 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.sources.calibration import CalibratedSource, TouchCalibration, fitted, turned
-from controller.sources.touch import Touch, TouchFrame, TouchSource
+from controller.sources.touch import (
+    CalibratedSource,
+    Touch,
+    TouchCalibration,
+    TouchFrame,
+    TouchSource,
+    fitted,
+    turned,
+)
 from model.errors import InputError
 from model.structure.plate import Material, Plate
 

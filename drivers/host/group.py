@@ -158,22 +158,26 @@ class Group(Members):
         for each in self.amplifiers.values():  # before the others are waited for: they stop then
             if is_lost(each):
                 raise LinkTimeout(each.line.loss or each.silence_cause)
-        await self.all([self._feed(each, self.epoch) for each in self.amplifiers.values()])
+        feeding: list[Awaitable[Values]] = []
+        for name, each in self.amplifiers.items():
+            if each.silence_cause is None:
+                now = each.line.time()
+                if now >= self._running_due.get(name, 0.0) and each.feeding.tells(now):
+                    pause = each.exchange_time("Set") / _MAX_STATUS_LOAD
+                    self._running_due[name] = now + max(pause, _STATUS_INTERVAL)
+                    feeding.append(self._read_and_feed(each, self.epoch))
+                else:
+                    feeding.append(each.ping())
+            elif name not in self._readings or self._readings[name].done():
+                reading = each.read_status(Priority.READING)
+                reading.add_done_callback(_seen)
+                self._readings[name] = reading
+        await self.all(feeding)
 
-    async def _feed(self, amplifier: Amplifier, before: int) -> None:
-        name = amplifier.name
-        if amplifier.silence_cause is None:
-            now, due = amplifier.line.time(), self._running_due.get(name, 0.0)
-            if now >= due and amplifier.feeding.tells(now):
-                pause = amplifier.exchange_time("Set") / _MAX_STATUS_LOAD
-                self._running_due[name] = now + max(pause, _STATUS_INTERVAL)
-                await amplifier.read_status(Priority.HEARTBEAT)
-            self.check_none_since(before)
-            await amplifier.ping()
-        elif name not in self._readings or self._readings[name].done():
-            reading = amplifier.read_status(Priority.READING)
-            reading.add_done_callback(_seen)
-            self._readings[name] = reading
+    async def _read_and_feed(self, amplifier: Amplifier, before: int) -> Values:
+        await amplifier.read_status(Priority.HEARTBEAT)
+        self.check_none_since(before)
+        return await amplifier.ping()
 
     async def disarm(self, ramp: float = DISARM_RAMP) -> None:
         """Ramp [s] to silence and switch the high voltage off, read back from every amplifier.

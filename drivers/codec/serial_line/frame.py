@@ -89,29 +89,25 @@ class FrameReader:
         frames = []
         *ended, rest = (self._rest + data).split(b"\0")
         for piece in ended:
-            if piece and not self._is_skipping:  # a leading zero has nothing before it
-                frame = self._decoded(piece)
-                if frame is not None:
-                    frames.append(frame)
+            is_read = piece and not self._is_skipping  # a leading zero has nothing before it
             self._is_skipping = False
+            if not is_read:
+                continue
+            try:
+                content = cobs.decode(piece) if len(piece) <= _STUFFED_MAX else b""
+            except cobs.DecodeError:
+                content = b""
+            body, crc = content[: -_CRC.size], content[-_CRC.size :]
+            if len(content) < _OVERHEAD or _CRC.unpack(crc) != (zlib.crc32(body),):
+                self._on_invalid(piece[:_STUFFED_MAX])
+                continue
+            kind, version, address, sequence = _HEADER.unpack_from(body)
+            frames.append(Frame(kind, address, sequence, body[_HEADER.size :], version))
         if len(rest) > _STUFFED_MAX and not self._is_skipping:
             self._on_invalid(rest[:_STUFFED_MAX])
             self._is_skipping = True
         self._rest = b"" if self._is_skipping else rest
         return frames
-
-    def _decoded(self, stuffed: bytes) -> Frame | None:
-        """Decode a frame without its delimiters; None if it is damaged."""
-        try:
-            content = cobs.decode(stuffed) if len(stuffed) <= _STUFFED_MAX else b""
-        except cobs.DecodeError:
-            content = b""
-        body, crc = content[: -_CRC.size], content[-_CRC.size :]
-        if len(content) < _OVERHEAD or _CRC.unpack(crc) != (zlib.crc32(body),):
-            self._on_invalid(stuffed[:_STUFFED_MAX])
-            return None
-        kind, version, address, sequence = _HEADER.unpack_from(body)
-        return Frame(kind, address, sequence, body[_HEADER.size :], version)
 
 
 def pack_words(words: Sequence[int]) -> bytes:

@@ -52,7 +52,8 @@ class Transition:
     """From one complex amplitude to another, from start [s] on until end.
 
     Along straight lines through knots a step [s] apart, or without knots along a raised cosine that
-    lasts one step; a step of 0 changes at once.
+    lasts one step; a step of 0 changes at once. half [s], radius: by which its start and its first
+    amplitude may differ, see `drivers.uncertain_playback`.
     """
 
     start: float
@@ -61,6 +62,8 @@ class Transition:
     last: complex
     end: float
     knots: tuple[complex, ...] = ()
+    half: float = 0.0
+    radius: float = 0.0
 
     def at(self, time: float) -> complex:
         """Return the amplitude at a time [s], before start the first one."""

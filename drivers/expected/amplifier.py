@@ -396,22 +396,22 @@ class ExpectedAmplifier:
 
     def _check_achieved(self, number: int, reply: Values, when: Interval) -> None:
         """Compare what a layer plays with what it must."""
-        outputs, problems = self.outputs, list[Problem]()
+        outputs = self.outputs
+        if number not in outputs.sure(when):
+            return
+        playing = outputs.playback.playing(number)
+        token = outputs.playback.tokens.get(number, 0)
         can_scale = outputs.may_derate or not outputs.is_exact
-        for one in outputs.possible(when):
-            playing, token = one.playback.playing(number), one.playback.tokens.get(number, 0)
-            problem: Problem | None = ("token", "token", token, reply["token"])
-            if reply["token"] == token:
-                problem = achieved_problem(
-                    playing, reply, self.can, is_exact=outputs.is_exact, can_scale=can_scale
-                )
-            lasting = outputs.lasting.get(number, {0})
-            if problem is None and reply["commands"] and reply["valid_for"] not in lasting:
-                problem = "plays", "valid_for", sorted(lasting), reply["valid_for"]
-            if problem is None:
-                return
-            problems.append(problem)
-        for rule, what, must, seen in problems[:1]:
+        problem: Problem | None = ("token", "token", token, reply["token"])
+        if reply["token"] == token:
+            problem = achieved_problem(
+                playing, reply, self.can, is_exact=outputs.is_exact, can_scale=can_scale
+            )
+        lasting = outputs.lasting.get(number, {0})
+        if problem is None and reply["commands"] and reply["valid_for"] not in lasting:
+            problem = "plays", "valid_for", sorted(lasting), reply["valid_for"]
+        if problem is not None:
+            rule, what, must, seen = problem
             report = self.report if reply["commands"] else self.report_silence
             report(rule, when[1], f"{what} of achieved layer {number}", must=must, seen=seen)
 

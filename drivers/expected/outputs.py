@@ -23,6 +23,7 @@ _LASTING = 3.0  # s; what ends after it is not awaited
 _FINE = 0.026  # Hz; half a step of the wire
 _RAMP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["level"]
 _LAYERS, _VOICES = QUANTITIES["layer_count"].maximum, QUANTITIES["voices"].maximum
+_ALL_LAYERS = {*range(_LAYERS)}
 
 
 class Report(Protocol):
@@ -144,14 +145,18 @@ class ExpectedOutputs:
         extra = self._slack + _DRIFT * (when[1] - since)
         return when[0] - extra, when[1] + extra
 
-    def possible(self, when: Interval) -> list[UncertainPlayback]:
-        """Return what may play between two times, nothing while a layer is unknown."""
+    def sure(self, when: Interval) -> set[int]:
+        """Return the layers of which it is known what they play between two times.
+
+        No layer while what one of them plays is unknown.
+        """
         start, end = self._widened(when)
-        return [*self._plays.possible(start, end)] if max(self._unknown) < start else []
+        is_known = max(self._unknown) < start
+        return _ALL_LAYERS - self._plays.unsure(start, end) if is_known else set()
 
     def waits(self, when: Interval) -> bool:
         """Whether a set surely waits for the end of an onset, whenever within an interval."""
-        return all(each.playback.waiting for each in self.possible(when))
+        return self.sure(when) == _ALL_LAYERS and bool(self.playback.waiting)
 
     def settled_at(self, now: float) -> float:
         """Return when all that plays lasts for long or is silent [s], as far as is known."""
@@ -166,11 +171,15 @@ class ExpectedOutputs:
 
     def check(self, shown: Values, when: Interval) -> None:
         """Compare a status that was true at some time between two; the next counts from there."""
-        states, tokens, start = self.possible(when), shown["tokens"], self._widened(when)[0]
+        tokens, start = shown["tokens"], self._widened(when)[0]
         levels = [_LEVEL.from_wire(level) for level in shown["levels"]]
-        low = self._check_levels(states, levels, when, self._report)
-        if states:
-            self._check_tokens(states, tokens, when)
+        if sure := self.sure(when):
+            low = self._check_levels(levels, when, self._report)
+            for layer, token in enumerate(tokens):
+                must = self.playback.tokens.get(layer, 0)
+                if layer in sure and token != must:
+                    what = f"token of layer {layer}, {self._since(when)}"
+                    self._report("token", when[1], what, must=must, seen=token)
             is_limited = bool(shown["flags"] >> STATUS_FLAGS["limited"] & 1)
             is_beyond = low > 1 + _TOLERANCE + 2 * self._half_step
             must_be = is_beyond and self.is_exact and not self.may_derate
@@ -200,31 +209,28 @@ class ExpectedOutputs:
         report_low: takes levels that are too low, None where they may be.
         """
         when = time, time
-        states = self.possible(when)
-        self._check_levels(states, levels, when, report_low)
+        if sure := self.sure(when):
+            self._check_levels(levels, when, report_low)
         lag = self._plays.lag + self._slack
-        for channel, frequency in frequencies.items() if len(states) == 1 else ():
+        for channel, frequency in frequencies.items() if sure == _ALL_LAYERS else ():
             voices = self.playback.voices_of(channel)
             lasting = sorted({each.frequency for each in voices if not each.has_ended})
             is_settled = all(each.transition.end < time - lag for each in voices)
             if lasting and is_settled and all(abs(each - frequency) > _FINE for each in lasting):
                 what = f"frequency of channel {channel}"
-                self._report("plays", time, what, must=_one_of(lasting), seen=frequency)
+                self._report(
+                    "plays", time, what, must=" or ".join(map(str, lasting)), seen=frequency
+                )
 
     def _check_levels(
-        self,
-        states: Sequence[UncertainPlayback],
-        levels: Sequence[float],
-        when: Interval,
-        report_low: Report | None,
+        self, levels: Sequence[float], when: Interval, report_low: Report | None
     ) -> float:
         """Compare levels of channels; returns the largest level that one surely has."""
         can_be_low = self.may_derate or not self.is_exact or report_low is None
         start, end = self._widened(when)
         largest = 0.0
-        for channel, level in enumerate(levels[: self.playback.channels] if states else ()):
-            bounds = [one.bounds(channel, start, end, is_exact=self.interferes) for one in states]
-            low, high = min(each for each, _ in bounds), max(each for _, each in bounds)
+        for channel, level in enumerate(levels[: self.playback.channels]):
+            low, high = self._plays.bounds(channel, start, end, is_exact=self.interferes)
             largest = max(largest, low)
             voices = len(self.playback.all_voices[channel])
             slack = max((_MAX_STEPS + voices) * self._half_step, _TOLERANCE)
@@ -236,19 +242,6 @@ class ExpectedOutputs:
                 must = f"{low:.6g} to {high:.6g}"
                 report(self._rule(channel, level, when), when[1], what, must=must, seen=level)
         return largest
-
-    def _check_tokens(
-        self, states: Sequence[UncertainPlayback], tokens: Sequence[int], when: Interval
-    ) -> None:
-        """Compare the token of each layer."""
-        after = states[-1].copied()
-        after.advance(self._widened(when)[1] + 2 * after.lag)
-        known = [one.playback.tokens for one in (*states, after)]
-        for layer, token in enumerate(tokens):
-            must = {each.get(layer, 0) for each in known}
-            if token not in must:
-                what = f"token of layer {layer}, {self._since(when)}"
-                self._report("token", when[1], what, must=_one_of(must), seen=token)
 
     def _since(self, when: Interval) -> str:
         low, high = 1e3 * (when[0] - self.began[1]), 1e3 * (when[1] - self.began[0])
@@ -264,7 +257,3 @@ class ExpectedOutputs:
             return "silent"
         before = self._before[channel] if channel < len(self._before) else 0.0
         return "commit" if abs(level - before) < _TOLERANCE else "plays"
-
-
-def _one_of(known: Sequence[object] | set[int]) -> str:
-    return " or ".join(map(str, known))

@@ -9,7 +9,6 @@ import typer
 from model.commands.options import JsonOption, TableArgument
 from model.config.points import parse_point
 from model.errors import InputError
-from model.rig.uncertainty import Uncertainty
 
 table_app = typer.Typer(help="Build, query and check localization tables.")
 
@@ -65,14 +64,13 @@ def query(
     ERA, and predicted levels and contrast.
     """
     from model.table.file import load_table
-    from model.table.query import prepared_timing, query_as_json
-    from model.table.question import Question
+    from model.table.query import query_line
 
-    if swap_bands and not own:
-        raise InputError("--swap-bands must be given with --own; in a batch by bands_may_swap")
     if batch is not None:
-        if target or quiet or own:
-            raise InputError("--target, --own and --quiet must be left out with --batch")
+        if target or quiet or own or swap_bands:
+            raise InputError(
+                "--target, --own, --quiet and --swap-bands must be left out with --batch"
+            )
         defaults = {
             "level_db_sl": level,
             "mode": drive_mode,
@@ -80,33 +78,33 @@ def query(
         }
         _query_batch(table_file, batch, defaults)
         return
-    if own:
-        if target or drive_mode or envelopes:
-            raise InputError("--own must be given without --target, --mode and --envelopes")
-        _answer(table_file, own, quiet or [], level=level, swap_bands=swap_bands, as_json=as_json)
-        return
-    if not target:
+    if not (target or own):
         raise InputError(
             "targets must be at least one, got none; give --target X,Y or --own X,Y, metres, or "
             "--batch FILE"
         )
-    question = Question(
-        targets=tuple(parse_point(text, what="--target") for text in target),
-        quiet=tuple(parse_point(text, what="--quiet") for text in quiet or []),
-        level_db_sl=level,
-        drive_mode=drive_mode,
-        envelopes=envelopes,
-    )
+    given = {
+        "targets": [parse_point(text, what="--target") for text in target or []],
+        "own": [_own(text) for text in own or []],
+        "quiet": [parse_point(text, what="--quiet") for text in quiet or []],
+        "mode": drive_mode,
+        "envelopes": envelopes,
+        "bands_may_swap": swap_bands,
+    }
+    line = {key: value for key, value in given.items() if value} | {"level_db_sl": level}
     table = load_table(table_file)
-    table.prepare(drive_mode, with_ringing=False)
-    answer = query_as_json(table, question, prepared_timing(table))
+    answer = query_line(table, json.dumps(line))
     if as_json:
         print(json.dumps(answer))
-    else:
-        _print_answer(answer, table.uncertainty)
+        return
+    (_print_contents if own else _print_answer)(answer)
+    print(
+        f"promised: what nine of ten plates within the rig's uncertainty give ({table.uncertainty})"
+    )
+    print(f"solved in {1000 * answer['solve_time_s']:.1f} ms")
 
 
-def _print_answer(answer: dict[str, Any], uncertainty: Uncertainty) -> None:
+def _print_answer(answer: dict[str, Any]) -> None:
     for era, tone in answer["drive"].items():
         print(
             f"{era:4s} {tone['frequency_hz']:7.2f} Hz  level {tone['level']:.4f}  "
@@ -142,36 +140,9 @@ def _print_answer(answer: dict[str, Any], uncertainty: Uncertainty) -> None:
     rows.append(("residual after the end", answer["residual_db"], "dB nominal"))
     for name, value, unit in rows:
         print(f"{name:30s} {value:z6.1f} {unit}")
-    print(f"promised: what nine of ten plates within the rig's uncertainty give ({uncertainty})")
-    print(f"solved in {1000 * answer['solve_time_s']:.1f} ms")
 
 
-def _answer(
-    table_file: Path,
-    own: list[str],
-    quiet: list[str],
-    *,
-    level: float,
-    swap_bands: bool,
-    as_json: bool,
-) -> None:
-    """Answer several contents at once."""
-    from model.table.file import load_table
-    from model.table.query import answer_as_json
-    from model.table.request import ANY_BAND, Finger, Request
-
-    requests = []
-    for text in own:
-        place, _, band = text.partition("@")
-        at = parse_point(place, what="--own")
-        requests.append(Request(at, _band(band) if band else ANY_BAND, level))
-    fingers = [Finger(parse_point(text, what="--quiet")) for text in quiet]
-    table = load_table(table_file)
-    table.prepare("phased", with_ringing=False)
-    found = answer_as_json(table, requests, fingers, bands_may_swap=swap_bands)
-    if as_json:
-        print(json.dumps(found))
-        return
+def _print_contents(found: dict[str, Any]) -> None:
     print("finger [m]         frequency       level  contrast  foreign level")
     for layer in found["layers"]:
         print(
@@ -190,10 +161,13 @@ def _answer(
         print(f"worst finger: {found['robust_worst_db']:.1f} dB promised")
     for line in found["applied"]:
         print(f"changed: {line}")
-    print(
-        f"promised: what nine of ten plates within the rig's uncertainty give ({table.uncertainty})"
-    )
-    print(f"solved in {1000 * found['solve_time_s']:.1f} ms")
+
+
+def _own(text: str) -> dict[str, Any]:
+    """A finger with a content of its own, of X,Y[@LOW-HIGH]."""
+    place, _, band = text.partition("@")
+    at = parse_point(place, what="--own")
+    return {"at": at, "band_hz": _band(band)} if band else {"at": at}
 
 
 def _band(text: str) -> tuple[float, float]:

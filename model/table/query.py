@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from model.drive_modes import UNRESTRICTED
 from model.errors import InputError, first_problem
 from model.finger.perception import STRONG_DB_SL
 from model.table.answer import answer
@@ -77,18 +78,6 @@ def _parsed(line: str, defaults: Mapping[str, Any]) -> _Line:
     return asked.model_copy(update={k: v for k, v in defaults.items() if k not in given})
 
 
-def _question(asked: _Line) -> Question:
-    targets = [*([] if asked.target is None else [asked.target]), *asked.targets]
-    return Question(
-        targets=tuple((x, y) for x, y in targets),
-        quiet=tuple((x, y) for x, y in asked.quiet),
-        level_db_sl=asked.level_db_sl,
-        drive_mode=asked.mode,
-        envelopes=asked.envelopes,
-        loads=tuple(asked.loads),
-    )
-
-
 def query_table(
     table: LocalizationTable,
     question: Question,
@@ -138,31 +127,40 @@ def query_as_json(table: LocalizationTable, question: Question, timing: Timing) 
         "is_imperceptible_to_quiet": pattern.is_imperceptible_to_quiet,
         "usable_level_db_sl": pattern.usable_level_db_sl,
         "ramp_s": pattern.ramp,
-        "onset": envelopes_as_json(pattern.onset, table),
-        "ending": envelopes_as_json(pattern.ending, table),
+        "onset": _envelopes_as_json(pattern.onset, table),
+        "ending": _envelopes_as_json(pattern.ending, table),
         "solve_time_s": elapsed,
     }
 
 
-def _answer_of_line(table: LocalizationTable, asked: _Line) -> dict[str, Any]:
-    """Answer the requests of a line; its loads are those of the quiet fingers."""
+def _answer_to(table: LocalizationTable, asked: _Line, timing: Timing) -> dict[str, Any]:
+    """Answer a line; with contents of their own its loads are those of the quiet fingers."""
+    quiet = tuple((x, y) for x, y in asked.quiet)
+    if not asked.own:
+        targets = [*([] if asked.target is None else [asked.target]), *asked.targets]
+        question = Question(
+            targets=tuple((x, y) for x, y in targets),
+            quiet=quiet,
+            level_db_sl=asked.level_db_sl,
+            drive_mode=asked.mode,
+            envelopes=asked.envelopes,
+            loads=tuple(asked.loads),
+        )
+        return query_as_json(table, question, timing)
     requests = []
     for each in asked.own:
         given = each.model_dump(exclude_none=True)
-        given["at"] = tuple(each.at)
-        if each.band_hz:
-            given["band_hz"] = tuple(each.band_hz)
-        requests.append(Request(**{"level_db_sl": asked.level_db_sl} | given))
-    loads = asked.loads or [1.0] * len(asked.quiet)
-    if len(loads) != len(asked.quiet):
+        pairs = {key: tuple(given[key]) for key in ("at", "band_hz") if key in given}
+        requests.append(Request(**{"level_db_sl": asked.level_db_sl} | given | pairs))
+    loads = asked.loads or [1.0] * len(quiet)
+    if len(loads) != len(quiet):
         raise InputError(
-            f"loads must have one value per quiet finger ({len(asked.quiet)}), got {len(loads)}"
+            f"loads must have one value per quiet finger ({len(quiet)}), got {len(loads)}"
         )
-    fingers = [Finger((x, y), load) for (x, y), load in zip(asked.quiet, loads, strict=True)]
     return answer_as_json(
         table,
         requests,
-        fingers,
+        [Finger(at, load) for at, load in zip(quiet, loads, strict=True)],
         apart_hz=asked.apart_hz,
         bands_may_swap=asked.bands_may_swap,
     )
@@ -222,14 +220,7 @@ def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-def prepared_timing(table: LocalizationTable) -> Timing:
-    """Solve what the timing of patterns needs at every frequency of a table."""
-    timing = Timing(table)
-    timing.prepare(table.frequencies.tolist())
-    return timing
-
-
-def envelopes_as_json(
+def _envelopes_as_json(
     envelopes: Envelopes | None, table: LocalizationTable
 ) -> dict[str, Any] | None:
     """Return level 0..1 of the stroke and phase at the start and at every knot, by ERA."""
@@ -251,6 +242,13 @@ def _as_level_and_phase(amplitude: complex, *, stroke: float) -> dict[str, float
     return {"level": abs(amplitude) / stroke, "phase_deg": math.degrees(cmath.phase(amplitude))}
 
 
+def query_line(table: LocalizationTable, line: str) -> dict[str, Any]:
+    """Answer one line of a batch. Raises InputError."""
+    asked = _parsed(line, {})
+    drive_mode = UNRESTRICTED if asked.own else asked.mode
+    return _answer_to(table, asked, _prepared_timing(table, drive_mode))
+
+
 def query_batch(
     table: LocalizationTable,
     lines: Iterable[str],
@@ -260,16 +258,18 @@ def query_batch(
 
     defaults: of keys that lines leave out.
     """
-    table.prepare(with_ringing=False)
-    timing = prepared_timing(table)
+    timing = _prepared_timing(table)
     for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
-        try:
-            asked = _parsed(line, defaults)
-            if asked.own:
-                yield _answer_of_line(table, asked)
-            else:
-                yield query_as_json(table, _question(asked), timing)
-        except InputError as error:
-            yield {"error": str(error), "line": number}
+        if line.strip():
+            try:
+                yield _answer_to(table, _parsed(line, defaults), timing)
+            except InputError as error:
+                yield {"error": str(error), "line": number}
+
+
+def _prepared_timing(table: LocalizationTable, drive_mode: str | None = None) -> Timing:
+    """Solve what answers and the timing of patterns need at every frequency of a table."""
+    table.prepare(drive_mode, with_ringing=False)
+    timing = Timing(table)
+    timing.prepare(table.frequencies.tolist())
+    return timing

@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from operator import itemgetter
 from types import MappingProxyType
 from typing import Protocol, TypeAlias
 
@@ -101,11 +100,9 @@ class Bench:
         ]
         for amplifier, sensing in zip(self.amplifiers.values(), self._sensing, strict=True):
             amplifier.attach(sensing)
-        # By ERA: what its channel plays, and what moves its base, later by the amplifier's delay;
-        # between them the changes that are on their way, by their time [s].
+        # By ERA: what its channel plays, and what moves its base, later by the amplifier's delay.
         self._wired = [rig.wiring[era.name] for era in rig.eras]
         self._commanded: list[Voices] = [()] * len(rig.eras)
-        self._delayed: list[tuple[float, int, Voices]] = []
         self._applied_outputs: list[Voices] = [()] * len(rig.eras)
         self._errors = [imperfections.errors_of(era.name, rig) for era in rig.eras]
         self._shapes_at = lru_cache(_MAX_SHAPES)(
@@ -263,8 +260,7 @@ class Bench:
         amplifiers = self.amplifiers.values()
         while True:
             events = [amplifier.next_event for amplifier in amplifiers]
-            changes = [moment for moment, _, _ in self._delayed[:1]]
-            moment = min([to_time, *events, *changes])
+            moment = min([to_time, *events])
             self._time = max(self._time, moment)
             for amplifier, event in zip(amplifiers, events, strict=True):
                 if event <= moment or amplifier.is_derated:
@@ -287,22 +283,22 @@ class Bench:
             if name not in self.observers
         }
 
-    def _sample_plate(self, until: float = math.inf) -> None:
-        """Advance the plate to a time [s] or the present one; solves what is unsolved by then."""
+    def _sample_plate(self, until: float = math.inf, *, solves: bool = True) -> None:
+        """Advance the plate to a time [s] or the present one.
+
+        solves: fingers that are unsolved by then; otherwise to the first of them.
+        """
         end = min(until, self._time)
         while self._placements and self._placements[0].time <= end and not self._is_sampling:
+            if not (solves or self._placements[0].is_solved):
+                end = self._placements[0].time
+                break
             self._place(self._placements.popleft())
         self._sample_until(end)
 
     def _sample_what_is_solved(self) -> None:
         """Advance the plate by a second at most, to a finger that is unsolved."""
-        end = min(self._time, self._sampled_until + _MAX_STEP)
-        while self._placements and self._placements[0].time <= end:
-            if not self._placements[0].is_solved:
-                end = self._placements[0].time
-                break
-            self._place(self._placements.popleft())
-        self._sample_until(end)
+        self._sample_plate(self._sampled_until + _MAX_STEP, solves=False)
 
     def _place(self, placement: Placement) -> None:
         """Advance the plate to the time of a placement, and put its fingers on it."""
@@ -356,21 +352,17 @@ class Bench:
             commanded = self._commanded[index]
             if playing is not commanded and playing != commanded:
                 self._commanded[index] = playing
-                delay = self.imperfections.delay(wired.amplifier)
-                late = delayed(playing, delay) if delay else playing
-                self._delayed.append((self._time + delay, index, late))
-        self._delayed.sort(key=itemgetter(0))
-        while self._delayed and self._delayed[0][0] <= self._time:
-            _, index, playing = self._delayed.pop(0)
-            self._apply(index, playing)
+                self._apply(index, playing)
         while self._played and self._played[0][1] < self._time - KEPT:
             self._played.popleft()
 
     def _apply(self, index: int, playing: Voices) -> None:
-        """Let an output move the base of an ERA from now on."""
-        self._plant.set_input(index, self._motion(index, playing), since=self._time)
-        self._played.append((self._applied_outputs[index], self._time))
-        self._applied_outputs[index] = playing
+        """Let an output move the base of an ERA, after its amplifier's delay."""
+        delay = self.imperfections.delay(self._wired[index].amplifier)
+        late, since = delayed(playing, delay) if delay else playing, self._time + delay
+        self._plant.set_input(index, self._motion(index, late), since=since)
+        self._played.append((self._applied_outputs[index], since))
+        self._applied_outputs[index] = late
 
     def _motion(self, index: int, playing: Voices) -> Motion:
         """The base motion of an ERA by the output of its channel, imperfections included."""

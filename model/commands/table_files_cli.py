@@ -75,7 +75,7 @@ def plot(
     output.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     files = []
-    with progress_bar("cells and contact sets") as progress:
+    with progress_bar("questions") as progress:
         overview = find_overview(table, progress=progress)
     for name, figure in table_figures(table, overview):
         path = output / f"{name}.{to.value}"

@@ -30,7 +30,7 @@ def show(
 
     table = load_table(table_file)
     started = time.perf_counter()
-    with progress_bar("cells and contact sets") as progress:
+    with progress_bar("questions") as progress:
         overview = find_overview(table, progress=progress)
     summary, cells = summarize(table, overview), overview.cells
     elapsed = time.perf_counter() - started

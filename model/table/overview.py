@@ -1,8 +1,8 @@
 """What a table reaches: cells of its map, felt contrast of random contacts, their summary."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,12 +14,12 @@ from model.table.question import Question
 from model.table.random_contacts import random_contacts
 from model.table.table import LocalizationTable
 from model.table.weak_cells import (
-    Ask,
     Contrasts,
     WeakCells,
     ask_once,
+    contrasts_reached,
     find_weak_cells,
-    map_grid,
+    pair_questions,
     sampling_error,
 )
 
@@ -45,55 +45,30 @@ def find_overview(
 ) -> Overview:
     """Query a table for its map and its contact sets; takes a second, five with sixteen ERAs.
 
-    progress: called with the number of finished cells and sets, and the total.
+    progress: called with the number of answered questions, and the total.
     """
-    ask, cells = ask_once(table), map_grid(table).cell_count
-    total = cells + 2 * CONTACT_SETS
-    found = find_weak_cells(table, ask=ask, progress=lambda done, _: progress(done, total))
-    rng = np.random.default_rng(0)
-    contrasts = [found.pairs_db]
-    for others in (2, 3):
-        before = cells + (others - 2) * CONTACT_SETS
-        report = partial(_report_sets, progress, before=before, total=total)
-        contrasts.append(
-            contrast_distribution(table, others=others, rng=rng, ask=ask, progress=report)
-        )
-    return Overview(found, contrasts)
+    rng, ask, answered = np.random.default_rng(0), ask_once(table), list[list[Contrasts | None]]()
+    cells = pair_questions(table)
+    groups = [*cells, *(set_questions(table, others=others, rng=rng) for others in (2, 3))]
+    total = sum(map(len, groups))
+    for group in groups:
+        answered.append([*map(ask, group)])
+        progress(sum(map(len, answered)), total)
+    weak = find_weak_cells(table, answered[: len(cells)])
+    sets = [contrasts_reached(each) for each in answered[len(cells) :]]
+    return Overview(weak, [weak.pairs_db, *sets])
 
 
-def _report_sets(
-    progress: Callable[[int, int], None], done: int, *, before: int, total: int
-) -> None:
-    progress(before + done, total)
-
-
-def contrast_distribution(
-    table: LocalizationTable,
-    *,
-    others: int,
-    rng: np.random.Generator,
-    ask: Ask | None = None,
-    progress: Callable[[int], None] = lambda done: None,
-) -> FloatArray:
-    """Robust and nominal felt contrast [dB] of random contact sets, (2, up to CONTACT_SETS).
-
-    Sets with an unreachable target are left out, and all on a plate too small for them. ask:
-    answers questions, `ask_once` by default; progress: called with the number of finished sets.
-    """
-    ask = ask or ask_once(table)
-    contrasts: list[Contrasts] = []
-    for _ in range(2 * CONTACT_SETS):
-        try:
+def set_questions(
+    table: LocalizationTable, *, others: int, rng: np.random.Generator
+) -> list[Question]:
+    """Questions with fingers at random, one the target; none on a plate too small for them."""
+    found: list[Question] = []
+    with suppress(InputError):
+        for _ in range(CONTACT_SETS):
             contacts = random_contacts(rng, others + 1, table.plate, tries=50 * CONTACT_SETS)
-        except InputError:
-            break
-        found = ask(Question(contacts[:1], contacts[1:]))
-        if found is not None:
-            contrasts.append(found)
-        progress(len(contrasts))
-        if len(contrasts) == CONTACT_SETS:
-            break
-    return np.array(contrasts, dtype=float).reshape(-1, 2).T
+            found.append(Question(contacts[:1], contacts[1:]))
+    return found
 
 
 def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -109,34 +110,26 @@ def map_grid(table: LocalizationTable) -> Grid:
 
 
 def find_weak_cells(
-    table: LocalizationTable,
-    *,
-    ask: Ask | None = None,
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    table: LocalizationTable, answered: Sequence[Sequence[Contrasts | None]]
 ) -> WeakCells:
-    """Query the table for each cell of `map_grid` in its default drive mode.
-
-    ask: answers questions, `ask_once` by default; progress: called with the number of finished
-    cells and the total.
-    """
+    """The map, of what `pair_questions` have been answered, cell by cell."""
     grid = map_grid(table)
-    centres = grid.centres(table.plate)
-    found, errors = np.full((2, 2, len(centres)), np.nan)
-    ask = ask or ask_once(table)
-    pairs: list[Contrasts] = []
-    for cell, questions in enumerate(pair_questions(table)):
-        answered = list(map(ask, questions))
-        pairs += filter(None, answered)
+    found, errors = np.full((2, 2, len(answered)), np.nan)
+    for cell, answers in enumerate(answered):
         # -inf where the level is not reached.
-        contrasts = [-np.inf if each is None else each[0] for each in answered]
+        contrasts = [-np.inf if each is None else each[0] for each in answers]
         if contrasts:
             # A sample with -inf cannot be interpolated.
             found[:, cell] = np.percentile(contrasts, [50, 10], method="inverted_cdf")
             errors[:, cell] = [sampling_error(contrasts, percent) for percent in (50, 10)]
-        progress(cell + 1, len(centres))
+    pairs = contrasts_reached(chain.from_iterable(answered))
     median, tenth = found
-    values = np.array(pairs, dtype=float).reshape(-1, 2).T
-    return WeakCells(grid, centres, median, tenth, errors, values)
+    return WeakCells(grid, grid.centres(table.plate), median, tenth, errors, pairs)
+
+
+def contrasts_reached(answered: Iterable[Contrasts | None]) -> FloatArray:
+    """Robust and nominal felt contrast [dB] of answers that reach the level, (2, answers)."""
+    return np.array([*filter(None, answered)], dtype=float).reshape(-1, 2).T
 
 
 def pair_questions(table: LocalizationTable) -> list[list[Question]]:

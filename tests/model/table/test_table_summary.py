@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -12,14 +13,15 @@ from model.table.build import build_table
 from model.table.overview import (
     CONTACT_SETS,
     Overview,
-    contrast_distribution,
     find_overview,
+    set_questions,
     summarize,
 )
 from model.table.question import Question
 from model.table.weak_cells import (
     WeakCells,
     ask_once,
+    contrasts_reached,
     find_weak_cells,
     map_grid,
     pair_questions,
@@ -38,7 +40,7 @@ def table():
 
 def test_weak_cells_of_a_symmetric_plate_are_symmetric(table):
     """Cells that mirror each other have the same contrast, to the noise of the drawn plates."""
-    weak = find_weak_cells(table)
+    weak = find_overview(table).cells
     for values in (weak.median_db, weak.tenth_db):
         rows = values.reshape(3, 4)
         assert np.abs(rows - rows[:, ::-1]).mean() < 0.7
@@ -63,7 +65,7 @@ def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
         drawn.setdefault(target, []).append(float(rng.uniform(0, 30)))
         return drawn[target][-1], 0.0
 
-    weak = find_weak_cells(table, ask=at_random)
+    weak = find_weak_cells(table, [[*map(at_random, each)] for each in pair_questions(table)])
     assert len(drawn) == len(weak.centres) == 12
     for values, share in ((weak.median_db, 0.5), (weak.tenth_db, 0.1)):
         for value, contrasts in zip(values, drawn.values(), strict=True):
@@ -177,7 +179,7 @@ def test_weak_cells_are_not_feasible_when_only_19_db_sl_are_reached(table):
     """The map is at 20 dB SL, which no pattern reaches with these strokes."""
     weaker = with_strokes(table, 10 ** ((19.0 - table.available_level_db_sl.max()) / 20))
     assert weaker.available_level_db_sl.max() == pytest.approx(19.0, abs=0.01)
-    weak = find_weak_cells(weaker)
+    weak = find_overview(weaker).cells
     assert np.isneginf(weak.median_db).all()
     assert not weak.feasible.any()
 
@@ -209,29 +211,17 @@ def test_summary_counts_levels_and_shares(table):
 
 
 @pytest.mark.parametrize("others", [1, 3])
-def test_contrast_distribution_uses_fingers_apart(table, others):
-    """A number of sets at least 5 cm apart; where no target is reached it ends at twice that."""
-    asked = []
+def test_contact_sets_are_of_fingers_apart(table, others):
+    """As many sets as are wanted, all at least 5 cm apart, no two alike."""
+    questions = set_questions(table, others=others, rng=np.random.default_rng(1))
+    assert len({question.contacts for question in questions}) == CONTACT_SETS
+    for question in questions:
+        assert len(question.quiet) == others
+        for one, other in combinations(question.contacts, 2):
+            assert math.dist(one, other) >= 0.05
 
-    def answer(question):
-        asked.append(np.array([*question.targets, *question.quiet]))
-        return len(asked), len(asked) + 3
 
-    def refuse(question):
-        answer(question)
-
-    found, none = (
-        contrast_distribution(
-            table,
-            others=others,
-            rng=np.random.default_rng(1),
-            ask=each,
-        )
-        for each in (answer, refuse)
-    )
-    assert found.tolist() == [list(range(1, CONTACT_SETS + 1)), list(range(4, CONTACT_SETS + 4))]
-    assert (none.shape, len(asked)) == ((2, 0), 3 * CONTACT_SETS)
-    for contacts in asked:
-        assert contacts.shape == (others + 1, 2)
-        gaps = np.linalg.norm(contacts[:, None] - contacts, axis=-1)
-        assert gaps[np.triu_indices(others + 1, 1)].min() >= 0.05
+def test_sets_that_miss_the_level_are_left_out():
+    """Of three answers the one without contrast."""
+    assert contrasts_reached([(1.0, 2.0), None, (3.0, 4.0)]).tolist() == [[1, 3], [2, 4]]
+    assert contrasts_reached([None]).shape == (2, 0)

@@ -49,13 +49,20 @@ def calibrate(
     check_enough_sensors(alive, responses)
     values = responses.values[:, :, alive].copy()
     values[:, dead_eras] = np.nan
+    plate = sensed_plate(rig, responses.points[alive], responses.frequencies, has_form=True)
+    part, z = Problem.of(plate, values), np.zeros(plate.model.space.size)
+    z[plate.numbers] = screened.start
+    start = start_at(part, z)
+    # One that is elsewhere, or has come loose.
+    heard = start.used.sum(axis=(0, 1)) > np.isfinite(values).sum(axis=(0, 1)) / 2
+    if not heard.all():
+        alive[alive] = heard
+        check_enough_sensors(alive, responses)
+        part, start = part.at(heard), start.at(heard, plate.model.space)
     points = responses.points[alive]
-    plate = sensed_plate(rig, points, responses.frequencies, has_form=True)
-    part, start = Problem.of(plate, values), np.zeros(plate.model.space.size)
-    start[plate.numbers] = screened.start
 
     # All scales are free at first, so that a wrong one does not bias the fit.
-    fit = solve(part, start_at(part, start))
+    fit = solve(part, start)
     free_scales = part.free_scales
     if not all_scales:
         scales = _relative(part.scales(fit.z))

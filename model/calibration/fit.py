@@ -160,19 +160,20 @@ def start_at(problem: Problem, z: FloatArray) -> Start:
     """Scales of sensors, outliers and noise by the plate at z (p,)."""
     values, model = problem.values, problem.plate.responses(z)
     used, scales = np.isfinite(values), np.ones(values.shape[2])
+    heard = used.any(axis=(0, 1))
     for _ in range(_ROUNDS):
         weight = used / row_rms(values, used)[:, :, None]
         gains, _ = project_gains(scales * model, values, weight)
         predicted = np.nan_to_num(gains)[:, :, None] * model
         share = np.divide(values, predicted, out=np.full_like(values, np.nan), where=used)
-        scales = np.nanmedian(share.real, axis=(0, 1))
+        scales[heard] = np.nanmedian(share.real[:, :, heard], axis=(0, 1))
         scales = scales / np.median(scales)
         raw = np.abs(values - scales * predicted)
         noise = _noise_of(values, raw, used)
         kept = _without_worst(raw / noise[:, :, None], used)
         if (kept == used).all():
             break
-        used = kept
+        used, heard = kept, kept.any(axis=(0, 1))
     return Start(problem.at_scales(z, scales), noise, used)
 
 

@@ -121,6 +121,19 @@ def test_calibrate_finds_a_dead_era_despite_gaps_and_outliers(rig, truth):
     )
 
 
+def test_calibrate_leaves_out_a_sensor_that_is_elsewhere(rig: Rig, truth: Rig) -> None:
+    """P6 stands beside P1, so that it reads what that one does: the others find the plate."""
+    clean = measured(truth)
+    values = clean.values.copy()
+    values[:, :, NAMES.index("P6")] = 1.05 * values[:, :, NAMES.index("P1")]
+    found = calibrated(rig, replace(clean, values=values))
+    assert found.dead_sensors == ("P6",)
+    assert found.outlier_count == 0
+    np.testing.assert_allclose(
+        [one.value for one in found.parameters], true_values(truth), rtol=0.02
+    )
+
+
 def test_calibrate_keeps_what_is_not_identified(rig):
     """From 40 to 44 Hz springs outweigh bolts and dampers: these are kept and reported."""
     frequencies = np.linspace(40.0, 44.0, 4)

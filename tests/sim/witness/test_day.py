@@ -36,7 +36,7 @@ def play_group(
     return witness.finish(), witness.frames
 
 
-@pytest.mark.parametrize("seed", shortly(range(12), [1, 7, 11]))
+@pytest.mark.parametrize("seed", shortly((*range(8), 11), [1, 7, 11]))
 @pytest.mark.parametrize(("kind", "lines"), in_turn(KINDS, [*LINES]))
 def test_witness_finds_nothing_in_random_days(kind: str, lines: str, seed: int) -> None:
     """Layers, stops, disarms, faults, and watchdogs that expire, heard at the amplifiers' end."""

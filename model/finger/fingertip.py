@@ -37,15 +37,13 @@ class DiscRule:
         contain. Points outside move to the nearest place inside and weigh nothing; the weights of
         the others make the mean of linear functions exact.
         """
-        shape = (*self.weights.shape[:-1], len(low), len(self.points))
-        weights = np.broadcast_to(self.weights[..., None, :], shape)
+        weights = self.weights[..., None, :].repeat(len(low), axis=-2)
         if low.max() <= -1 and high.min() >= 1:
-            return np.broadcast_to(self.points, (len(low), *self.points.shape)), weights
+            return self.points[None].repeat(len(low), axis=0), weights
         inside = np.minimum(np.maximum(self.points, low[:, None]), high[:, None])
         is_kept = (inside == self.points).all(axis=2)
         is_cut = ~is_kept.all(axis=1)
         if is_cut.any():
-            weights = weights.copy()
             weights[..., is_cut, :] = self._refit(is_kept[is_cut], low[is_cut], high[is_cut])
         return inside, weights
 

@@ -101,11 +101,16 @@ class Raster:
         side_x, side_y = np.minimum(np.maximum(PATCH, wide), count).tolist()
         return side_x, side_y
 
-    @property
+    @cached_property
     def _points(self) -> tuple[IntArray, FloatArray]:
         """Number of points along x and y, and their spacing [m]."""
         count = np.array([self.nx, self.ny])
         return count, np.array([self.length, self.width]) / (count - 1)
+
+    @cached_property
+    def _side(self) -> IntArray:
+        """The same of a patch."""
+        return np.array(self.patch)
 
     @cached_property
     def _patch_index(self) -> IntArray:
@@ -131,7 +136,7 @@ class Raster:
 
         (k, patch) and (k, p, patch).
         """
-        (count, spacing), side = self._points, np.array(self.patch)
+        (count, spacing), side = self._points, self._side
         start = np.rint(centres / spacing - (side - 1) / 2).astype(int)
         start = np.minimum(np.maximum(start, 0), count - side)
         local = (points / spacing - start[:, None]) * (2 / (side - 1)) - 1

@@ -106,7 +106,7 @@ class PlateInTime:
     def with_phalanges(self, shapes: FloatArray) -> FloatArray:
         """Shapes (p, r) of all coordinates, from those of the reduced plate's, which come first."""
         phalanges = len(self.vectors) // 2 - shapes.shape[1]
-        return np.hstack([shapes, np.zeros((len(shapes), phalanges))])
+        return np.pad(shapes, ((0, 0), (0, phalanges))) if phalanges else shapes
 
     @cached_property
     def displacement(self) -> ComplexArray:

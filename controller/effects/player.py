@@ -96,9 +96,10 @@ class EffectPlayer:
         ]
         clicking = {target.key for target in targets if target.is_short}
         self._waiting = {key: self._waiting[key] for key in self._waiting if key in clicking}
+        now_felt = tuple([each for each in targets if not self._waits(each, now, ends)])
         return HapticIntent(
-            tuple(target for target in targets if not self._waits(target, now, ends)),
-            self._reason,
+            now_felt,
+            "" if now_felt else self._reason,
             until=min(ends, default=None),
             protected=frozenset(
                 key

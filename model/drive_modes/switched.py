@@ -48,7 +48,7 @@ def find_switched(forms: Forms) -> list[tuple[float, Drive]]:
         some = np.sort(order[:count])  # a partition's own order is another one elsewhere
         pair, first, second = np.unravel_index(some, bounds.shape)
         tones = np.array([[first, one[pair]], [second, other[pair]]])
-        score = _scores(forms, powers, *tones)
+        score = np.where(bound[some] < 0, 0, _scores(forms, powers, *tones))
         best = best_few(score, ALTERNATIVES)
         if count >= len(bound) or score[best[-1]] >= bound[order[count]]:
             break

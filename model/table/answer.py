@@ -203,10 +203,15 @@ class _Answering:
 
 def is_out_of_bounds(found: Answer) -> bool:
     """Whether a finger has less contrast, or more of others' contents, than it allows."""
-    streams, contrast = found.contents.streams, found.tones.contrast_db
-    targets = [finger for stream in streams for finger in stream.targets]
-    is_low = [contrast[each][2] < found.requests[each].min_contrast_db for each in targets]
-    return (len(streams) > 1 and any(is_low)) or bool(disturbed_fingers(found))
+    is_one_of_many = len(found.contents.streams) > 1  # one alone cannot give way to others
+    return (is_one_of_many and lacks_contrast(found)) or bool(disturbed_fingers(found))
+
+
+def lacks_contrast(found: Answer) -> bool:
+    """Whether a finger has less contrast to others' contents than its request asks for."""
+    targets = [finger for stream in found.contents.streams for finger in stream.targets]
+    contrast, requests = found.tones.contrast_db, found.requests
+    return any(contrast[each][2] < requests[each].min_contrast_db for each in targets)
 
 
 def disturbed_fingers(found: Answer) -> list[int]:

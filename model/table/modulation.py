@@ -15,7 +15,7 @@ import numpy as np
 from model.arrays import FloatArray, IntArray
 from model.choice import best_of
 from model.finger.perception import decibels
-from model.table.answer import is_out_of_bounds
+from model.table.answer import disturbed_fingers, lacks_contrast
 from model.table.contents import Stream, Tones
 from model.table.contents_kernel import choose_tones
 from model.table.fingers_on_plate import FingersOnPlate
@@ -97,7 +97,7 @@ def _is_served(found: Answer, steady: Answer) -> bool:
     worst, before = found.promised_worst_db, steady.promised_worst_db
     if worst is not None and before is not None and worst < min(MIN_CONTRAST_DB, before):
         return False
-    return not is_out_of_bounds(found)
+    return not (lacks_contrast(found) or disturbed_fingers(found))
 
 
 def _carriers(table: LocalizationTable, steady: int, modulation: float) -> Iterator[list[int]]:

@@ -126,6 +126,18 @@ def test_a_modulation_is_left_out_where_a_finger_would_feel_too_much(table):
     assert with_modulation(table, found, [30.0]) == found
 
 
+def test_a_modulation_is_left_out_where_its_own_finger_would_have_too_little_contrast(table):
+    """A content alone, beside a quiet finger, that asks for what it has steady, less 0.1 dB."""
+    request, quiet = Request((0.126, 0.081), level_db_sl=12.0), Finger((0.234, 0.049))
+    plain = answer(table, [request], [quiet])
+    modulated = with_modulation(table, plain, [20.0])
+    assert modulated.layers[0].side_bands
+    assert modulated.promised_worst_db < plain.promised_worst_db - 0.1
+    asks = (replace(request, min_contrast_db=plain.promised_worst_db - 0.1),)
+    steady = replace(plain, requests=asks)
+    assert with_modulation(table, steady, [20.0]) is steady
+
+
 def test_fingers_that_share_or_are_held_back_feel_side_bands_too(table):
     """What they say of others' contents nine of ten unseen plates keep; their bounds hold."""
     shares = [

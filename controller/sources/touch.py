@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 from urllib.parse import parse_qsl
 
-import numpy as np
-
 from model.errors import InputError
 from model.structure.plate import Plate
 from registry.plugins import Derived, PluginRegistry
@@ -147,6 +145,8 @@ def fitted(touched: Sequence[Point], positions: Sequence[Point], plate: Plate) -
     touched: sensor coordinates 0..1; positions: on the plate [m] from its south-west corner, y
     upwards. Raises InputError for points on a line or residuals above 5 mm.
     """
+    import numpy as np  # a source without a calibration does not need it
+
     expected = np.array([(x / plate.length, 1 - y / plate.width) for x, y in positions])
     measured = np.column_stack((np.array(touched, dtype=float), np.ones(len(touched))))
     solution = np.linalg.lstsq(measured, expected, rcond=None)[0]

@@ -20,7 +20,8 @@ from drivers.protocol.table import QUANTITIES, SHORTENED_FADE
 _STEP = QUANTITIES["envelope_step"]
 _PER_FULL, _PER_DEGREE = QUANTITIES["level"].per_unit, QUANTITIES["phase"].per_unit
 _PER_HERTZ = QUANTITIES["frequency"].per_unit
-_SAME = 1e-6  # s; ends nearer than that are one, so that rounding decides nothing
+SAME = 1e-6
+"""Ends of fades that are nearer than that are one, so that rounding decides nothing [s]."""
 
 
 @lru_cache(maxsize=256)  # of a set's command asked for by its limits, its playback and its commit
@@ -173,7 +174,7 @@ class Voice:
         uncertainty [s]: see `Playback`.
         """
         transition, end = self.transition, time + ramp
-        if transition.last or transition.end > end + _SAME:
+        if transition.last or transition.end > end + SAME:
             is_over = time - uncertainty >= transition.end
             first = transition.last if is_over else transition.reached(time, uncertainty)
             transition = Transition(time, ramp, first, 0j, end)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from drivers.playback import Playback
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import QUANTITIES
-from drivers.voices import Transition, Voice, along, peak_of, steepest, voices_after
+from drivers.voices import SAME, Transition, Voice, along, peak_of, steepest, voices_after
 
 _PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
 _SILENCE: Sequence[complex] = (0j,)
@@ -72,6 +72,11 @@ class Bounds:
             if old is not None:
                 starts = old.transition.points(self._since)
                 is_new = old.transition is not voice.transition
+                # One that falls silent by itself goes on if it is silent before a fade would end.
+                latest = voice.transition.end + self._half + SAME
+                is_fading = is_new and voice.has_ended and not voice.transition.knots
+                if is_fading and not old.transition.last and old.transition.end <= latest:
+                    voice, is_new = old, False
                 sets = _NONE if old.has_ended else sets
             courses.append(_Course(voice, starts, sets, is_new))
         return courses

@@ -127,6 +127,16 @@ SHAPED = Layer(0, (tone(level=0.2, onset=Envelope(100, ((1000, 0), (2000, 0)))),
 SWELLING = tone(level=0.05, onset=Envelope(500, ((500, 0),)))
 ENDING = tone(level=0.1, ending=Envelope(100, ((8000, 0),)))
 
+# Silent for 100 ms, at 0.9 after 120 and silent again after 140; such that it plays amid a ramp.
+PULSE = tone(level=0.0, onset=Envelope(200, ((0, 0),) * 5 + ((9000, 0),)))
+
+
+def sudden(level: float) -> Layer:
+    """A layer whose tone is there within 2 ms, while what it replaces fades for 60 ms."""
+    shape = Envelope(10, ((round(10_000 * level), 0),))
+    return Layer(0, (HIGH(level=level, onset=shape),), ramp=0.06)
+
+
 LOUD_END = tone(0, 1.0, 200.0, ending=Envelope(100, ((10000, 0),) * 10))
 COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
     # 0.6 in one layer leaves 0.4 for another; once it has faded, 0.9 is admitted.
@@ -179,6 +189,16 @@ COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
             plays(0.0, Layer(0, (tone(0, 1.0),))),
             refused(1.0, Layer(0, (LOUD_END,), ramp=1.0, valid_for=0.001)),
             Asked(1.0, Layer(0, (tone(0, 1.0, 200.0),), ramp=1.0, valid_for=0.001)),
+        ],
+    ),
+    # A set that comes after 80 ms or later lets a pulse go on, which ends before its ramp does.
+    "a pulse that ends before a ramp": (
+        WIDE,
+        [
+            plays(0.0, Layer(0, (PULSE,))),
+            refused(0.0, sudden(0.9)),
+            Asked(0.0, sudden(0.1)),
+            Asked(0.15, sudden(0.9)),
         ],
     ),
     # 0.5 in two layers of one channel: 1, in two channels: a half.

@@ -194,7 +194,7 @@ def _cell(value: float | None, unit: str = "") -> str:
 def _usable(answer: dict[str, Any]) -> str:
     """The unit of the level that leaves quiet fingers at -10, judged up to the level that plays."""
     is_bound = answer["usable_level_db_sl"] >= answer["level_db_sl"]
-    return "dB SL or more" if is_bound else "dB SL"
+    return "dB SL nominal or more" if is_bound else "dB SL nominal"
 
 
 def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> None:

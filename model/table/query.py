@@ -75,6 +75,8 @@ def _parsed(line: str, defaults: Mapping[str, Any]) -> _Line:
     if others := given & (_OF_TARGETS if asked.own else _OF_OWN):
         without = "without" if asked.own else "with"
         raise InputError(f"{', '.join(sorted(others))} must be given {without} own")
+    if {"target", "targets"} <= given:
+        raise InputError("target must be given without targets; name all of them there")
     return asked.model_copy(update={k: v for k, v in defaults.items() if k not in given})
 
 

@@ -44,6 +44,7 @@ BAD_LINES = {
     '{"target": [0.1]}': "target",
     '{"target": [0.1, 0.1], "loud": 3}': "loud",
     '{"target": [0.1, "x"]}': "target.1",
+    '{"target": [0.1, 0.1], "targets": [[0.2, 0.1]]}': "target must be given without targets",
     "{}": "at least one target",
 }
 

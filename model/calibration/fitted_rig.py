@@ -154,7 +154,7 @@ def uncertainty_of(
         phase_deg=_rounded(phase_deg),
         thickness=_rounded(min(rms("modulus") / 2, 0.03)) if known["modulus"] else before.thickness,
         stiffness=_rounded(min(rms("stiffness"), 0.5)) if known["stiffness"] else before.stiffness,
-        damping=1 + _rounded(min(math.exp(losses), 4.0) - 1),
+        damping=1 + _rounded(math.exp(min(losses, math.log(4.0))) - 1),
     )
 
 

@@ -78,6 +78,10 @@ def query(
         }
         _query_batch(table_file, batch, defaults)
         return
+    if swap_bands and not own:
+        raise InputError("--swap-bands must be given with --own")
+    if own and (target or drive_mode or envelopes):
+        raise InputError("--own must be given without --target, --mode and --envelopes")
     if not (target or own):
         raise InputError(
             "targets must be at least one, got none; give --target X,Y or --own X,Y, metres, or "

@@ -218,6 +218,12 @@ class Playback:
         """Sets of layers that start when onsets have ended."""
         return tuple([layer.waiting[1] for layer in self._layers.values() if layer.waiting])
 
+    def next_tokens(self, layer: int) -> set[int]:
+        """Return the tokens that a layer may have now, or once what is due of it has happened."""
+        known = self._layers.get(layer)
+        waiting = () if known is None or known.waiting is None else known.waiting[2:]
+        return {0, self.tokens.get(layer, 0), *waiting}
+
     @property
     def silent_from(self) -> float:
         """Time from which every channel is silent [s]; infinite while a tone lasts."""

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from drivers.expected.achieved import Problem, achieved_problem
-from drivers.expected.outputs import ExpectedOutputs, Report, Unclear
+from drivers.expected.outputs import ExpectedOutputs, Report, Unclear, one_of
 from drivers.expected.sets import ExpectedSet
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token, token_after
@@ -397,19 +397,23 @@ class ExpectedAmplifier:
     def _check_achieved(self, number: int, reply: Values, when: Interval) -> None:
         """Compare what a layer plays with what it must."""
         outputs = self.outputs
-        if number not in outputs.sure(when):
+        if not (sure := outputs.sure(when)):
             return
-        playing = outputs.playback.playing(number)
-        token = outputs.playback.tokens.get(number, 0)
-        can_scale = outputs.may_derate or not outputs.is_exact
-        problem: Problem | None = ("token", "token", token, reply["token"])
-        if reply["token"] == token:
+        possible = outputs.tokens_of(number, sure)
+        problem: Problem | None = None
+        if reply["token"] not in possible:
+            problem = "token", "token", one_of(possible), reply["token"]
+        elif number in sure:
             problem = achieved_problem(
-                playing, reply, self.can, is_exact=outputs.is_exact, can_scale=can_scale
+                outputs.playback.playing(number),
+                reply,
+                self.can,
+                is_exact=outputs.is_exact,
+                can_scale=outputs.may_derate or not outputs.is_exact,
             )
-        lasting = outputs.lasting.get(number, {0})
-        if problem is None and reply["commands"] and reply["valid_for"] not in lasting:
-            problem = "plays", "valid_for", sorted(lasting), reply["valid_for"]
+            lasting = outputs.lasting.get(number, {0})
+            if problem is None and reply["commands"] and reply["valid_for"] not in lasting:
+                problem = "plays", "valid_for", sorted(lasting), reply["valid_for"]
         if problem is not None:
             rule, what, must, seen = problem
             report = self.report if reply["commands"] else self.report_silence

@@ -5,7 +5,7 @@ asked of `drivers.uncertain_playback`.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Protocol, TypeAlias
 
 from drivers.playback import Playback, playback_of
@@ -154,6 +154,12 @@ class ExpectedOutputs:
         is_known = max(self._unknown) < start
         return _ALL_LAYERS - self._plays.unsure(start, end) if is_known else set()
 
+    def tokens_of(self, layer: int, sure: set[int]) -> set[int]:
+        """Return the tokens that a layer may show; sure: layers of which it is known."""
+        if layer in sure:
+            return {self.playback.tokens.get(layer, 0)}
+        return self.playback.next_tokens(layer)
+
     def waits(self, when: Interval) -> bool:
         """Whether a set surely waits for the end of an onset, whenever within an interval."""
         return self.sure(when) == _ALL_LAYERS and bool(self.playback.waiting)
@@ -176,10 +182,10 @@ class ExpectedOutputs:
         if sure := self.sure(when):
             low = self._check_levels(levels, when, self._report)
             for layer, token in enumerate(tokens):
-                must = self.playback.tokens.get(layer, 0)
-                if layer in sure and token != must:
+                possible = self.tokens_of(layer, sure)
+                if token not in possible:
                     what = f"token of layer {layer}, {self._since(when)}"
-                    self._report("token", when[1], what, must=must, seen=token)
+                    self._report("token", when[1], what, must=one_of(possible), seen=token)
             is_limited = bool(shown["flags"] >> STATUS_FLAGS["limited"] & 1)
             is_beyond = low > 1 + _TOLERANCE + 2 * self._half_step
             must_be = is_beyond and self.is_exact and not self.may_derate
@@ -218,9 +224,7 @@ class ExpectedOutputs:
             is_settled = all(each.transition.end < time - lag for each in voices)
             if lasting and is_settled and all(abs(each - frequency) > _FINE for each in lasting):
                 what = f"frequency of channel {channel}"
-                self._report(
-                    "plays", time, what, must=" or ".join(map(str, lasting)), seen=frequency
-                )
+                self._report("plays", time, what, must=one_of(lasting), seen=frequency)
 
     def _check_levels(
         self, levels: Sequence[float], when: Interval, report_low: Report | None
@@ -257,3 +261,8 @@ class ExpectedOutputs:
             return "silent"
         before = self._before[channel] if channel < len(self._before) else 0.0
         return "commit" if abs(level - before) < _TOLERANCE else "plays"
+
+
+def one_of(known: Iterable[object]) -> str:
+    """Return what something must be: one of some values."""
+    return " or ".join(map(str, known))

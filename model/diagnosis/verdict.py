@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.calibration_screening import LEAST_SENSORS
+from model.calibration.calibration_screening import LEAST_SENSORS, check_enough_sensors
 from model.calibration.responses import Responses
 from model.calibration.sensed_plate import SensedPlate, sensed_plate
 from model.choice import best_by
@@ -108,6 +108,7 @@ def diagnose(
     """
     if not observation.measured.any():
         raise InputError("no channel was driven; drive each in turn and measure again")
+    check_enough_sensors(np.ones(len(observation.sensors), dtype=bool), observation)
     if len(observation.frequencies) < _LEAST_FREQUENCIES:
         raise InputError(
             f"a diagnosis needs at least {_LEAST_FREQUENCIES} frequencies, got "

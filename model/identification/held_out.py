@@ -52,10 +52,9 @@ def hold_out(fitted: Fitted) -> HeldOut | None:
         unseen = measurement.known & (folds == fold)
         if not unseen.any():
             continue
-        part = measurement.part(folds != fold)
-        if not part.known.any():
+        if (unseen == measurement.known).all():
             return None
-        shown = Problem(model, part)
+        shown = Problem(model, measurement.part(folds != fold))
         found = solve(shown, fitted.best.x, fitted.space.uncertain, evaluations=_EVALUATIONS)
         fits.append(found.x)
         plate = model.at(found.x)

@@ -54,6 +54,16 @@ class Measurement:
     at_end: tuple[Repeat, ...] = ()
     drives_lag: bool = False
 
+    def __post_init__(self) -> None:
+        """Refuse values without an error, none at all, and frequencies in another order."""
+        if not (np.diff(self.frequencies) > 0).all():
+            raise InputError("measurement: frequencies must ascend, each once")
+        if not self.known.any():
+            raise InputError("a measurement must have values, got none")
+        std = self.std[self.known]
+        if not (std > 0).all() or not np.isfinite(std).all():
+            raise InputError(f"measurement: std must be above zero, got {std.min():g}")
+
     @classmethod
     def of(
         cls,
@@ -77,7 +87,7 @@ class Measurement:
     @cached_property
     def known(self) -> NDArray[np.bool_]:
         """Which responses were measured, (f, s, n)."""
-        return np.isfinite(self.values) & (self.std > 0)
+        return np.isfinite(self.values)
 
     @property
     def count(self) -> int:

@@ -227,6 +227,20 @@ def test_plate_that_is_not_linear_or_drifts_is_refused(
             repeated.check()
 
 
+def test_values_without_an_error_and_frequencies_in_another_order_are_refused(
+    measurement: Measurement,
+) -> None:
+    """A sensor that reads exactly nothing has neither; so has a measurement without values."""
+    silent = np.where(np.arange(measurement.values.shape[1])[:, None] == 1, 0, measurement.values)
+    for values, frequencies in (
+        (silent, FREQUENCIES),
+        (np.full_like(measurement.values, np.nan), FREQUENCIES),
+        (measurement.values, FREQUENCIES[::-1]),
+    ):
+        with pytest.raises(InputError):
+            Measurement.of(measurement.sensors, frequencies, values)
+
+
 @pytest.mark.long
 def test_plate_of_another_kind_is_not_explained(rig: Rig, measurement: Measurement) -> None:
     """A sensor whose phases are conjugated leaves chi² beyond what promises anything."""

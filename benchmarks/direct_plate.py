@@ -4,9 +4,8 @@ Of polynomials it is `model.spectral.direct`; of finite elements one sparse fact
 frequency.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import TypeAlias
 
 import numpy as np
 from scipy import sparse
@@ -14,7 +13,7 @@ from scipy import sparse
 from model.arrays import ComplexArray, FloatArray
 from model.fem.mesh import Mesh
 from model.fem.plate import PlateMatrices, assemble, factorise
-from model.spectral.direct import direct_spectral_acceleration
+from model.spectral.direct import Responder, direct_spectral_acceleration
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import (
     Era,
@@ -25,12 +24,6 @@ from model.structure.attachments import (
 )
 from model.structure.modal_elasticity import loss_factors
 from model.structure.plate import Plate
-
-Responder: TypeAlias = Callable[..., ComplexArray]
-"""Acceleration [m/s²] of each ERA alone at full stroke, (f, eras, p).
-
-Of ERAs, frequencies (f,) [Hz], points (p, 2) [m], and loads by name.
-"""
 
 
 def direct_responder(plate: Plate, mesh: PlateMesh) -> Responder:

@@ -5,7 +5,8 @@ the frequency at hand, and the compliance that polynomials do not resolve is add
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -29,6 +30,12 @@ from model.structure.footprint import as_footprints
 from model.structure.laminate_section import short_wave_plate
 from model.structure.modal_elasticity import loss_factors
 from model.structure.plate import Plate
+
+Responder: TypeAlias = Callable[..., ComplexArray]
+"""Acceleration [m/s²] of each ERA alone at full stroke, (f, eras, p).
+
+Of ERAs, frequencies (f,) [Hz], points (p, 2) [m], and loads by name.
+"""
 
 
 def direct_spectral_acceleration(

@@ -246,9 +246,11 @@ def _as_level_and_phase(amplitude: complex, *, stroke: float) -> dict[str, float
 
 def query_line(table: LocalizationTable, line: str) -> dict[str, Any]:
     """Answer one line of a batch. Raises InputError."""
-    asked = _parsed(line, {})
-    drive_mode = UNRESTRICTED if asked.own else asked.mode
-    return _answer_to(table, asked, _prepared_timing(table, drive_mode))
+    asked, timing = _parsed(line, {}), Timing(table)
+    table.prepare(UNRESTRICTED if asked.own else asked.mode, with_ringing=False)
+    if not asked.own:  # contents of their own have no envelopes
+        timing.prepare(table.frequencies.tolist())
+    return _answer_to(table, asked, timing)
 
 
 def query_batch(
@@ -260,18 +262,12 @@ def query_batch(
 
     defaults: of keys that lines leave out.
     """
-    timing = _prepared_timing(table)
+    table.prepare(with_ringing=False)
+    timing = Timing(table)
+    timing.prepare(table.frequencies.tolist())
     for number, line in enumerate(lines, start=1):
         if line.strip():
             try:
                 yield _answer_to(table, _parsed(line, defaults), timing)
             except InputError as error:
                 yield {"error": str(error), "line": number}
-
-
-def _prepared_timing(table: LocalizationTable, drive_mode: str | None = None) -> Timing:
-    """Solve what answers and the timing of patterns need at every frequency of a table."""
-    table.prepare(drive_mode, with_ringing=False)
-    timing = Timing(table)
-    timing.prepare(table.frequencies.tolist())
-    return timing

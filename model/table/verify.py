@@ -15,12 +15,12 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.grid import Grid
@@ -28,7 +28,7 @@ from model.finger.perception import contrast_db, decibels, detection_threshold
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig
-from model.spectral.direct import direct_spectral_acceleration
+from model.spectral.direct import Responder, direct_spectral_acceleration
 from model.spectral.mesh import PlateMesh, SpectralMesh
 from model.structure.attachments import fingertip_loads, footprints_of
 from model.table.exact_plates import draw_plates, felt_on
@@ -40,12 +40,6 @@ from model.transients.base_motion import ramped_onset
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation, base_amplitudes, tone_amplitudes
-
-Responder: TypeAlias = Callable[..., ComplexArray]
-"""Acceleration [m/s²] of each ERA alone at full stroke, (f, eras, p).
-
-Of ERAs, frequencies (f,) [Hz], points (p, 2) [m], and loads by name.
-"""
 
 CONTENT_TOLERANCE = 1e-4
 """Relative L2 error of the content; the paper's plate has some 1e-5, on its coarsest mesh 2e-5."""

@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -257,6 +257,18 @@ async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(
         with pytest.raises(LinkError, match="aborted: stopped"):
             await arming
         assert (await era.status()).state == "QUICK_STOP_ACTIVE"
+
+
+@in_virtual_time
+async def test_fault_that_lasts_aborts_the_demonstration() -> None:
+    """At the end, for the cause of the fault, though all scenes have been played."""
+    async with asyncio.TaskGroup() as tasks:
+        recorder = TouchRecorder(cast(SimulatedPlate, None), tasks, on_row=lambda row: None)
+        recorder.armed()
+        recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
+        nothing = cast(Any, None)
+        with pytest.raises(LinkError, match=f"aborted: {FAULT}$"):
+            await run._play([], 0, recorder, nothing, nothing)
 
 
 async def test_far_end_terminates_process_when_not_ready_in_time(

@@ -282,10 +282,8 @@ class AsyncClient(AsyncCalls):
             if self._is_closed:
                 raise Unreachable(f"this client of the daemon at {self.path} is closed")
             if self._link is None or not self._link.is_open:
-                link, connection = (
-                    await DaemonLink.open(self.path, self._name),
-                    self._connections + 1,
-                )
+                link = await DaemonLink.open(self.path, self._name)
+                connection = self._connections + 1
                 following = link.follow(partial(self._received, connection))
                 self._following = asyncio.create_task(following, name="API")
                 self._following.add_done_callback(lambda _: self._changed.set())

@@ -54,6 +54,7 @@ from controller.effects.player import EffectPlayer
 from controller.learning.learning import Learning
 from controller.loop.loop import Controller
 from controller.loop.table_query import MAX_DB_SL
+from controller.sources.contacts import Contact
 from drivers import clock
 from drivers.host.stop import Stopped
 from model.table.table import LocalizationTable
@@ -256,19 +257,19 @@ class ApiService:
                 where="level_db_sl",
                 remedy="raise its level in the surface layout",
             )
-        place = params.x_m, params.y_m
-        near = {math.dist((each.x, each.y), place): each for each in self._publisher.view.contacts}
-        distance = min(near, default=math.inf)
-        if distance > PLAY_RADIUS:
+
+        def distance(contact: Contact) -> float:
+            return math.dist((contact.x, contact.y), (params.x_m, params.y_m))
+
+        nearest = min(self._publisher.view.contacts, key=distance, default=None)
+        if nearest is None or distance(nearest) > PLAY_RADIUS:
             raise RpcError(
                 ErrorCode.REFUSED,
                 f"no finger within {1e3 * PLAY_RADIUS:g} mm of ({params.x_m:g}, {params.y_m:g}) m",
                 where="x_m",
                 remedy="touch the plate there, or send a touch over the API",
             )
-        self._layout.play(
-            params.effect, near[distance], clock.now(), level_db_sl=params.level_db_sl
-        )
+        self._layout.play(params.effect, nearest, clock.now(), level_db_sl=params.level_db_sl)
         self._controller.request_update()
         return Empty()
 

@@ -68,9 +68,8 @@ class TouchInputs:
         while True:
             started_at = clock.now()
             try:
-                source = await in_thread(
-                    touch_input.make, name="touch source"
-                )  # a plug-in may block
+                # A plug-in may block.
+                source = await in_thread(touch_input.make, name="touch source")
                 await source.run(deliver)
             except Exception as error:
                 is_expected = isinstance(error, InputError | OSError)

@@ -256,15 +256,14 @@ class Members:
         staging: list[Awaitable[Staged]] = []
         for name, of_one in layers.items():
             staging.append(self.amplifiers[name].stage(token, of_one, now=is_silent))
-        results: list[Staged | BaseException] = []
-        if len(staging) > 1:
+        results: list[Staged | BaseException]
+        if len(staging) == 1:  # as in `all`
+            try:
+                results = [await staging[0]]
+            except DriverError as error:
+                results = [error]
+        else:
             results = await asyncio.gather(*staging, return_exceptions=True)
-        else:  # without a further iteration of the event loop
-            for each in staging:
-                try:
-                    results.append(await each)
-                except DriverError as error:
-                    results.append(error)
         refusals: dict[str, CommandRefused] = {}
         has_failed = is_silent
         for name, result in zip(layers, results, strict=True):

@@ -253,6 +253,12 @@ class Record:
         self.shifts = [shift for each in fields if isinstance(each, Bits) for shift in each.shifts]
         """Of the numbers that share a word."""
 
+    @property
+    def form(self) -> str:
+        """The fields as `struct` names them, a word each: shared ones and numbers."""
+        signed = [isinstance(each, Number) and each.quantity.minimum < 0 for each in self.fields]
+        return "".join("h" if each else "H" for each in signed)
+
     def append(self, words: list[int], *rows: Mapping[str, Any]) -> list[int]:
         """Append the words of values, by row, and return all.
 
@@ -288,6 +294,7 @@ class Record:
         """Raise TypeError or ValueError for a number of rows, in the order of the fields."""
         for field, column in zip(self.fields, zip(*rows, strict=True), strict=False):
             if isinstance(field, Number):
+                # An array has no numbers with a fraction, for which a comparison would do.
                 for number in (min(column), max(array("q", column))):
                     if not field.quantity.minimum <= number <= field.quantity.maximum:
                         raise ValueError(_out_of_range(field.name, field.quantity, number))

@@ -26,6 +26,8 @@ _LAST_TOKEN = QUANTITIES["token"].maximum
 PART_WORDS = MAX_WORDS - len(MESSAGES["Set"].request.fields) + 1
 MAX_PARTS = 127
 _LAYER, _AFTER, _RENEW, _COUNT = LAYER.shifts
+_HEAD_FORM, _COMMAND_FORM = LAYER.form, COMMAND.form
+_ENVELOPE_FORM, _KNOT_FORM = ENVELOPE.form, KNOT.form
 _CHANNEL, _KEEP_PHASE, _SKIP_ENDING, _ONSET, _ENDING = COMMAND.shifts
 
 
@@ -99,12 +101,12 @@ def pack_layers(layers: Iterable[LayerSet]) -> list[int]:
     """
     form, numbers = "=", list[int]()
     for layer in layers:
-        form += "HHH"
+        form += _HEAD_FORM
         flags = layer.after << _AFTER | layer.renew << _RENEW
         bits = layer.layer << _LAYER | flags | len(layer.commands) << _COUNT
         numbers += (bits, layer.ramp, layer.valid_for)
         for command in layer.commands:
-            form += "HHHh"
+            form += _COMMAND_FORM
             onset, ending = command.onset, command.ending
             flags = command.keep_phase << _KEEP_PHASE | command.skip_ending << _SKIP_ENDING
             flags |= (onset is not None) << _ONSET | (ending is not None) << _ENDING
@@ -112,7 +114,7 @@ def pack_layers(layers: Iterable[LayerSet]) -> list[int]:
             numbers += (bits, command.frequency, command.level, command.phase)
             for shape in (onset, ending):
                 if shape is not None:
-                    form += "HH" + "Hh" * len(shape.knots)
+                    form += _ENVELOPE_FORM + _KNOT_FORM * len(shape.knots)
                     numbers += (len(shape.knots), shape.step)
                     numbers += chain.from_iterable(shape.knots)
     return list(memoryview(struct.pack(form, *numbers)).cast("H"))

@@ -171,13 +171,17 @@ class Voice:
     def faded(self, time: float, ramp: float, uncertainty: float = 0.0) -> "Voice":
         """Return it falling silent along a ramp [s], or as it does if that is no later.
 
-        uncertainty [s]: see `Playback`.
+        uncertainty [s]: see `Playback`. Where it decides which of both is sooner, the largest
+        amplitude of either lasts until both are over.
         """
         transition, end = self.transition, time + ramp
-        if transition.last or transition.end > end + SAME:
+        if transition.last or transition.end > end + uncertainty + SAME:
             is_over = time - uncertainty >= transition.end
             first = transition.last if is_over else transition.reached(time, uncertainty)
             transition = Transition(time, ramp, first, 0j, end)
+        elif uncertainty and transition.end > end - uncertainty:
+            largest, over = transition.peak(time - uncertainty), max(transition.end, end)
+            transition = Transition(over, 0.0, complex(largest), 0j, over)
         return Voice(self.layer, self.frequency, self.origin, transition, True, self.ending)
 
     def ended(self, time: float, ramp: float, uncertainty: float = 0.0) -> "Voice":

@@ -7,6 +7,7 @@ only silence is admitted. Times [s] are of any one clock.
 
 import logging
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -15,7 +16,7 @@ from drivers.contents import Layer
 from drivers.errors import CommandRefused
 from drivers.host.bounds import Bounds
 from drivers.host.limits import COMMIT_DELAY, TOLERANCE, Budget, Rounding, Vibration, wire_limits
-from drivers.playback import playback_of
+from drivers.playback import Playback
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
 from drivers.protocol.table import QUANTITIES, has_feature
@@ -59,7 +60,8 @@ class Ledger:
 
     def forget(self) -> None:
         """Start anew: the amplifier is silent, armed or not."""
-        self.playback = playback_of(self.capabilities)
+        # Which fades the amplifier cuts short depends on when it plays: for upper bounds, none.
+        self.playback = Playback(self.capabilities["channels"], voices=sys.maxsize)
         self.lag = 0.0  # s; by which what plays may be later than `playback` says
         self.doubt: Doubt | None = None
         """What was committed and is not confirmed."""

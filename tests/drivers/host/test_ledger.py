@@ -130,6 +130,8 @@ ENDING = tone(level=0.1, ending=Envelope(100, ((8000, 0),)))
 # Silent for 100 ms, at 0.9 after 120 and silent again after 140; such that it plays amid a ramp.
 PULSE = tone(level=0.0, onset=Envelope(200, ((0, 0),) * 5 + ((9000, 0),)))
 
+LOW_SOON = Envelope(200, ((9000, 0),) + ((500, 0),) * 6)
+
 
 def sudden(level: float) -> Layer:
     """A layer whose tone is there within 2 ms, while what it replaces fades for 60 ms."""
@@ -201,6 +203,18 @@ COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
             Asked(0.15, sudden(0.9)),
         ],
     ),
+    # It goes on (0.9 in 20 ms) or fades (pi/2 · 0.9 in 60), beside pi/2 · 0.05 in 60: 69.9.
+    "a pulse that beats with what follows": (
+        replace(WIDE, slew=69.9),
+        [plays(0.0, Layer(0, (PULSE,))), Asked(0.0, Layer(0, (tone(level=0.05),), ramp=0.06))],
+    ),
+    "a pulse that beats too fast": (
+        replace(WIDE, slew=69.8),
+        [
+            plays(0.0, Layer(0, (PULSE,))),
+            refused(0.0, Layer(0, (tone(level=0.05),), ramp=0.06)),
+        ],
+    ),
     # 0.5 in two layers of one channel: 1, in two channels: a half.
     "power of all layers and channels": (
         replace(WIDE, power=0.6),
@@ -269,6 +283,41 @@ def test_ledger_admits_what_is_within_the_limits(name: str) -> None:
         assert one.ramp <= asked.longest
         if asked.plays:
             play(ledger, token, asked.at, asked.layer)
+
+
+# Each played up to 10 ms after it was sent; None: silence. 0.9 beside what may go on is too much.
+LATE: Mapping[str, Sequence[tuple[float, Layer | None]]] = {
+    # Silence from 85 ms on along 60 ms leaves a pulse that is over after 140; from 75 ms on not.
+    "a pulse that silence lets go on": [(0.0, Layer(0, (PULSE,))), (0.075, None)],
+    # 0.9 at 20 ms and little more until 160: if it plays late, it fades at 31 ms from nearly there.
+    "a fade where a pulse is low": [
+        (0.0, Layer(0, (tone(level=0.0, onset=LOW_SOON),))),
+        (0.031, Layer(0, (), ramp=0.13)),
+    ],
+    # Of eight voices, at 1.1 all sound and 0.5 is cut short for a ninth; at 1.11 one is over.
+    "a fade that is not cut short": [
+        (0.0, Layer(0, (tone(level=0.5),))),
+        *((0.1 * number, Layer(number, (tone(level=0.01),))) for number in range(1, 8)),
+        (1.0, Layer(0, (), ramp=1.0)),
+        (1.055, Layer(1, (), ramp=0.05)),
+        (1.1, Layer(0, (tone(level=0.01),))),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", LATE)
+def test_what_a_commit_may_leave_playing_if_it_comes_late_counts(name: str) -> None:
+    """Each set may have been played when it was sent or 10 ms later; all is over a second later."""
+    ledger, at = Ledger(WIDE, {**CAN, "voices": 8}), 0.0
+    for token, (at, layer) in enumerate(LATE[name], 1):
+        if layer is None:
+            ledger.silenced(0.06, at, at + 0.01)
+        else:
+            ledger.sent(token, ledger.admit([layer], at), at)
+            ledger.confirmed(at + 0.01)
+    loud = Layer(2, (HIGH(level=0.9),))
+    refusal(ledger, loud, at=at + 0.025)
+    assert ledger.admit([loud], at + 1.0)
 
 
 def test_check_that_fails_refuses_and_leaves_silence_possible() -> None:

@@ -16,7 +16,7 @@ from model.commands.options import JsonOption
 from model.errors import InputError
 
 if TYPE_CHECKING:
-    from model.identification.measured_plate import DeviceSettings, MeasuredPlate
+    from model.identification.measurement import DeviceSettings, MeasuredPlate
     from model.rig.rig import Rig
 
 _NOT_EXPLAINED = (
@@ -107,7 +107,7 @@ def identify(
     from model.config.points import parse_frequencies
     from model.identification import identification_report
     from model.identification.identify import identify as fit
-    from model.identification.measured_plate import DeviceSettings
+    from model.identification.measurement import DeviceSettings
     from model.identification.promise import expected_contrast
 
     settings: DeviceSettings | None = None
@@ -173,7 +173,7 @@ def _measured_by_device(
     rig: "Rig", settings: "DeviceSettings", *, is_shown: bool
 ) -> "MeasuredPlate":
     """Measure by a sound card, with a progress bar on a terminal."""
-    from model.identification.measured_plate import measure_by_device
+    from model.identification.measurement import measure_by_device
 
     with shown_progress("runs", is_shown=is_shown) as progress:
         return measure_by_device(rig, settings, progress=progress)
@@ -188,7 +188,7 @@ def _refuse(given: Mapping[str, object], *, rule: str) -> None:
 
 if TYPE_CHECKING:
     from model.config.document import Document
-    from model.identification.measured_plate import MeasuredPlate
+    from model.identification.measurement import MeasuredPlate
     from model.rig.rig import Rig
 
 

@@ -20,7 +20,7 @@ from model.errors import InputError
 
 if TYPE_CHECKING:
     from model.calibration.responses import Responses
-    from model.identification.measured_plate import MeasuredPlate
+    from model.identification.measurement import MeasuredPlate
     from model.rig.rig import Rig
 
 rig_app = typer.Typer(no_args_is_help=True, help="Check and identify a rig.")

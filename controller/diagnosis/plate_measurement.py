@@ -24,8 +24,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.choice import best_first, best_of
 from model.errors import InputError
-from model.identification.measured_plate import MeasuredPlate
-from model.identification.measurement import Measurement, Repeat
+from model.identification.measurement import MeasuredPlate, Measurement, Repeat
 from model.rig.rig import Rig
 from model.vibration.excitation import Tone
 

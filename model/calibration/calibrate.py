@@ -13,7 +13,6 @@ from model.calibration.calibration_result import (
     FittedParameter,
     SensorScale,
 )
-from model.calibration.calibration_screening import Screened, check_enough_sensors
 from model.calibration.fit import Fit, Problem, solve, start_at
 from model.calibration.fitted_rig import (
     gain_rows,
@@ -24,7 +23,7 @@ from model.calibration.fitted_rig import (
     uncertainty_of,
 )
 from model.calibration.held_out import hold_out, initial_responses, relative_error
-from model.calibration.responses import Responses
+from model.calibration.responses import Responses, Screened, check_enough_sensors
 from model.calibration.sensed_plate import sensed_plate
 from model.calibration.variable_projection import row_rms
 from model.choice import best_of

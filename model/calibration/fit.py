@@ -183,20 +183,20 @@ def solve(problem: Problem, start: Start) -> Fit:
     finite = np.isfinite(problem.values)
     for _ in range(_ROUNDS):
         weight, before = used / noise[:, :, None], noise
-        z, found = _search(problem, z, weight)
+        found = _search(problem, z, weight)
+        z = found.x
         raw = _deviation(problem, z, weight)
-        noise = _noise_of(problem.values, raw, used, _noise_left(problem, z, found, weight))
+        noise = _noise_of(problem.values, raw, used, _noise_left(problem, found, weight))
         # What form errors explain comes back.
         kept = finite & ~(raw > _MAX_DEVIATION * np.sqrt(2) * noise[:, :, None])
         is_settled = bool((kept == used).all() and (np.abs(noise / before - 1) < _SETTLED).all())
         used = kept
         if is_settled:
             break
-    return _result(problem, *_search(problem, z, used / noise[:, :, None]), noise, used)
+    return _result(problem, _search(problem, z, used / noise[:, :, None]), noise, used)
 
 
-def _search(problem: Problem, start: FloatArray, weight: FloatArray) -> tuple[FloatArray, Found]:
-    """Parameters (p,), and what the search of some of them ended with."""
+def _search(problem: Problem, start: FloatArray, weight: FloatArray) -> Found:
     return fit_with_gains(
         problem.plate.model,
         problem.values,
@@ -214,13 +214,13 @@ def _deviation(problem: Problem, z: FloatArray, weight: FloatArray) -> FloatArra
     return np.abs(problem.values - np.nan_to_num(gains)[:, :, None] * model)
 
 
-def _noise_left(problem: Problem, z: FloatArray, found: Found, weight: FloatArray) -> FloatArray:
+def _noise_left(problem: Problem, found: Found, weight: FloatArray) -> FloatArray:
     """Share (f, e, s) of each value's noise that is left in its residual: 1 - its leverage.
 
     That is of its row's gain, and of all that is searched, for which tolerances leave less.
     """
     inside = weight > 0
-    model, _ = problem.responses(z)
+    model, _ = problem.responses(found.x)
     by_gain = np.abs(weight * model) ** 2
     total = by_gain.sum(axis=2, keepdims=True)
     left = 1 - by_gain / np.where(total > 0, total, 1)
@@ -242,10 +242,8 @@ def _directions(found: Found) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]
     return rows[:, seen], columns[seen].T / strength[seen] / size[:, None], blind
 
 
-def _result(
-    problem: Problem, z: FloatArray, found: Found, noise: FloatArray, used: NDArray[np.bool_]
-) -> Fit:
-    searched, weight = problem.searched, used / noise[:, :, None]
+def _result(problem: Problem, found: Found, noise: FloatArray, used: NDArray[np.bool_]) -> Fit:
+    z, searched, weight = found.x, problem.searched, used / noise[:, :, None]
     rows = int(used.any(axis=2).sum())
     freedom = max(len(found.residuals) - 2 * rows - int(searched.sum()), 1)
     chi2 = float((found.residuals**2).sum()) / freedom

@@ -1,4 +1,4 @@
-"""Measured responses, value by value and as an array over a rig's ERAs."""
+"""Measured responses: value by value, as an array over a rig's ERAs, and what a fit can use."""
 
 import math
 from collections.abc import Sequence
@@ -14,6 +14,8 @@ from model.rig.rig import Rig
 # Tolerances of a ruler [m]: of an ERA's position, and of a sensor beyond the plate's edge.
 _ERA_TOLERANCE = 5e-3
 _EDGE_TOLERANCE = 1e-3
+_SILENT_SENSOR = 0.005  # of the loudest sensor, in the median over frequencies and ERAs
+LEAST_SENSORS = 3
 
 
 @dataclass(frozen=True)
@@ -152,3 +154,43 @@ def _era_of(measured: MeasuredValue, rig: Rig) -> int:
 
 def _shown(point: tuple[float, float]) -> str:
     return f"({point[0]:g}, {point[1]:g})"
+
+
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """What a check of responses has found.
+
+    dead_eras (e,), dead_sensors (s,): masks of those that do not move the plate, and that hear next
+    to nothing; start (n,): the fitted values of the most likely plate, as `SensedPlate.numbers` are
+    in its space.
+    """
+
+    dead_eras: NDArray[np.bool_]
+    dead_sensors: NDArray[np.bool_]
+    start: FloatArray
+
+
+def silent_sensors(responses: Responses) -> NDArray[np.bool_]:
+    """Mask of sensors without a response to any ERA (s,)."""
+    size = np.abs(responses.values)
+    loudest = np.where(np.isfinite(size), size, 0).max(axis=2, keepdims=True)
+    share = size / np.where(loudest > 0, loudest, np.nan)
+    heard = [typical(share[:, :, s]) for s in range(size.shape[2])]
+    return ~(np.array(heard) >= _SILENT_SENSOR)
+
+
+def check_enough_sensors(alive: NDArray[np.bool_], responses: Responses) -> None:
+    """Raise InputError unless enough sensors (s,) have a signal."""
+    if alive.sum() < LEAST_SENSORS:
+        dead = [n for n, live in zip(responses.sensors, alive, strict=True) if not live]
+        without = f" ({', '.join(dead)} without a signal)" if dead else ""
+        raise InputError(
+            f"at least {LEAST_SENSORS} sensors must have a signal, better eight or more, got "
+            f"{alive.sum()}{without}"
+        )
+
+
+def typical(values: NDArray[np.inexact]) -> float:
+    """Median magnitude of finite values; NaN without any."""
+    finite = np.abs(values)[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else float("nan")

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.form_errors import reduced_modes
 from model.identification.forward import ForwardModel, Sensor
-from model.identification.identified_rig import rig_with
 from model.identification.parameters import FORM, KINDS, Space, space_of
-from model.identification.values import Values
+from model.identification.values import Values, rig_with
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty

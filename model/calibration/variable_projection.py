@@ -29,27 +29,21 @@ def fit_with_gains(
     robust: float | None = None,
     drives: Sequence[int] | None = None,
     tolerance: float | None = None,
-) -> tuple[FloatArray, Found]:
+) -> Found:
     """Fit some parameters (p,) of a model to values (f, e, s), every gain g beside them.
 
     weight (f, e, s): zero where nothing was measured; start (p,), of which searched are changed;
     prior, robust: see `search`; drives (e,): number of the ERA that each channel drives, its own by
-    default; tolerance: relative standard deviation of |g| from 1, none by default. Returns
-    parameters (p,), and what the search of some of them ended with.
+    default; tolerance: relative standard deviation of |g| from 1, none by default.
     """
     inside = weight > 0
     rows, of_eras = inside.any(axis=2), slice(None) if drives is None else list(drives)
 
-    def full(y: FloatArray) -> FloatArray:
-        whole = start.copy()
-        whole[searched] = y
-        return whole
-
-    def linearised(y: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        found, by_y = responses_of(model, full(y), searched)
-        found, by_y = found[:, of_eras], by_y[:, :, of_eras]
+    def linearised(z: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        found, by_z = responses_of(model, z, searched)
+        found, by_z = found[:, of_eras], by_z[:, :, of_eras]
         gains, left = project_gains(found, values, weight, tolerance=tolerance)
-        by_gain, slopes = projection_slopes(found, by_y, values, weight, tolerance=tolerance)
+        by_gain, slopes = projection_slopes(found, by_z, values, weight, tolerance=tolerance)
         if tolerance is None:
             return left[inside], slopes[:, inside].T
         size = np.abs(gains)
@@ -60,9 +54,8 @@ def fit_with_gains(
             np.hstack([slopes[:, inside], by_wander]).T,
         )
 
-    bounds = np.array([model.space.lower, model.space.upper])[:, searched]
-    found = search(linearised, start[searched], bounds, prior=prior, robust=robust)
-    return full(found.y), found
+    bounds = np.array([model.space.lower, model.space.upper])
+    return search(linearised, start, bounds, searched, prior=prior, robust=robust)
 
 
 def responses_of(

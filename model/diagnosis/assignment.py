@@ -1,18 +1,21 @@
-"""Assignment of channels to ERAs by the modal assurance criterion (MAC) of shapes over sensors.
+"""What channels drive: ERAs by the modal assurance criterion (MAC) of shapes; polarity by phases.
 
 MAC is 1 for the same shape with any gain and phase, about one over the number of sensors for noise.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import stdtr
 
 from model.arrays import ComplexArray, FloatArray
+from model.calibration.responses import Responses, typical
 from model.calibration.sensed_plate import STARTS, SensedPlate
 from model.calibration.variable_projection import modal_assurance
 from model.choice import best_of
 
+_MIN_COHERENCE = 0.6  # length of the mean of unit phasors of a reliable phase
 _LEAST_MISFIT = 0.02  # below it sensors' errors dominate
 
 
@@ -30,15 +33,15 @@ class ShapeMatch:
     @property
     def nearest(self) -> tuple[int, ...]:
         """Index of the ERA most similar to each channel; its own if not driven."""
-        typical = np.array(
+        found = np.array(
             [
-                [_typical(self.mac[:, i, j]) for j in range(self.mac.shape[2])]
+                [typical(self.mac[:, i, j]) for j in range(self.mac.shape[2])]
                 for i in range(self.mac.shape[1])
             ]
         )
         return tuple(
             best_of(np.nan_to_num(row, nan=-1.0)) if np.isfinite(row).any() else i
-            for i, row in enumerate(typical)
+            for i, row in enumerate(found)
         )
 
     def confidence(self, channel: int, era: int, other: int) -> float:
@@ -62,7 +65,7 @@ def match_shapes(plate: SensedPlate, values: ComplexArray) -> ShapeMatch:
         mac = _mac(values, plate.responses(plate.moved(*start)))
         found = ShapeMatch(mac, start)
         score = float(
-            sum(_typical(mac[:, i, j]) for i, j in enumerate(found.nearest) if _driven(mac, i))
+            sum(typical(mac[:, i, j]) for i, j in enumerate(found.nearest) if _driven(mac, i))
         )
         # Values far from the rig's must be clearly better.
         score -= 0.05 * sum(map(abs, start)) * values.shape[1]
@@ -86,7 +89,33 @@ def _driven(mac: FloatArray, channel: int) -> bool:
     return bool(np.isfinite(mac[:, channel]).any())
 
 
-def _typical(mac: FloatArray) -> float:
-    """Median over frequencies, NaN without values."""
-    finite = mac[np.isfinite(mac)]
-    return float(np.median(finite)) if len(finite) else float("nan")
+@dataclass(frozen=True)
+class ChannelPhase:
+    """Phase error of a channel [degrees], None if unknown.
+
+    sign: 1 or -1, 0 if unknown; confidence 0..1.
+    """
+
+    degrees: float | None = None
+    sign: int = 0
+    confidence: float = 0.0
+
+
+def phases_of_drive(observation: Responses, predicted: ComplexArray) -> list[ChannelPhase]:
+    """Phases relative to the drive; predicted (f, e, s), NaN for channels to be skipped."""
+    found = []
+    for channel in range(predicted.shape[1]):
+        measured, model = observation.values[:, channel], predicted[:, channel]
+        finite = np.isfinite(measured) & np.isfinite(model)
+        inner = (np.where(finite, np.conj(model), 0) * np.where(finite, measured, 0)).sum(axis=1)
+        inner = inner[np.abs(inner) > 0]
+        if len(inner) == 0:
+            found.append(ChannelPhase())
+            continue
+        mean = complex(np.mean(inner / np.abs(inner)))
+        angle = math.degrees(np.angle(mean))
+        if abs(mean) < _MIN_COHERENCE:
+            found.append(ChannelPhase(None, 0, abs(mean)))
+        else:
+            found.append(ChannelPhase(angle, 1 if abs(angle) < 90 else -1, abs(mean)))
+    return found

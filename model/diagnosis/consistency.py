@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.calibration_screening import Screened
-from model.calibration.responses import Responses
+from model.calibration.responses import Responses, Screened
 from model.calibration.sensed_plate import SensedPlate
 from model.calibration.variable_projection import project_gains, row_rms
 from model.choice import best_by

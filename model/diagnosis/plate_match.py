@@ -90,7 +90,7 @@ def match_plate(
         at[gains_of[used]] = levels / std[used]
         # Two channels may drive one ERA: each has its own level beside the gain of the last one.
         beside[used] = levels - std[used] * at[gains_of[used]]
-        z, best = fit_with_gains(
+        best = fit_with_gains(
             model,
             *relative_to(beside),
             at,
@@ -99,8 +99,9 @@ def match_plate(
             drives=drives,
             tolerance=_GAIN_TOLERANCE,
         )
-        tried.append((z, best, beside))
-    z, best, beside = best_by(tried, lambda each: -each[1].cost)
+        tried.append((best, beside))
+    best, beside = best_by(tried, lambda each: -each[0].cost)
+    z = best.x
     predicted = plate.responses(z)[:, driven]
     _, residual = project_gains(predicted, *relative_to(beside), tolerance=_GAIN_TOLERANCE)
     share = (model_error * np.abs(residual))[inside]

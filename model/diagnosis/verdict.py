@@ -8,11 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.calibration_screening import LEAST_SENSORS, check_enough_sensors
-from model.calibration.responses import Responses
+from model.calibration.responses import LEAST_SENSORS, Responses, check_enough_sensors
 from model.calibration.sensed_plate import SensedPlate, sensed_plate
 from model.choice import best_by
-from model.diagnosis.assignment import ShapeMatch, match_responses, match_shapes
+from model.diagnosis.assignment import (
+    ChannelPhase,
+    ShapeMatch,
+    match_responses,
+    match_shapes,
+    phases_of_drive,
+)
 from model.diagnosis.causes import Explanation, explain
 from model.diagnosis.diagnosis_screening import (
     BadSensor,
@@ -22,7 +27,6 @@ from model.diagnosis.diagnosis_screening import (
 )
 from model.diagnosis.plate_difference import PlateDifference, plate_difference
 from model.diagnosis.plate_match import MAX_FIT_ERROR, MODEL_ERROR, Match, match_plate
-from model.diagnosis.polarity import ChannelPhase, phases_of_drive
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
 

@@ -15,7 +15,7 @@ from scipy import linalg
 
 from model.arrays import FloatArray
 from model.identification.derivatives import jacobian
-from model.identification.fit import Problem, solve
+from model.identification.least_squares import Problem, solve
 from model.identification.stages import Fitted, chi2
 
 SHARE = 5

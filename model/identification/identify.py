@@ -1,16 +1,19 @@
 """Identification of a rig by responses measured in place."""
 
+import math
 from dataclasses import dataclass
 
+import numpy as np
+
+from model.arrays import FloatArray
 from model.errors import InputError
 from model.identification.advice import unknowns
 from model.identification.held_out import HeldOut, hold_out
-from model.identification.identified_rig import rig_with
 from model.identification.measurement import Measurement
-from model.identification.plausible import check_gains
+from model.identification.parameters import Space
 from model.identification.posterior import Posterior
 from model.identification.stages import Fitted, Setting, chi2, fit_in_stages
-from model.identification.values import Values
+from model.identification.values import Values, rig_with
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
@@ -23,6 +26,8 @@ DRIVE_GAIN, DRIVE_PHASE_DEG = 0.01, 1.0
 """How far a drive repeats from one day to the next, which no measurement tells."""
 
 _LEAST_VALUES = 16
+_GAIN_STDS = 5.0
+_LEAST_GAIN, _LEAST_PHASE = 0.3, math.radians(20)  # what gains are allowed at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +78,7 @@ def identify(
     misfit = chi2(fitted)
     is_explained = misfit <= MAX_CHI2
     if is_explained:
-        check_gains(rig, measurement, values, fitted.space)
+        _check_gains(rig, measurement, values, fitted.space)
     posterior = Posterior.of(fitted.space, fitted.best)
     unknown = unknowns(setting, fitted, posterior)
     if unknown:
@@ -133,3 +138,33 @@ def solved_for(rig: Rig, frequency_max: float) -> FreePlate:
         # Places move freely only where a plate is solved in functions over all of it.
         mesh = mesh_of("auto", rig.plate, frequency_max=rig.limits.frequency_max)
     return solve_free_plate(rig.plate, mesh, frequency_max=max(frequency_max, 200.0))
+
+
+def _check_gains(rig: Rig, measurement: Measurement, values: Values, space: Space) -> None:
+    """Raise InputError for gains no drive or sensor has: another unit, a sign, a wrong plug.
+
+    A response tells only the product of a drive's and a sensor's gain, so that the fit shares an
+    error of either among both, and its residuals do not show a wrong unit or sign.
+    """
+    drives = [f"drive {era.name}" for era in rig.eras]
+    sensors = [f"sensor {sensor.name}" for sensor in measurement.sensors]
+    wrong = [
+        *_wrong_gains(drives, np.log(values.drive_gains), space, ""),
+        *_wrong_gains(sensors, np.log(values.sensor_gains), space, "sensor_"),
+    ]
+    if wrong:
+        raise InputError(
+            "measurement must be acceleration in m/s² along the drives' motion, got gains of "
+            f"{'; '.join(wrong)}; check unit, sign and plug of each sensor and drive"
+        )
+
+
+def _wrong_gains(names: list[str], logarithms: FloatArray, space: Space, whose: str) -> list[str]:
+    """Those whose complex logarithm of the gain is beyond what is usual, in words."""
+    gain, phase = (space.std[space.groups[whose + kind]].max() for kind in ("gain", "phase"))
+    return [
+        f"{name} {math.exp(one.real):.2f} at {math.degrees(one.imag):.0f}°"
+        for name, one in zip(names, logarithms.tolist(), strict=True)
+        if abs(one.real) > max(_LEAST_GAIN, _GAIN_STDS * gain)
+        or abs(one.imag) > max(_LEAST_PHASE, _GAIN_STDS * phase)
+    ]

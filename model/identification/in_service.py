@@ -20,14 +20,12 @@ from model.arrays import FloatArray
 from model.identification.alarm import PLACES, Alarm, Taken
 from model.identification.forward import ForwardModel, Sensor
 from model.identification.hypotheses import Explanation, explain
-from model.identification.identified_rig import rig_with
 from model.identification.identify import Identification, solved_for
-from model.identification.noise import NoiseLevel
 from model.identification.parameters import FINGER_PARTS, KINDS, MODE_SHIFTS, space_of
 from model.identification.settled import SettledPattern, Touched
-from model.identification.settled_update import State, update
+from model.identification.settled_update import NoiseLevel, State, update
 from model.identification.stages import Setting
-from model.identification.values import Values
+from model.identification.values import Values, rig_with
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.modal_elasticity import lowest_elastic

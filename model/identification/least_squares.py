@@ -1,23 +1,33 @@
-"""Nonlinear least squares with exact derivatives and priors, for every fit of a plate."""
+"""Nonlinear least squares with exact derivatives and priors, for every fit of a plate.
+
+And the most likely parameters of measured responses by it.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.choice import best_first
+from model.identification.derivatives import jacobian
+from model.identification.forward import ForwardModel
+from model.identification.measurement import Measurement
+
+_CONVERGED = 1e-7  # of the cost, whose changes by one standard deviation are 1
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Where a search ended: y (n,), and half the sum of squares that it minimised.
+    """Where a search ended: x (p,), and half the sum of squares that it minimised.
 
     residuals (2 m + k,), jacobian (2 m + k, n): real parts of all m values, imaginary parts, then
-    the k rows of the prior; without robust weights.
+    the k rows of the prior, by the n searched; without robust weights.
     """
 
-    y: FloatArray
+    x: FloatArray
     cost: float
     residuals: FloatArray
     jacobian: FloatArray
@@ -27,6 +37,7 @@ def search(
     linearised: Callable[[FloatArray], tuple[ComplexArray, ComplexArray]],
     start: FloatArray,
     bounds: FloatArray,
+    searched: NDArray[np.bool_],
     *,
     prior: tuple[FloatArray, FloatArray] | None = None,
     robust: float | None = None,
@@ -34,19 +45,27 @@ def search(
     tolerance: float = 1e-8,
     inside: float = 1e-9,
 ) -> Found:
-    """Minimize complex residuals (m,) with derivatives (m, n), from a start within bounds (2, n).
+    """Minimize complex residuals (m,) over the n of x (p,) that are searched (p,).
 
-    All in standard deviations. prior: rows (k, n) and what they are to give (k,), by default each
-    argument by itself and zero; robust: standard deviations from which a residual counts as its
-    magnitude, not its square. evaluations: at most; a plate that fits takes ten. tolerance: of the
-    sum of squares, relative; inside: how far from its bounds a start is at least, without which a
-    start that is zero begins with small steps.
+    All in standard deviations. linearised: residuals of x, and their derivatives (m, n) by what is
+    searched; start (p,): of all, which the others keep; bounds (2, p). prior: rows (k, n) and what
+    they are to give (k,), by default each argument by itself and zero; robust: standard deviations
+    from which a residual counts as its magnitude, not its square. evaluations: at most; a plate
+    that fits takes ten. tolerance: of the sum of squares, relative; inside: how far from its bounds
+    a start is at least, without which a start that is zero begins with small steps.
     """
-    rows, targets = (np.eye(len(start)), np.zeros(len(start))) if prior is None else prior
+    count = int(searched.sum())
+    rows, targets = (np.eye(count), np.zeros(count)) if prior is None else prior
+    bounds = bounds[:, searched]
     last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
+    def whole(y: FloatArray) -> FloatArray:
+        x = start.copy()
+        x[searched] = y
+        return x
+
     def real(y: FloatArray, scale: float | None) -> tuple[FloatArray, FloatArray]:
-        left, slopes = linearised(y)
+        left, slopes = linearised(whole(y))
         if scale is not None:
             left, slopes = _softened(left, slopes, scale)
         return (
@@ -72,7 +91,7 @@ def search(
     least = np.minimum(inside, np.ptp(bounds, axis=0) / 4)
     found = least_squares(
         residuals,
-        np.clip(start, bounds[0] + least, bounds[1] - least),
+        np.clip(start[searched], bounds[0] + least, bounds[1] - least),
         jacobian,
         bounds=(bounds[0], bounds[1]),
         x_scale="jac",
@@ -81,7 +100,7 @@ def search(
         ftol=tolerance,
     )
     plain = both(found.x) if robust is None else real(found.x, None)
-    return Found(found.x, float(found.cost), *plain)
+    return Found(whole(found.x), float(found.cost), *plain)
 
 
 def single_changes(
@@ -106,3 +125,80 @@ def _softened(
     weight = np.sqrt(2 / (1 + root))
     grown = (left.conj()[:, None] * slopes).real / (2 * scale**2 * root * (1 + root))[:, None]
     return weight * left, weight[:, None] * (slopes - left[:, None] * grown)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Residuals in standard deviations (2 n,) and their derivatives by x (2 n, p) at x (p,)."""
+
+    x: FloatArray
+    residuals: FloatArray
+    jacobian: FloatArray
+
+    @cached_property
+    def cost(self) -> float:
+        """Sum of squares of residuals and parameters: minus twice the log likelihood."""
+        return float(self.residuals @ self.residuals + self.x @ self.x)
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """J^T J + 1, (p, p)."""
+        found = self.jacobian.T @ self.jacobian
+        found[np.diag_indices_from(found)] += 1
+        return np.asarray(found)
+
+    @cached_property
+    def gradient(self) -> FloatArray:
+        """Half the derivative of the cost, (p,)."""
+        return np.asarray(self.jacobian.T @ self.residuals + self.x)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A model of a measurement; extra_noise (f, 1, 1): of each part beside its error."""
+
+    model: ForwardModel
+    measurement: Measurement
+    extra_noise: FloatArray | None = None
+
+    @cached_property
+    def std(self) -> FloatArray:
+        """Error of each part of the values that were measured (n,)."""
+        std = np.hypot(self.measurement.std, 0.0 if self.extra_noise is None else self.extra_noise)
+        return std[self.measurement.known]
+
+    def residuals(self, x: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """Residuals in standard deviations (n,) and their derivatives (n, p)."""
+        measurement, plate = self.measurement, self.model.at(x)
+        J = jacobian(plate)[measurement.known] / self.std[:, None]
+        return (plate.responses - measurement.values)[measurement.known] / self.std, J
+
+    def linearised(self, x: FloatArray) -> Linearised:
+        """The same in real and imaginary parts."""
+        found, J = self.residuals(x)
+        residuals = np.concatenate([found.real, found.imag])
+        return Linearised(x, residuals, np.concatenate([J.real, J.imag]))
+
+
+def solve(
+    problem: Problem, start: FloatArray, free: NDArray[np.bool_], *, evaluations: int = 40
+) -> Linearised:
+    """Minimise the cost over the free parameters (p,) within their bounds, from a start (p,).
+
+    evaluations: of the model, at most.
+    """
+    space = problem.model.space
+
+    def linearised(x: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        residuals, J = problem.residuals(x)
+        return residuals, J[:, free]
+
+    found = search(
+        linearised,
+        np.clip(start, space.lower, space.upper),
+        np.array([space.lower, space.upper]),
+        free,
+        evaluations=evaluations,
+        tolerance=_CONVERGED,
+    )
+    return problem.linearised(found.x)

@@ -1,9 +1,11 @@
 """Responses that were measured on a rig in place, with their errors and repetitions."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.identification.forward import Sensor
+from model.rig.rig import Rig
 
 NONLINEAR = 0.02
 """Relative difference of responses at two levels beyond which a plate is not linear."""
@@ -119,3 +122,56 @@ class Measurement:
                         f"response to ERA {repeat.era} at {repeat.frequency:g} Hz must stay within "
                         f"{100 * limit:g} %, got {100 * difference:.1f} % {cause}"
                     )
+
+
+Progress = Callable[[int, int], None]
+"""Called with what is done and all."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPlate:
+    """A measurement with how it came about.
+
+    level: of what played, 0..1 of full stroke; duration [s]; sensors: the ones used, for programs;
+    notes: lines for people; details: keys and values for programs.
+    """
+
+    measurement: Measurement
+    level: float
+    duration: float
+    sensors: tuple[Mapping[str, object], ...]
+    notes: tuple[str, ...]
+    details: Mapping[str, object]
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceSettings:
+    """What `era rig identify --device` was given.
+
+    sensors_file: of accelerometers; device: that plays and records; frequencies (f,) [Hz], level:
+    None for the usual ones; periods: seconds of each run that count; seed: of the phases.
+    """
+
+    device: str
+    sensors_file: Path
+    frequencies: FloatArray | None
+    level: float | None
+    periods: int
+    seed: int
+
+
+class PlateMeasurer(Protocol):
+    """Plays on all ERAs of a rig and measures its plate."""
+
+    def __call__(self, rig: Rig, settings: DeviceSettings, *, progress: Progress) -> MeasuredPlate:
+        """Raises InputError, LinkError."""
+
+
+_MEASURER = "sim.measuring.plate_measurement:measure_plate"
+"""By name: this package does not import the one beside it."""
+
+
+def measure_by_device(rig: Rig, settings: DeviceSettings, *, progress: Progress) -> MeasuredPlate:
+    """Measure a plate by a sound card."""
+    measure: PlateMeasurer = resolve_name(_MEASURER)
+    return measure(rig, settings, progress=progress)

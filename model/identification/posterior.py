@@ -14,7 +14,7 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import FloatArray
-from model.identification.fit import Linearised
+from model.identification.least_squares import Linearised
 from model.identification.parameters import KINDS, Space
 from model.rig.uncertainty import Uncertainty
 

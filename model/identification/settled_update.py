@@ -1,5 +1,6 @@
-"""Update of a plate by settled patterns, the fingers of each estimated with it."""
+"""Update of a plate by settled patterns, the fingers of each estimated with it; their noise."""
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,9 @@ from model.identification.settled import Touched, finger_count, finger_covarianc
 
 _LEAST = 1e-14  # of the largest variance
 _INSIDE = 0.1  # standard deviations
+_PATTERNS = 60
+_FIRST_NOISE = 8.0
+_LEAST_NOISE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,16 +70,14 @@ def update(
     centre = np.concatenate([before.x, np.zeros(q)])
     values = np.concatenate([each.pattern.numbers for each in patterns])
     std = np.concatenate([each.std for each in patterns])
-    loose = np.flatnonzero(np.diagonal(prior) > 0)
+    loose = np.diagonal(prior) > 0
     variance, axes = np.linalg.eigh(prior[np.ix_(loose, loose)])
     rows = (axes / np.sqrt(np.maximum(variance, _LEAST * variance.max()))).T
     at = centre.copy()
     if start is not None:
         at[: len(start)] = start
 
-    def linearised(y: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        z = centre.copy()
-        z[loose] = y
+    def linearised(z: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         predicted, H = _linearised(patterns, z, p, q)
         return (predicted - values) / std + 0j, H[:, loose] / std[:, None] + 0j
 
@@ -83,13 +85,14 @@ def update(
     bounds[:, :p] = space.lower, space.upper
     found = search(
         linearised,
-        at[loose],
-        bounds[:, loose],
+        at,
+        bounds,
+        loose,
         prior=(rows, rows @ centre[loose]),
         evaluations=evaluations,
         inside=_INSIDE,
     )
-    at[loose] = found.y
+    at = found.x
     predicted, H = _linearised(patterns, at, p, q)
     gain = prior @ H.T
     inverse = linalg.inv(H @ gain + np.diag(std**2))
@@ -132,3 +135,25 @@ def _linearised(
         rows.append(row)
         first += own
     return np.concatenate(predicted), np.concatenate(rows)
+
+
+class NoiseLevel:
+    """Noise of readings relative to the largest that a `SettledPattern` states, 0.3 to 1.
+
+    An error that is taken too large hides a change until other parameters have taken it up. The
+    most likely variance is that of the residuals over the numbers that no parameter takes up
+    (D. J. C. MacKay, Bayesian interpolation, Neural Computation 4, 1992, 415-447, eq. 4.11).
+
+    It begins at the largest. Below 0.3 a plate is never known: what a finger's model leaves counts
+    as noise, too. Never above 1, or a change would make itself unremarkable.
+    """
+
+    def __init__(self) -> None:
+        self._recent: deque[tuple[float, float]] = deque(maxlen=_PATTERNS)
+        self.relative = 1.0
+
+    def take(self, updated: Updated) -> None:
+        """Take what an update by a pattern of this noise has left of it."""
+        self._recent.append((self.relative**2 * updated.misfit, updated.freedom))
+        misfit, freedom = np.array(self._recent).sum(axis=0) + _FIRST_NOISE
+        self.relative = float(np.clip(np.sqrt(misfit / freedom), _LEAST_NOISE, 1.0))

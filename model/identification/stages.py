@@ -15,12 +15,11 @@ from model.arrays import FloatArray
 from model.choice import NEARLY, best_by, ranked_by
 from model.finger.grid import Grid
 from model.identification.derivatives import by_mass_at
-from model.identification.fit import Linearised, Problem, solve
 from model.identification.forward import ForwardModel, Sensor
-from model.identification.identified_rig import plate_with
-from model.identification.least_squares import single_changes
+from model.identification.least_squares import Linearised, Problem, single_changes, solve
 from model.identification.measurement import Measurement
 from model.identification.parameters import MODE_SHIFTS, Space, inwards, space_of
+from model.identification.values import plate_with
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig
 from model.structure.modal_elasticity import lowest_elastic

@@ -9,8 +9,13 @@ import numpy as np
 from model.arrays import FloatArray
 from model.choice import best_first
 from model.identification.forward import Sensor
-from model.identification.measured_plate import DeviceSettings, MeasuredPlate, Progress
-from model.identification.measurement import Measurement, Repeat
+from model.identification.measurement import (
+    DeviceSettings,
+    MeasuredPlate,
+    Measurement,
+    Progress,
+    Repeat,
+)
 from model.rig.rig import Rig
 from sim.measuring.desk import Desk
 from sim.measuring.loopback import converters

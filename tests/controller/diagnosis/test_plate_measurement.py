@@ -22,7 +22,7 @@ from memory_machine import live_in_memory
 from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.identify import identify
-from model.identification.measured_plate import MeasuredPlate
+from model.identification.measurement import MeasuredPlate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad

@@ -88,9 +88,10 @@ def test_residuals_found_are_without_the_robust_weights() -> None:
         lambda x: (A @ x - values + 0j, A + 0j),
         np.zeros(1),
         np.array([[-9.0], [9.0]]),
+        np.array([True]),
         prior=(np.zeros((0, 1)), np.zeros(0)),
         robust=0.1,
     )
-    assert found.y[0] < 2.0  # 7.1 by least squares
+    assert found.x[0] < 2.0  # 7.1 by least squares
     np.testing.assert_allclose(found.jacobian, np.vstack([A, 0 * A]))
-    np.testing.assert_allclose(found.residuals[:4], A @ found.y - values)
+    np.testing.assert_allclose(found.residuals[:4], A @ found.x - values)

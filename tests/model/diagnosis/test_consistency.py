@@ -10,8 +10,8 @@ from distorted_responses import DISTORTIONS
 from long_form import shortly
 from model.calibration.responses import Responses
 from model.diagnosis import causes
+from model.diagnosis.assignment import phases_of_drive
 from model.diagnosis.consistency import check_consistency
-from model.diagnosis.polarity import phases_of_drive
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.rig.rig import Rig

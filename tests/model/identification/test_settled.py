@@ -11,9 +11,8 @@ from model.arrays import FloatArray
 from model.identification.alarm import WINDOW, Alarm, Taken
 from model.identification.forward import Sensor
 from model.identification.in_service import Known, LivePlate
-from model.identification.noise import NoiseLevel
 from model.identification.settled import SettledPattern, Touched
-from model.identification.settled_update import State, Updated, update
+from model.identification.settled_update import NoiseLevel, State, Updated, update
 from model.rig.file import example_rig_path, load_rig
 from settled_patterns import settled_patterns
 

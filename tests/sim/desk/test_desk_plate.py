@@ -16,7 +16,7 @@ from drivers.errors import LinkError
 from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.errors import InputError
 from model.identification.identify import identify
-from model.identification.measured_plate import MeasuredPlate
+from model.identification.measurement import MeasuredPlate
 from model.rig.rig import Rig
 from model.structure.attachments import fingertip_loads
 from sim.measuring.desk import Desk

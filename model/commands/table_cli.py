@@ -1,6 +1,8 @@
 """`era table query`: the pattern for a set of contacts, or a content for each finger."""
 
 import json
+import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,7 +33,7 @@ def query(
         typer.Option(
             metavar="X,Y[@LOW-HIGH]",
             help="Position of a finger in metres that is to feel a vibration of its own, and the "
-            "lowest and highest frequency of it in Hz; repeatable.",
+            "lowest and highest frequency of it in Hz, or a single one; repeatable.",
         ),
     ] = None,
     swap_bands: Annotated[
@@ -52,8 +54,8 @@ def query(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Questions as JSON lines; print one answer a line. Other options are the defaults "
-            "of keys left out.",
+            help="Questions as JSON lines, - for standard input; print one answer a line. Other "
+            "options are the defaults of keys left out.",
         ),
     ] = None,
     as_json: JsonOption = False,
@@ -64,7 +66,7 @@ def query(
     ERA, and predicted levels and contrast.
     """
     from model.table.file import load_table
-    from model.table.query import query_line
+    from model.table.query import query_one
 
     if batch is not None:
         if target or quiet or own or swap_bands:
@@ -97,7 +99,7 @@ def query(
     }
     line = {key: value for key, value in given.items() if value} | {"level_db_sl": level}
     table = load_table(table_file)
-    answer = query_line(table, json.dumps(line))
+    answer = query_one(table, line)
     if as_json:
         print(json.dumps(answer))
         return
@@ -169,20 +171,21 @@ def _print_contents(found: dict[str, Any]) -> None:
 
 def _own(text: str) -> dict[str, Any]:
     """A finger with a content of its own, of X,Y[@LOW-HIGH]."""
-    place, _, band = text.partition("@")
+    place, separator, band = text.partition("@")
     at = parse_point(place, what="--own")
-    return {"at": at, "band_hz": _band(band)} if band else {"at": at}
+    return {"at": at, "band_hz": _band(band)} if separator else {"at": at}
 
 
 def _band(text: str) -> tuple[float, float]:
     """Lowest and highest frequency [Hz] of LOW-HIGH, or of one frequency."""
 
-    low, _, high = text.partition("-")
+    low, separator, high = text.partition("-")
     try:
-        return float(low), float(high or low)
+        return float(low), float(high if separator else low)
     except ValueError:
         raise InputError(
-            f"band of --own must be LOW-HIGH in Hz, such as 40-120, got {text!r}"
+            "band of --own must be LOW-HIGH or a single frequency in Hz, such as @40-120 or @110, "
+            f"got {text!r}"
         ) from None
 
 
@@ -212,11 +215,16 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
 
     table = load_table(table_file)
     has_failed = False
+    is_piped = batch == Path("-")
     try:
-        with open(batch, encoding="utf-8", opener=regular_file) as lines:
+        with (
+            nullcontext(sys.stdin)
+            if is_piped
+            else open(batch, encoding="utf-8", opener=regular_file)
+        ) as lines:
             for answer in query_batch(table, lines, defaults):
                 has_failed = has_failed or "error" in answer
-                print(json.dumps(answer))
+                print(json.dumps(answer), flush=is_piped)
     except OSError as error:
         raise InputError(
             f"--batch {batch} cannot be read: {error.strerror}; give a file of JSON lines"

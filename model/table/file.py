@@ -19,6 +19,7 @@ from model.arguments import expect, expect_path, shown
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError, first_problem
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
+from model.files.replacing import begins_with
 from model.finger.grid import Grid
 from model.finger.perception import check_has_threshold
 from model.rig.meshes import mesh_from_dict
@@ -140,8 +141,10 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
             f"{path}: no such table; build one: era table build RIG -o {path.with_suffix('.npz')}"
         ) from None
     except UNREADABLE as error:
-        why = "not a .npz file" if isinstance(error, BadZipFile) else error
-        if isinstance(error, OSError):
+        why: object = error
+        if isinstance(error, BadZipFile):
+            why = "cut off or damaged" if begins_with(path, ZIP) else "not a .npz file"
+        elif isinstance(error, OSError):
             why = error.strerror or error
         raise InputError(
             f"{path}: not a readable localization table ({why}); give a file of era table build, "

@@ -60,9 +60,13 @@ _OF_OWN = {"bands_may_swap", "apart_hz"}
 """Keys of a line that only one of both kinds of questions has."""
 
 
-def _parsed(line: str, defaults: Mapping[str, Any]) -> _Line:
+def _parsed(line: str | Mapping[str, Any], defaults: Mapping[str, Any]) -> _Line:
+    """A question, as JSON or as its keys and values; raises InputError."""
     try:
-        asked = _Line.model_validate_json(line)
+        if isinstance(line, str):
+            asked = _Line.model_validate_json(line)
+        else:
+            asked = _Line.model_validate(line)
     except ValidationError as error:
         key, rule = first_problem(error)
         raise InputError(
@@ -244,9 +248,9 @@ def _as_level_and_phase(amplitude: complex, *, stroke: float) -> dict[str, float
     return {"level": abs(amplitude) / stroke, "phase_deg": math.degrees(cmath.phase(amplitude))}
 
 
-def query_line(table: LocalizationTable, line: str) -> dict[str, Any]:
-    """Answer one line of a batch. Raises InputError."""
-    asked, timing = _parsed(line, {}), Timing(table)
+def query_one(table: LocalizationTable, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Answer one question, of the keys of a batch's line. Raises InputError."""
+    asked, timing = _parsed(values, {}), Timing(table)
     table.prepare(UNRESTRICTED if asked.own else asked.mode, with_ringing=False)
     if not asked.own:  # contents of their own have no envelopes
         timing.prepare(table.frequencies.tolist())

@@ -92,6 +92,16 @@ def test_load_table_refuses_a_damaged_file(path, damage):
         load_table(path)
 
 
+def test_load_table_says_that_half_a_table_is_cut_off(path, tmp_path):
+    """A table whose end is missing, as of a full disk, is told from a file of another kind."""
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(InputError, match="cut off"):
+        load_table(path)
+    (tmp_path / "t.txt").write_text("not a table")
+    with pytest.raises(InputError, match=r"not a \.npz file"):
+        load_table(tmp_path / "t.txt")
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [

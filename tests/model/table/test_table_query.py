@@ -72,6 +72,14 @@ def test_batch_answers_line_by_line(table_file, tmp_path, has_errors):
     assert len(errors) == 2 * has_errors
 
 
+def test_batch_reads_standard_input(table_file):
+    """`-` is no file of that name: what another program writes is answered."""
+    line = '{"target": [0.1, 0.1], "mode": "phased"}\n'
+    result = RUNNER.invoke(app, ["table", "query", str(table_file), "--batch", "-"], input=line)
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["mode"] == "phased"
+
+
 def test_batch_takes_options_as_defaults_of_its_lines(table_file, tmp_path):
     """Level, mode and envelopes of the command hold where a line leaves them out."""
     batch = tmp_path / "b.jsonl"

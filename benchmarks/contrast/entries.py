@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 
 from benchmarks.contrast.data_set import VERSION, ContactSet, DataSet, data_set
 from benchmarks.contrast.optimum import optimum
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
 from model.rig.uncertainty import Uncertainty
 from model.table.build import build_table
-from model.table.exact_plates import Plates, draw_plates, fields_on
+from model.table.exact_plates import Plates, accelerations_on, draw_plates, touched
 from model.table.question import Question
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, Tone
@@ -57,8 +57,15 @@ class _Case:
         """Fields of each ERA alone at full stroke, (f, points, eras)."""
         n, k = len(self.table.eras), len(self.contacts.contacts)
         one = draw_plates(self.rng, Uncertainty.none(), count=1, era_count=n, contact_count=k)
-        rows = range(len(self.table.frequencies))
-        return np.array([fields_on(self.table, self.question, row, one)[0] for row in rows])
+        (found,) = self.fields_on(np.arange(len(self.table.frequencies)), one)
+        return np.asarray(found)
+
+    def fields_on(self, rows: IntArray, plates: Plates) -> ComplexArray:
+        """Fields on plates at rows (f,) of the table's frequencies, (d, f, points, eras)."""
+        strokes = np.diag([complex(era.stroke) for era in self.table.eras])
+        bases = np.repeat(strokes[None], len(rows), axis=0)
+        at = touched(self.table, self.question)
+        return accelerations_on(self.table, *at, rows, bases, plates).swapaxes(2, 3)
 
     @property
     def weights(self) -> FloatArray:
@@ -132,8 +139,8 @@ class _HeldOut:
 
     def accelerations(self, frequency: float, plates: "_Drawn") -> ComplexArray:
         """Fields (m, points, eras)."""
-        row = int(np.searchsorted(self.case.table.frequencies, frequency))
-        return fields_on(self.case.table, self.case.question, row, plates.plates)
+        rows = np.searchsorted(self.case.table.frequencies, [frequency])
+        return self.case.fields_on(rows, plates.plates)[:, 0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,9 +27,8 @@ from model.structure.attachments import (
     Load,
     attached_stiffness,
     coupled_forces,
-    drive_forces,
     footprints_of,
-    on_diagonal,
+    unit_accelerations,
 )
 from model.structure.footprint import as_footprints
 from model.structure.modal_elasticity import ModalElasticity, loss_factors
@@ -67,11 +66,10 @@ class FreePlate:
         for points off the plate.
         """
         omega = self._omega(frequencies)
-        stiffness = attached_stiffness(eras, loads, omega)
-        applied = on_diagonal(drive_forces(eras, omega), rows=stiffness.shape[1])
-        footprints = footprints_of(eras, loads)
-        _, displacement = self._moved(omega, footprints, stiffness, applied, points)
-        return np.asarray(-(omega**2)[:, None, None] * displacement)
+        at = footprints_of(eras, loads)
+        return unit_accelerations(
+            eras, loads, omega, lambda held, driven: self._moved(omega, at, held, driven, points)[1]
+        )
 
     def receptances(
         self,

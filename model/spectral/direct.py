@@ -20,11 +20,9 @@ from model.spectral.stiffness import air_motion, along_mass
 from model.structure.attachments import (
     Era,
     Load,
-    attached_stiffness,
     coupled_forces,
-    drive_forces,
     footprints_of,
-    on_diagonal,
+    unit_accelerations,
 )
 from model.structure.footprint import as_footprints
 from model.structure.laminate_section import short_wave_plate
@@ -71,10 +69,9 @@ def direct_spectral_acceleration(
             D = layered.dynamic_stiffness(parity, frequency)
             receptance[number] += shapes @ np.linalg.solve(D, shapes[:count].T)
     between, to_points = np.split(receptance, [count], axis=1)
-    stiffness = attached_stiffness(eras, loads, omega)
-    applied = on_diagonal(drive_forces(eras, omega), rows=count)
-    displacement = (to_points @ coupled_forces(between, stiffness, applied)).transpose(0, 2, 1)
-    return np.asarray(-(omega**2)[:, None, None] * displacement)
+    return unit_accelerations(
+        eras, loads, omega, lambda *by: (to_points @ coupled_forces(between, *by)).swapaxes(1, 2)
+    )
 
 
 class AtOneFrequency(SpectralPlate):

@@ -11,7 +11,7 @@ The plate on its attachments is a low-rank correction of the free plate (Woodbur
 
 import cmath
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, TypeAlias, TypeVar
 
@@ -257,6 +257,22 @@ def full_strokes(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
     strokes = np.array([era.stroke for era in eras])
     gains = np.array([era.gain(omega / (2 * np.pi)) for era in eras], dtype=complex)
     return np.asarray(strokes * gains.reshape(len(eras), len(omega)).T)
+
+
+def unit_accelerations(
+    eras: Sequence[Era],
+    loads: Sequence[Load],
+    omega: FloatArray,
+    moved: Callable[[ComplexArray, ComplexArray], ComplexArray],
+) -> ComplexArray:
+    """Acceleration [m/s²] of a plate by each ERA alone at full stroke, (f, eras, p).
+
+    moved: displacement (f, eras, p) of the plate, of the dynamic stiffnesses of ERAs and loads
+    (f, a) and the forces applied to them (f, a, eras), by omega (f,) [rad/s].
+    """
+    stiffness = attached_stiffness(eras, loads, omega)
+    applied = on_diagonal(drive_forces(eras, omega), rows=stiffness.shape[1])
+    return np.asarray(-(omega**2)[:, None, None] * moved(stiffness, applied))
 
 
 def coupled_forces(

@@ -8,7 +8,7 @@ less than 1e-3 over 2 %.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -108,22 +108,8 @@ def powers_on(
 
     At the fine points of `read_fingertips` of a question, finger by finger.
     """
-    rows, found = _responses(table, *_touched(table, question), excitation, plates)
+    rows, found = _responses(table, *touched(table, question), excitation, plates)
     return rows, np.abs(found) ** 2
-
-
-def fields_on(
-    table: LocalizationTable, question: Question, row: int, plates: Plates
-) -> ComplexArray:
-    """Acceleration [m/s²] of each ERA alone at full stroke on plates, (d, points, eras).
-
-    At the points of `read_fingertips` of a question, finger by finger, at a row of the table's
-    frequencies; without the deviation of the field.
-    """
-    exact = replace(plates, deviation=np.zeros_like(plates.deviation))
-    bases = np.diag([complex(era.stroke) for era in table.eras])
-    touched = _touched(table, question)
-    return np.stack([_response(table, *touched, row, base, exact).T for base in bases], axis=-1)
 
 
 def amplitudes_on(
@@ -138,7 +124,7 @@ def amplitudes_on(
     return table.frequencies[rows], np.abs(found)
 
 
-def _touched(
+def touched(
     table: LocalizationTable, question: Question
 ) -> tuple[FloatArray, Sequence[FingertipLoad]]:
     """Shapes at the fine points of a question's fingers (k, p, r), and their loads."""
@@ -156,53 +142,47 @@ def _responses(
     """Rows of an excitation's frequencies (m,), and its accelerations (m, points, d) [m/s²]."""
     frequencies, bases = base_amplitudes(excitation, table.eras)
     rows = np.searchsorted(table.frequencies, frequencies)
-    found = [
-        _response(table, discs, fingers, row, base, plates)
-        for row, base in zip(rows, bases, strict=True)
-    ]
-    return rows, np.array(found)
+    found = accelerations_on(table, discs, fingers, rows, bases[:, None], plates)[:, :, 0]
+    weights = np.abs(bases) / [era.stroke for era in table.eras]
+    size = np.sqrt((table.error_power[rows] * weights**2).sum(axis=1))
+    deviation = np.repeat(plates.deviation, discs.shape[1], axis=1)
+    return rows, (found + np.multiply.outer(deviation, size).swapaxes(1, 2)).transpose(1, 2, 0)
 
 
-def _response(
+def accelerations_on(
     table: LocalizationTable,
     discs: FloatArray,
     fingers: Sequence[FingertipLoad],
-    row: int,
-    base: ComplexArray,
+    rows: IntArray,
+    bases: ComplexArray,
     plates: Plates,
 ) -> ComplexArray:
-    """Acceleration (points, d) [m/s²] under the fingers for a base motion (eras,) [m]."""
-    frequency = table.frequencies[row]
-    omega = 2 * np.pi * frequency
-    k, c, m = (np.array([getattr(era, key) for era in table.eras]) for key in _ERA_KEYS)
-    springs = dynamic_stiffness(
-        plates.stiffness * k, plates.damping[:, None] * c, np.zeros(1), omega
-    )
-    (masses,) = attached_stiffness((), table.masses, np.array([omega]))
-    resting = np.zeros(len(discs), dtype=complex)
-    if fingers:
-        resting[:] = [each.dynamic_stiffness(np.array(omega)) for each in fingers]
-    d = len(springs)
-    stiffness = np.hstack(
-        [
-            springs - omega**2 * m,
-            np.broadcast_to(masses, (d, len(masses))),
-            plates.load * resting,
-        ]
-    )
-    shapes = np.vstack([table.attachment_shapes, discs[:, 0]])
-    nominal = table.attached.modal[row]
-    exact = (nominal.real + 1j * plates.loss[:, None] * nominal.imag)[:, None]
-    modal = modal_receptance(exact, np.array([omega]), plates.thickness)[:, 0]
-    receptance = np.asarray((modal[:, None, :] * shapes) @ shapes.T, dtype=complex)
-    applied = np.zeros((*stiffness.shape, 1), dtype=complex)
-    gains = np.array([complex(era.gain(np.array(frequency))) for era in table.eras])
-    applied[:, : len(k), 0] = springs * plates.gain * gains * base
-    forces = coupled_forces(receptance, stiffness, applied)[:, :, 0]
-    found = -(omega**2) * (modal * (forces @ shapes)) @ discs.reshape(-1, discs.shape[-1]).T
-    weights = np.abs(base) / [era.stroke for era in table.eras]
-    size = math.sqrt(float(table.error_power[row] @ weights**2))
-    return np.asarray((found + size * np.repeat(plates.deviation, discs.shape[1], axis=1)).T)
+    """Acceleration (d, m, c, points) [m/s²] for base motions (m, c, eras) [m].
+
+    At rows (m,) of the table's frequencies and points of shapes discs (k, p, r), each finger at the
+    first point of its disc; without the deviation of the field.
+    """
+    w, eras = table.attached.omega[rows], table.eras
+    k, c, bolts = (np.array([getattr(era, key) for era in eras]) for key in _ERA_KEYS)
+    damping = plates.damping[:, None, None] * c
+    springs = dynamic_stiffness(plates.stiffness[:, None] * k, damping, 0.0, w[:, None])
+    loads = plates.load[:, : len(fingers)]
+    factors = np.pad(loads, ((0, 0), (len(table.masses), 0)), constant_values=1.0)
+    resting = attached_stiffness((), [*table.masses, *fingers], w)
+    at_eras = springs - (w**2)[:, None] * bolts
+    stiffness = np.concatenate([at_eras, factors[:, None] * resting], axis=-1)
+    nominal = table.attached.modal[rows]
+    lossy = nominal.real + 1j * plates.loss[:, None, None] * nominal.imag
+    modal = modal_receptance(lossy, w, plates.thickness)[:, :, None]
+    shapes = np.vstack([table.attachment_shapes, discs[: len(fingers), 0]])
+    receptance = np.asarray((modal * shapes) @ shapes.T, dtype=complex)
+    gains = np.array([era.gain(table.frequencies[rows]) for era in eras]).T
+    driven = (springs * plates.gain[:, None] * gains)[:, :, None] * bases
+    still = ((0, 0), (0, 0), (0, 0), (0, len(shapes) - len(eras)))
+    forces = coupled_forces(receptance, stiffness, np.pad(driven, still).swapaxes(2, 3))
+    moved = modal * (forces.swapaxes(2, 3) @ shapes)
+    found = -(w**2)[:, None, None] * (moved @ discs.reshape(-1, discs.shape[-1]).T)
+    return np.asarray(found)
 
 
 _ERA_KEYS = ("stiffness", "damping", "bolt_mass")

@@ -200,11 +200,7 @@ def modal_matrices(
         if attachment_shapes is None
         else attachment_shapes
     )
-    elasticity = ModalElasticity.of(reduced.plate, reduced.omega**2, reduced.losses)
-    elastic = np.diag(elasticity.eigenvalues)
-    M, C, K = contribution(phi[: len(fixed)], fixed)
-    M += np.eye(len(elastic))
-    K += elastic
+    elasticity, (M, C, K) = on_springs(reduced, fixed, phi[: len(fixed)])
     eigenvalues, psi = linalg.eigh(K, M)
     omega = np.sqrt(eigenvalues)
     lossy = (psi.T * elasticity.eigenvalues * elasticity.relative_loss) @ psi
@@ -216,13 +212,18 @@ def modal_matrices(
     return _under_fingertips((M, C, K), phi[len(fixed) :], [each.fingertip for each in contacts])
 
 
-def contribution(
-    phi: FloatArray, loads: Sequence[PointLoad]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Contribution of loads with these shapes (n, r) to M, C and K."""
-    mass = (phi.T * [load.mass for load in loads]) @ phi
-    damping = (phi.T * [load.damping for load in loads]) @ phi
-    return mass, damping, (phi.T * [load.stiffness for load in loads]) @ phi
+def on_springs(
+    reduced: ReducedPlate, loads: Sequence[PointLoad], phi: FloatArray
+) -> tuple[ModalElasticity, tuple[FloatArray, FloatArray, FloatArray]]:
+    """Elasticity of the free plate, and M, C, K (r, r) with loads of shapes phi (n, r).
+
+    C is of the loads alone.
+    """
+    elasticity = ModalElasticity.of(reduced.plate, reduced.omega**2, reduced.losses)
+    values = ([getattr(load, key) for load in loads] for key in ("mass", "damping", "stiffness"))
+    mass, damping, stiffness = ((phi.T * each) @ phi for each in values)
+    M, K = mass + np.eye(len(mass)), stiffness + np.diag(elasticity.eigenvalues)
+    return elasticity, (M, damping, K)
 
 
 def _under_fingertips(

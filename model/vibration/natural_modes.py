@@ -16,11 +16,10 @@ from model.fem.plate import (
     simply_supported_modes,
 )
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.reduction.reduced_plate import contribution, reduce_free_plate
+from model.reduction.reduced_plate import on_springs, reduce_free_plate
 from model.rig.rig import Rig
 from model.spectral.mesh import PlateMesh, SpectralMesh
 from model.structure.attachments import PointLoad, footprints_of
-from model.structure.modal_elasticity import ModalElasticity
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,9 +96,8 @@ def natural_modes(
 def _modes_with(free: FreePlate, attached: list[PointLoad]) -> NaturalModes:
     """All modes of the undamped plate with attachments, of the truncated ones some mixtures."""
     reduced = reduce_free_plate(free, footprints_of(attached))
-    M, _, K = contribution(reduced.at(footprints_of(attached)), attached)
-    elastic = ModalElasticity.of(reduced.plate, reduced.omega**2, reduced.losses).eigenvalues
-    squares, coordinates = linalg.eigh(K + np.diag(elastic), M + np.eye(len(M)))
+    _, (M, _, K) = on_springs(reduced, attached, reduced.at(footprints_of(attached)))
+    squares, coordinates = linalg.eigh(K, M)
     frequencies = np.sqrt(np.maximum(squares, 0)) / (2 * np.pi)
     return NaturalModes(frequencies, reduced.at, coordinates, free.mesh)
 

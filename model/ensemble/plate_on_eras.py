@@ -20,6 +20,7 @@ import numpy as np
 
 from model.arrays import Complex64Array, FloatArray
 from model.ensemble.attached_plate import AttachedPlate
+from model.structure.attachments import coupled_forces
 
 MODELLED = 0
 THICKER, THINNER = 1, 2
@@ -105,16 +106,9 @@ def _eliminated(
     Z, w2, n = plate.stiffness[row], plate.minus_omega2[row], plate.era_count
     modal = plate.shapes * receptance[:, None]
     A = modal @ plate.shapes.T
-    system = np.asarray(Z[:, None] * A, dtype=np.complex64)
-    _add_diagonal(system, np.float32(1))
-    K = np.linalg.inv(system)
+    K = coupled_forces(A, Z, np.eye(len(Z), dtype=np.complex64))
     coupling = np.asarray(Z[:, None] * A * Z, dtype=np.complex64)
-    _add_diagonal(coupling, Z)
+    coupling.reshape(len(A), -1)[:, :: len(Z) + 1] += Z
     moved = np.asarray(A @ (K[:, :, :n] * plate.forces[row]))
     by_force = np.asarray(w2 * (K.swapaxes(1, 2) @ modal), dtype=np.complex64)
     return by_force, np.asarray(-coupling / w2**2), moved
-
-
-def _add_diagonal(matrices: Complex64Array, values: Complex64Array | np.float32) -> None:
-    """Add values (n,) to the diagonals of matrices (t, n, n)."""
-    matrices.reshape(len(matrices), -1)[:, :: matrices.shape[1] + 1] += values

@@ -1,6 +1,7 @@
 """What commands that fit a rig to a measurement have in common: the file they write, their end."""
 
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ import typer
 
 from model.commands.options import next_line
 from model.errors import InputError
-from model.files.replacing import check_ending, check_place
+from model.files.replacing import check_ending, check_place, check_replaceable
 
 if TYPE_CHECKING:
     from model.config.document import Document
@@ -18,14 +19,24 @@ if TYPE_CHECKING:
 NO_FIT = 1
 """Exit status where a fit does not explain the measurement."""
 
+_HEADING = re.compile(rb"# .* by `era (calibrate|rig identify)`:$|$")
+"""First line of a rig that was fitted, or of an empty file."""
+
 
 def check_rig_output(output: Path, *taken: Path) -> None:
-    """Raise InputError unless a rig can be written to a place other than the files taken."""
+    """Raise InputError unless a rig can be written to a place other than the files taken.
+
+    There may be a fitted rig already, but no file that somebody wrote.
+    """
     check_place(output, example="rig2.yaml")
     check_ending(output, ".yaml", ".yml", what="a rig file")
     for file in taken:
         if output.resolve() == file.resolve():
             raise InputError(f"--output must differ from {file}; choose another name")
+    if output.is_file():
+        with output.open("rb") as stream:
+            is_fitted = _HEADING.match(stream.readline().rstrip()) is not None
+        check_replaceable(output, is_own=is_fitted, what="rig that `era` fitted")
 
 
 def write_fitted_rig(
@@ -38,7 +49,7 @@ def write_fitted_rig(
 ) -> list[str]:
     """Write the document of a rig with the values of its fit, and return the files written.
 
-    rigs: before and after; comment: heading and lines of the report.
+    rigs: before and after; comment: a heading as in _HEADING, and lines of the report.
     """
     from model.files.array_file import whole_or_nothing
     from model.rig.rewritten import rewritten_text

@@ -131,6 +131,7 @@ def design(
         found = search_layouts(problems, starts=starts, runner=runner)
     files = [str(path) for path in write_design(output, found, document.data)]
     result = {**summary(found), "time_s": time.perf_counter() - started, "files": files}
+    _warn_of_light(result["eras"])
     if as_json:
         print(json.dumps(result))
         return
@@ -185,6 +186,23 @@ def _stiffnesses(text: str) -> list[float] | list[None]:
             f"--stiffness must be at most {MAX_STIFFNESSES} different values above 0, got {text!r}"
         )
     return sorted(found) or [None]
+
+
+LIGHT = 0.2
+"""Share of the ERAs' mean load below which the plate may tip when a finger presses elsewhere."""
+
+
+def _warn_of_light(eras: dict[str, dict[str, Any]]) -> None:
+    """Name the ERAs that carry so little that the plate nearly tips."""
+    loads = {name: era["static_load_n"] for name, era in eras.items()}
+    least = LIGHT * sum(loads.values()) / len(loads)
+    if light := [f"{name} ({load:.2f} N)" for name, load in loads.items() if load < least]:
+        typer.echo(
+            f"era: warning: {', '.join(light)}: carries less than {least:.2f} N of the plate's "
+            "weight, a fifth of the mean; a finger may lift the plate off: fix it there, or leave "
+            "out places by --where",
+            err=True,
+        )
 
 
 def _show(result: dict[str, Any], *, own_count: int) -> None:

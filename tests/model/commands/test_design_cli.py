@@ -101,6 +101,19 @@ def test_given_layouts_are_ranked_and_the_best_written(small, tmp_path: Path) ->
     assert set(found["by_count_db"]) == {"3", "4"}
 
 
+@pytest.mark.parametrize(("depth", "is_light"), [("4.6 in", True), ("9 in", False)])
+def test_design_warns_of_a_plate_that_nearly_tips(small, tmp_path: Path, depth, is_light) -> None:
+    """An ERA a tenth of an inch behind the centre of mass carries all but 2 % of the weight."""
+    layout = f"layouts:\n  tee: [[0, 0], [12 in, 0], [6 in, {depth}]]\n"
+    (tmp_path / "layouts.yaml").write_text(layout)
+    result = design("--layouts", str(tmp_path / "layouts.yaml"), "-o", str(tmp_path), "--json")
+    assert result.exit_code == 0, result.output
+    light = [
+        name for name, era in json.loads(result.stdout)["eras"].items() if name in result.stderr
+    ]
+    assert len(light) == 2 * is_light
+
+
 LAYOUTS = """layouts:
   corners: [[0, 0], [12 in, 0], [12 in, 9 in], [0, 9 in]]
   skew:    [[1 in, 0], [11 in, 0], [9 in, 9 in], [0, 7 in]]

@@ -158,7 +158,10 @@ def _check_phases_and_places(
 
 
 def _exchanged(observation: Responses, model: ComplexArray) -> list[tuple[str, str]]:
-    """Pairs of a sensor and the one at whose place it is, from responses (f, e, s) of the model."""
+    """Pairs of a sensor and the one at whose place it is, which is elsewhere too.
+
+    model: responses (f, e, s).
+    """
     values = observation.values
     weight = np.isfinite(values) / row_rms(values)[:, :, None]
     gains, _ = project_gains(model, values, weight)
@@ -170,8 +173,8 @@ def _exchanged(observation: Responses, model: ComplexArray) -> list[tuple[str, s
     return [
         (names[sensor], names[place])
         for sensor, place in zip(sensors, places, strict=True)
-        if sensor != place
-        and coherence[sensor, sensor] < _OWN_PLACE
+        if coherence[sensor, sensor] < _OWN_PLACE
+        and coherence[place, place] < _OWN_PLACE  # else two are at one place, which is no exchange
         and coherence[sensor, place] > _OTHER_PLACE
     ]
 

@@ -27,6 +27,7 @@ _SHARES = np.array([1.0, 0.5, 0.5])  # amplitudes of carrier and side bands
 _ALL_DB = 20 * math.log10(float(np.linalg.norm(_SHARES)))  # of all three above the carrier
 _NEAR = 2  # carriers tried on each side of the steady one, by frequencies of the table
 _SAME = 0.5  # Hz; by which both side bands may differ in distance from the carrier
+_ROUNDING_DB = 1e-3  # of a promise that stays the same
 
 
 def with_modulation(
@@ -95,7 +96,11 @@ def frequency_of(layer: Layer) -> float:
 def _is_served(found: Answer, steady: Answer) -> bool:
     """Whether all fingers have what they require, and no less than 6 dB unless they had less."""
     worst, before = found.promised_worst_db, steady.promised_worst_db
-    if worst is not None and before is not None and worst < min(MIN_CONTRAST_DB, before):
+    if (
+        worst is not None
+        and before is not None
+        and worst < min(MIN_CONTRAST_DB, before - _ROUNDING_DB)
+    ):
         return False
     return not (lacks_contrast(found) or disturbed_fingers(found))
 

@@ -9,7 +9,7 @@ from model.finger.perception import detection_threshold
 from model.table.answer import answer
 from model.table.build import build_table
 from model.table.exact_plates import draw_plates, powers_on
-from model.table.modulation import frequency_of, with_modulation
+from model.table.modulation import frequency_of, with_gains, with_modulation
 from model.table.question import Question
 from model.table.request import Finger, Request
 from paper_table import contact_sets, smooth_rig
@@ -32,6 +32,20 @@ def powers(table, tones, places, plates):
 def sides_of(layer):
     """Frequencies of a layer's side bands."""
     return sorted(next(iter(tones.values())).frequency for tones in layer.side_bands)
+
+
+def test_contents_lowered_alike_are_served_as_before(table):
+    """Contrasts are ratios of levels, so none of crowded fingers has less than it had."""
+    crowded = 0
+    for places in contact_sets(8, fingers=4, seed=4):
+        requests = [Request(at, level_db_sl=15.0) for at in places]
+        found = answer(table, requests, min_contrast_db=-99.0)
+        if found.promised_worst_db < 6.0:
+            crowded += 1
+            for gain_db in (-1.0, -3.0, -7.0):
+                lowered = with_gains(table, found, [gain_db] * len(requests))
+                assert lowered.promised_worst_db == pytest.approx(found.promised_worst_db, abs=1e-4)
+    assert crowded > 2
 
 
 @pytest.mark.parametrize("modulation", [10.0, 30.0])

@@ -79,7 +79,7 @@ def assemble(plate: Plate, mesh: Mesh) -> PlateMatrices:
             f"mesh: must cover the plate of {plate.length:g} x {plate.width:g} m, got "
             f"{mesh.length:g} x {mesh.width:g} m; make the mesh for this plate"
         )
-    density = plate.material.rho * plate.thickness
+    density = plate.surface_density
     rotary = density * plate.thickness**2 / 12
     along_x, along_y = mesh.along
     value = sparse.kron(along_y.integrals["vv"], along_x.integrals["vv"])

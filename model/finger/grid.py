@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arguments import is_whole
-from model.arrays import FloatArray
+from model.arrays import FloatArray, lattice
 from model.errors import InputError
 from model.structure.plate import Plate
 
@@ -34,7 +34,5 @@ class Grid:
 
     def centres(self, plate: Plate) -> FloatArray:
         """Centres of the cells [m], (cell_count, 2)."""
-        cell_y, cell_x = np.meshgrid(np.arange(self.ny), np.arange(self.nx), indexing="ij")
-        x = (cell_x + 0.5) * plate.length / self.nx
-        y = (cell_y + 0.5) * plate.width / self.ny
-        return np.column_stack([x.ravel(), y.ravel()])
+        x = (np.arange(self.nx) + 0.5) * plate.length / self.nx
+        return lattice(x, (np.arange(self.ny) + 0.5) * plate.width / self.ny)

@@ -32,7 +32,7 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
         "nu": plate.material.nu,
         "loss_factor": plate.loss_factor,
         "mass_kg": plate.mass,
-        "surface_density_kg_m2": plate.material.rho * plate.thickness,
+        "surface_density_kg_m2": plate.surface_density,
         "flexural_rigidity_n_m": plate.flexural_rigidity,
         "bending_wavelength_m": {
             f"{frequency:g}_hz": _wavelength(plate, frequency)

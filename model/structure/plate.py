@@ -73,8 +73,25 @@ class Bond(StrEnum):
     NONE = "none"
 
 
+class Sheet:
+    """A sheet of one material of a thickness [m]."""
+
+    material: Material
+    thickness: float
+
+    @property
+    def surface_density(self) -> float:
+        """Mass per area [kg/m²]."""
+        return self.material.rho * self.thickness
+
+    @property
+    def flexural_rigidity(self) -> float:
+        """Flexural rigidity D = E h³ / 12 (1 - nu²) [N m], paper Eq. 7."""
+        return self.material.E * self.thickness**3 / (12 * (1 - self.material.nu**2))
+
+
 @dataclass(frozen=True)
-class Layer:
+class Layer(Sheet):
     """One layer of a laminate; thickness [m].
 
     loss_factor: eta of its modulus E (1 + i eta). by_frequency: rows of frequency [Hz], ascending,
@@ -106,16 +123,6 @@ class Layer:
     def is_elastic(self) -> bool:
         """Whether its modulus is real and the same at all frequencies."""
         return not self.by_frequency and not self.loss_factor
-
-    @property
-    def surface_density(self) -> float:
-        """Mass per area [kg/m²]."""
-        return self.material.rho * self.thickness
-
-    @property
-    def flexural_rigidity(self) -> float:
-        """Flexural rigidity of the layer alone [N m], of its modulus E."""
-        return self.material.E * self.thickness**3 / (12 * (1 - self.material.nu**2))
 
 
 @dataclass(frozen=True)
@@ -219,7 +226,7 @@ LOSS_FREQUENCY = 150.0
 
 
 @dataclass(frozen=True)
-class Plate:
+class Plate(Sheet):
     """A rectangular plate of constant thickness with its corner at the origin.
 
     length [m] along x, width [m] along y, thickness [m]; loss_factor is the structural loss
@@ -269,12 +276,7 @@ class Plate:
     @property
     def mass(self) -> float:
         """Mass of the bare plate [kg]."""
-        return self.material.rho * self.thickness * self.length * self.width
-
-    @property
-    def flexural_rigidity(self) -> float:
-        """Flexural rigidity D = E h³ / 12 (1 - nu²) [N m], paper Eq. 7."""
-        return self.material.E * self.thickness**3 / (12 * (1 - self.material.nu**2))
+        return self.surface_density * self.length * self.width
 
     @property
     def shear_rigidity(self) -> float:
@@ -287,27 +289,24 @@ class Plate:
 
         The order of magnitude of the plate's lowest modes for any support.
         """
-        surface_density = self.material.rho * self.thickness
-        side = max(self.length, self.width)
-        return math.pi / 2 * math.sqrt(self.flexural_rigidity / surface_density) / side**2
+        return self.bending_frequency(2 * max(self.length, self.width))
 
     def bending_wavelength(self, frequency: float) -> float:
         """Wavelength [m] of a bending wave at a frequency [Hz] in the thin-plate limit."""
         omega = 2 * math.pi * frequency
-        surface_density = self.material.rho * self.thickness
-        wavenumber = (surface_density * omega**2 / self.flexural_rigidity) ** 0.25
+        wavenumber = (self.surface_density * omega**2 / self.flexural_rigidity) ** 0.25
         return float(2 * math.pi / wavenumber)
 
     def bending_frequency(self, wavelength: float) -> float:
         """Frequency [Hz] of a bending wave of a wavelength [m] in the thin-plate limit."""
-        surface_density = self.material.rho * self.thickness
-        return 2 * math.pi / wavelength**2 * math.sqrt(self.flexural_rigidity / surface_density)
+        return (
+            2 * math.pi * math.sqrt(self.flexural_rigidity / self.surface_density) / wavelength**2
+        )
 
     def wave_stiffness(self, frequency: float) -> float:
         """Dynamic stiffness of an infinite plate under a point force, |F / w| [N/m]."""
-        surface_density = self.material.rho * self.thickness
         omega = 2 * math.pi * frequency
-        return 8 * omega * math.sqrt(self.flexural_rigidity * surface_density)
+        return 8 * omega * math.sqrt(self.flexural_rigidity * self.surface_density)
 
     def modes_below(self, frequency: float) -> int:
         """Number of modes of the free plate up to a frequency [Hz], as an estimate.

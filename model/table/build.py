@@ -18,7 +18,7 @@ from model.finger.grid import Grid
 from model.finger.perception import check_has_threshold
 from model.processes import on_processes
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.reduction.reduced_plate import reduce_plate
+from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig, canonical_json
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import footprints_of
@@ -155,9 +155,8 @@ def _solve(problem: TableProblem, part: Callable[[TableProblem], Arrays]) -> Arr
 
 def _modes(problem: TableProblem) -> Arrays:
     """Reduced plate at ERAs and loads, and on the raster."""
-    rig, highest = problem.rig, float(problem.frequencies[-1])
-    attached = footprints_of(rig.eras, rig.masses)
-    reduced = reduce_plate(rig.plate, rig.mesh, attached, frequency_max=highest)
+    attached = footprints_of(problem.rig.eras, problem.rig.masses)
+    reduced = reduce_free_plate(problem.free_plate, attached)
     dispersion = reduced.dispersion
     if dispersion is None:
         nothing = np.zeros((0, len(reduced.omega)), dtype=complex)

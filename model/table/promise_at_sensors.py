@@ -15,13 +15,13 @@ import numpy as np
 from model.arrays import FloatArray
 from model.ensemble.measures import percentile
 from model.errors import InputError
-from model.finger.perception import decibels, detection_threshold
+from model.finger.perception import decibels, sensation_level
 from model.table.exact_plates import amplitudes_on, draw_plates
 from model.table.pattern import Pattern
 from model.table.question import Point, Question
 from model.table.random_contacts import are_apart
 from model.table.table import LocalizationTable
-from model.table.verify import MIN_KEPT_SHARE, PLATES, sensed
+from model.table.verify import MIN_KEPT_SHARE, PLATES
 
 _TRIES = 1000
 _MAX_OTHERS = 3
@@ -125,7 +125,7 @@ def measured_promise(
     table: LocalizationTable, promise: Promise, frequencies: FloatArray, amplitudes: FloatArray
 ) -> MeasuredPromise:
     """Compare amplitudes (f, sensors) [m/s²] at the sensors of a promise, frequencies (f,) [Hz]."""
-    target, *quiet = decibels(_felt(table, frequencies, amplitudes)).tolist()
+    target, *quiet = sensation_level(frequencies, amplitudes, table.threshold).tolist()
     return MeasuredPromise(promise, target - max(quiet), target)
 
 
@@ -163,8 +163,8 @@ def _promise(
         era_count=len(table.eras),
         contact_count=len(names),
     )
-    frequencies, amplitudes = amplitudes_on(table, question.contacts, pattern.excitation, plates)
-    level = decibels(_felt(table, frequencies, amplitudes))
+    tones = amplitudes_on(table, question.contacts, pattern.excitation, plates)
+    level = sensation_level(*tones, table.threshold)
     contrast = level[0] - level[1:].max(axis=0)
     return Promise(
         tuple(names),
@@ -173,9 +173,3 @@ def _promise(
         median_db=float(percentile(contrast, 50)),
         level_db_sl=float(percentile(level[0])),
     )
-
-
-def _felt(table: LocalizationTable, frequencies: FloatArray, amplitudes: FloatArray) -> FloatArray:
-    """Amplitudes (f, ...) [m/s²] in multiples of their thresholds, felt together (...,)."""
-    threshold = detection_threshold(frequencies, table.threshold)
-    return sensed(amplitudes / threshold.reshape(-1, *[1] * (amplitudes.ndim - 1)))

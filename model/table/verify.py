@@ -312,11 +312,11 @@ class _AnswerChecker:
         )
         in_time = steady_in_time(plate, Transients(plate), pattern.excitation, discs)
         threshold = detection_threshold(frequencies, self._table.threshold)[:, None]
-        direct, in_time = direct / threshold, in_time / threshold
-        rest = rest / threshold
+        felt, felt_in_time, felt_elsewhere = (
+            np.linalg.norm(tones / threshold, axis=0) for tones in (direct, in_time, rest)
+        )
         error = field_error(self._table, float(frequencies[-1]))
-        error *= math.sqrt(float((sensed(rest) ** 2).mean()))
-        felt = sensed(direct)
+        error *= math.sqrt(float((felt_elsewhere**2).mean()))
         at_target = float(decibels(1 + error / (felt[:count] @ weights)))
         at_quiet = float(decibels(1 + error / felt[count:].max()))
         contrast = pattern.felt_contrast_db
@@ -325,8 +325,8 @@ class _AnswerChecker:
             pattern,
             predicted_contrast_db=math.nan if contrast is None else contrast,
             direct_level_db_sl=float(decibels(felt[:count] @ weights)),
-            direct_contrast_db=_contrast(direct, weights),
-            contrast_in_time_db=_contrast(in_time, weights),
+            direct_contrast_db=_contrast(felt, weights),
+            contrast_in_time_db=_contrast(felt_in_time, weights),
             level_tolerance_db=ROUNDING_DB + at_target,
             contrast_tolerance_db=ROUNDING_DB + at_target + at_quiet,
         )
@@ -349,14 +349,9 @@ def steady_in_time(
     return np.asarray(np.hypot(*np.split(fitted, 2)))
 
 
-def sensed(amplitudes: FloatArray) -> FloatArray:
-    """Tones (f, p) in multiples of their thresholds, felt together (p,)."""
-    return np.asarray(np.linalg.norm(amplitudes, axis=0))
-
-
-def _contrast(amplitudes: FloatArray, weights: FloatArray) -> float:
+def _contrast(felt: FloatArray, weights: FloatArray) -> float:
     """Felt contrast [dB] of a target, whose points with their weights come first."""
-    target, quiet = np.split(sensed(amplitudes), [len(weights)])
+    target, quiet = np.split(felt, [len(weights)])
     return float(contrast_db([target], quiet, [weights]))
 
 

@@ -122,7 +122,7 @@ def hour(seed: int, *, is_quiet: bool) -> Hour:
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
     values = hidden.measured(FREQUENCIES, np.random.default_rng([seed, 1]))
     identified = identify(rig, Measurement.of(sensors, FREQUENCIES, values), seed=seed)
-    live, mounted = LivePlate(Known.of(identified)), hidden.mounted
+    live, mounted = LivePlate(Known.of_rig(identified.rig, sensors)), hidden.mounted
     loaded = table_of(identified.rig, FREQUENCIES, loaded=True)
     weightless = table_of(identified.rig, FREQUENCIES, loaded=False)
     table, first, rng = loaded, mounted.plate, np.random.default_rng([seed, 2])
@@ -149,7 +149,9 @@ def hour(seed: int, *, is_quiet: bool) -> Hour:
         noise = rng.standard_normal((2, len(measured)))
         measured = measured + 0.01 * np.abs(measured) * (noise[0] + 1j * noise[1])
         fingers = tuple(RestingFinger(x, y, Fingertip()) for x, y in places.tolist())
-        report = live.take(SettledPattern(60 * minute, frequency, bases, measured, fingers))
+        report = live.take(
+            SettledPattern(60 * minute, frequency, bases, measured, fingers, has_phase=False)
+        )
         found.take(seed, minute, report)
         if number % _FOLLOWED_EVERY == 0:
             table = table_following(loaded, live.known.rig)

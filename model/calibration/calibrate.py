@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
@@ -44,21 +45,20 @@ def calibrate(
     all_scales: estimate the scale of every sensor, not only of wrong ones. Raises InputError if
     fewer than three sensors have a signal, and for a plate of another size.
     """
-    alive, dead_eras = ~screened.dead_sensors, screened.dead_eras
-    check_enough_sensors(alive, responses)
-    values = responses.values[:, :, alive].copy()
-    values[:, dead_eras] = np.nan
-    plate = sensed_plate(rig, responses.points[alive], responses.frequencies, has_form=True)
-    part, z = Problem.of(plate, values), np.zeros(plate.model.space.size)
-    z[plate.numbers] = screened.start
-    start = start_at(part, z)
-    # One that is elsewhere, or has come loose.
-    heard = start.used.sum(axis=(0, 1)) > np.isfinite(values).sum(axis=(0, 1)) / 2
-    if not heard.all():
-        alive[alive] = heard
-        check_enough_sensors(alive, responses)
-        part, start = part.at(heard), start.at(heard, plate.model.space)
-    points = responses.points[alive]
+    dead, dead_eras = screened.dead_sensors.copy(), screened.dead_eras
+    while True:
+        check_enough_sensors(~dead, responses)
+        live = responses.without(dead)
+        values = live.values.copy()
+        values[:, dead_eras] = np.nan
+        plate = sensed_plate(rig, live.points, live.frequencies, has_form=True)
+        part, z = Problem.of(plate, values), np.zeros(plate.model.space.size)
+        z[plate.numbers] = screened.start
+        start = start_at(part, z)
+        heard = start.used.sum(axis=(0, 1)) > np.isfinite(values).sum(axis=(0, 1)) / 2
+        if heard.all():
+            break
+        dead[~dead] = ~heard  # elsewhere, or loose
 
     # All scales are free at first, so that a wrong one does not bias the fit.
     fit = solve(part, start)
@@ -73,17 +73,12 @@ def calibrate(
         found = _with_median_scale_one(problem, found)
     _check_sides(problem, found)
     _check_outliers(problem, found)
-    names = tuple(name for name, live in zip(responses.sensors, alive, strict=True) if live)
     return _report(
         problem,
         found,
-        points=points,
-        names=names,
-        frequencies=responses.frequencies,
-        dead_sensors=tuple(
-            name for name, live in zip(responses.sensors, alive, strict=True) if not live
-        ),
-        dead_eras=tuple(era.name for era, dead in zip(rig.eras, dead_eras, strict=True) if dead),
+        live,
+        dead_sensors=tuple(compress(responses.sensors, dead)),
+        dead_eras=tuple(compress((era.name for era in rig.eras), dead_eras)),
     )
 
 
@@ -159,18 +154,16 @@ def _with_median_scale_one(problem: Problem, fit: Fit) -> Fit:
 def _report(
     problem: Problem,
     fit: Fit,
+    live: Responses,
     *,
-    points: FloatArray,
-    names: tuple[str, ...],
-    frequencies: FloatArray,
     dead_sensors: tuple[str, ...],
     dead_eras: tuple[str, ...],
 ) -> Calibration:
     fitted, scales, before = problem.plate, problem.scales(fit.z), problem.plate.rig
     rig = rig_of_fit(problem, fit)
-    responses, gains = predicted_by(rig, problem, points, fit)
+    responses, gains = predicted_by(rig, problem, live.points, fit)
     eras = tuple(
-        replace(era, gains=gain_rows(gains[:, number], frequencies) or era.gains)
+        replace(era, gains=gain_rows(gains[:, number], live.frequencies) or era.gains)
         for number, era in enumerate(rig.eras)
     )
     bounds = np.array([fitted.model.space.lower, fitted.model.space.upper])
@@ -192,7 +185,7 @@ def _report(
             strict=True,
         )
     )
-    held_out = hold_out(problem, fit, points, names)
+    held_out = hold_out(problem, fit, live)
     uncertainty = uncertainty_of(before.uncertainty, problem, fit, parameters, held_out, gains)
     measured_count = int(np.isfinite(problem.values).sum())
     return Calibration(
@@ -205,7 +198,7 @@ def _report(
         scales=tuple(
             SensorScale(name, float(scale), float(error))
             for name, scale, error, free in zip(
-                names, scales, problem.scale_errors(fit), problem.free_scales, strict=True
+                live.sensors, scales, problem.scale_errors(fit), problem.free_scales, strict=True
             )
             if free
         ),
@@ -214,8 +207,8 @@ def _report(
         error=_fit_error(problem, fit),
         chi2=fit.chi2,
         held_out=held_out,
-        sensors=names,
-        frequencies=frequencies,
+        sensors=live.sensors,
+        frequencies=live.frequencies,
         measured=problem.values / scales,
         before=initial_responses(problem),
         after=gains[:, :, None] * responses,

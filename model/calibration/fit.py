@@ -35,7 +35,6 @@ from model.calibration.variable_projection import (
     row_rms,
 )
 from model.identification.least_squares import Found
-from model.identification.parameters import Space
 
 _MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
 _ROUNDS = 8
@@ -65,14 +64,13 @@ class Problem:
         searched = space.uncertain & ~space.of("gain")
         return cls(plate, values, searched, np.ones(values.shape[2], dtype=bool))
 
-    def at(self, kept: NDArray[np.bool_]) -> "Problem":
-        """Select some of the sensors (s,)."""
-        return Problem(
-            self.plate.at_some(kept),
-            self.values[:, :, kept],
-            self.searched[_of_sensors(self.plate.model.space, kept)],
-            self.free_scales[kept],
-        )
+    def without(self, sensors: NDArray[np.bool_]) -> Self:
+        """The same where some sensors (s,) measured nothing; what is theirs stays as it starts."""
+        groups, searched = self.plate.model.space.groups, self.searched.copy()
+        searched[groups["sensor_scale"]] &= ~sensors
+        searched[groups["sensor_place"]] &= np.repeat(~sensors, 2)
+        values = np.where(sensors, np.nan, self.values)
+        return replace(self, values=values, searched=searched)
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -102,24 +100,15 @@ class Problem:
         """Rows (m, n) that hold what is searched of scales and form errors; their targets (m,)."""
         space, held = self.plate.model.space, self.searched.copy()
         held[self.plate.numbers] = False
-        held[space.groups["sensor_scale"]] = ~self.free_scales
+        held[space.groups["sensor_scale"]] &= ~self.free_scales
         rows, targets = np.eye(space.size)[held], np.zeros(held.sum())
         if self.free_scales.all():
             # Gains determine a common scale; the mean is held.
             mean = np.zeros((1, space.size))
             own = space.groups["sensor_scale"]
-            mean[0, own] = _HOLD * space.std[own] / len(self.free_scales)
+            mean[0, own] = _HOLD * (space.std * self.searched)[own] / len(self.free_scales)
             rows, targets = np.vstack([rows, mean]), np.append(targets, mean @ start)
         return rows[:, self.searched], targets
-
-
-def _of_sensors(space: Space, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask (p,) of the parameters that remain of a space with some of the sensors (s,)."""
-    own = np.ones(space.size, dtype=bool)
-    for kind in ("sensor_gain", "sensor_phase", "sensor_scale"):
-        own[space.groups[kind]] = kept
-    own[space.groups["sensor_place"]] = np.repeat(kept, 2)
-    return own
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,10 +122,6 @@ class Start:
     z: FloatArray
     noise: FloatArray
     used: NDArray[np.bool_]
-
-    def at(self, kept: NDArray[np.bool_], space: Space) -> Self:
-        """Select some of the sensors (s,) of a space."""
-        return replace(self, z=self.z[_of_sensors(space, kept)], used=self.used[:, :, kept])
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,8 +164,8 @@ def start_at(problem: Problem, z: FloatArray) -> Start:
 
 def solve(problem: Problem, start: Start) -> Fit:
     """Fit parameters, scales and form errors."""
-    z, noise, used = start.z, start.noise, start.used
     finite = np.isfinite(problem.values)
+    z, noise, used = start.z, start.noise, start.used & finite
     for _ in range(_ROUNDS):
         weight, before = used / noise[:, :, None], noise
         found = _search(problem, z, weight)

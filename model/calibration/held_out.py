@@ -1,6 +1,7 @@
 """Validation of a fit at sensors held out of it."""
 
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,18 +10,17 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import HeldOut
 from model.calibration.fit import Fit, Problem, solve
 from model.calibration.fitted_rig import predicted_by, rig_of_fit
+from model.calibration.responses import Responses
 from model.calibration.variable_projection import row_rms
 from model.identification.held_out import SHARE, relative_rms
 
 
-def hold_out(
-    problem: Problem, fit: Fit, points: FloatArray, names: tuple[str, ...]
-) -> HeldOut | None:
-    """Fit without some of the sensors of known scale, and predict their responses.
+def hold_out(problem: Problem, fit: Fit, live: Responses) -> HeldOut | None:
+    """Fit without some of the live sensors of known scale, and predict their responses.
 
-    points (s, 2) [m]. Predicted by the rig as its file has it, without other form errors.
+    Predicted by the rig as its file has it, without other form errors.
     """
-    count = len(names)
+    count = len(live.sensors)
     candidates = np.flatnonzero(~problem.free_scales | problem.free_scales.all())
     wanted = round(count / SHARE)
     if count < SHARE or len(candidates) <= wanted:
@@ -28,15 +28,17 @@ def hold_out(
     evenly_spaced = np.linspace(0, len(candidates) - 1, wanted + 2)[1:-1].round().astype(int)
     unseen = np.zeros(count, dtype=bool)
     unseen[candidates[evenly_spaced]] = True
-    part = problem.at(~unseen)
-    seen = solve(part, fit.at(~unseen, problem.plate.model.space))
+    part = problem.without(unseen)
+    seen = solve(part, fit)
     rig, scales = rig_of_fit(part, seen), problem.scales(fit.z)
-    responses, gains = predicted_by(rig, problem, points, replace(fit, used=fit.used & ~unseen))
+    responses, gains = predicted_by(
+        rig, problem, live.points, replace(fit, used=fit.used & ~unseen)
+    )
     predicted = gains[:, :, None] * responses * scales
     size = row_rms(problem.values)
     which = fit.used & unseen
     return HeldOut(
-        tuple(name for name, out in zip(names, unseen, strict=True) if out),
+        tuple(compress(live.sensors, unseen)),
         relative_error(
             problem.values, initial_responses(problem) * scales, size, unseen[None, None]
         ),

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +66,7 @@ class Responses:
         kept = ~sensors
         return replace(
             self,
-            sensors=tuple(name for name, keep in zip(self.sensors, kept, strict=True) if keep),
+            sensors=tuple(compress(self.sensors, kept)),
             points=self.points[kept],
             values=self.values[:, :, kept],
         )
@@ -182,8 +183,8 @@ def silent_sensors(responses: Responses) -> NDArray[np.bool_]:
 def check_enough_sensors(alive: NDArray[np.bool_], responses: Responses) -> None:
     """Raise InputError unless enough sensors (s,) have a signal."""
     if alive.sum() < LEAST_SENSORS:
-        dead = [n for n, live in zip(responses.sensors, alive, strict=True) if not live]
-        without = f" ({', '.join(dead)} without a signal)" if dead else ""
+        dead = ", ".join(compress(responses.sensors, ~alive))
+        without = f" ({dead} without a signal)" if dead else ""
         raise InputError(
             f"at least {LEAST_SENSORS} sensors must have a signal, better eight or more, got "
             f"{alive.sum()}{without}"

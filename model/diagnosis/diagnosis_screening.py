@@ -1,6 +1,7 @@
 """Detection of dead channels and unusable sensors."""
 
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,8 +67,8 @@ def usable_sensors(
         return observation, ()
     silent = silent_sensors(replace(observation, values=values))
     check_enough_sensors(~silent, observation)
-    names = [name for name, out in zip(observation.sensors, silent, strict=True) if out]
-    return observation.without(silent), tuple(BadSensor(name, 0.0) for name in names)
+    mute = tuple(BadSensor(name, 0.0) for name in compress(observation.sensors, silent))
+    return observation.without(silent), mute
 
 
 def off_scale(observation: Responses, values: ComplexArray, match: Match) -> list[BadSensor]:

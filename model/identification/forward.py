@@ -8,9 +8,8 @@ ERA j, moved by its gain g_j, with
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Self
 
 import numpy as np
 
@@ -138,10 +137,6 @@ class ForwardModel:
         last = first + self.mass_count + len(self.fingers)
         sensors = range(last, last + len(self.space.indices("sensor_place")) // 2)
         return np.array([*movable, *sensors], dtype=int)
-
-    def with_frequencies(self, frequencies: FloatArray) -> Self:
-        """The same at other frequencies (f,) [Hz]."""
-        return replace(self, frequencies=frequencies, last_places=dict(self.last_places))
 
     def at(self, x: FloatArray) -> "PlateAt":
         """The plate for parameters x (p,)."""

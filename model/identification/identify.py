@@ -22,8 +22,8 @@ from model.spectral.mesh import PlateMesh, SpectralMesh
 MAX_CHI2 = 2.0
 """chi² beyond which a model does not explain a measurement, and nothing is promised from it."""
 
-DRIVE_GAIN, DRIVE_PHASE_DEG = 0.01, 1.0
-"""How far a drive repeats from one day to the next, which no measurement tells."""
+# How far a drive repeats from one day to the next, which no measurement tells.
+_DRIVE_GAIN, _DRIVE_PHASE_DEG = 0.01, 1.0
 
 _LEAST_VALUES = 16
 _GAIN_STDS = 5.0
@@ -56,20 +56,12 @@ class Identification:
         return self.chi2 <= MAX_CHI2
 
 
-def identify(
-    rig: Rig,
-    measurement: Measurement,
-    *,
-    seed: int = 0,
-    drive_gain: float = DRIVE_GAIN,
-    drive_phase_deg: float = DRIVE_PHASE_DEG,
-) -> Identification:
+def identify(rig: Rig, measurement: Measurement, *, seed: int = 0) -> Identification:
     """Identify a rig by a measurement on it; the same for the same data and seed.
 
-    drive_gain, drive_phase_deg: how far drives repeat. Raises InputError for a plate that was not
-    linear or has changed during the measurement, for gains that no drive or sensor has (another
-    unit, a wrong sign), and where it leaves unknown what answers depend
-    on, with the tone and the sensor that would show it.
+    Raises InputError for a plate that was not linear or has changed during the measurement, for
+    gains that no drive or sensor has (another unit, a wrong sign), and where it leaves unknown what
+    answers depend on, with the tone and the sensor that would show it.
     """
     _check(rig, measurement)
     setting = Setting(rig, solved_for(rig, float(measurement.frequencies[-1])), measurement)
@@ -87,8 +79,8 @@ def identify(
     if is_explained:
         uncertainty = posterior.uncertainty(
             uncertainty,
-            gain=drive_gain,
-            phase_deg=drive_phase_deg,
+            gain=_DRIVE_GAIN,
+            phase_deg=_DRIVE_PHASE_DEG,
             field=held_out.unexplained if held_out else 0.0,
         )
     if held_out:

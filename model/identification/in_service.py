@@ -20,11 +20,10 @@ from model.arrays import FloatArray
 from model.identification.alarm import PLACES, Alarm, Taken
 from model.identification.forward import ForwardModel, Sensor
 from model.identification.hypotheses import Explanation, explain
-from model.identification.identify import Identification, solved_for
-from model.identification.parameters import FINGER_PARTS, KINDS, MODE_SHIFTS, space_of
+from model.identification.identify import solved_for
+from model.identification.parameters import KINDS, MODE_SHIFTS, space_of
 from model.identification.settled import SettledPattern, Touched
 from model.identification.settled_update import NoiseLevel, State, update
-from model.identification.stages import Setting
 from model.identification.values import Values, rig_with
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
@@ -48,8 +47,7 @@ class Report:
 
     nis: squared innovation in its covariance, of `count` numbers; alarm: whether it began one, none
     while the plate counts as changed; is_held: whether the state waits for an explanation;
-    explanation: where one was found now; fingers (k, 4): factors of FINGER_PARTS of each finger of
-    the pattern, none while held.
+    explanation: where one was found now.
     """
 
     nis: float
@@ -57,7 +55,6 @@ class Report:
     alarm: bool
     is_held: bool
     explanation: Explanation | None
-    fingers: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,17 +81,6 @@ class Known:
         """The rig as it is known now."""
         values = Values.of(self.before, self.model.space, self.state.x)
         return rig_with(self.before, values, self.uncertainty)
-
-    @classmethod
-    def of(cls, found: Identification) -> Self:
-        """What an identification has shown."""
-        problem = found.fitted.problem
-        setting = Setting(found.before, problem.model.free, problem.measurement)
-        # A spare mass weighs nothing so far.
-        model = setting.model(problem.model.mass_count + 1)
-        known = found.posterior.within(model.space)
-        state = State(known.x, known.covariance)
-        return cls(found.before, found.rig.uncertainty, model, state, found.is_explained)
 
     @classmethod
     def of_rig(cls, rig: Rig, sensors: Sequence[Sensor]) -> Self:
@@ -152,16 +138,13 @@ class LivePlate:
                 self._go_back(suspect)
                 explanation = self._explained(pattern.time).explanation
             self._alarm.clear()
-            return Report(
-                after.nis, after.count, is_new, bool(self._held), explanation, np.zeros((0, 4))
-            )
+            return Report(after.nis, after.count, is_new, bool(self._held), explanation)
         if self.has_changed and self._alarm.is_full:
             self.known = replace(self.known, change="")
         if known.is_explained and not self.has_changed and not self._alarm.is_odd:
             self.known = replace(self.known, state=after.state, time=pattern.time)
             self._noise.take(after)
-        fingers = np.exp(_FINGER * after.fingers.reshape(-1, len(FINGER_PARTS)))
-        return Report(after.nis, after.count, False, False, None, fingers)
+        return Report(after.nis, after.count, False, False, None)
 
     def _go_back(self, suspect: list[Taken]) -> None:
         """Return to the state before the first suspect pattern, and hold them."""
@@ -178,13 +161,13 @@ class LivePlate:
             later = explain(drifted, self._held[-_EARLY:])
             found = later if later.name else found
         if found is None or not (is_full or (found.name and found.lead > _CERTAIN)):
-            return Report(np.nan, 0, False, True, None, np.zeros((0, 4)))
+            return Report(np.nan, 0, False, True, None)
         self._held = []
         if found.can_be_followed:
             self.known = replace(self.known, state=found.state, time=time)
         else:
             self.known = replace(self.known, change=str(found))
-        return Report(np.nan, 0, False, False, found, np.zeros((0, 4)))
+        return Report(np.nan, 0, False, False, found)
 
     @cached_property
     def _theory(self) -> FloatArray:

@@ -137,10 +137,6 @@ class Space:
             chosen[self.groups[kind]] = True
         return chosen & self.uncertain
 
-    def without(self, *kinds: str) -> "Space":
-        """The same where all of these kinds is known."""
-        return replace(self, std=np.where(self.of(*kinds), 0.0, self.std))
-
     def knowing_all_but(self, kinds: Mapping[str, tuple[Number, Number, Number]]) -> "Space":
         """The same where only some kinds are uncertain.
 

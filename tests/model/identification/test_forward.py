@@ -136,7 +136,7 @@ def test_drive_lags_as_an_actuator_with_a_resonance(model: ForwardModel) -> None
     space, x = model.space, np.zeros(model.space.size)
     for name, value in (("inertia of drive SE", 4.0), ("drag of drive SE", 1.2)):
         x[space.index(name)] = value / space.std[space.index(name)]
-    at_resonance = model.with_frequencies(np.array([500.0]))
+    at_resonance = replace(model, frequencies=np.array([500.0]))
     lagging, rigid = (at_resonance.at(each).responses[0] for each in (x, np.zeros(space.size)))
     np.testing.assert_allclose(lagging[:, 1], rigid[:, 1] / 0.6j)
     np.testing.assert_allclose(lagging[:, [0, 2, 3]], rigid[:, [0, 2, 3]])

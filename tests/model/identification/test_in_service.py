@@ -24,7 +24,7 @@ def play(
 
 def test_loosened_mount_is_named_and_followed(hidden: Hidden, found: Identification) -> None:
     """Quiet patterns raise no alarm; a mount 20 % softer does within 8, and is named NE."""
-    live = LivePlate(Known.of(found))
+    live = LivePlate(Known.of_rig(found.rig, found.fitted.problem.model.sensors))
     quiet = play(live, hidden, hidden.mounted, count=10, start=0)
     assert not any(report.alarm for report in quiet)
     assert np.mean([report.nis / report.count for report in quiet]) < 1.5
@@ -43,7 +43,7 @@ def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
     found: Identification,
 ) -> None:
     """Thickness by 1 % more after an hour; after two weeks by 2 %, stiffness by 10 %."""
-    live = LivePlate(replace(Known.of(found), time=0.0))
+    live = LivePlate(replace(Known.of_rig(found.rig, found.fitted.problem.model.sensors), time=0.0))
     space = live.known.model.space
 
     def known(kind: str, hours: float) -> float:
@@ -60,7 +60,7 @@ def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
 @pytest.mark.long
 def test_sticker_is_named_in_its_place(hidden: Hidden, found: Identification) -> None:
     """3 g are named a mass within ten patterns, to 0.6 g and 1.5 cm."""
-    live = LivePlate(Known.of(found))
+    live = LivePlate(Known.of_rig(found.rig, found.fitted.problem.model.sensors))
     play(live, hidden, hidden.mounted, count=10, start=0)
     sticker = np.array([0.11, 0.16, 3e-3])
     changed = replace(hidden.mounted, masses=np.vstack([hidden.mounted.masses, sticker]))
@@ -74,14 +74,16 @@ def test_sticker_is_named_in_its_place(hidden: Hidden, found: Identification) ->
 
 def test_heavy_finger_is_no_change(hidden: Hidden, found: Identification) -> None:
     """Fingers of six times the usual load, beyond three standard deviations, raise no alarm."""
-    live = LivePlate(Known.of(found))
+    live = LivePlate(Known.of_rig(found.rig, found.fitted.problem.model.sensors))
     heavy = settled_patterns(hidden, hidden.mounted, count=12, start=0, heaviest=6.0)
     assert not any(live.take(each).alarm for each in heavy)
 
 
 def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, found: Identification) -> None:
     """After an identification with chi² above 2 patterns leave the state as it was."""
-    live = LivePlate(Known.of(replace(found, chi2=2.5)))
+    live = LivePlate(
+        replace(Known.of_rig(found.rig, found.fitted.problem.model.sensors), is_explained=False)
+    )
     before = live.known.state
     play(live, hidden, hidden.mounted, count=2, start=0)
     assert live.known.state is before
@@ -90,7 +92,7 @@ def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, found: Iden
 @pytest.mark.long
 def test_change_that_nothing_explains_is_said(hidden: Hidden, found: Identification) -> None:
     """Two mounts and a gain at once are no known change: the state stays and says so."""
-    live = LivePlate(Known.of(found))
+    live = LivePlate(Known.of_rig(found.rig, found.fitted.problem.model.sensors))
     mounted = hidden.mounted
     odd = replace(
         mounted,
@@ -104,10 +106,3 @@ def test_change_that_nothing_explains_is_said(hidden: Hidden, found: Identificat
     assert reports[-1].explanation.name == ""
     assert live.has_changed
     assert live.known.state is before
-
-
-def test_fingers_of_a_touch_are_refined(hidden: Hidden, found: Identification) -> None:
-    """Factors of the parts of every finger come with the report, above zero."""
-    (report,) = play(LivePlate(Known.of(found)), hidden, hidden.mounted, count=1, start=3)
-    assert report.fingers.shape[1] == 4
-    assert (report.fingers > 0).all()

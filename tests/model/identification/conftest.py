@@ -6,6 +6,7 @@ import pytest
 from benchmarks.identification.hidden import Hidden, draw
 from model.identification.forward import Sensor
 from model.identification.identify import Identification, identify
+from model.identification.in_service import Known
 from model.identification.measurement import Measurement
 from model.rig.file import example_rig_path, load_rig
 from settled_patterns import FREQUENCIES
@@ -24,3 +25,9 @@ def found(hidden: Hidden) -> Identification:
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
     values = hidden.measured(FREQUENCIES, np.random.default_rng(1))
     return identify(rig, Measurement.of(sensors, FREQUENCIES, values))
+
+
+@pytest.fixture(scope="session")
+def known(found: Identification) -> Known:
+    """What a daemon knows of that plate when it starts: what the identified rig states."""
+    return Known.of_rig(found.rig, found.fitted.problem.model.sensors)

@@ -57,11 +57,9 @@ def said(reports: Iterable[Report]) -> str:
 
 
 @pytest.mark.long
-def test_hand_that_stays_is_no_sticker_and_leaves_again(
-    hidden: Hidden, found: Identification
-) -> None:
+def test_hand_that_stays_is_no_sticker_and_leaves_again(hidden: Hidden, known: Known) -> None:
     """It is named where it rests, answers are cautious until it is gone; then service goes on."""
-    live = LivePlate(Known.of_rig(found.rig, found.fitted.problem.model.sensors))
+    live = LivePlate(known)
     own = {each.name: getattr(hidden.mounted, each.name) for each in fields(Mounted)}
     rested = Rested(**own)
     reports = play(live, hidden, rested, count=6)
@@ -75,22 +73,22 @@ def test_hand_that_stays_is_no_sticker_and_leaves_again(
 
 
 @pytest.mark.long
-def test_heavy_sticker_is_no_hand(hidden: Hidden, found: Identification) -> None:
+def test_heavy_sticker_is_no_hand(hidden: Hidden, known: Known) -> None:
     """10 g where the hand was are a mass."""
     sticker = np.array([*HAND, 10e-3])
     plate = replace(hidden.mounted, masses=np.vstack([hidden.mounted.masses, sticker]))
-    live = LivePlate(Known.of_rig(found.rig, found.fitted.problem.model.sensors))
+    live = LivePlate(known)
     reports = map(live.take, settled_patterns(hidden, plate, count=6, start=0))
     assert said(reports) == "a mass"
 
 
 @pytest.mark.long
-def test_crack_is_named(hidden: Hidden, found: Identification) -> None:
+def test_crack_is_named(hidden: Hidden, known: Known) -> None:
     """A patch of 2.3 by 6.9 cm at an edge that has lost half of its stiffness is a crack.
 
     After ten patterns, which have told the gains of the sensors.
     """
-    live = LivePlate(Known.of_rig(found.rig, found.fitted.problem.model.sensors))
+    live = LivePlate(known)
     play(live, hidden, hidden.mounted, count=10)
     reports = play(live, hidden, softened(hidden.mounted, EDGE), count=6, start=10)
     assert said(reports) == "a crack"

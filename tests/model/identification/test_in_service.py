@@ -7,7 +7,6 @@ import pytest
 
 from benchmarks.identification.hidden import Hidden
 from benchmarks.identification.thin_plate import Mounted
-from model.identification.identify import Identification
 from model.identification.in_service import Known, LivePlate, Report
 from settled_patterns import settled_patterns
 
@@ -22,9 +21,9 @@ def play(
     return [live.take(pattern) for pattern in patterns]
 
 
-def test_loosened_mount_is_named_and_followed(hidden: Hidden, found: Identification) -> None:
+def test_loosened_mount_is_named_and_followed(hidden: Hidden, known: Known) -> None:
     """Quiet patterns raise no alarm; a mount 20 % softer does within 8, and is named NE."""
-    live = LivePlate(Known.of_rig(found.rig, found.fitted.problem.model.sensors))
+    live = LivePlate(known)
     quiet = play(live, hidden, hidden.mounted, count=10, start=0)
     assert not any(report.alarm for report in quiet)
     assert np.mean([report.nis / report.count for report in quiet]) < 1.5
@@ -40,10 +39,10 @@ def test_loosened_mount_is_named_and_followed(hidden: Hidden, found: Identificat
 
 
 def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
-    found: Identification,
+    known: Known,
 ) -> None:
     """Thickness by 1 % more after an hour; after two weeks by 2 %, stiffness by 10 %."""
-    live = LivePlate(replace(Known.of_rig(found.rig, found.fitted.problem.model.sensors), time=0.0))
+    live = LivePlate(replace(known, time=0.0))
     space = live.known.model.space
 
     def known(kind: str, hours: float) -> float:
@@ -58,9 +57,9 @@ def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
 
 
 @pytest.mark.long
-def test_sticker_is_named_in_its_place(hidden: Hidden, found: Identification) -> None:
+def test_sticker_is_named_in_its_place(hidden: Hidden, known: Known) -> None:
     """3 g are named a mass within ten patterns, to 0.6 g and 1.5 cm."""
-    live = LivePlate(Known.of_rig(found.rig, found.fitted.problem.model.sensors))
+    live = LivePlate(known)
     play(live, hidden, hidden.mounted, count=10, start=0)
     sticker = np.array([0.11, 0.16, 3e-3])
     changed = replace(hidden.mounted, masses=np.vstack([hidden.mounted.masses, sticker]))
@@ -72,27 +71,25 @@ def test_sticker_is_named_in_its_place(hidden: Hidden, found: Identification) ->
     assert (added.x, added.y) == pytest.approx((0.11, 0.16), abs=0.015)
 
 
-def test_heavy_finger_is_no_change(hidden: Hidden, found: Identification) -> None:
+def test_heavy_finger_is_no_change(hidden: Hidden, known: Known) -> None:
     """Fingers of six times the usual load, beyond three standard deviations, raise no alarm."""
-    live = LivePlate(Known.of_rig(found.rig, found.fitted.problem.model.sensors))
+    live = LivePlate(known)
     heavy = settled_patterns(hidden, hidden.mounted, count=12, start=0, heaviest=6.0)
     assert not any(live.take(each).alarm for each in heavy)
 
 
-def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, found: Identification) -> None:
+def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, known: Known) -> None:
     """After an identification with chi² above 2 patterns leave the state as it was."""
-    live = LivePlate(
-        replace(Known.of_rig(found.rig, found.fitted.problem.model.sensors), is_explained=False)
-    )
+    live = LivePlate(replace(known, is_explained=False))
     before = live.known.state
     play(live, hidden, hidden.mounted, count=2, start=0)
     assert live.known.state is before
 
 
 @pytest.mark.long
-def test_change_that_nothing_explains_is_said(hidden: Hidden, found: Identification) -> None:
+def test_change_that_nothing_explains_is_said(hidden: Hidden, known: Known) -> None:
     """Two mounts and a gain at once are no known change: the state stays and says so."""
-    live = LivePlate(Known.of_rig(found.rig, found.fitted.problem.model.sensors))
+    live = LivePlate(known)
     mounted = hidden.mounted
     odd = replace(
         mounted,

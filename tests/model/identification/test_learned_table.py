@@ -10,8 +10,6 @@ from benchmarks.identification.hidden import Hidden
 from benchmarks.identification.thin_plate import Mounted
 from model.errors import InputError
 from model.identification import learned_table
-from model.identification.forward import Sensor
-from model.identification.identify import Identification
 from model.identification.in_service import Known
 from model.identification.learned_table import LearnedTable
 from model.rig.rig import Rig
@@ -25,20 +23,9 @@ POINTS = np.array([[0.06, 0.05], [0.15, 0.11], [0.26, 0.17], [0.22, 0.04]])
 
 
 @pytest.fixture(scope="module")
-def rig(found: Identification) -> Rig:
-    """The paper's rig as identified on it."""
-    return found.rig
-
-
-@pytest.fixture(scope="module")
-def table(rig: Rig) -> LocalizationTable:
-    """Its table at a few tones."""
-    return build_table(rig, frequencies=TONES, drive_mode="phased")
-
-
-def sensors_of(rig: Rig) -> list[Sensor]:
-    """One at each ERA."""
-    return [Sensor(era.name, era.name) for era in rig.eras]
+def table(known: Known) -> LocalizationTable:
+    """The table of the identified rig at a few tones."""
+    return build_table(known.before, frequencies=TONES, drive_mode="phased")
 
 
 def loosened(mounted: Mounted) -> Mounted:
@@ -56,10 +43,10 @@ def error(table: LocalizationTable, plate: Mounted) -> float:
 
 @pytest.mark.long
 def test_answers_follow_a_loosened_mount(
-    hidden: Hidden, rig: Rig, table: LocalizationTable
+    hidden: Hidden, known: Known, table: LocalizationTable
 ) -> None:
     """Fields that a loose mount puts off by over a tenth are within a third of that afterwards."""
-    learned = LearnedTable(table, Known.of_rig(rig, sensors_of(rig)))
+    learned = LearnedTable(table, known)
     for pattern in settled_patterns(hidden, hidden.mounted, count=12, start=0):
         learned.take(pattern)
     loose = loosened(hidden.mounted)
@@ -73,10 +60,10 @@ def test_answers_follow_a_loosened_mount(
 
 @pytest.mark.long
 def test_answers_wait_for_an_explanation(
-    hidden: Hidden, rig: Rig, table: LocalizationTable
+    hidden: Hidden, known: Known, table: LocalizationTable
 ) -> None:
     """A quiet pattern gives a new table, odd ones that raise an alarm none."""
-    learned = LearnedTable(table, Known.of_rig(rig, sensors_of(rig)))
+    learned = LearnedTable(table, known)
     quiet = [
         learned.take(each) for each in settled_patterns(hidden, hidden.mounted, count=12, start=0)
     ]
@@ -92,11 +79,11 @@ def test_answers_wait_for_an_explanation(
 
 @pytest.mark.long
 def test_unexplained_change_widens_the_errors_of_answers(
-    hidden: Hidden, rig: Rig, table: LocalizationTable, tmp_path: Path
+    hidden: Hidden, known: Known, table: LocalizationTable, tmp_path: Path
 ) -> None:
     """Answers then are robust to the errors of a plate that was not measured, also when resumed."""
     file = tmp_path / "learned.npz"
-    learned = LearnedTable(table, Known.of_rig(rig, sensors_of(rig)), file=file)
+    learned = LearnedTable(table, known, file=file)
     for pattern in settled_patterns(hidden, hidden.mounted, count=12, start=0):
         learned.take(pattern)
     odd = replace(
@@ -111,19 +98,19 @@ def test_unexplained_change_widens_the_errors_of_answers(
     wide, built = learned.current.uncertainty, Uncertainty()
     assert (wide.gain, wide.thickness, wide.damping) == (built.gain, built.thickness, built.damping)
     learned.save()
-    resumed = LearnedTable.resumed(table, Known.of_rig(rig, sensors_of(rig)), file=file)
+    resumed = LearnedTable.resumed(table, known, file=file)
     assert resumed.change == learned.change != ""
     assert resumed.current.uncertainty == wide
 
 
 def test_pattern_that_no_table_follows_leaves_the_state(
-    hidden: Hidden, rig: Rig, table: LocalizationTable, monkeypatch: pytest.MonkeyPatch
+    hidden: Hidden, known: Known, table: LocalizationTable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """State, answers and time are those before a refused pattern, and the next one is taken."""
-    learned = LearnedTable(table, Known.of_rig(rig, sensors_of(rig)))
+    learned = LearnedTable(table, known)
     first, second, third = settled_patterns(hidden, hidden.mounted, count=3, start=0)
     learned.take(first)
-    known, current = learned.live.known, learned.current
+    state, current = learned.live.known, learned.current
 
     def refused(table: LocalizationTable, rig: Rig) -> LocalizationTable:
         raise InputError("thickness must be within 10 %, got 20 %")
@@ -132,17 +119,16 @@ def test_pattern_that_no_table_follows_leaves_the_state(
         patch.setattr(learned_table, "table_following", refused)
         with pytest.raises(InputError, match="thickness"):
             learned.take(second)
-    assert learned.live.known is known
+    assert learned.live.known is state
     assert learned.current is current
     assert learned.take(third).table is not None
 
 
 def test_what_was_learned_is_resumed_for_its_table_only(
-    hidden: Hidden, rig: Rig, table: LocalizationTable, tmp_path: Path
+    hidden: Hidden, known: Known, table: LocalizationTable, tmp_path: Path
 ) -> None:
     """The same state and answers come back; another rig's table and a damaged file are refused."""
     file = tmp_path / "learned.npz"
-    known = Known.of_rig(rig, sensors_of(rig))
     learned = LearnedTable.resumed(table, known, file=file)
     for pattern in settled_patterns(hidden, hidden.mounted, count=3, start=0):
         learned.take(pattern)
@@ -164,7 +150,7 @@ def test_what_was_learned_is_resumed_for_its_table_only(
     with pytest.raises(InputError, match="this table"):
         LearnedTable.resumed(replace(table, masses=()), known, file=file)
     with pytest.raises(InputError, match="this rig"):
-        LearnedTable.resumed(table, Known.of_rig(rig, sensors_of(rig)[:2]), file=file)
+        LearnedTable.resumed(table, Known.of_rig(known.before, known.model.sensors[:2]), file=file)
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(bytes(content))

@@ -1,4 +1,4 @@
-/* Stages of an answer for arrays of numpy: forms, and what is felt of tones. */
+/* Stages of an answer for arrays of numpy: fingertips, forms, and what is felt of tones. */
 #include "answer.h"
 
 typedef struct {
@@ -15,6 +15,16 @@ typedef struct {
     int count;
     void *to[4];
 } job;
+
+static void run_fingertips(const job *each, arena *memory) {
+    const raster *on = each->on;
+    const size_t k = each->count, few = on->few, fine = on->fine;
+    const tips found = read_tips(on, each->by, k, memory);
+    memcpy(each->to[0], found.few, k * few * on->r * sizeof(float));
+    memcpy(each->to[1], found.fine, k * fine * on->r * sizeof(float));
+    memcpy(each->to[2], found.few_weights, k * few * sizeof(float));
+    memcpy(each->to[3], found.fine_weights, k * fine * sizeof(float));
+}
 
 static void run_forms(const job *each, arena *memory) {
     const plates *on = each->on;
@@ -73,6 +83,12 @@ static int done(void (*run)(const job *, arena *), job each) {
     const int status = guarded(run, &each, &memory);
     release(&memory, (arena){NULL, NULL, NULL});
     return status;
+}
+
+/* `tips` but for the centres, under fingertips at places (count, 2) [m]. */
+int fingertips_stage(const raster *on, const double *places, int count, void *few, void *fine, void *few_weights,
+                     void *fine_weights) {
+    return done(run_fingertips, (job){on, places, NULL, NULL, count, {few, fine, few_weights, fine_weights}});
 }
 
 /* Forms at rows (count). */

@@ -22,13 +22,6 @@ from model.drive_modes.forms import LEVEL_MARGIN
 from model.ensemble.measures import PERCENTILE
 from model.ensemble.touched_by_kernel import draws_structure, plates_structure
 from model.ensemble.touched_plate import RIDGE
-from model.finger.fingertip import (
-    FINE_POINTS,
-    FINGERTIP_RADIUS,
-    FIVE_AND_FINE,
-    FIVE_POINTS,
-    GAUSS_LEGENDRE,
-)
 from model.table.contents import (
     JUDGING_DRAWS,
     KEPT,
@@ -44,6 +37,7 @@ from model.table.contents import (
 )
 from model.table.contents_numpy import choose_by_numpy
 from model.table.fingers_on_plate import CENTRE_AND_RIM, MAX_FINGERS_BY_POINT, MAX_VARIANCE_FINE
+from model.table.raster_kernel import given_raster
 
 if TYPE_CHECKING:
     from model.table.table import LocalizationTable
@@ -128,17 +122,8 @@ def _with(table: "LocalizationTable", fingers: int) -> _Fingers:
 
 def _kept_of(table: "LocalizationTable") -> _Kept:
     """The plate, its raster, and how tones are chosen on a table, as kernels read them."""
-    uncertainty, raster = table.uncertainty, table.raster
+    uncertainty = table.uncertainty
     variance = uncertainty.gain_variance
-    few, fine = len(FIVE_POINTS.points), len(FINE_POINTS.points)
-    read = GivenRaster(raster.nx, raster.ny, *raster.patch, table.shapes.shape[1], few, fine)
-    read.length, read.width, read.radius = raster.length, raster.width, FINGERTIP_RADIUS
-    read.point(
-        points=FIVE_AND_FINE.points,
-        weights=FIVE_AND_FINE.weights,
-        nodes=GAUSS_LEGENDRE,
-        shapes=table.shapes,
-    )
     rules = Rules(
         *(KEPT, MISSING, MAX_FINGERS_BY_POINT, MIN_CANDIDATES, MAX_COMBINATIONS, PRUNING_STEP),
         *(len(CENTRE_AND_RIM), variance < MAX_VARIANCE_FINE, uncertainty.thickness > 0),
@@ -154,7 +139,7 @@ def _kept_of(table: "LocalizationTable") -> _Kept:
         error=table.error_power,
         frequencies=table.frequencies,
     )
-    return plates_structure(table.on_eras), read, rules, {}
+    return plates_structure(table.on_eras), given_raster(table), rules, {}
 
 
 def _method(of: coherent.Method) -> Method:

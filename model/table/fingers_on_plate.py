@@ -49,10 +49,11 @@ class FingersOnPlate:
 
         loads: of each relative to the rig's fingertip, empty for 1.
         """
-        tips = table.read_fingertips(places)
-        centres = tips.few[:, 0]
         if by_kernel:
-            return cls(table, tips, touch(table.on_eras, centres, loads))
+            tips = table.read_fingertips(places)
+            return cls(table, tips, touch(table.on_eras, tips.few[:, 0], loads))
+        tips = table.raster.fingertips(np.array(places), table.shapes)
+        centres = tips.few[:, 0]
         stiffness = table.attached.finger_stiffness(len(centres), loads)
         return cls(table, tips, TouchedPlate(table.on_eras, centres, stiffness))
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
+from model.compiled.kernels import kernels
 from model.drive_modes.switched import highest_levels
 from model.ensemble.attached_plate import AttachedPlate, attach
 from model.ensemble.plate_on_eras import PlateOnEras
@@ -34,6 +35,7 @@ from model.table.pattern_query import find_pattern
 from model.table.pulse_gains import OverEffect
 from model.table.question import MIN_LEVEL_DB_SL, Point, Question
 from model.table.raster import FingertipShapes, Raster
+from model.table.raster_kernel import fingertips_by
 from model.transients.ringing import RampedRinging, ramped_ringing
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation, base_amplitudes
@@ -292,7 +294,10 @@ class LocalizationTable:
 
     def read_fingertips(self, places: Sequence[Point]) -> FingertipShapes:
         """Shapes at fingertips centred at places [m] of the plate."""
-        return self.raster.fingertips(np.array(places), self.shapes)
+        by = kernels()
+        if by is None:
+            return self.raster.fingertips(np.array(places), self.shapes)
+        return fingertips_by(by, self, places)
 
     @cached_property
     def error_power(self) -> Float32Array:
@@ -311,6 +316,11 @@ class LocalizationTable:
         """Fields at the centres of the cells, (f, eras, cells)."""
         return self.unit_fields(self.cell_centres)
 
+    @cached_property
+    def _cell_power(self) -> Complex64Array:
+        """Power summed over the cells, (f, eras, eras)."""
+        return _power(self._cell_fields)
+
     def _modal_fields(
         self, contacts: Sequence[Point], loads: Sequence[float] = ()
     ) -> Complex64Array:
@@ -322,5 +332,11 @@ class LocalizationTable:
 
     def background(self, targets: Sequence[Point]) -> Complex64Array:
         """Mean power of the plate beyond targets, without fingers on it, (f, eras, eras)."""
-        rest = self._cell_fields[:, :, is_background(self.cell_centres, targets)]
-        return np.asarray(rest.conj() @ rest.swapaxes(1, 2) / np.float32(rest.shape[2]))
+        near = self._cell_fields[:, :, ~is_background(self.cell_centres, targets)]
+        count = self._cell_fields.shape[2] - near.shape[2]
+        return (self._cell_power - _power(near)) / np.float32(count)
+
+
+def _power(fields: Complex64Array) -> Complex64Array:
+    """Power of fields (f, eras, p) summed over the points, (f, eras, eras)."""
+    return np.asarray(fields.conj() @ fields.swapaxes(1, 2))

@@ -1,11 +1,13 @@
 """Onset, ending and transient measures of patterns."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 
+from model.arrays import FloatArray
 from model.table.effect_level import EffectLevels
 from model.table.pattern import Pattern
-from model.table.question import Question
+from model.table.question import Point, Question
 from model.table.table import LocalizationTable
 from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped
 from model.transients.measures import Transients
@@ -23,7 +25,9 @@ class Timing:
         self._table, self._eras = table, table.eras
         self.levels: EffectLevels | None = EffectLevels(table)
         variance = table.uncertainty.gain_variance
-        self._shaper = shaper or Shaper(table.in_time, gain_variance=variance)
+        self._shaper = shaper or Shaper(
+            table.in_time, gain_variance=variance, fingertips=partial(_few_points, table)
+        )
 
     def following(self, table: LocalizationTable) -> "Timing":
         """The timing of a table that has followed its plate, with envelopes as shaped for this one.
@@ -80,3 +84,9 @@ class Timing:
         if pattern.ending is None:
             return ramped_ending(pattern.excitation, self._eras, ramp=pattern.ramp)
         return shaped(pattern.ending, self._eras)
+
+
+def _few_points(table: LocalizationTable, places: Sequence[Point]) -> tuple[FloatArray, FloatArray]:
+    """Weights (k, p) of few points under fingertips, and their shapes (k, p, r)."""
+    tips = table.read_fingertips(places)
+    return tips.few_weights.astype(float), tips.few.astype(float)

@@ -14,8 +14,9 @@ stroke (`model.transients.knots`).
 """
 
 import math
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
+from typing import TypeAlias
 
 import numpy as np
 
@@ -35,6 +36,9 @@ _KEPT = 16  # readings; of an onset and its ending, and of fingers that rest
 
 Position = tuple[float, float]
 
+Fingertips: TypeAlias = Callable[[Sequence[Position]], tuple[FloatArray, FloatArray]]
+"""Weights (k, p) of points under fingertips at positions (k,) [m], and their shapes (k, p, r)."""
+
 
 class Shaper:
     """Shaping of onsets and endings for a plate on its ERAs.
@@ -42,9 +46,15 @@ class Shaper:
     Everything that does not depend on the contacts is computed once for each frequency.
     """
 
-    def __init__(self, plate: PlateInTime, *, gain_variance: float) -> None:
-        """Prepare; gain_variance: of the ERAs' complex gains (`Uncertainty.gain_variance`)."""
+    def __init__(
+        self, plate: PlateInTime, *, gain_variance: float, fingertips: Fingertips | None = None
+    ) -> None:
+        """Prepare; gain_variance: of the ERAs' complex gains (`Uncertainty.gain_variance`).
+
+        fingertips: None for a reading point by point.
+        """
         self._plate = plate
+        self._read_fingertips = fingertips or partial(_fingertips_on, plate)
         self._gain_variance = gain_variance
         self._names = [era.name for era in plate.eras]
         self._strokes = np.array([era.stroke for era in plate.eras])
@@ -154,12 +164,7 @@ class Shaper:
         found = {each: known.get(each) for each in positions}  # of which others may drop some
         new = [each for each, one in found.items() if one is None]
         if new:
-            plate = self._plate.reduced.plate
-            points, weights = fingertips_on(
-                np.array(new), length=plate.length, width=plate.width, rule=FIVE_POINTS
-            )
-            shapes = self._plate.shapes_at(points.reshape(-1, 2))
-            shapes = shapes.reshape(*weights.shape, -1)
+            weights, shapes = self._read_fingertips(new)
             made = dict(zip(new, zip(weights, shapes, strict=True), strict=True))
             found.update(made)
             known.update(made)
@@ -172,3 +177,14 @@ class Shaper:
         """The same for the plate beyond 50 mm of all targets; all of a plate too small for it."""
         shapes = self._shapes[is_background(self._centres, targets)]
         return np.asarray(shapes / math.sqrt(len(shapes)))
+
+
+def _fingertips_on(
+    plate: PlateInTime, positions: Sequence[Position]
+) -> tuple[FloatArray, FloatArray]:
+    """Read the shapes of a plate under fingertips, as `Fingertips`."""
+    on = plate.reduced.plate
+    points, weights = fingertips_on(
+        np.array(positions), length=on.length, width=on.width, rule=FIVE_POINTS
+    )
+    return weights, plate.shapes_at(points.reshape(-1, 2)).reshape(*weights.shape, -1)

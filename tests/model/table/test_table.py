@@ -145,6 +145,32 @@ def test_fingertips_reads_the_points_of_the_disc():
     np.testing.assert_allclose(few[0, 1:] - few[0, :1], 0.013 * CROSS, atol=1e-7)
 
 
+@pytest.mark.usefixtures("kernels_or_numpy")
+def test_read_fingertips_reads_the_points_and_weights_of_the_disc():
+    """Reading x and y themselves gives back the points, also where edges cut a fingertip."""
+    table = smooth_table()
+    table = replace(table, shapes=table.raster.points.astype(np.float32))
+    tips = table.read_fingertips(CONTACTS)
+    points = np.array([fingertip_points(x, y, table.plate) for x, y in CONTACTS])
+    np.testing.assert_allclose(tips.fine, points, atol=1e-6)
+    np.testing.assert_allclose(tips.few, points[:, [0, 9, 12, 15, 18]], atol=1e-6)
+    weights = [fingertip_weights(x, y, table.plate) for x, y in CONTACTS]
+    np.testing.assert_allclose(tips.fine_weights, weights, atol=1e-5)
+    np.testing.assert_allclose(tips.few_weights[0], [0.5, *[0.125] * 4], atol=1e-6)
+
+
+def test_background_is_the_mean_over_cells_beyond_five_centimetres():
+    """The power of a drive there, cell by cell, and everywhere on a plate without such cells."""
+    table = smooth_table()
+    weights = np.exp(1j * np.arange(len(table.eras)))
+    for targets in ([TARGET], [TARGET, (0.0, 0.0)], [*map(tuple, table.cell_centres.tolist())]):
+        apart = np.hypot(*(table.cell_centres[:, None] - targets).transpose(2, 0, 1)).min(axis=1)
+        rest = table.cell_centres[(apart > 0.05) if (apart > 0.05).any() else apart < 1]
+        expected = (np.abs(weights @ table.unit_fields(rest)) ** 2).mean(axis=1)
+        found = weights.conj() @ table.background(targets) @ weights
+        np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
 def test_fingertips_interpolates_fields_of_the_plate():
     """At 500 Hz as well the interpolation is within 1e-4 of the field, beside an ERA as inside."""
     rig = smooth_rig()

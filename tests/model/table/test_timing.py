@@ -15,6 +15,7 @@ from model.table.question import Question
 from model.table.timing import Timing
 from model.transients.base_motion import ramped_ending, ramped_onset, shaped
 from model.transients.measures import Transients
+from model.transients.shaping import Shaper
 from model.transients.time_response import plate_in_time
 from paper_plate import make_paper_rig
 
@@ -62,6 +63,18 @@ def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table,
     assert shaped_pattern.transient_contrast_db > plain.transient_contrast_db + 3
     assert shaped_pattern.residual_db < plain.residual_db - 10
     assert shaped_pattern.excitation == plain.excitation
+
+
+@pytest.mark.parametrize("quiet", [(), ((0.25, 0.18), (0.005, 0.1))])
+def test_envelopes_are_those_of_fingertips_read_point_by_point(table, quiet):
+    """Knots within a per mille of the largest, at an edge of the plate as well."""
+    question = replace(QUESTION, quiet=quiet)
+    found = Timing(table).with_envelopes(question, table.query(question))
+    shaper = Shaper(table.in_time, gain_variance=table.uncertainty.gain_variance)
+    onset = shaper.onset(found.excitation, targets=question.targets, quiet=quiet)
+    largest = max(each.largest for each in onset.values())
+    for name, each in onset.items():
+        np.testing.assert_allclose(found.onset[name].knots, each.knots, atol=1e-3 * largest)
 
 
 def test_transient_measures_without_quiet_fingers(table):

@@ -9,8 +9,8 @@ from contextvars import ContextVar
 from typing import Protocol, TypeAlias
 
 
-class Port(Protocol):
-    """An open serial port; data and loss are reported to the callbacks of its opening."""
+class OpenPort(Protocol):
+    """What a line needs of a port that is open; it is told of data and loss."""
 
     @property
     def is_blocked(self) -> bool:
@@ -24,6 +24,10 @@ class Port(Protocol):
 
     def poll(self) -> None:
         """Hand over what has come and was not read yet."""
+
+
+class Port(OpenPort, Protocol):
+    """A port of a line; data and loss are reported to the callbacks of its opening."""
 
     def close(self) -> None:
         """Close it; no callback is called afterwards."""

@@ -15,8 +15,8 @@ from controller.loop.plate_set import PlateSet
 from controller.loop.routing import Drive, restarted_by, tones_by_era
 from controller.sources.contacts import MAX_CONTACT_TIMEOUT, Contact, ContactKey
 from drivers.errors import CommandRefused
-from drivers.host.ledger import is_vibrating
 from drivers.host.members import Played
+from drivers.protocol.sets import is_vibrating
 from drivers.protocol.table import QUANTITIES
 from model.rig.rig import Rig
 from model.table.pattern import Pattern

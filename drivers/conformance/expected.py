@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from drivers.conformance.client import Late, Violation
-from drivers.expected.achieved import TONE, achieved_problem
+from drivers.expected.achieved import achieved_layer, achieved_problem
 from drivers.expected.amplifier import ExpectedAmplifier
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
@@ -34,11 +34,4 @@ class Judge(ExpectedAmplifier):
         if problem := achieved_problem(one, shown, self.can, is_exact=False):
             rule, what, must, seen = problem
             self.report(rule, 0.0, f"{what} in layer {one.layer}", must=must, seen=seen)
-        found = {each["channel"]: each for each in shown["commands"]}
-        plays = [
-            replace(tone, **{name: found[tone.channel][name] for name in TONE})
-            if tone.channel in found
-            else replace(tone, level=0)
-            for tone in driven
-        ]
-        return replace(one, commands=tuple(plays))
+        return achieved_layer(one, shown)

@@ -24,6 +24,7 @@ from drivers.conformance.client import (
 from drivers.conformance.expected import NAMES, Judge
 from drivers.conformance.material import FULL, Material, Rows, Send, layer, play, send
 from drivers.expected.amplifier import OFF
+from drivers.host.wire import reply_words
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, pack_layers, parts
 from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES, REACTION, STATES
@@ -42,7 +43,6 @@ _POLL, _OVERSLEPT, _SETTLING = 0.0005, 0.05, 0.02  # s
 _READ_ALONE = ("GetCaps", "GetStatus", "GetFaults")  # on Modbus: half an exchange
 _BY_EXCEPTION = ("UNKNOWN_TYPE", "BAD_LENGTH")  # on Modbus, where no channel is named
 _MOVING = STATES["SWITCHED_ON"], STATES["FAULT_REACTION_ACTIVE"]
-_STATUSES = [name for name, each in MESSAGES.items() if "levels" in each.reply.names]
 
 
 class Subject(Material):
@@ -61,10 +61,9 @@ class Subject(Material):
         client.quiet = REPLY_TIMEOUT
         self.heard_at = clock.now()
         channels, layers = can["channels"], can["layers"]
-        rows = dict.fromkeys(_STATUSES, 9 + channels + layers)
-        rows |= {"GetAchieved": 4 + 4 * channels, "Set": 3}
-        rows |= {"GetCaps": 18 + 3 * channels, "GetMeasured": 1 + 2 * channels}
-        client.reply_words = {MESSAGES[name].number: words for name, words in rows.items()}
+        client.reply_words = {
+            each.number: reply_words(name, channels, layers) for name, each in MESSAGES.items()
+        }
 
     @property
     def shown(self) -> Judge:

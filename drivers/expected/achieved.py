@@ -1,5 +1,6 @@
 """What a layer plays by a GetAchieved, compared with what it must play: steps and shares."""
 
+from dataclasses import replace
 from typing import TypeAlias
 
 from drivers.protocol.records import Values
@@ -13,11 +14,18 @@ _DERATED = 0.01  # by which the shares of a derated set may differ
 
 
 def achieved_problem(
-    one: LayerSet, reply: Values, can: Values, *, is_exact: bool, can_scale: bool = False
+    one: LayerSet,
+    reply: Values,
+    can: Values,
+    *,
+    is_exact: bool,
+    can_scale: bool = False,
+    slack: float = 0.0,
 ) -> Problem | None:
     """Return what is wrong with how a layer plays by a reply; None if it is within half a step.
 
-    can: capabilities. is_exact: to the word; can_scale: all levels may be lower by one factor.
+    can: capabilities. is_exact: to the word; can_scale: all levels may be lower by one factor;
+    slack: in steps of the wire, beside the steps of the amplifier.
     """
     found = {each["channel"]: each for each in reply["commands"]}
     shares: dict[int, float] = {}
@@ -33,7 +41,7 @@ def achieved_problem(
         for name in TONE if tone.level else ("level",):  # silence has no phase
             error = abs(got[name] - requested[name])
             error = min(error, _TURN - error) if name == "phase" else error
-            allowed = 0.0 if is_exact else _rounding(name, tone, can)
+            allowed = 0.0 if is_exact or not tone.level else _rounding(name, tone, can) + slack
             is_scaled = can_scale and name == "level" and got[name] <= requested[name]
             if error > allowed and not is_scaled:
                 what = f"error of achieved {name} of channel {tone.channel}"
@@ -45,6 +53,14 @@ def achieved_problem(
     if apart > _DERATED + can.get("level_step", 1) / min(shares, default=1):
         return "commit", "shares of its channels", "alike", sorted(shares.values())
     return None
+
+
+def achieved_layer(one: LayerSet, reply: Values) -> LayerSet:
+    """Return a layer as it plays by a reply: other levels, frequencies and phases."""
+    found = {each["channel"]: {name: each[name] for name in TONE} for each in reply["commands"]}
+    silent = {"level": 0}
+    commands = [replace(tone, **found.get(tone.channel, silent)) for tone in one.commands]
+    return replace(one, commands=tuple(commands))
 
 
 def _rounding(name: str, tone: Command, can: Values) -> float:

@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from itertools import chain
 
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import LayerSet, unpack_layers
-from drivers.protocol.table import STAGED_LIFE
+from drivers.protocol.sets import Assembly, LayerSet, unpack_layers
+from drivers.protocol.table import QUANTITIES, STAGED_LIFE
 from drivers.uncertain_playback import Interval
+
+_MAX_WORDS = QUANTITIES["set_words"].maximum
 
 
 class ExpectedSet:
@@ -15,8 +16,7 @@ class ExpectedSet:
 
     def __init__(self) -> None:
         self.is_exact = True
-        self._sent: dict[int, Sequence[int]] = {}  # parts of one token, the first of which at
-        self._sent_of, self._sent_at, self._count = 0, -math.inf, 0
+        self._sent = Assembly()
         self._whole: tuple[int, tuple[LayerSet, ...]] = (0, ())  # token, and layers
         self._replaced = 0  # token of a set of which it is known what really plays
         self._taken: set[int] = set()  # parts that have their reply
@@ -29,19 +29,14 @@ class ExpectedSet:
 
     def sent(self, part: Values, time: float) -> str:
         """Note a part that is sent; returns what is wrong with it, or ""."""
-        token, index, count = part["token"], part["index"], part["parts"]
-        if token != self._sent_of or time - self._sent_at > STAGED_LIFE:
-            self._sent, self._sent_of, self._sent_at = {}, token, time
-            self._count = count
-        if not index < count == self._count:
-            return f"index must be below {self._count} parts, got {index} of {count}"
-        self._sent[index] = part["stream"]
-        if len(self._sent) == count:
-            try:
-                stream = chain(*(self._sent[each] for each in range(count)))
-                self._whole = token, unpack_layers([*stream])
-            except Refusal as refusal:
-                return str(refusal)
+        if time - self._sent.began > STAGED_LIFE:  # whatever an amplifier does
+            self._sent.drop()
+        try:
+            stream = self._sent.add(part, time, _MAX_WORDS)
+            if stream is not None:
+                self._whole = part["token"], unpack_layers(stream)
+        except Refusal as refusal:
+            return str(refusal)
         return ""
 
     def whole(self, token: int) -> tuple[LayerSet, ...] | None:
@@ -78,7 +73,7 @@ class ExpectedSet:
         for index in range(count):
             if index not in self._taken:
                 possible.append((index, 0, 0))
-            if index not in self._sent:
+            if index not in self._sent.collected:
                 break
         else:
             possible.append((0, 1 - part["now"], part["now"]))

@@ -8,6 +8,7 @@ from typing import Any
 
 from drivers import clock
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout, Preempted
+from drivers.expected.achieved import achieved_layer, achieved_problem
 from drivers.host.dialogue import MAX_CONTRADICTIONS, Dialogue
 from drivers.host.jobs import Priority
 from drivers.host.ledger import Ledger
@@ -15,7 +16,7 @@ from drivers.host.line import Line
 from drivers.host.stop import Stop, Stopped
 from drivers.host.timing import REPLY_TIMEOUT, STOP_RAMP
 from drivers.protocol.records import Values, bits_of
-from drivers.protocol.sets import Command, LayerSet, is_newer_token
+from drivers.protocol.sets import LayerSet, is_newer_token
 from drivers.protocol.table import (
     ENABLED,
     FAULTS,
@@ -40,7 +41,7 @@ _RAMP, _WATCHDOG = QUANTITIES["ramp"], QUANTITIES["watchdog"]
 _ENERGISED = (STATES["SWITCHED_ON"], ENABLED)
 _POSITIVE = ("frequency_step", "level_step", "phase_step")
 _FULL_LEVEL = ("motion of a stiff source", "output of a linear amplifier")
-_HALF_TURN = 180 * QUANTITIES["phase"].per_unit
+_WIRE_ROUNDING = 0.5  # steps of the wire, beside half a step of the amplifier
 
 
 class Amplifier(Dialogue):
@@ -158,25 +159,27 @@ class Amplifier(Dialogue):
             )
         return status
 
-    async def read_achieved(self, one: LayerSet) -> LayerSet:
-        """Read what plays of a layer of the set committed last; the ledger goes on with it.
+    async def read_achieved(self, one: LayerSet, token: int) -> LayerSet:
+        """Read what plays of a layer of the set with this token; the ledger goes on with it.
 
-        Raises CommandRefused where it contradicts the set, as that of the last one did.
+        A layer that goes on with an earlier set is returned as it was sent. Raises CommandRefused
+        where the amplifier contradicts the set, as it did the last one.
         """
-        values = await self.request("GetAchieved", {"layer": one.layer}, Priority.SET)
-        commands = tuple(
-            Command(each["channel"], each["frequency"], each["level"], each["phase"])
-            for each in values["commands"]
+        shown = await self.request("GetAchieved", {"layer": one.layer}, Priority.SET)
+        if one.renew or shown["token"] != token:
+            return one
+        problem = achieved_problem(
+            one, shown, self.capabilities, is_exact=False, slack=_WIRE_ROUNDING
         )
-        achieved = replace(one, commands=commands)
-        problem = achieved_problem(one, achieved, self.capabilities)
+        achieved = achieved_layer(one, shown)
         if problem is None:
             self._misachieved = 0
-            self.ledger.playback.correct(achieved, values["token"])
+            self.ledger.playback.correct(achieved, token)
             return achieved
         self._misachieved += 1
         if self._misachieved >= MAX_CONTRADICTIONS:
-            raise self.contradicted(problem)
+            _, what, must, seen = problem
+            raise self.contradicted(f"{what} in layer {one.layer} must be {must}, got {seen}")
         return achieved
 
     async def silence(self, ramp: float) -> Values:
@@ -312,28 +315,3 @@ def check_capabilities(can: Values, name: str, *, is_output: bool | None) -> Non
             f"amplifier {name}: full level must be {_FULL_LEVEL[is_output]} as in the rig file, "
             f"got {_FULL_LEVEL[has_output]}; correct the rig file, or connect another amplifier"
         )
-
-
-def achieved_problem(sent: LayerSet, achieved: LayerSet, can: Values) -> str | None:
-    """Describe what a layer that plays contradicts; None if it is what was sent, to the steps.
-
-    can: values of the capabilities. Envelopes are not compared: an amplifier does not report them.
-    """
-    commands = {command.channel: command for command in sent.commands if command.level}
-    played = {command.channel: command for command in achieved.commands if command.level}
-    if commands.keys() != played.keys():
-        return f"channels of layer {sent.layer} must be {[*commands]}, got {[*played]}"
-    for channel, command in commands.items():
-        got = played[channel]
-        phase = (got.phase - command.phase + _HALF_TURN) % (2 * _HALF_TURN) - _HALF_TURN
-        for name, difference in (
-            ("frequency", got.frequency - command.frequency),
-            ("level", got.level - command.level),
-            ("phase", phase),
-        ):
-            if abs(difference) > (can[f"{name}_step"] + 1) / 2:
-                return (
-                    f"{name} achieved on channel {channel} in layer {sent.layer} must be "
-                    f"{getattr(command, name)}, got {getattr(got, name)} (steps of the wire)"
-                )
-    return None

@@ -18,7 +18,7 @@ from drivers.host.bounds import Bounds
 from drivers.host.limits import COMMIT_DELAY, TOLERANCE, Budget, Rounding, Vibration, wire_limits
 from drivers.playback import Playback
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, LayerSet
+from drivers.protocol.sets import Command, LayerSet, is_vibrating
 from drivers.protocol.table import QUANTITIES, has_feature
 from registry.limits import GuardLimits
 
@@ -328,14 +328,3 @@ def is_silence(layers: Sequence[Layer]) -> bool:
         if layer.tones or layer.renew:
             return False
     return True
-
-
-def is_vibrating(*layers: LayerSet) -> bool:
-    """Whether any layer plays after its set, so that it spends time and rate."""
-    for one in layers:
-        if one.renew:
-            return True
-        for command in one.commands:
-            if command.is_driven:
-                return True
-    return False

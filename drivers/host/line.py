@@ -8,10 +8,11 @@ against what really went out before. Times [s] are of the event loop's clock.
 import asyncio
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from drivers import trace
 from drivers.errors import CommandRefused, FrameError, LinkError, LinkTimeout, Preempted
+from drivers.hardware import OpenPort
 from drivers.host.jobs import Job, JobQueue, JointStart, Priority
 from drivers.host.timing import ATTEMPTS, REPLY_TIMEOUT
 from drivers.host.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
@@ -32,24 +33,13 @@ _NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")
 SUPERSEDED = "superseded by a newer set, or by a stop or disarm"
 
 
-class Port(Protocol):
-    """An open port; what it receives goes to `Line.received`, its loss to `Line.lose`."""
-
-    @property
-    def is_blocked(self) -> bool:
-        """Whether it has not taken all bytes yet."""
-
-    def write(self, data: bytes) -> None:
-        """Send bytes, as soon as the port takes them; raises LinkError."""
-
-    def poll(self) -> None:
-        """Hand over what has come and was not read yet."""
-
-
 class Line:
-    """A line, open from its construction until it is lost or closed."""
+    """A line, open from its construction until it is lost or closed.
 
-    def __init__(self, wire: Wire, port: Port, name: str) -> None:
+    What its port receives goes to `received`, a loss to `lose`.
+    """
+
+    def __init__(self, wire: Wire, port: OpenPort, name: str) -> None:
         self.wire = wire
         self.name = name
         self.loss: str | None = None

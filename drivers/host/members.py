@@ -387,7 +387,7 @@ def _check_plays(name: str, status: Values, staged: Staged) -> None:
 
 async def _achieved(amplifier: Amplifier, staged: Staged) -> tuple[LayerSet, ...]:
     """Read the layers of a set that plays, as the amplifier has achieved them."""
-    return tuple([await amplifier.read_achieved(one) for one in staged.layers])
+    return tuple([await amplifier.read_achieved(one, staged.token) for one in staged.layers])
 
 
 async def _status_of(amplifier: Amplifier, token: int, sent: Awaitable[Values]) -> Values:

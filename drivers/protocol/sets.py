@@ -94,6 +94,17 @@ class LayerSet:
     renew: bool = False
 
 
+def is_vibrating(*layers: LayerSet) -> bool:
+    """Whether any layer plays after its set, so that it spends time and rate."""
+    for one in layers:
+        if one.renew:
+            return True
+        for command in one.commands:
+            if command.is_driven:
+                return True
+    return False
+
+
 def pack_layers(layers: Iterable[LayerSet]) -> list[int]:
     """Return the stream of a set; struct.error for a number that is no word.
 

@@ -84,11 +84,6 @@ class AmplifierSession:
         self.constants[what] = reported
 
 
-def is_vibrating(layers: Sequence[LayerSet]) -> bool:
-    """Whether a set makes anything vibrate, or go on to."""
-    return any(one.renew or any(each.is_driven for each in one.commands) for one in layers)
-
-
 _DELAYS_KEPT = 64
 
 

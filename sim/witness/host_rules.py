@@ -7,7 +7,7 @@ import math
 from collections.abc import Collection, Hashable, Mapping, Sequence
 
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet
+from drivers.protocol.sets import LayerSet, is_vibrating
 from drivers.protocol.table import LATCHED, QUANTITIES
 from sim.witness.amplifier_session import (
     AmplifierSession,
@@ -16,7 +16,6 @@ from sim.witness.amplifier_session import (
     ExpectedSets,
     check_expected,
     check_set,
-    is_vibrating,
 )
 from sim.witness.config import TimeLimits
 from sim.witness.decoded import A_READ, FEEDING, HELLO, Request, Sent
@@ -109,7 +108,7 @@ class HostRules:
         """
         if request.name == "Set":
             layers = session.amplifier.sets.whole(request.values["token"])
-            return layers is not None and not is_vibrating(layers)
+            return layers is not None and not is_vibrating(*layers)
         is_unconfirmed = session.is_disarming or session.first_stop is not None
         is_silencing = is_unconfirmed or time < self._last_silencing + _CONFIRMED
         return request.name in _SILENCING or (request.name == "GetStatus" and is_silencing)
@@ -154,7 +153,7 @@ class HostRules:
             self._check_arm(session, time)
         if request.name == "Set" and layers is not None:
             check_set(session, time, request.values["token"], layers)
-            if is_vibrating(layers):
+            if is_vibrating(*layers):
                 self._check_justified(session, time)
                 if self.expected is not None:
                     check_expected(session, time, layers, self.expected)
@@ -337,7 +336,7 @@ class HostRules:
         is_new = token not in session.committed_tokens
         session.committed_tokens.append(token)
         played.commit(layers, token, time)
-        if is_vibrating(layers):
+        if is_vibrating(*layers):
             session.last_vibration = time
         if is_new:
             self._expect_commits(session, time, token)

@@ -12,14 +12,15 @@ import tempfile
 from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+from pydantic import BaseModel, ValidationError
 
 from controller.child import ended
 from controller.demo.touch_row import FingerVibration, Position
 from drivers.errors import LinkError
+from model.errors import first_problem
 from model.finger.perception import DEFAULT_THRESHOLD
 
 WATCHDOG = 2.0
@@ -67,18 +68,18 @@ class SimulatedPlate:
         reply = await self._request("felt", since_s=since, until_s=until)
         return {
             id: FingerVibration(
-                frequencies=np.array(felt["frequencies_hz"], dtype=float),
-                amplitudes=np.array(felt["amplitude_m_s2"], dtype=float).reshape(
-                    len(felt["frequencies_hz"]), len(felt["peak_m_s2"])
+                frequencies=np.array(felt.frequencies_hz),
+                amplitudes=np.array(felt.amplitude_m_s2).reshape(
+                    len(felt.frequencies_hz), len(felt.peak_m_s2)
                 ),
-                peaks=np.array(felt["peak_m_s2"], dtype=float),
-                weights=np.array(felt["weights"], dtype=float),
+                peaks=np.array(felt.peak_m_s2),
+                weights=np.array(felt.weights),
                 threshold=self._threshold,
             )
-            for id, felt in reply["fingers"].items()
+            for id, felt in reply.fingers.items()
         }
 
-    async def _request(self, op: str, **values: object) -> dict[str, Any]:
+    async def _request(self, op: str, **values: object) -> "_Reply":
         """The reply to a request; raises LinkError if there is none or it is an error."""
         try:
             async with asyncio.timeout(_REPLY_TIMEOUT):
@@ -86,15 +87,33 @@ class SimulatedPlate:
                 reader, writer = await asyncio.open_unix_connection(path, limit=_MAX_REPLY)
                 with contextlib.closing(writer):
                     writer.write(json.dumps({"op": op, **values}).encode() + b"\n")
-                    reply: dict[str, Any] = json.loads(await reader.readline())
+                    reply = _Reply.model_validate_json(await reader.readline())
         except (OSError, ValueError) as error:  # no line, or half of one, is no JSON
+            why = str(error) or "it took too long"
+            if isinstance(error, ValidationError):
+                why = " ".join(first_problem(error))
             raise LinkError(
-                f"simulated plate at {self._control}: no reply to {op} "
-                f"({str(error) or 'it took too long'}); {_REMEDY}"
+                f"simulated plate at {self._control}: no reply to {op} ({why}); {_REMEDY}"
             ) from error
-        if "error" in reply:
-            raise LinkError(f"simulated plate: {op} refused: {reply['error']}")
+        if reply.error is not None:
+            raise LinkError(f"simulated plate: {op} refused: {reply.error}")
         return reply
+
+
+class _Felt(BaseModel):
+    """Vibration of a finger, as the control socket has it."""
+
+    frequencies_hz: list[float]
+    amplitude_m_s2: list[list[float]]
+    peak_m_s2: list[float]
+    weights: list[float]
+
+
+class _Reply(BaseModel):
+    """What is read of a reply of the control socket."""
+
+    error: str | None = None
+    fingers: dict[str, _Felt] = {}
 
 
 @contextlib.asynccontextmanager

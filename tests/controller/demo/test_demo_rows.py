@@ -309,9 +309,11 @@ async def test_far_end_reports_exit_status_when_rig_is_invalid(
         (b'{"error": "finger is 1; it must be a text"}\n', r"felt refused: finger is 1"),
         (b'{"fingers": ', r"/sock: no reply to felt"),
         (b"x" * (2 << 20), r"/sock: no reply to felt"),
+        (b"3\n", r"/sock: no reply to felt"),
+        (b'{"fingers": {"1": {"weights": 3}}}\n', r"/sock: no reply to felt .*fingers.1"),
         (None, r"/sock: no reply to felt .*too long"),
     ],
-    ids=["an error", "half a line", "no line", "nothing"],
+    ids=["an error", "half a line", "no line", "a number", "other keys", "nothing"],
 )
 async def test_plate_without_a_reply_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: bytes | None, reason: str

@@ -41,6 +41,7 @@ _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
 _STOP_TIMEOUT = 2.0  # s; for boards that restart when their port is opened
 _RAMP = 0.05  # s; neither start nor end of a drive clicks
 _TOKEN = 1
+_UNKNOWN = "it is unknown when its watchdog was fed last: switch it off"
 _SENSOR_UNITS = {
     "ACCELERATION": "m/s²",
     "VELOCITY": "m/s",
@@ -145,7 +146,7 @@ async def stop(url: str) -> dict[str, Any]:
             if amplifier.status is not None:
                 rows = status_rows(amplifier.status)
     except LinkError as error:
-        cause = str(error)
+        cause = f"{error}; {_UNKNOWN}"
     return {
         "url": url,
         "silence": "may_play" if cause else "confirmed_silent",
@@ -167,7 +168,7 @@ async def _stop(amplifier: Amplifier) -> str:
     stopped = await amplifier.stop(timeout=_STOP_TIMEOUT)
     if stopped.is_confirmed:
         return ""
-    return f"{cause or stopped.cause}; it is unknown when its watchdog was fed last: switch it off"
+    return f"{cause or stopped.cause}; {_UNKNOWN}"
 
 
 async def set_address(url: str, address: int, serial_number: str | None) -> dict[str, Any]:

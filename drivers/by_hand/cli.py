@@ -278,7 +278,7 @@ def _act(
     if json_:
         print(json.dumps(result))
         return result
-    rows = {k: value for k, value in result.items() if k != "sensors" and value is not None}
+    rows = {k: value for k, value in result.items() if k != "sensors" and value not in (None, "")}
     width = max(map(len, rows))
     for key, value in rows.items():
         print(f"{key:{width}}  {in_words(value)}")

@@ -57,9 +57,9 @@ def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> Repo
     """
     files: dict[str, str] = {}
     missing: list[str] = []
-    for path in configs:
-        for named in _with_named(path, missing):
-            _include(named, files, missing)
+    named = [each for path in configs for each in _with_named(path, missing)]
+    for path in {each.resolve(): each for each in named}.values():
+        _include(path, files, missing)
     try:
         with Client.connect(socket, name="era report") as daemon:
             files["status.json"] = daemon.status().model_dump_json(indent=2)

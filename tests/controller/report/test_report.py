@@ -52,8 +52,9 @@ def test_example_rig_is_shown_without_its_comments() -> None:
     assert yaml.load(shown(text, home=HOME)) == yaml.load(text)
 
 
-def test_report_includes_files_of_daemon(tmp_path: Path) -> None:
-    """Its rig, layout and last dumps, but no table and no other files; missing ones are listed."""
+@pytest.mark.parametrize("given", [["d.yaml"], ["rig.yaml", "d.yaml"]])
+def test_report_includes_files_of_daemon(tmp_path: Path, given: list[str]) -> None:
+    """Its rig, layout and last dumps once, but no table or other files; missing ones are listed."""
     (tmp_path / "rig.yaml").write_text(example_rig_path().read_text("utf-8"), "utf-8")
     (tmp_path / "d.yaml").write_text(
         "rig: rig.yaml\nlayout: none.yaml\ntable: t.npz\ndumps: {folder: dumps}\n", "utf-8"
@@ -63,7 +64,7 @@ def test_report_includes_files_of_daemon(tmp_path: Path) -> None:
     for number in range(MAX_DUMPS + 2):
         (tmp_path / "dumps" / f"era-fault-2026-{number}.jsonl").write_text(str(number), "utf-8")
     (tmp_path / "dumps" / "other.txt").write_text("x", "utf-8")
-    report = collect([tmp_path / "d.yaml"], socket=tmp_path / "no.sock", home=HOME)
+    report = collect([tmp_path / name for name in given], socket=tmp_path / "no.sock", home=HOME)
     dumps = [f"era-fault-2026-{number}.jsonl" for number in range(2, MAX_DUMPS + 2)]
     assert set(report.files) == {"d.yaml", "rig.yaml", *dumps, "versions.json"}
     layout, daemon = report.missing

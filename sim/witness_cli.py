@@ -198,6 +198,11 @@ def _relay(
         async with relays(endpoints, names, checker) as ends:
             for endpoint, end in zip(endpoints, ends, strict=True):
                 print(endpoint.url, end, sep="  ", file=to, flush=True)
+            print(
+                "checking what passes the right URL, to be used in place of the left; a server is "
+                "connected to when a host is; Ctrl-C ends",
+                file=sys.stderr,
+            )
             await ended.wait()
 
     asyncio.run(run())

@@ -176,5 +176,5 @@ def _summary(rows: "list[TouchRow]") -> str:
     return (
         f"{touches}; of {len(kept)} with other fingers on the plate {sum(kept)} "
         f"({sum(kept) / len(kept):.0%}) felt at least the contrast promised\n"
-        "(promised: what nine of ten plates within the rig's uncertainty give)"
+        "(nine of ten plates within the rig's uncertainty keep a promise; --seed draws another one)"
     )

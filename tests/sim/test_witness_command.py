@@ -264,7 +264,7 @@ async def test_witness_relays_a_wire_until_interrupted(
         assert sum(len(piece.data) > 0 for piece in read_capture(capture, wires=["wire1"])) >= 6
     else:
         assert process.returncode == 2
-        (error,) = err.decode().splitlines()
+        _, error = err.decode().splitlines()
         assert "capture.txt" in error
 
 
@@ -280,3 +280,4 @@ def test_witness_without_frames_has_checked_nothing(monkeypatch: pytest.MonkeyPa
     result = CliRunner().invoke(app, ["witness", URL])
     assert isinstance(result.exception, InputError)
     assert "nothing was checked" in str(result.exception)
+    assert "Ctrl-C ends" in result.stderr

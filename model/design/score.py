@@ -28,7 +28,7 @@ import numpy as np
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from model.choice import best_rows
 from model.ensemble.attached_plate import mounts_of
-from model.ensemble.touched_plate import gram, power_of
+from model.ensemble.touched_plate import expected_power, power_of
 from model.finger.fingertip import FIVE_POINTS, fingertips_on
 from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL, detection_threshold
@@ -47,7 +47,7 @@ LAWSON_STEPS = 2
 LEVEL_PENALTY = 0.1
 """Decibels of score for one of level: with 1 in place of 0 to 0.15 scores follow answers less."""
 
-_RIDGE, _LEAST = np.float32(1e-6), np.float32(1e-30)
+_LEAST = np.float32(1e-30)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,25 +184,21 @@ class Scorer:
         motion.reshape(f, -1)[:, :: n + 1] += stroke
         t, L, released, G_f = t[0], L[0], released[0], G_f[0]
         damping = t.reshape(f, -1, n) @ (minus_omega2 * by_damping[:, :, None] * motion)
-        root = np.sqrt(weights)[..., None]
         parts = [h, damping.reshape(h.shape), *((fields[1:] - h) * np.float32(math.sqrt(0.5)))]
-        rows = [each * root for each in parts]
         reach = np.sqrt(_mean_power(t, weights)) * -minus_omega2
-        rows.append(reach[..., None] * (by_stiffness[:, :, None] * motion)[:, None])
+        own = reach[..., None] * (by_stiffness[:, :, None] * motion)[:, None]
         if uncertainty.fingertip > 0:
             by_load = np.sqrt(_mean_power(L[..., None], weights)) * np.abs(released)[..., None]
             load = by_load * np.float32(uncertainty.fingertip) * (D * released)[..., None]
-            rows.append((load * G_f * scale)[:, :, None])
-        every = np.concatenate(rows, axis=2)
-        power = gram(every)
-        diagonal = power.reshape(f, m, -1)[..., :: n + 1]
-        ridge = _RIDGE / n * diagonal.real.sum(axis=2, keepdims=True)
-        gains = np.float32(uncertainty.gain_variance) * _mean_power(h, weights)
-        diagonal += gains + ridge + _LEAST
+            own = np.concatenate([own, (load * G_f * scale)[:, :, None]], axis=2)
+        error = np.full((f, 1, n), _LEAST)
         if uncertainty.field > 0:
             over_plate = places.to_plate[:, :, chosen] @ K[0] * scale
             mean_square = (np.abs(over_plate) ** 2).mean(axis=1, keepdims=True)
-            diagonal += np.float32(uncertainty.field**2) * mean_square
+            error += np.float32(uncertainty.field**2) * mean_square
+        power = expected_power(
+            parts, own, weights, gain_variance=uncertainty.gain_variance, error_power=error
+        )
         return (h * weights[..., None]).sum(axis=2), power
 
     def _score(

@@ -21,6 +21,7 @@ loss factor changes next to nothing.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -147,22 +148,21 @@ class TouchedPlate:
             for node in (THICKER, THINNER):
                 other, _ = self.sources(rows, np.full(f, node), every)
                 changes.append((other[:, :, :n] * forces - h) * np.float32(math.sqrt(0.5)))
-        each = np.stack(changes, axis=1).reshape(f, -1, g, p, n).swapaxes(1, 2)
-        power = gram((each * np.sqrt(weights)[:, None, :, None]).reshape(f, g, -1, n))
         a, k = moved.shape[1], len(self.centres)
         uncertain = np.concatenate([np.arange(n), np.arange(a - k, a)])
         load = np.float32(plate.uncertainty.fingertip) * self.stiffness[rows]
         by_one = np.concatenate([plate.by_stiffness[rows], load], axis=1)
         deformed = stretched[:, uncertain] * by_one[:, :, None]
         reach = power_of(by_force[:, :, uncertain]).reshape(f, g, p, -1)
-        mean = weights[:, None]
-        by_attachment = outer(deformed).reshape(f, n + k, -1)
-        power += ((mean @ reach)[:, :, 0] @ by_attachment).reshape(f, g, n, n)
-        size = (mean @ power_of(h).reshape(f, g, p, n))[:, :, 0]
-        diagonal = power.reshape(f, g, -1)[..., :: n + 1]
-        values = diagonal.real + plate.uncertainty.gain_variance * size + error_power[rows, None]
-        diagonal[:] = values + RIDGE / n * values.sum(axis=-1, keepdims=True)
-        found = h.reshape(f, g, p, n)
+        own = np.sqrt(weights[:, None] @ reach).swapaxes(2, 3) * deformed[:, None]
+        found, *changed = (each.reshape(f, g, p, n) for each in changes)
+        power = expected_power(
+            [found, *changed],
+            own,
+            weights,
+            gain_variance=plate.uncertainty.gain_variance,
+            error_power=error_power[rows, None],
+        )
         uncertain = power - gram(found * np.sqrt(weights)[:, :, None])
         if fine is None:
             return LoadedContacts(found, None, power, uncertain)
@@ -301,6 +301,30 @@ def drawn_on(
     )
     first_base = on.first.get(by.bases, MODELLED)
     return draws, nodes, (by.bases if first_base else 1, first_base), first
+
+
+def expected_power(
+    fields: Sequence[Complex64Array],
+    own: Complex64Array,
+    weights: Float32Array,
+    *,
+    gain_variance: float,
+    error_power: Float32Array,
+) -> Complex64Array:
+    """Expected powers R at g groups of points, (f, g, n, n).
+
+    fields: h and each of its changes (f, g, p, n); own (f, g, j, n): changes by the stiffness of
+    each attachment and the load of each finger, root mean square over the points; weights (g, p) of
+    the points; error_power (f, ..., n): mean square of the error of each ERA's field.
+    """
+    f, g, _, n = own.shape
+    root = np.sqrt(weights)[..., None]
+    power = gram(np.concatenate([*(each * root for each in fields), own], axis=2))
+    size = (weights[:, None] @ power_of(fields[0]))[:, :, 0]
+    diagonal = power.reshape(f, g, -1)[..., :: n + 1]
+    values = diagonal.real + np.float32(gain_variance) * size + error_power
+    diagonal[:] = values + np.float32(RIDGE / n) * values.sum(axis=-1, keepdims=True)
+    return power
 
 
 def gram(rows: Complex64Array) -> Complex64Array:

@@ -36,7 +36,7 @@ from controller.daemon.api_views import (
     hello_result,
     predicted_of,
 )
-from controller.daemon.config import DaemonConfig
+from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.operation import LEASE_OVER
 from controller.daemon.publisher import EventPublisher
 from controller.daemon.states import (
@@ -49,12 +49,12 @@ from controller.daemon.states import (
     check_lease,
 )
 from controller.daemon.supervisor import Supervisor
-from controller.daemon.touch_inputs import ApiTouches
 from controller.effects.player import EffectPlayer
 from controller.learning.learning import Learning
 from controller.loop.loop import Controller
 from controller.loop.table_query import MAX_DB_SL
 from controller.sources.contacts import Contact
+from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
 from drivers.host.stop import Stopped
 from model.table.table import LocalizationTable
@@ -83,7 +83,6 @@ class ApiService:
         supervisor: Supervisor,
         *,
         publisher: EventPublisher,
-        touches: ApiTouches,
         layout: EffectPlayer,
         learning: Learning | None,
     ) -> None:
@@ -92,7 +91,6 @@ class ApiService:
         self._controller = controller
         self._supervisor = supervisor
         self._publisher = publisher
-        self._touches = touches
         self._layout = layout
         self._learning = learning
         self._next_number = itertools.count(1)
@@ -105,7 +103,8 @@ class ApiService:
     def client_left(self, client: Connection) -> None:
         """Release what a disconnected client holds; lift its fingers."""
         self._publisher.hub.forget(client)
-        self._touches.lift_all(client, now=clock.now())
+        if client.number is not None:
+            self._controller.lift(f"{_origin(client)}:")
 
     def holds_lease(self, client: Connection) -> bool:
         """Whether a client armed or renewed the current lease: it is never evicted."""
@@ -228,7 +227,14 @@ class ApiService:
     def _touch(self, client: Connection, params: TouchParams) -> Empty:
         if client.number is None:
             client.number = next(self._next_number)
-        self._touches.add(client, params, client_name=str(client.number), now=client.received_at)
+        plate, origin = self._config.rig.plate, _origin(client)
+        touches = tuple(
+            Touch(point.id, point.x_m / plate.length, 1 - point.y_m / plate.width)
+            for point in params.touches
+        )
+        # The same source name of two clients denotes two sources.
+        name = f"{origin}:{params.source}"
+        self._controller.deliver(TouchFrame(name, client.received_at, touches, origin=origin))
         return Empty()
 
     def _effects(self, client: Connection, params: Empty) -> EffectsResult:
@@ -290,6 +296,11 @@ class ApiService:
         """Disarm if the client disconnected before it received its lease."""
         if client.has_left:
             self._supervisor.withdraw(token, "the arming client disconnected")
+
+
+def _origin(client: Connection) -> str:
+    """Return the origin of a client's touches, with which the names of its sources begin."""
+    return f"{API_SOURCES}:{client.number}"
 
 
 def _armed_already(operation: Operation) -> RpcError:

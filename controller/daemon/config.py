@@ -11,7 +11,6 @@ from controller.daemon.config_sections import CalibrationSection, DaemonSection,
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.layout_file import is_layout_document, load_layout
 from controller.sources.touch import (
-    CalibratedSource,
     TouchCalibration,
     TouchSource,
     fitted,
@@ -44,8 +43,8 @@ class TouchInput:
     calibration: TouchCalibration
 
     def make(self) -> TouchSource:
-        """Create the source, in plate coordinates; raises InputError."""
-        return CalibratedSource(open_source(self.url), self.calibration)
+        """Create the source, in its own coordinates; raises InputError."""
+        return open_source(self.url)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock
 from controller.daemon.states import ENERGISED, DaemonState, Operation
 from controller.daemon.supervisor import Supervisor
-from controller.daemon.touch_inputs import ApiTouches, TouchInputs
+from controller.daemon.touch_inputs import TouchInputs
 from controller.effects.player import EffectPlayer
 from controller.learning.learning import Learning
 from controller.loop.loop import Controller
@@ -121,15 +121,13 @@ class Daemon:
             )
             self._controller.observers.append(self.learning.observer)
         self._controller.observers.append(observer)
-        self._touches = ApiTouches(config.rig.plate, self._controller.deliver)
-        self._inputs = TouchInputs(self._controller.deliver)
+        self._inputs = TouchInputs(self._controller.deliver, self._controller.lift)
         self._api = ApiService(
             config,
             table,
             self._controller,
             self._supervisor,
             publisher=self._publisher,
-            touches=self._touches,
             layout=self._layout,
             learning=self.learning,
         )

@@ -1,27 +1,21 @@
-"""Touch inputs of the daemon: the configured sources, and the touches of API clients."""
+"""Touch inputs of the daemon: the configured sources."""
 
 import asyncio
 import logging
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 
-from controller.api.methods import TouchParams
-from controller.daemon.config import API_SOURCES, TouchInput
-from controller.daemon.deferred_calls import call_guarded
-from controller.sources.touch import Touch, TouchFrame
+from controller.daemon.config import TouchInput
+from controller.sources.touch import ALIGNED, TouchFrame
 from drivers import clock
 from drivers.pauses import Backoff
 from drivers.threads import in_thread
 from model.errors import InputError
-from model.structure.plate import Plate
 from registry.plugins import failure_text
 
 _MIN_PAUSE, _MAX_PAUSE = 1.0, 30.0  # s; before a failed source is restarted
 _CLOSE_TIMEOUT = 0.2  # s
-MAX_SOURCES_PER_CLIENT = 64  # with fingers down
-_SOURCE_TIMEOUT = 1.0  # s; without a frame, after which a source has no finger down any more
 
 _logger = logging.getLogger(__name__)
 
@@ -29,12 +23,14 @@ _logger = logging.getLogger(__name__)
 class TouchInputs:
     """Runs touch sources concurrently.
 
-    deliver receives their frames, each source name prefixed with the configured name. A source that
-    fails is restarted after a growing pause.
+    deliver receives their frames in coordinates of the plate, each source name prefixed with the
+    configured name; lift, that prefix: of a source that ends, fails or is cancelled. One that fails
+    is restarted after a growing pause.
     """
 
-    def __init__(self, deliver: Callable[[TouchFrame], None]) -> None:
+    def __init__(self, deliver: Callable[[TouchFrame], None], lift: Callable[[str], None]) -> None:
         self._deliver = deliver
+        self._lift = lift
         self._running: list[asyncio.Task[None]] = []
 
     def start(self, inputs: Iterable[TouchInput]) -> None:
@@ -59,10 +55,15 @@ class TouchInputs:
         await asyncio.wait([ends], timeout=_CLOSE_TIMEOUT)
 
     async def _run(self, touch_input: TouchInput) -> None:
+        prefix, calibration = f"{touch_input.name}:", touch_input.calibration
+
         def deliver(frame: TouchFrame) -> None:
             # The sender chooses the name, which is printed on terminals.
             source = frame.source if frame.source.isprintable() else ascii(frame.source)
-            self._deliver(replace(frame, source=f"{touch_input.name}:{source}"))
+            touches = frame.touches
+            if calibration != ALIGNED:
+                touches = tuple(map(calibration.apply, touches))
+            self._deliver(replace(frame, source=prefix + source, touches=touches))
 
         backoff = Backoff(_MIN_PAUSE, _MAX_PAUSE)
         while True:
@@ -78,43 +79,7 @@ class TouchInputs:
             else:
                 _logger.info("touch source %s: finished", touch_input.name)
                 return
+            finally:
+                self._lift(prefix)
             # A panel may be plugged in later, a port be released.
             await asyncio.sleep(backoff.pause(ran_for=clock.now() - started_at))
-
-
-class ApiTouches:
-    """Touch frames of API clients, each delivered in its turn; which clients have fingers down."""
-
-    def __init__(self, plate: Plate, deliver: Callable[[TouchFrame], None]) -> None:
-        self._plate = plate
-        self._deliver = deliver
-        # With fingers down, and the time [s] of the last frame.
-        self._sources: dict[object, dict[str, float]] = {}
-
-    def add(self, client: object, params: TouchParams, *, client_name: str, now: float) -> None:
-        """Add a frame that arrived at a time [s]; raises InputError for too many sources.
-
-        The same source name of two clients denotes two sources.
-        """
-        source = f"{API_SOURCES}:{client_name}:{params.source}"
-        sources = self._sources.setdefault(client, {})
-        sources.pop(source, None)
-        if params.touches:
-            for old in [each for each in sources if now - sources[each] > _SOURCE_TIMEOUT]:
-                del sources[old]
-            if len(sources) >= MAX_SOURCES_PER_CLIENT:
-                raise InputError(
-                    f"a client must have at most {MAX_SOURCES_PER_CLIENT} touch sources with "
-                    "fingers down; lift some first"
-                )
-            sources[source] = now
-        touches = tuple(
-            Touch(point.id, point.x_m / self._plate.length, 1 - point.y_m / self._plate.width)
-            for point in params.touches
-        )
-        self._deliver(TouchFrame(source, now, touches, origin=f"{API_SOURCES}:{client_name}"))
-
-    def lift_all(self, client: object, *, now: float) -> None:
-        """Lift all fingers of a client at a time [s], whatever fails at one of its sources."""
-        for source in self._sources.pop(client, ()):
-            call_guarded(partial(self._deliver, TouchFrame(source, now, ())))

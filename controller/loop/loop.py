@@ -315,6 +315,14 @@ class Controller:
         for reason in change.rejected:
             self._rejects.count(reason, f"touch of {frame.source}")
 
+    def lift(self, prefix: str) -> None:
+        """Lift the fingers of all sources whose names begin so, whatever fails at one of them."""
+        for source in self._tracker.sources_of(prefix):
+            try:
+                self.deliver(TouchFrame(source, clock.now(), ()))
+            except Exception:
+                _logger.exception("loop: fingers of %s not lifted", source)
+
     def request_update(self) -> None:
         """Query the intent source again, because its intent changed without a touch."""
         if self._decider_if_open is not None:

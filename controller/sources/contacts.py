@@ -170,6 +170,10 @@ class ContactTracker:
             return -math.inf
         return min(self._sources[key.source].expiry, self._taps.get(key, math.inf))
 
+    def sources_of(self, prefix: str) -> list[str]:
+        """Return the sources with contacts whose names begin so."""
+        return [name for name in self._sources if name.startswith(prefix)]
+
     def update(self, frame: TouchFrame, *, keeps_taps: bool = False) -> Change:
         """Apply a frame, which replaces the previous one of its source.
 

@@ -4,7 +4,6 @@ A calibration is an affine map from coordinates of a sensor to those of the plat
 c, y' = d x + e y + f on coordinates 0..1 from the top left corner.
 """
 
-import asyncio
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -123,7 +122,7 @@ class TouchCalibration:
         )
 
 
-_ALIGNED = TouchCalibration()
+ALIGNED = TouchCalibration()
 
 
 def turned(degrees: int = 0, *, mirror: str | None = None) -> TouchCalibration:
@@ -166,37 +165,6 @@ def fitted(touched: Sequence[Point], positions: Sequence[Point], plate: Plate) -
         )
     (a, d), (b, e), (c, f) = solution.tolist()
     return TouchCalibration(((a, b, c), (d, e, f)))
-
-
-class CalibratedSource(TouchSource):
-    """A touch source mapped to the coordinates of the plate; fingers are lifted when it ends."""
-
-    def __init__(self, source: TouchSource, calibration: TouchCalibration) -> None:
-        self._source = source
-        self._calibration = calibration
-
-    async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-        """Run the source and deliver its frames with mapped touches.
-
-        Its fingers are lifted as soon as it ends, fails or is cancelled.
-        """
-        apply = None if self._calibration == _ALIGNED else self._calibration.apply
-        touched: dict[str, TouchFrame] = {}
-
-        def placed(frame: TouchFrame) -> None:
-            touched.pop(frame.source, None)
-            if frame.touches:
-                touched[frame.source] = frame
-            if apply is not None:
-                frame = replace(frame, touches=tuple(map(apply, frame.touches)))
-            deliver(frame)
-
-        try:
-            await self._source.run(placed)
-        finally:
-            now = asyncio.get_running_loop().time()
-            for frame in touched.values():
-                deliver(replace(frame, time=now, touches=()))
 
 
 def _reversed(row: Row) -> Row:

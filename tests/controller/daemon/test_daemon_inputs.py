@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import math
 import random
 import socket
 import threading
@@ -11,83 +12,62 @@ from pathlib import Path
 
 import pytest
 
-from controller.api.methods import TouchParams
-from controller.api.schema import TouchPoint
 from controller.daemon.config import TouchInput
-from controller.daemon.touch_inputs import MAX_SOURCES_PER_CLIENT, ApiTouches, TouchInputs
-from controller.sources.touch import Touch, TouchCalibration, TouchFrame, TouchSource
+from controller.daemon.touch_inputs import TouchInputs
+from controller.sources.contacts import Change
+from controller.sources.touch import Touch, TouchCalibration, TouchFrame, TouchSource, turned
 from daemon_bench import ready_daemon, until
 from daemon_process import Journal
 from drivers import clock
 from examples.make_touches import tuio_datagram
 from model.errors import InputError
-from model.structure.plate import Material, Plate
 from tuio_messages import free_port, panel
 from virtual_loop import in_virtual_time
-
-PLATE = Plate(0.4, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
-
-
-def params(source: str, *places: tuple[float, float]) -> TouchParams:
-    """A frame as sent by a client."""
-    touches = [TouchPoint(id=id, x_m=x, y_m=y) for id, (x, y) in enumerate(places)]
-    return TouchParams(source=source, touches=touches)
+from witness_config import tell_first
 
 
-def test_touches_are_delivered_in_places_of_the_sensor() -> None:
-    """Shares of a plate of 0.4 by 0.2 m, from its north-west corner, under the client's name."""
+@in_virtual_time
+async def test_touches_of_clients_are_delivered_in_places_of_the_sensor(tmp_path: Path) -> None:
+    """Shares of a plate of 0.3048 by 0.2286 m, from its north-west corner, by client and source."""
     frames: list[TouchFrame] = []
-    touches = ApiTouches(PLATE, frames.append)
-    touches.add("client", params("me", (0.1, 0.1), (0.3, 0.05)), client_name="1", now=1)
-    touches.add("client", params("me"), client_name="1", now=2)
-    touched, lifted = frames
-    assert (touched.source, touched.origin, touched.time) == ("api:1:me", "api:1", 1)
-    assert [(each.x, each.y) for each in touched.touches] == [
-        pytest.approx(place) for place in ((0.25, 0.5), (0.75, 0.75))
-    ]
-    assert lifted.touches == ()
+    async with ready_daemon(tmp_path) as (bench, one), await bench.client() as other:
+        tell_first(bench.daemon._controller, "deliver", frames.append)
+        await one.touch([(0.0762, 0.1143), (0.2286, 0.05715)], source="me")
+        await other.touch([(0.1, 0.1)], source="me")
+        touched, second = frames
+        assert (touched.source, touched.origin) == ("api:1:me", "api:1")
+        assert (second.source, second.origin) == ("api:2:me", "api:2")
+        assert touched.time <= clock.now()
+        assert [(each.x, each.y) for each in touched.touches] == [
+            pytest.approx(place) for place in ((0.25, 0.5), (0.75, 0.75))
+        ]
 
 
-def test_touches_of_leaving_client_are_lifted() -> None:
-    """An empty frame for each of its sources with fingers down, and for no others."""
-    frames: list[TouchFrame] = []
-    touches = ApiTouches(PLATE, frames.append)
-    touches.add("a", params("me", (0.1, 0.1)), client_name="1", now=1)
-    touches.add("a", params("lifted", (0.1, 0.1)), client_name="1", now=1)
-    touches.add("a", params("lifted"), client_name="1", now=1)
-    touches.add("b", params("me", (0.1, 0.1)), client_name="2", now=1)
-    frames.clear()
-    touches.lift_all("a", now=2)
-    touches.lift_all("unknown", now=2)
-    assert frames == [TouchFrame("api:1:me", 2, ())]
+@in_virtual_time
+async def test_fingers_of_a_leaving_client_are_lifted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At once, of every source but one where that fails, which times out; others' stay."""
+    async with ready_daemon(tmp_path) as (bench, era):
+        tracker = bench.daemon._controller._tracker
+        update = tracker.update
 
+        def failing(frame: TouchFrame, **options: bool) -> Change:
+            if frame.source == "api:1:fails" and not frame.touches:
+                raise ZeroDivisionError
+            return update(frame, **options)
 
-def test_leaving_client_is_lifted_though_one_of_its_sources_fails() -> None:
-    """The fingers of its other sources would stay until they time out."""
-    lifted: list[str] = []
-
-    def deliver(frame: TouchFrame) -> None:
-        if not frame.touches:
-            lifted.append(frame.source)
-            raise ZeroDivisionError
-
-    touches = ApiTouches(PLATE, deliver)
-    for source in ("one", "other"):
-        touches.add("a", params(source, (0.1, 0.1)), client_name="1", now=1)
-    touches.lift_all("a", now=2)
-    assert lifted == ["api:1:one", "api:1:other"]
-
-
-def test_sources_of_client_are_bounded() -> None:
-    """64 with fingers down; lifting those of one source permits another, as does its silence."""
-    touches = ApiTouches(PLATE, lambda frame: None)
-    for number in range(MAX_SOURCES_PER_CLIENT):
-        touches.add("a", params(str(number), (0.1, 0.1)), client_name="1", now=1)
-    with pytest.raises(InputError, match="64"):
-        touches.add("a", params("more", (0.1, 0.1)), client_name="1", now=1)
-    touches.add("a", params("0"), client_name="1", now=1)
-    touches.add("a", params("more", (0.1, 0.1)), client_name="1", now=1)
-    touches.add("a", params("again", (0.1, 0.1)), client_name="1", now=2.5)
+        monkeypatch.setattr(tracker, "update", failing)
+        async with await bench.client() as leaving:
+            for source in ("fails", "one", "lifted"):
+                await leaving.touch([(0.1, 0.1)], source=source)
+            await leaving.touch([], source="lifted")
+            await era.touch([(0.2, 0.1)], source="one")
+            down = [each.source for each in (await era.status()).contacts]
+            assert down == ["api:1:fails", "api:1:one", "api:2:one"]
+        await asyncio.sleep(0.02)
+        down = [each.source for each in (await era.status()).contacts]
+        assert down == ["api:1:fails", "api:2:one"]
 
 
 @dataclass
@@ -120,7 +100,8 @@ async def test_inputs_run_beside_each_other(
     }
     monkeypatch.setattr("controller.daemon.config.open_source", panels.__getitem__)
     frames: list[str] = []
-    inputs = TouchInputs(lambda frame: frames.append(frame.source))
+    lifted: list[str] = []
+    inputs = TouchInputs(lambda frame: frames.append(frame.source), lifted.append)
     one, two, three = (
         TouchInput(name, url, TouchCalibration())
         for name, url in (("left", "a:"), ("right", "b:"), ("table", "c:"))
@@ -129,8 +110,32 @@ async def test_inputs_run_beside_each_other(
     await until(lambda: len(frames) == 3 and caplog.messages)
     assert sorted(frames) == ["left:'x\\x1b[2J'", "right:y", "table:z"]
     assert caplog.messages == ["touch source right: failed, restarting: unplugged"]
+    assert lifted == ["right:"]
     await inputs.close()
     assert (panels["a:"].ended, panels["c:"].ended) == (["x\x1b[2J"], ["z"])
+    assert sorted(lifted[1:]) == ["left:", "table:"]
+
+
+async def test_input_maps_touches_to_the_plate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames keep their time and ids; not finite stays so, for contacts to refuse."""
+
+    class Once(TouchSource):
+        async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
+            deliver(TouchFrame("panel", 1.5, (Touch(4, 0.25, 0.5), Touch(5, math.nan, 0)), 3.0))
+
+    monkeypatch.setattr("controller.daemon.config.open_source", lambda url: Once())
+    seen: list[TouchFrame] = []
+    lifted: list[str] = []
+    inputs = TouchInputs(seen.append, lifted.append)
+    inputs.start([TouchInput("left", "a:", turned(180))])
+    await until(lambda: lifted)
+    (frame,) = seen
+    assert (frame.source, frame.time, frame.timeout) == ("left:panel", 1.5, 3.0)
+    assert frame.touches[0] == Touch(4, 0.75, 0.5)
+    assert frame.touches[1].id == 5
+    assert math.isnan(frame.touches[1].x)
+    assert lifted == ["left:"]
+    await inputs.close()
 
 
 LEFT: list[TouchInputs] = []
@@ -152,7 +157,7 @@ def test_closing_waits_for_no_source_that_goes_on(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("controller.daemon.touch_inputs._CLOSE_TIMEOUT", 0.0)
 
     async def serve() -> None:
-        LEFT.append(TouchInputs(lambda frame: None))
+        LEFT.append(TouchInputs(lambda frame: None, lambda prefix: None))
         LEFT[0].start([TouchInput("left", "a:", TouchCalibration())])
         await started.wait()
         await LEFT[0].close()
@@ -186,7 +191,7 @@ async def test_failed_input_is_restarted_after_growing_pauses(
 
     monkeypatch.setattr("controller.daemon.config.open_source", lambda url: Late())
     monkeypatch.setattr("controller.daemon.touch_inputs.asyncio.sleep", pause)
-    inputs = TouchInputs(lambda frame: None)
+    inputs = TouchInputs(lambda frame: None, lambda prefix: None)
     inputs.start([TouchInput("left", "a:", TouchCalibration())])
     while len(runs) < 3:
         await sleep(0.001)

@@ -250,6 +250,15 @@ def test_frames_become_contacts(name: str) -> None:
         assert len(tracker.contacts) <= MAX_CONTACTS
 
 
+def test_tracker_names_the_sources_that_have_contacts() -> None:
+    """By the beginning of their names, as of one input; those that were lifted are none."""
+    tracker = ContactTracker(PLATE)
+    for source in ("a:one", "a:two", "ab:one"):
+        tracker.update(frame(0.0, (1, 0.5, 0.5), source=source))
+    tracker.update(frame(0.0, source="a:two"))
+    assert tracker.sources_of("a:") == ["a:one"]
+
+
 def test_tracker_follows_loads_in_steps_once_a_finger_has_landed() -> None:
     """None in the first 100 ms; then only what differs by half, within 0.4 and 2.5.
 

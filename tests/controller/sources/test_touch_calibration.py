@@ -1,19 +1,12 @@
 """From a sensor's coordinates to the plate's."""
 
-import asyncio
-import math
-from collections.abc import Callable
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.sources.touch import (
-    CalibratedSource,
     Touch,
     TouchCalibration,
-    TouchFrame,
-    TouchSource,
     fitted,
     turned,
 )
@@ -97,28 +90,3 @@ def test_fitted_refuses_points_on_a_line(
     """On the sensor or on the plate: every finger would be on that line."""
     with pytest.raises(InputError, match="three corners"):
         fitted(touched, positions, PLATE)
-
-
-async def test_calibrated_source_maps_touches_and_lifts_them_at_its_end() -> None:
-    """Frames keep their source, time and ids; not finite stays so, for contacts to refuse.
-
-    Of two sources that it has reported, the one with fingers down is lifted when it fails.
-    """
-
-    class Once(TouchSource):
-        async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-            deliver(TouchFrame("other", 1.0, (Touch(4, 0.25, 0.5),)))
-            deliver(TouchFrame("other", 1.0, ()))
-            deliver(TouchFrame("panel", 1.5, (Touch(4, 0.25, 0.5), Touch(5, math.nan, 0)), 3.0))
-            raise InputError("unplugged")
-
-    seen: list[TouchFrame] = []
-    with pytest.raises(InputError, match="unplugged"):
-        await CalibratedSource(Once(), turned(180)).run(seen.append)
-    _, _, frame, lifted = seen
-    assert (lifted.source, lifted.touches) == ("panel", ())
-    assert 1.5 < lifted.time <= asyncio.get_running_loop().time()
-    assert (frame.source, frame.time) == ("panel", 1.5)
-    assert frame.touches[0] == Touch(4, 0.75, 0.5)
-    assert frame.touches[1].id == 5
-    assert math.isnan(frame.touches[1].x)

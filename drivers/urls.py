@@ -63,8 +63,7 @@ class AmplifierUrl:
         except ValueError as error:
             raise self.refused(f"URL must be valid: {error}") from None
         self.place, self.number = parts.netloc, parts.fragment
-        # /dev/ttyUSB0, or COM3 of /COM3
-        self.path = re.sub(r"^/(?=COM\d+$)", "", unquote(parts.path), flags=re.IGNORECASE)
+        self.path = unquote(parts.path)
         pairs = parse_qsl(parts.query, keep_blank_values=True)
         self.options = dict(pairs)
         if unknown := sorted(self.options.keys() - set(known)):

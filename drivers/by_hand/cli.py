@@ -27,7 +27,7 @@ EXIT_STATUS: dict[type[BaseException], int] = {
 # \b: these lines stay as they are.
 _URLS = """\b
 URLs:
-  serial:///dev/ttyUSB0?baud=921600&address=1   a serial port, on Windows serial:///COM3
+  serial:///dev/ttyUSB0?baud=921600&address=1   a serial port
   serial+tcp://HOST:PORT                        a serial server with raw TCP
   modbus+tcp://HOST:PORT/UNIT                   Modbus over TCP; ?baud=19200 for a gateway
   modbus+rtu:///dev/ttyS1?baud=115200#UNIT      Modbus on a serial port

@@ -130,10 +130,7 @@ def with_slcan(candidate: Candidate) -> Candidate:
         return candidate
     heard = adapter.nodes or ("none",)
     what = adapter.problem or f"heartbeats of nodes: {', '.join(map(str, heard))}"
-    urls = tuple(
-        f"can+slcan://{_absolute(candidate.name)}?bitrate={BITRATE}#{node}"
-        for node in adapter.nodes
-    )
+    urls = tuple(f"can+slcan://{candidate.name}?bitrate={BITRATE}#{node}" for node in adapter.nodes)
     description = f"{candidate.description}: slcan adapter {adapter.version}, {what}"
     return Candidate(candidate.name, description, urls, is_slcan=True)
 
@@ -141,14 +138,10 @@ def with_slcan(candidate: Candidate) -> Candidate:
 def _serial_ports() -> Iterator[Candidate]:
     for port in sorted(comports()):
         path = port.device
-        urls = tuple(f"serial://{_absolute(path)}?baud={speed}" for speed in _SPEEDS)
-        urls += (f"modbus+rtu://{_absolute(path)}?baud={RTU_BAUD}#{ADDRESS}",)
+        urls = tuple(f"serial://{path}?baud={speed}" for speed in _SPEEDS)
+        urls += (f"modbus+rtu://{path}?baud={RTU_BAUD}#{ADDRESS}",)
         description = "serial port" if port.description == _UNDESCRIBED else port.description
         yield Candidate(path, description, urls, is_serial=True)
-
-
-def _absolute(path: str) -> str:
-    return path if path.startswith("/") else f"/{path}"
 
 
 def _can_interfaces() -> Iterator[Candidate]:

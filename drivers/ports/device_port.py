@@ -48,9 +48,12 @@ class DevicePort(ABC):
     def read_watched(self) -> bytes:
         """Return what has come; raises one of `failures`."""
 
-    @abstractmethod
     def read_waiting(self) -> bytes:
-        """Return what comes within a short time; raises one of `failures`. Reader thread."""
+        """Return what comes within a short time; raises one of `failures`. Reader thread.
+
+        Of a device without a descriptor.
+        """
+        raise NotImplementedError
 
     @abstractmethod
     def shut(self) -> None:

@@ -9,7 +9,7 @@ import contextlib
 import errno
 import os
 import select
-import threading
+import termios
 from collections.abc import Callable
 from typing import final
 
@@ -22,13 +22,8 @@ from drivers.ports.tcp import open_connection
 from drivers.threads import in_thread
 from drivers.urls import Place
 
-READ_TIMEOUT = 0.1  # s; interval in which a reader thread notices its end
 _READ_MAX = 4096
-_OPENING_FAILURES: tuple[type[Exception], ...] = (OSError, ValueError)  # of pyserial, at opening
-with contextlib.suppress(ImportError):  # Windows has no terminals
-    import termios
-
-    _OPENING_FAILURES += (termios.error,)
+_OPENING_FAILURES = (OSError, ValueError, termios.error)  # of pyserial
 
 _NO_PERMISSION = (
     "no permission; add the user to the group that owns the port "
@@ -78,7 +73,6 @@ def _open_device(place: Place) -> serial.Serial:
         baudrate=place.baud,
         parity=serial.PARITY_NONE if is_pseudo else place.parity,
         stopbits=place.stop,
-        timeout=READ_TIMEOUT,
         exclusive=True,
     )
     try:
@@ -104,7 +98,7 @@ def remedy_of(error: BaseException | None) -> str:
 
 @final
 class SerialPort(DevicePort):
-    """A port of pyserial, written by the event loop, or by a thread where it has no descriptor."""
+    """A port of pyserial, read and written by the event loop."""
 
     kind = "serial line"
 
@@ -117,20 +111,15 @@ class SerialPort(DevicePort):
     ) -> None:
         self._port = port
         self._unsent = b""
-        descriptor = _descriptor(port)
-        super().__init__(name, descriptor, on_data, on_loss)
-        self._writer = None if descriptor is not None else _ThreadWriter(self, port.write)
+        super().__init__(name, port.fileno(), on_data, on_loss)
 
     @property
     def is_blocked(self) -> bool:
         """Whether the port has not taken all bytes yet."""
-        return bool(self._unsent) or (self._writer is not None and self._writer.is_blocked)
+        return bool(self._unsent)
 
     def write(self, data: bytes) -> None:
         """Send bytes, as soon as the port takes them; raises LinkError."""
-        if self._writer is not None:
-            self._writer.write(data)
-            return
         was_blocked, self._unsent = bool(self._unsent), data
         self._send()
         if was_blocked is not bool(self._unsent):
@@ -141,10 +130,6 @@ class SerialPort(DevicePort):
         self._unsent = b""
         self._watch_room(False)
         super().close()
-        if self._writer is not None:
-            self._writer.close()
-            with contextlib.suppress(OSError, AttributeError):
-                self._port.cancel_read()
 
     def read_watched(self) -> bytes:
         """Return what has come; OSError for the end, which an empty read of a terminal is not."""
@@ -160,11 +145,6 @@ class SerialPort(DevicePort):
             if state.poll(0):
                 raise OSError("end of file")
         return data
-
-    def read_waiting(self) -> bytes:
-        """Return what comes within READ_TIMEOUT."""
-        data = self._port.read(1)
-        return bytes(data + self._port.read(self._port.in_waiting) if data else data)
 
     def shut(self) -> None:
         """Close the port."""
@@ -195,55 +175,3 @@ class SerialPort(DevicePort):
             self._send()
         if not self._unsent:
             self._watch_room(False)
-
-
-def _descriptor(port: serial.Serial) -> int | None:
-    """Return the file descriptor of a port, if it has one."""
-    if os.name != "posix":
-        return None
-    try:
-        return int(port.fileno())
-    except (OSError, AttributeError):  # UnsupportedOperation is an OSError
-        return None
-
-
-class _ThreadWriter:
-    """Writes to a port by a function that blocks, in a thread."""
-
-    def __init__(self, port: DevicePort, write: Callable[[bytes], object]) -> None:
-        self._port, self._write = port, write
-        self._changed = threading.Condition()
-        self._unsent: bytes | None = None
-        self._is_writing = self._is_closed = False
-        threading.Thread(target=self._run, name=f"era-write {port.name}", daemon=True).start()
-
-    @property
-    def is_blocked(self) -> bool:
-        return self._is_writing or self._unsent is not None
-
-    def write(self, data: bytes) -> None:
-        with self._changed:
-            self._unsent = data
-            self._changed.notify()
-
-    def close(self) -> None:
-        with self._changed:
-            self._is_closed, self._unsent = True, None
-            self._changed.notify()
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._is_writing = False
-                while self._unsent is None and not self._is_closed:
-                    self._changed.wait()
-                data, self._unsent = self._unsent, None
-                self._is_writing = True
-            if data is None:
-                return
-            try:
-                self._write(data)
-            except OSError as error:
-                with contextlib.suppress(RuntimeError):  # of a closed loop
-                    self._port.loop.call_soon_threadsafe(self._port.lose, error)
-                return

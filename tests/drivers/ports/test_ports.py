@@ -7,7 +7,6 @@ import pty
 import socket
 import subprocess
 import sys
-import threading
 import tty
 from collections.abc import Iterator
 from unittest.mock import Mock
@@ -139,46 +138,6 @@ async def test_error_of_whoever_takes_the_data_is_no_loss(ends: tuple[serial.Ser
     assert not losses
     watched.close()
     await watched.wait_closed()
-
-
-async def test_port_without_a_descriptor_is_written_by_a_thread() -> None:
-    """A port that takes nothing for seconds does not block the caller."""
-    entered, taken = threading.Semaphore(0), threading.Semaphore(0)
-    written: list[bytes] = []
-    losses: asyncio.Queue[str] = asyncio.Queue()
-
-    class Device:
-        in_waiting = 0
-
-        def fileno(self) -> int:
-            raise OSError("no descriptor")
-
-        def read(self, size: int) -> bytes:
-            return b""
-
-        def cancel_read(self) -> None:
-            """Do nothing."""
-
-        def close(self) -> None:
-            """Do nothing."""
-
-        def write(self, data: bytes) -> None:
-            entered.release()
-            assert taken.acquire(timeout=TIMEOUT)
-            written.append(data)
-            if data == b"stop":
-                raise ConnectionResetError("gone")
-
-    port = SerialPort(Device(), "COM3", lambda data: None, losses.put_nowait)  # type: ignore[arg-type]
-    port.write(b"one")
-    assert await asyncio.to_thread(entered.acquire, timeout=TIMEOUT)
-    for data in (b"two", b"stop"):
-        assert port.is_blocked
-        port.write(data)
-    taken.release(2)
-    assert "serial line COM3 was lost (gone)" in await asyncio.wait_for(losses.get(), TIMEOUT)
-    assert written == [b"one", b"stop"]
-    await port.wait_closed()
 
 
 MEGABYTE = 1 << 20

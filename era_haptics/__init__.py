@@ -7,96 +7,18 @@ Invalid input raises InputError, a ValueError.
 
 These names are stable; the packages behind them (`model`, `sim`, `drivers`, `controller`) change
 without notice. A name is loaded at its first use, so that a client of the daemon does not wait for
-linear algebra.
+linear algebra; `__init__.pyi` says from where, also to type checkers.
 """
 
+import re
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-if TYPE_CHECKING:
-    from controller.api.async_client import AsyncClient as AsyncClient
-    from controller.api.client import Client as Client
-    from controller.api.client_protocol import LeaseLost as LeaseLost
-    from controller.api.client_protocol import Notification as Notification
-    from controller.api.client_protocol import Unreachable as Unreachable
-    from controller.api.jsonrpc import NotSilent as NotSilent
-    from controller.api.jsonrpc import RpcError as RpcError
-    from drivers.by_hand.blocking import BlockingAmplifier as BlockingAmplifier
-    from drivers.errors import CommandRefused as CommandRefused
-    from drivers.errors import DriverError as DriverError
-    from drivers.errors import LinkError as LinkError
-    from era_haptics.amplifiers import commands_for as commands_for
-    from era_haptics.amplifiers import open_amplifier as open_amplifier
-    from era_haptics.calibration import calibrate as calibrate
-    from era_haptics.designs import RankedLayout as RankedLayout
-    from era_haptics.designs import design as design
-    from era_haptics.drive import Drive as Drive
-    from era_haptics.pictures import draw_contrast_map as draw_contrast_map
-    from era_haptics.pictures import draw_map as draw_map
-    from era_haptics.pictures import draw_pattern as draw_pattern
-    from era_haptics.pictures import draw_playback as draw_playback
-    from era_haptics.solved_plate import SolvedPlate as SolvedPlate
-    from era_haptics.tables import answer as answer
-    from era_haptics.tables import contrast_map as contrast_map
-    from era_haptics.tables import query as query
-    from era_haptics.tables import table as table
-    from model.calibration.calibration_result import Calibration as Calibration
-    from model.errors import InputError as InputError
-    from model.finger.grid import Grid as Grid
-    from model.reduction.reduced_plate import SupportedModes as SupportedModes
-    from model.rig.file import example_rig_path as example_rig_path
-    from model.rig.file import load_rig as load_rig
-    from model.rig.rig import Rig as Rig
-    from model.rig.uncertainty import Uncertainty as Uncertainty
-    from model.structure.attachments import Fingertip as Fingertip
-    from model.table.contrast_map import ContrastMap as ContrastMap
-    from model.table.file import load_table as load_table
-    from model.table.file import save_table as save_table
-    from model.table.pattern import Pattern as Pattern
-    from model.table.request import Answer as Answer
-    from model.table.request import Finger as Finger
-    from model.table.request import Request as Request
-    from model.table.table import LocalizationTable as LocalizationTable
-    from model.vibration.excitation import Tone as Tone
-    from model.vibration.maps import PlateMap as PlateMap
-    from registry.limits import GuardLimits as GuardLimits
-    from sim.plant.playback import Playback as Playback
-
-_NAMES = {
-    "controller.api.async_client": "AsyncClient",
-    "controller.api.client": "Client",
-    "controller.api.client_protocol": "LeaseLost Notification Unreachable",
-    "controller.api.jsonrpc": "NotSilent RpcError",
-    "drivers.by_hand.blocking": "BlockingAmplifier",
-    "drivers.errors": "CommandRefused DriverError LinkError",
-    "era_haptics.amplifiers": "commands_for open_amplifier",
-    "era_haptics.calibration": "calibrate",
-    "era_haptics.drive": "Drive",
-    "era_haptics.pictures": "draw_contrast_map draw_map draw_pattern draw_playback",
-    "era_haptics.solved_plate": "SolvedPlate",
-    "era_haptics.designs": "RankedLayout design",
-    "era_haptics.tables": "answer contrast_map query table",
-    "model.calibration.calibration_result": "Calibration",
-    "model.errors": "InputError",
-    "model.finger.grid": "Grid",
-    "model.reduction.reduced_plate": "SupportedModes",
-    "model.rig.file": "example_rig_path load_rig",
-    "model.rig.rig": "Rig",
-    "model.rig.uncertainty": "Uncertainty",
-    "model.structure.attachments": "Fingertip",
-    "model.table.contrast_map": "ContrastMap",
-    "model.table.file": "load_table save_table",
-    "model.table.pattern": "Pattern",
-    "model.table.request": "Answer Finger Request",
-    "model.table.table": "LocalizationTable",
-    "model.vibration.excitation": "Tone",
-    "model.vibration.maps": "PlateMap",
-    "registry.limits": "GuardLimits",
-    "sim.plant.playback": "Playback",
-}
-"""Names by the module that defines them."""
-
-_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
+_IMPORT = re.compile(r"^from (\S+) import (\w+) as", re.MULTILINE)
+_STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+_HOMES = {name: module for module, name in _IMPORT.findall(_STUB)}
+"""The module that defines each name."""
 
 __all__ = sorted(_HOMES)
 

@@ -1,0 +1,51 @@
+# The names of the package and where each is defined: for type checkers, and for `__init__.py`.
+from controller.api.async_client import AsyncClient as AsyncClient
+from controller.api.client import Client as Client
+from controller.api.client_protocol import LeaseLost as LeaseLost
+from controller.api.client_protocol import Notification as Notification
+from controller.api.client_protocol import Unreachable as Unreachable
+from controller.api.jsonrpc import NotSilent as NotSilent
+from controller.api.jsonrpc import RpcError as RpcError
+from drivers.by_hand.blocking import BlockingAmplifier as BlockingAmplifier
+from drivers.errors import CommandRefused as CommandRefused
+from drivers.errors import DriverError as DriverError
+from drivers.errors import LinkError as LinkError
+from era_haptics.amplifiers import commands_for as commands_for
+from era_haptics.amplifiers import open_amplifier as open_amplifier
+from era_haptics.calibration import calibrate as calibrate
+from era_haptics.designs import RankedLayout as RankedLayout
+from era_haptics.designs import design as design
+from era_haptics.drive import Drive as Drive
+from era_haptics.pictures import draw_contrast_map as draw_contrast_map
+from era_haptics.pictures import draw_map as draw_map
+from era_haptics.pictures import draw_pattern as draw_pattern
+from era_haptics.pictures import draw_playback as draw_playback
+from era_haptics.solved_plate import SolvedPlate as SolvedPlate
+from era_haptics.tables import answer as answer
+from era_haptics.tables import contrast_map as contrast_map
+from era_haptics.tables import query as query
+from era_haptics.tables import table as table
+from model.calibration.calibration_result import Calibration as Calibration
+from model.errors import InputError as InputError
+from model.finger.grid import Grid as Grid
+from model.reduction.reduced_plate import SupportedModes as SupportedModes
+from model.rig.file import example_rig_path as example_rig_path
+from model.rig.file import load_rig as load_rig
+from model.rig.rig import Rig as Rig
+from model.rig.uncertainty import Uncertainty as Uncertainty
+from model.structure.attachments import Fingertip as Fingertip
+from model.table.contrast_map import ContrastMap as ContrastMap
+from model.table.file import load_table as load_table
+from model.table.file import save_table as save_table
+from model.table.pattern import Pattern as Pattern
+from model.table.request import Answer as Answer
+from model.table.request import Finger as Finger
+from model.table.request import Request as Request
+from model.table.table import LocalizationTable as LocalizationTable
+from model.vibration.excitation import Tone as Tone
+from model.vibration.maps import PlateMap as PlateMap
+from registry.limits import GuardLimits as GuardLimits
+from sim.plant.playback import Playback as Playback
+
+_HOMES: dict[str, str]
+__all__: list[str]

@@ -5,8 +5,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from numpy.lib.stride_tricks import sliding_window_view
 
+from era_haptics.arguments import Positions, as_points
 from era_haptics.drive import Drives, excitation_of
-from era_haptics.positions import Positions, as_points
 from era_haptics.solved_plate import SolvedPlate
 from model.arguments import expect
 from model.arrays import FloatArray

@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 from functools import cached_property
 
-from era_haptics.arguments import as_pair, expect_rig
+from era_haptics.arguments import Positions, as_loads, as_pair, as_points, expect_rig
 from era_haptics.drive import Drives, excitation_of
-from era_haptics.positions import Positions, as_loads, as_points
 from model.arguments import expect_number, is_whole, shown
 from model.errors import InputError
 from model.reduction.free_plate import FreePlate, solve_free_plate

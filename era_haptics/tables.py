@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 from functools import lru_cache
 
-from era_haptics.arguments import as_frequencies, expect_rig
-from era_haptics.positions import Positions, as_loads, as_points
+from era_haptics.arguments import Positions, as_frequencies, as_loads, as_points, expect_rig
 from model.arguments import expect, expect_number, shown
 from model.arrays import FloatArray
 from model.errors import InputError

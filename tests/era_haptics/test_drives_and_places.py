@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import era_haptics as era
+from era_haptics.arguments import as_points
 from era_haptics.drive import excitation_of
-from era_haptics.positions import as_points
 from paper_plate import make_paper_rig
 
 RIG = make_paper_rig(12, 9)

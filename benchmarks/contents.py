@@ -143,7 +143,6 @@ def _print_modulated(
     import numpy as np
 
     from model.table.answer import answer
-    from model.table.modulation import with_modulation
     from model.table.request import Finger, Request
 
     steady, cost = [], []
@@ -151,7 +150,8 @@ def _print_modulated(
         requests = [Request(at) for at in places[:contents]]
         fingers = [Finger(at) for at in places[contents:]]
         plain = answer(table, requests, fingers)
-        found = with_modulation(table, plain, [modulation, *[None] * (contents - 1)])
+        requests[0] = replace(requests[0], modulation_hz=modulation)
+        found = answer(table, requests, fingers)
         before, after = plain.promised_worst_db, found.promised_worst_db
         if found.layers[0].side_bands and before is not None and after is not None:
             steady.append(before)

@@ -22,7 +22,6 @@ from model.choice import best_of
 from model.counting import counted
 from model.errors import InputError
 from model.table.answer import answer
-from model.table.modulation import with_modulation
 from model.table.pattern import IMPERCEPTIBLE_DB_SL
 from model.table.request import MIN_CONTRAST_DB, Answer, verdict_of
 from model.table.table import LocalizationTable
@@ -276,6 +275,4 @@ def _answered(
     requests = requests_of(table, fingers, playable, protected or frozenset())
     others = fingers_of(quiet, protected or frozenset())
     least = -math.inf if protected is None else MIN_CONTRAST_DB
-    found = answer(table, requests, others, min_contrast_db=least)
-    modulations = [target.modulation_hz for _, target in fingers]
-    return with_modulation(table, found, modulations, playable=playable)
+    return answer(table, requests, others, min_contrast_db=least, playable=playable)

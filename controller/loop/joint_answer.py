@@ -23,7 +23,7 @@ from model.choice import NEARLY
 from model.finger.perception import FELT_DB_SL, decibels
 from model.table import request
 from model.table.answer import answer
-from model.table.modulation import frequency_of, with_gains, with_modulation
+from model.table.modulation import with_gains
 from model.table.pattern import IMPERCEPTIBLE_DB_SL, ONSET_RAMP, Pattern
 from model.table.promised import share_stroke
 from model.table.question import MIN_LEVEL_DB_SL, Question
@@ -60,12 +60,14 @@ def query_jointly(
     is_moving: whether only their places have changed. Raises InputError for fingers that are too
     close.
     """
-    requests = requests_of(table, targets, capabilities.frequencies, protected)
+    playable = capabilities.frequencies
+    requests = _as_layers_allow(
+        requests_of(table, targets, playable, protected), capabilities.layers
+    )
     fingers = fingers_of(quiet, protected)
     kept = _kept(requests, targets, before)
-    found = _answer(table, requests, fingers, kept, math.inf if is_moving else KEPT_WITHIN)
-    modulations, playable = _modulations(targets, capabilities.layers), capabilities.frequencies
-    found = with_modulation(table, found, modulations, playable=playable)
+    kept_within = math.inf if is_moving else KEPT_WITHIN
+    found = _answer(table, requests, fingers, kept, kept_within, playable)
     strokes = {era.name: era.stroke for era in table.eras}
     free, factor = found, _factor_within(found, capabilities, strokes)
     if factor < 1 - NEARLY:
@@ -75,8 +77,7 @@ def query_jointly(
             softer = [
                 _at_gain(*each) for each in zip(requests, found.layers, gains_db, strict=True)
             ]
-            lowered = answer(table, softer, fingers)
-            lowered = with_modulation(table, lowered, modulations, playable=playable)
+            lowered = answer(table, softer, fingers, playable=playable)
         found = lowered
         factor = _factor_within(found, capabilities, strokes)
     change = float(decibels(factor))
@@ -110,7 +111,7 @@ def query_jointly(
             voices = [layer.excitation, *layer.side_bands]
             is_continued = all(
                 (then := before.get((contact.key, voice))) is not None
-                and then.frequency == frequency_of(replace(layer, excitation=tones))
+                and then.frequency == replace(layer, excitation=tones).frequency
                 for voice, tones in enumerate(voices)
             )
             carrier = before.get((contact.key, 0))
@@ -137,16 +138,18 @@ def query_jointly(
     )
 
 
-def _modulations(targets: Sequence[tuple[Contact, Target]], layers: int) -> list[float | None]:
-    """Return how each target is modulated [Hz], by priority as far as there are layers.
+def _as_layers_allow(requests: Sequence[Request], layers: int) -> list[Request]:
+    """The requests, steady where there are no layers for side bands, of low priority first.
 
     A layer is left to a click.
     """
-    found: list[float | None] = [None] * len(targets)
-    spare = layers - len(targets) - 1
-    for number in sorted(range(len(targets)), key=lambda each: -targets[each][1].priority):
-        if targets[number][1].modulation_hz is not None and spare >= _SIDE_BANDS:
-            found[number], spare = targets[number][1].modulation_hz, spare - _SIDE_BANDS
+    found, spare = [*requests], layers - len(requests) - 1
+    for number in sorted(range(len(found)), key=lambda each: -found[each].priority):
+        if found[number].modulation_hz is not None:
+            if spare >= _SIDE_BANDS:
+                spare -= _SIDE_BANDS
+            else:
+                found[number] = replace(found[number], modulation_hz=None)
     return found
 
 
@@ -168,6 +171,7 @@ def requests_of(
             content=None if target.is_own else target.content,
             min_contrast_db=OWN_CONTRAST_DB if target.is_own else -math.inf,
             max_foreign_db_sl=_bound(contact, protected),
+            modulation_hz=target.modulation_hz,
         )
         for contact, target in targets
     ]
@@ -207,15 +211,16 @@ def _answer(
     fingers: Sequence[Finger],
     kept: Sequence[Request],
     kept_within: float,
+    playable: tuple[float, float],
 ) -> Answer:
     """Answer with the kept frequencies, or with any where that is so much better [dB]."""
-    found = answer(table, kept, fingers)
+    found = answer(table, kept, fingers, playable=playable)
     worst, served = found.promised_worst_db, _served(found)
     least = OWN_CONTRAST_DB if math.isfinite(kept_within) else -math.inf
     is_good = served == len(requests) and (worst is None or worst >= least)
     if is_good or list(kept) == list(requests):
         return found
-    other = answer(table, requests, fingers)
+    other = answer(table, requests, fingers, playable=playable)
     gain = _worst(other) - _worst(found)
     is_better = _served(other) > served or (_served(other) == served and gain >= kept_within)
     return other if is_better else found
@@ -301,8 +306,8 @@ def _gains_db(
 
 def _at_gain(request: Request, layer: Layer, gain_db: float) -> Request:
     """A request at the frequency of its layer, at a lower level."""
-    frequency = frequency_of(layer)
-    band = request.band_hz if math.isinf(frequency) else (frequency, frequency)
+    frequency = layer.frequency
+    band = request.band_hz if frequency is None else (frequency, frequency)
     level = max(MIN_LEVEL_DB_SL, request.level_db_sl + gain_db)
     return replace(request, level_db_sl=level, band_hz=band)
 

@@ -18,7 +18,9 @@ from model.choice import best_by, best_of
 from model.errors import InputError
 from model.table.contents import Contents, Stream, Tones
 from model.table.contents_kernel import choose_tones
+from model.table.modulation import with_modulation
 from model.table.request import (
+    ANY_BAND,
     APART_HZ,
     MIN_CONTRAST_DB,
     Answer,
@@ -37,21 +39,29 @@ def answer(
     apart_hz: float = APART_HZ,
     bands_may_swap: bool = False,
     min_contrast_db: float = MIN_CONTRAST_DB,
+    playable: tuple[float, float] = ANY_BAND,
 ) -> Answer:
     """Answer the requests of all fingers at once, each with a tone of its own.
 
     fingers: those that are to feel nothing; apart_hz: distance of the contents' frequencies, where
     their bands allow it; bands_may_swap: whether a content may have the band of another one;
-    min_contrast_db: below which the promise at the worst finger is not served as requested. Levels
+    min_contrast_db: below which the promise at the worst finger is not served as requested;
+    playable: lowest and highest frequency of side bands [Hz]. A content whose modulation would
+    leave a finger unserved, or whose side bands do not fit, is steady, as is a shared one. Levels
     are lowered where the ERAs' stroke does not allow all: of the lower priorities first, of one
     priority the louder ones first.
     Raises InputError for requests that contradict each other, and a band without frequencies.
     """
     expect_at_least(apart_hz, 0.0, what="apart_hz")
     check_requests(requests, fingers, table.plate)
-    return _Answering(table, tuple(requests), tuple(fingers), apart_hz, bands_may_swap).answer(
-        min_contrast_db
-    )
+    answering = _Answering(table, tuple(requests), tuple(fingers), apart_hz, bands_may_swap)
+    found = with_modulation(table, answering.answer(min_contrast_db), playable=playable)
+    steady = [
+        f"content of {_at(layer.request)} is steady"
+        for layer in found.layers
+        if layer.request.modulation_hz is not None and layer.excitation and not layer.side_bands
+    ]
+    return replace(found, applied=(*found.applied, *steady)) if steady else found
 
 
 @dataclass(frozen=True)
@@ -85,14 +95,14 @@ class _Answering:
         quiet = range(count, count + len(self.fingers))
         plan = _Plan(tuple(zip(range(count), strict=True)), tuple(quiet))
         tried = [found := self._measure(plan)]
-        while is_out_of_bounds(found) or (
+        while _is_out_of_bounds(found) or (
             found.tones.worst_db < min_contrast_db and len(plan.contents) > 1
         ):
             plan = self._with_less(plan, found)
             tried.append(found := self._measure(plan))
         if not found.tones.worst_db < min_contrast_db:  # NaN where nobody else is there
             return found
-        best = best_by([each for each in tried if not is_out_of_bounds(each)], _worst_of)
+        best = best_by([each for each in tried if not _is_out_of_bounds(each)], _worst_of)
         below = f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served"
         return replace(best, applied=(*best.applied, below))
 
@@ -120,7 +130,7 @@ class _Answering:
                 applied=(*plan.applied, f"{_at(requests[other[0]])} shares the content of "
                          f"{_at(requests[one[0]])}"),
             )  # fmt: skip
-        disturbed = disturbed_fingers(found)[:1]
+        disturbed = found.disturbed[:1]
         others = [each for each in contents if not {*disturbed}.intersection(each)]
         least = min(requests[each[0]].priority for each in others)
         lowest = [each for each in others if requests[each[0]].priority == least]
@@ -201,25 +211,10 @@ class _Answering:
         return Answer(*given, self.table.eras, self.table.frequencies)
 
 
-def is_out_of_bounds(found: Answer) -> bool:
+def _is_out_of_bounds(found: Answer) -> bool:
     """Whether a finger has less contrast, or more of others' contents, than it allows."""
     is_one_of_many = len(found.contents.streams) > 1  # one alone cannot give way to others
-    return (is_one_of_many and lacks_contrast(found)) or bool(disturbed_fingers(found))
-
-
-def lacks_contrast(found: Answer) -> bool:
-    """Whether a finger has less contrast to others' contents than its request asks for."""
-    targets = [finger for stream in found.contents.streams for finger in stream.targets]
-    contrast, requests = found.tones.contrast_db, found.requests
-    return any(contrast[each][2] < requests[each].min_contrast_db for each in targets)
-
-
-def disturbed_fingers(found: Answer) -> list[int]:
-    """Fingers that would feel more of others' contents than they allow."""
-    bounds = [each.max_foreign_db_sl for each in found.requests]
-    bounds += [each.max_foreign_db_sl for each in found.fingers]
-    levels = enumerate(zip(found.tones.foreign_db_sl, bounds, strict=True))
-    return [finger for finger, (level, bound) in levels if level > bound]
+    return (is_one_of_many and found.lacks_contrast) or bool(found.disturbed)
 
 
 def _worst_of(found: Answer) -> float:

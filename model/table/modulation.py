@@ -15,12 +15,11 @@ import numpy as np
 from model.arrays import FloatArray, IntArray
 from model.choice import best_of
 from model.finger.perception import decibels
-from model.table.answer import disturbed_fingers, lacks_contrast
 from model.table.contents import Stream, Tones
 from model.table.contents_kernel import choose_tones
 from model.table.fingers_on_plate import FingersOnPlate
 from model.table.promised import promised
-from model.table.request import ANY_BAND, APART_HZ, MIN_CONTRAST_DB, Answer, Layer
+from model.table.request import APART_HZ, MIN_CONTRAST_DB, Answer
 from model.table.table import LocalizationTable
 
 _SHARES = np.array([1.0, 0.5, 0.5])  # amplitudes of carrier and side bands
@@ -33,29 +32,28 @@ _ROUNDING_DB = 1e-3  # of a promise that stays the same
 def with_modulation(
     table: LocalizationTable,
     found: Answer,
-    modulations: Sequence[float | None],
     *,
-    playable: tuple[float, float] = ANY_BAND,
+    playable: tuple[float, float],
 ) -> Answer:
-    """Return an answer whose contents are modulated [Hz] where that leaves all fingers served.
+    """Return an answer modulated as its requests say, where that leaves all fingers served.
 
-    modulations: of each request, None for none; playable: lowest and highest frequency [Hz] of side
-    bands. These are as far below as above the carrier, where the table has a frequency nearest to
-    the modulation, and APART_HZ from all tones of other contents. A shared content is steady.
+    playable: lowest and highest frequency [Hz] of side bands. These are as far below as above the
+    carrier, where the table has a frequency nearest to the modulation, and APART_HZ from all tones
+    of other contents. A shared content is steady.
     """
     for number, stream in enumerate(found.contents.streams):
-        modulation, tones = modulations[stream.targets[0]], found.tones
+        request, tones = found.requests[stream.targets[0]], found.tones
+        modulation = request.modulation_hz
         if modulation is None or len(stream.targets) > 1:
             continue
         alone = cache(_alone_at(table, found, number))
-        band = found.requests[stream.targets[0]].band_hz
         limits = max(playable[0], table.frequencies[0]), min(playable[1], table.frequencies[-1])
         owners, rows = np.array(tones.owners), np.array(tones.rows)
         taken = table.frequencies[rows[owners != number]]
         tried = [
             each
             for each in _carriers(table, int(rows[owners == number][0]), modulation)
-            if _fits(table.frequencies[each], modulation, band, limits, taken)
+            if _fits(table.frequencies[each], modulation, request.band_hz, limits, taken)
         ]
         if not tried:
             continue
@@ -88,11 +86,6 @@ def with_gains(table: LocalizationTable, found: Answer, gains_db: Sequence[float
     return lowered if _is_served(lowered, found) else None
 
 
-def frequency_of(layer: Layer) -> float:
-    """Return the frequency of a layer's carrier [Hz]; infinite for none."""
-    return next((tone.frequency for tone in layer.excitation.values()), math.inf)
-
-
 def _is_served(found: Answer, steady: Answer) -> bool:
     """Whether all fingers have what they require, and no less than 6 dB unless they had less."""
     worst, before = found.promised_worst_db, steady.promised_worst_db
@@ -102,7 +95,7 @@ def _is_served(found: Answer, steady: Answer) -> bool:
         and worst < min(MIN_CONTRAST_DB, before - _ROUNDING_DB)
     ):
         return False
-    return not (lacks_contrast(found) or disturbed_fingers(found))
+    return not (found.lacks_contrast or found.disturbed)
 
 
 def _carriers(table: LocalizationTable, steady: int, modulation: float) -> Iterator[list[int]]:

@@ -36,6 +36,7 @@ class _Own(BaseModel):
     may_share: bool = False
     is_protected: bool = True
     load: float = 1.0
+    modulation_hz: float | None = None
 
 
 class _Line(BaseModel):
@@ -190,7 +191,7 @@ def answer_as_json(
         layers.append(
             {
                 "at_m": list(layer.request.at),
-                "frequency_hz": next(iter(tones.values())).frequency if tones else None,
+                "frequency_hz": layer.frequency,
                 # A shared content is played once, where it was asked for first.
                 "drive": {} if layer.verdict == "shared" else table.drive_of(tones),
                 "level_db_sl": layer.level_db_sl if tones else None,
@@ -200,6 +201,9 @@ def answer_as_json(
                 "robust_felt_contrast_db": _finite(layer.promised_contrast_db),
                 "foreign_level_db_sl": _finite(layer.foreign_level_db_sl),
                 "verdict": layer.verdict,
+                "side_bands": []
+                if layer.verdict == "shared"
+                else [table.drive_of(each) for each in layer.side_bands],
             }
         )
     quiet = [

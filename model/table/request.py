@@ -45,7 +45,8 @@ class Request:
     keeps the others' contents away where its own is given up; load: of the finger relative to the
     rig's fingertip; min_contrast_db: promised contrast to the contents of others below which
     contents give way; max_foreign_db_sl: level of others' contents at the finger that nine of ten
-    plates do not exceed, else these are held back.
+    plates do not exceed, else these are held back; modulation_hz: how often a second the strength
+    of the content comes and goes, MIN_MODULATION to MAX_MODULATION, None for a steady one.
     """
 
     at: Point
@@ -58,6 +59,7 @@ class Request:
     content: str | None = None
     min_contrast_db: float = -math.inf
     max_foreign_db_sl: float = math.inf
+    modulation_hz: float | None = None
 
     def __post_init__(self) -> None:
         """Check everything that does not depend on the table."""
@@ -82,6 +84,13 @@ class Request:
             raise InputError(f"content must be a name, got {shown(self.content)}")
         _check_bound(self.min_contrast_db, what="min_contrast_db", unit="dB")
         _check_bound(self.max_foreign_db_sl, what="max_foreign_db_sl", unit="dB SL")
+        if self.modulation_hz is not None:
+            expect_number(self.modulation_hz, what="modulation_hz", unit="Hz")
+            if not MIN_MODULATION <= self.modulation_hz <= MAX_MODULATION:
+                raise InputError(
+                    f"modulation_hz must be from {MIN_MODULATION:g} to {MAX_MODULATION:g} Hz, got "
+                    f"{self.modulation_hz:g}"
+                )
 
     def may_feel_one_with(self, other: "Request") -> bool:
         """Whether both fingers may feel one content."""
@@ -147,6 +156,11 @@ class Layer:
     foreign_level_db_sl: float | None = None
     is_disturbing: bool = False
     side_bands: tuple[Excitation, ...] = ()
+
+    @property
+    def frequency(self) -> float | None:
+        """The frequency of the content, without its side bands [Hz]; None where nothing plays."""
+        return next((tone.frequency for tone in self.excitation.values()), None)
 
 
 @dataclass(frozen=True)
@@ -231,6 +245,21 @@ class Answer:
         return _known(self.tones.worst_db)
 
     @property
+    def lacks_contrast(self) -> bool:
+        """Whether a finger has less contrast to others' contents than its request asks for."""
+        targets = [finger for stream in self.contents.streams for finger in stream.targets]
+        found, requests = self.tones.contrast_db, self.requests
+        return any(found[each][2] < requests[each].min_contrast_db for each in targets)
+
+    @property
+    def disturbed(self) -> list[int]:
+        """Fingers, by number, that would feel more of others' contents than they allow."""
+        bounds = [each.max_foreign_db_sl for each in self.requests]
+        bounds += [each.max_foreign_db_sl for each in self.fingers]
+        levels = enumerate(zip(self.tones.foreign_db_sl, bounds, strict=True))
+        return [finger for finger, (level, bound) in levels if level > bound]
+
+    @property
     def stroke_factor(self) -> float:
         """Of the requested levels what the ERAs' stroke allows, 1 for all."""
         return self.tones.stroke_factor
@@ -248,13 +277,12 @@ class Answer:
     def to_frame(self) -> Any:
         """What each request's finger feels as a pandas DataFrame, a row a finger; needs pandas."""
         at = np.array([layer.request.at for layer in self.layers])
-        tones = [next(iter(layer.excitation.values()), None) for layer in self.layers]
         return as_frame(
             {
                 "x_m": at[:, 0],
                 "y_m": at[:, 1],
                 "verdict": [layer.verdict for layer in self.layers],
-                "frequency_hz": [tone.frequency if tone else math.nan for tone in tones],
+                "frequency_hz": [layer.frequency or math.nan for layer in self.layers],
                 "promised_level_db_sl": [layer.promised_level_db_sl for layer in self.layers],
                 "promised_contrast_db": [layer.promised_contrast_db for layer in self.layers],
                 "foreign_level_db_sl": [layer.foreign_level_db_sl for layer in self.layers],

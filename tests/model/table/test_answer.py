@@ -408,23 +408,30 @@ def test_a_batch_holds_lines_with_contents(table_file, tmp_path):
     lines = [
         {"own": [own, {"at": [0.25, 0.18], "level_db_sl": 13}], "quiet": [[0.16, 0.2]]},
         {"target": [0.09, 0.07], "mode": "phased"},
+        {"own": [{"at": [0.126, 0.081], "modulation_hz": 20}, {"at": [0.234, 0.049]}]},
         {"own": [own], "target": [0.09, 0.07]},
         {"own": [own], "quiet": [[0.05, 0.19]], "loads": [1, 1]},
         {"own": [own | {"loud": 1}]},
         {"own": [own], "mode": "phased"},
         {"target": [0.09, 0.07], "apart_hz": 10},
         {"own": [own], "apart_hz": -1},
+        {"own": [own | {"modulation_hz": 9}]},
     ]
     batch = tmp_path / "b.jsonl"
     batch.write_text("\n".join(map(json.dumps, lines)))
     result = run(table_file, "--batch", str(batch), "--level", "14")
     assert result.exit_code == 1
-    first, second, *errors = map(json.loads, result.stdout.splitlines())
+    first, second, modulated, *errors = map(json.loads, result.stdout.splitlines())
     assert [each["promised_level_db_sl"] for each in first["layers"]] == pytest.approx(
         [14, 13], abs=1e-3
     )
     assert second["mode"] == "phased"
-    assert [each["line"] for each in errors] == [3, 4, 5, 6, 7, 8]
+    carrier, sides = modulated["layers"][0]["frequency_hz"], modulated["layers"][0]["side_bands"]
+    around = sorted({tone["frequency_hz"] for side in sides for tone in side.values()})
+    assert around == pytest.approx([carrier - 20, carrier + 20], abs=5.0)  # half a step
+    assert sum(around) == pytest.approx(2 * carrier)
+    assert modulated["layers"][1]["side_bands"] == []
+    assert [each["line"] for each in errors] == [4, 5, 6, 7, 8, 9, 10]
 
 
 @pytest.mark.parametrize(

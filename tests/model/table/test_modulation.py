@@ -9,7 +9,7 @@ from model.finger.perception import detection_threshold
 from model.table.answer import answer
 from model.table.build import build_table
 from model.table.exact_plates import draw_plates, powers_on
-from model.table.modulation import frequency_of, with_gains, with_modulation
+from model.table.modulation import with_gains
 from model.table.question import Question
 from model.table.request import Finger, Request
 from paper_table import contact_sets, smooth_rig
@@ -27,6 +27,11 @@ def powers(table, tones, places, plates):
     rows, power = powers_on(table, Question(tuple(places)), tones, plates)
     sensed = power[0] / detection_threshold(table.frequencies[rows]) ** 2
     return sensed.reshape(*tips.fine_weights.shape, -1), tips.fine_weights
+
+
+def modulated(request, modulation):
+    """The request with a modulation [Hz]."""
+    return replace(request, modulation_hz=modulation)
 
 
 def sides_of(layer):
@@ -55,8 +60,7 @@ def test_promise_of_a_modulated_content_is_kept(table, modulation):
     for number, places in enumerate(contact_sets(6, fingers=3, seed=4)):
         requests = [Request(at, level_db_sl=12.0) for at in places[:2]]
         fingers = [Finger(places[2])]
-        plain = answer(table, requests, fingers)
-        found = with_modulation(table, plain, [modulation, modulation])
+        found = answer(table, [modulated(each, modulation) for each in requests], fingers)
         plates = draw_plates(
             np.random.default_rng(number),
             table.uncertainty,
@@ -90,12 +94,12 @@ def test_side_bands_lie_evenly_about_the_carrier_at_half_its_amplitude(table):
     """Full modulation: half of the carrier's amplitude at the finger each, 1.8 dB more in all."""
     requests = [Request((0.126, 0.081), level_db_sl=14.0), Request((0.234, 0.049))]
     plain = answer(table, requests)
-    found = with_modulation(table, plain, [20.0, None])
+    found = answer(table, [modulated(requests[0], 20.0), requests[1]])
     layer = found.layers[0]
-    carrier = frequency_of(layer)
+    carrier = layer.frequency
     sides = sides_of(layer)
     assert sides == pytest.approx([carrier - 20.0, carrier + 20.0])
-    assert abs(carrier - frequency_of(found.layers[1])) >= 30
+    assert abs(carrier - found.layers[1].frequency) >= 30
     fields = {}
     for tones in (layer.excitation, *layer.side_bands):
         frequencies, amplitudes = table.amplitudes(
@@ -118,7 +122,7 @@ def test_side_bands_of_their_own_leak_less_than_those_of_the_carrier(table):
     for places in contact_sets(6, fingers=2, seed=7):
         requests = [Request(at, level_db_sl=12.0) for at in places]
         plain = answer(table, requests)
-        found = with_modulation(table, plain, [20.0, None])
+        found = answer(table, [modulated(requests[0], 20.0), requests[1]])
         if found.layers[0].side_bands:
             lost.append(plain.promised_worst_db - found.promised_worst_db)
     assert len(lost) >= 4
@@ -128,28 +132,29 @@ def test_side_bands_of_their_own_leak_less_than_those_of_the_carrier(table):
 def test_a_modulation_is_left_out_where_a_finger_would_feel_too_much(table):
     """Its bound for others' contents holds for side bands, too; no side bands beyond the table."""
     quiet = Finger((0.16, 0.20))
-    requests = [Request((0.09, 0.07), level_db_sl=12.0)]
-    plain = answer(table, requests, [quiet])
-    modulated = with_modulation(table, plain, [30.0])
-    leak = modulated.quiet[0].level_db_sl
-    bounded = (Finger(quiet.at, max_foreign_db_sl=leak - 0.1),)
-    assert modulated.layers[0].side_bands
-    assert not with_modulation(table, replace(plain, fingers=bounded), [30.0]).layers[0].side_bands
-    low = [Request((0.09, 0.07), (40.0, 50.0), level_db_sl=12.0)]
-    found = answer(table, low, [quiet])
-    assert with_modulation(table, found, [30.0]) == found
+    requests = [Request((0.09, 0.07), level_db_sl=12.0, modulation_hz=30.0)]
+    found = answer(table, requests, [quiet])
+    assert found.layers[0].side_bands
+    assert found.applied == ()
+    bounded = Finger(quiet.at, max_foreign_db_sl=found.quiet[0].level_db_sl - 0.1)
+    low = replace(requests[0], band_hz=(40.0, 50.0))
+    for steady in (answer(table, requests, [bounded]), answer(table, [low], [quiet])):
+        assert steady.layers[0].excitation
+        assert not steady.layers[0].side_bands
+        assert len(steady.applied) == 1
 
 
 def test_a_modulation_is_left_out_where_its_own_finger_would_have_too_little_contrast(table):
     """A content alone, beside a quiet finger, that asks for what it has steady, less 0.1 dB."""
     request, quiet = Request((0.126, 0.081), level_db_sl=12.0), Finger((0.234, 0.049))
     plain = answer(table, [request], [quiet])
-    modulated = with_modulation(table, plain, [20.0])
-    assert modulated.layers[0].side_bands
-    assert modulated.promised_worst_db < plain.promised_worst_db - 0.1
-    asks = (replace(request, min_contrast_db=plain.promised_worst_db - 0.1),)
-    steady = replace(plain, requests=asks)
-    assert with_modulation(table, steady, [20.0]) is steady
+    found = answer(table, [modulated(request, 20.0)], [quiet])
+    assert found.layers[0].side_bands
+    assert found.promised_worst_db < plain.promised_worst_db - 0.1
+    asks = replace(request, min_contrast_db=plain.promised_worst_db - 0.1)
+    steady = answer(table, [modulated(asks, 20.0)], [quiet])
+    assert steady.promised_worst_db == plain.promised_worst_db
+    assert not steady.layers[0].side_bands
 
 
 def test_fingers_that_share_or_are_held_back_feel_side_bands_too(table):
@@ -172,8 +177,8 @@ def test_fingers_that_share_or_are_held_back_feel_side_bands_too(table):
             for n, each in enumerate(plain.layers)
             if each.excitation and each.excitation != plain.layers[finger].excitation
         )
-        modulations = [20.0 if n == other else None for n in range(len(requests))]
-        found = with_modulation(table, plain, modulations)
+        requests[other] = modulated(requests[other], 20.0)
+        found = answer(table, requests)
         said = found.layers[finger].foreign_level_db_sl
         assert found.layers[finger].verdict == verdict
         assert found.layers[other].side_bands
@@ -190,30 +195,26 @@ def test_fingers_that_share_or_are_held_back_feel_side_bands_too(table):
         power = sum(powers(table, each, places, plates)[0][finger] for each in tones)
         level = 10 * np.log10(power.max(axis=0))
         assert 0.82 <= (level <= said).mean() <= 0.97
-        bounded = [*requests]
-        bounded[finger] = replace(requests[finger], max_foreign_db_sl=said - 0.1)
-        steady = replace(plain, requests=tuple(bounded))
-        assert with_modulation(table, steady, modulations) == steady
+        requests[finger] = replace(requests[finger], max_foreign_db_sl=said - 0.1)
+        assert not any(each.side_bands for each in answer(table, requests).layers)
 
 
 @pytest.mark.parametrize("modulation", [15.0, 25.0])
 def test_a_modulation_between_two_steps_of_the_table_plays_the_nearest(table, modulation):
     """At steps of 10 Hz 15 are 10 or 20 and 25 are 20 or 30, the same on both sides."""
     requests = [Request((0.126, 0.081), (150.0, 200.0)), Request((0.234, 0.049), (290.0, 320.0))]
-    found = with_modulation(table, answer(table, requests), [modulation, None])
-    carrier, (low, high) = frequency_of(found.layers[0]), sides_of(found.layers[0])
+    found = answer(table, [modulated(requests[0], modulation), requests[1]])
+    carrier, (low, high) = found.layers[0].frequency, sides_of(found.layers[0])
     assert carrier - low == pytest.approx(high - carrier)
     assert abs(high - carrier - modulation) == pytest.approx(5.0)
 
 
 def test_side_bands_stay_within_what_amplifiers_play(table):
     """At the lowest frequency of 100 Hz a carrier needs 120 Hz, else it is steady."""
-    requests = [Request((0.126, 0.081), (100.0, 110.0))]
+    requests = [Request((0.126, 0.081), (100.0, 110.0), modulation_hz=20.0)]
     fingers = [Finger((0.234, 0.049))]
-    plain = answer(table, requests, fingers)
-    assert with_modulation(table, plain, [20.0]).layers[0].side_bands
-    found = with_modulation(table, plain, [20.0], playable=(100.0, 300.0))
-    assert found == plain
+    assert answer(table, requests, fingers).layers[0].side_bands
+    assert not answer(table, requests, fingers, playable=(100.0, 300.0)).layers[0].side_bands
 
 
 @pytest.mark.parametrize("modulation", [20.0, 30.0])
@@ -221,11 +222,9 @@ def test_all_tones_of_two_contents_are_apart(table, modulation):
     """By 30 Hz, side bands of one and carrier and side bands of the other, where any is."""
     gaps = []
     for places in contact_sets(8, fingers=2, seed=7):
-        requests = [Request(at) for at in places]
-        plain = answer(table, requests)
-        found = with_modulation(table, plain, [modulation, modulation])
+        found = answer(table, [Request(at, modulation_hz=modulation) for at in places])
         if any(each.side_bands for each in found.layers):
-            one, other = ([frequency_of(each), *sides_of(each)] for each in found.layers)
+            one, other = ([each.frequency, *sides_of(each)] for each in found.layers)
             gaps.append(min(abs(a - b) for a in one for b in other))
     assert len(gaps) >= 4
     assert min(gaps) >= 30.0

@@ -133,7 +133,7 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
         raise InputError(
             f"fingerprint must be text, got {shown(fingerprint)}; give rig.fingerprint"
         )
-    rebuild = f"build it again: era table build RIG -o {path}"
+    rebuild = f"build it again, with the options it had: era table build RIG -o {path}"
     try:
         content = read_arrays(path, _DTYPES, max_bytes=MAX_BYTES)
     except FileNotFoundError:
@@ -172,9 +172,19 @@ def load_table(path: Path | str, *, fingerprint: str | None = None) -> Localizat
     if fingerprint is not None and fingerprint != table.fingerprint:
         raise InputError(
             f"{path}: fingerprint must be the rig's, {fingerprint[:12]}, got "
-            f"{table.fingerprint[:12]}, of another plate, uncertainty or fingertip; {rebuild}"
+            f"{table.fingerprint[:12]}, of another plate, uncertainty or fingertip; build it "
+            f"again: era table build RIG -o {path} {_options(table)}"
         )
     return table
+
+
+def _options(table: LocalizationTable) -> str:
+    """The options of `era table build` with which a table was built."""
+    f = [f"{each:g}" for each in table.frequencies]
+    steps = np.diff(table.frequencies)
+    is_even = len(f) > 1 and np.allclose(steps, steps[0])
+    frequencies = f"{f[0]}:{f[-1]}:{steps[0]:g}" if is_even else ",".join(f)
+    return f"--mode {table.drive_mode} --grid {table.grid} --frequencies {frequencies}"
 
 
 def _arrays(table: LocalizationTable) -> dict[str, NDArray[Any]]:

@@ -3,15 +3,18 @@
 import json
 import zipfile
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from model.config.points import parse_frequencies
 from model.errors import InputError
 from model.files.array_file import digest_of
+from model.table.build import solve_table
 from model.table.file import load_table, save_table
 from paper_plate import make_paper_rig
-from small_table import small_table
+from small_table import small_problem, small_table
 
 REMEDY = "era table build"
 
@@ -61,6 +64,20 @@ def test_load_table_refuses_another_plate_and_a_missing_file(path, tmp_path):
         load_table(path, fingerprint=thicker.fingerprint)
     with pytest.raises(InputError, match=REMEDY):
         load_table(tmp_path / "none.npz")
+
+
+@pytest.mark.parametrize("frequencies", [[60.0, 110.0, 250.0], [62.5, 65.0, 67.5]])
+def test_load_table_for_another_plate_names_the_options_of_the_table(tmp_path, frequencies):
+    """Who types the command gets frequencies, cells and drive mode that the table has."""
+    problem = replace(small_problem(), frequencies=np.array(frequencies))
+    table = solve_table(problem, drive_mode="phased")
+    save_table(table, tmp_path / "t.npz")
+    with pytest.raises(InputError) as refused:
+        load_table(tmp_path / "t.npz", fingerprint="0" * 64)
+    option = dict(pairwise(str(refused.value).split()))
+    assert (option["--mode"], option["--grid"]) == ("phased", "4x3")
+    assert option["-o"] == str(tmp_path / "t.npz")
+    np.testing.assert_allclose(parse_frequencies(option["--frequencies"]), frequencies)
 
 
 def set_byte(data, at, value):

@@ -167,18 +167,15 @@ def measure(
     return Responses(names, points, frequencies, values + noise * size * white / np.sqrt(2))
 
 
-def true_values(hidden: HiddenPlate) -> list[float]:
+def true_values(rig: Rig) -> list[float]:
     """The fitted values in the order of `model.calibration.sensed_plate.SensedPlate.rows`."""
-    plate = hidden.rig.plate
-    values = [plate.material.E, plate.loss_factor]
-    return values + [
-        v for era in hidden.rig.eras for v in (era.stiffness, era.damping, era.bolt_mass)
-    ]
+    values = [rig.plate.material.E, rig.plate.loss_factor]
+    return values + [v for era in rig.eras for v in (era.stiffness, era.damping, era.bolt_mass)]
 
 
-def true_gains(hidden: HiddenPlate) -> ComplexArray:
+def gains_of(rig: Rig) -> ComplexArray:
     """Gains (f, e) of the drives."""
-    rows = np.array([era.gains for era in hidden.rig.eras])  # (e, f, 3)
+    rows = np.array([era.gains for era in rig.eras])  # (e, f, 3)
     return np.asarray((rows[..., 1] * np.exp(1j * rows[..., 2])).T)
 
 
@@ -187,9 +184,7 @@ def gain_deviations(rig: Rig, true: ComplexArray) -> FloatArray:
 
     Magnitudes, then phases, (2, f, e).
     """
-    rows = np.array([era.gains for era in rig.eras])
-    found = (rows[..., 1] * np.exp(1j * rows[..., 2])).T
-    off = np.log(found / true)
+    off = np.log(gains_of(rig) / true)
     known = rig.uncertainty
     return np.abs([off.real / known.gain, off.imag / np.radians(known.phase_deg)])
 
@@ -207,9 +202,9 @@ def main() -> None:
         hidden = draw_plate(rig, form, seed=seed)
         responses = measure(hidden, rig, seed=seed, count=sensors_of(seed))
         write_responses_csv(folder / f"{seed}.csv", responses, rig)
-        gains = true_gains(hidden)
+        gains = gains_of(hidden.rig)
         truth = {
-            "values": true_values(hidden),
+            "values": true_values(hidden.rig),
             "gains": [gains.real.tolist(), gains.imag.tolist()],
         }
         (folder / f"{seed}.json").write_text(json.dumps(truth))

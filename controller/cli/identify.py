@@ -16,6 +16,7 @@ from model.commands.options import JsonOption
 from model.errors import InputError
 
 if TYPE_CHECKING:
+    from model.config.document import Document
     from model.identification.measurement import DeviceSettings, MeasuredPlate
     from model.rig.rig import Rig
 
@@ -184,12 +185,6 @@ def _refuse(given: Mapping[str, object], *, rule: str) -> None:
     for name, value in given.items():
         if value is not None:
             raise InputError(f"{name} {rule}")
-
-
-if TYPE_CHECKING:
-    from model.config.document import Document
-    from model.identification.measurement import MeasuredPlate
-    from model.rig.rig import Rig
 
 
 @contextmanager

@@ -6,7 +6,6 @@ from itertools import compress
 
 import numpy as np
 
-from model.arrays import FloatArray
 from model.calibration.calibration_result import (
     MAX_FIT_ERROR,
     MAX_OUTLIERS,
@@ -61,11 +60,10 @@ def calibrate(
         dead[~dead] = ~heard  # elsewhere, or loose
 
     # All scales are free at first, so that a wrong one does not bias the fit.
-    fit = solve(part, start)
+    fit = _with_median_scale_one(part, solve(part, start))
     free_scales = part.free_scales
     if not all_scales:
-        scales = _relative(part.scales(fit.z))
-        error = part.scale_errors(fit) / np.abs(np.median(part.scales(fit.z)))
+        scales, error = part.scales(fit.z), part.scale_errors(fit)
         free_scales = np.abs(scales - 1) > np.maximum(_WRONG_SCALE, _SIGNIFICANCE * error)
         fit = replace(fit, z=part.at_scales(fit.z, np.where(free_scales, scales, 1.0)))
     problem, found = _identified(replace(part, free_scales=free_scales), fit)
@@ -80,11 +78,6 @@ def calibrate(
         dead_sensors=tuple(compress(responses.sensors, dead)),
         dead_eras=tuple(compress((era.name for era in rig.eras), dead_eras)),
     )
-
-
-def _relative(scales: FloatArray) -> FloatArray:
-    """Scales of sensors to their median."""
-    return np.asarray(scales / np.median(scales))
 
 
 def _identified(problem: Problem, start: Fit) -> tuple[Problem, Fit]:

@@ -92,10 +92,6 @@ class Problem:
         found[own] = (scales - 1) / space.std[own]
         return found
 
-    def responses(self, z: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """Responses (f, e, s) as sensors read them, and derivatives (n, f, e, s) by n searched."""
-        return responses_of(self.plate.model, z, self.searched)
-
     def tolerances(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rows (m, n) that hold what is searched of scales and form errors; their targets (m,)."""
         space, held = self.plate.model.space, self.searched.copy()
@@ -170,8 +166,10 @@ def solve(problem: Problem, start: Start) -> Fit:
         weight, before = used / noise[:, :, None], noise
         found = _search(problem, z, weight)
         z = found.x
-        raw = _deviation(problem, z, weight)
-        noise = _noise_of(problem.values, raw, used, _noise_left(problem, found, weight))
+        model = problem.plate.responses(z)
+        gains, _ = project_gains(model, problem.values, weight)
+        raw = np.abs(problem.values - np.nan_to_num(gains)[:, :, None] * model)
+        noise = _noise_of(problem.values, raw, used, _noise_left(model, found, weight))
         # What form errors explain comes back.
         kept = finite & ~(raw > _MAX_DEVIATION * np.sqrt(2) * noise[:, :, None])
         is_settled = bool((kept == used).all() and (np.abs(noise / before - 1) < _SETTLED).all())
@@ -192,20 +190,12 @@ def _search(problem: Problem, start: FloatArray, weight: FloatArray) -> Found:
     )
 
 
-def _deviation(problem: Problem, z: FloatArray, weight: FloatArray) -> FloatArray:
-    """Magnitudes (f, e, s) of the residuals of all values, outliers included [1/s²]."""
-    model, _ = problem.responses(z)
-    gains, _ = project_gains(model, problem.values, weight)
-    return np.abs(problem.values - np.nan_to_num(gains)[:, :, None] * model)
-
-
-def _noise_left(problem: Problem, found: Found, weight: FloatArray) -> FloatArray:
+def _noise_left(model: ComplexArray, found: Found, weight: FloatArray) -> FloatArray:
     """Share (f, e, s) of each value's noise that is left in its residual: 1 - its leverage.
 
     That is of its row's gain, and of all that is searched, for which tolerances leave less.
     """
     inside = weight > 0
-    model, _ = problem.responses(found.x)
     by_gain = np.abs(weight * model) ** 2
     total = by_gain.sum(axis=2, keepdims=True)
     left = 1 - by_gain / np.where(total > 0, total, 1)
@@ -236,7 +226,7 @@ def _result(problem: Problem, found: Found, noise: FloatArray, used: NDArray[np.
     root = root * math.sqrt(max(chi2, 1.0))
     error = np.zeros(len(z))
     error[searched] = np.where(blind, np.inf, np.linalg.norm(root, axis=1))
-    model, by_z = problem.responses(z)
+    model, by_z = responses_of(problem.plate.model, z, searched)
     gains, _ = project_gains(model, problem.values, weight)
     by_gain, _ = projection_slopes(model, by_z, problem.values, weight)
     power = (np.abs(weight * model) ** 2).sum(axis=2)

@@ -110,7 +110,7 @@ def uncertainty_of(
     express, and at least the median error at held-out sensors, which is that of the field. What is
     not identified keeps the value of the rig before.
     """
-    errors, era_count = problem.plate.errors(fit.z, fit.error), len(problem.plate.rig.eras)
+    errors = problem.plate.errors(fit.z, fit.error)
     relative = {
         kind: [
             math.hypot(
@@ -121,13 +121,10 @@ def uncertainty_of(
         ]
         for kind in ("modulus", "loss_factor", "stiffness", "damping")
     }
-    whole = {
-        "modulus": 1,
-        "loss_factor": 1,
-        "stiffness": era_count,
-        "damping": era_count,
+    known = {
+        kind: len(values) == sum(one.parameter.kind == kind for one in parameters)
+        for kind, values in relative.items()
     }
-    known = {kind: len(values) == whole[kind] for kind, values in relative.items()}
 
     def rms(kind: str) -> float:
         return float(np.sqrt(np.mean(np.square(relative[kind]))))

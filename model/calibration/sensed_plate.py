@@ -7,10 +7,8 @@ of the plate, and stiffness, damping and bolt mass of each ERA. The free plate i
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import compress
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.form_errors import reduced_modes
@@ -108,13 +106,6 @@ class SensedPlate:
                 + (names.index(row.era) if row.era else 0)
                 for row in self.rows
             ]
-        )
-
-    def at_some(self, kept: NDArray[np.bool_]) -> "SensedPlate":
-        """Select some of the sensors (s,)."""
-        sensors = list(compress(self.model.sensors, kept))
-        return SensedPlate(self.rig, replace(self.model, sensors=sensors, last_places={})).of(
-            self.rig
         )
 
     def of(self, rig: Rig) -> "SensedPlate":

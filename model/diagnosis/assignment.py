@@ -13,7 +13,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses, typical
 from model.calibration.sensed_plate import STARTS, SensedPlate
 from model.calibration.variable_projection import modal_assurance
-from model.choice import best_of
+from model.choice import best_by, best_of
 
 _MIN_COHERENCE = 0.6  # length of the mean of unit phasors of a reliable phase
 _LEAST_MISFIT = 0.02  # below it sensors' errors dominate
@@ -29,6 +29,11 @@ class ShapeMatch:
 
     mac: FloatArray
     start: tuple[float, float]
+
+    @property
+    def starts(self) -> tuple[tuple[float, float], ...]:
+        """Logarithms of factors from which to search: none, and those of that plate."""
+        return tuple(dict.fromkeys([(0.0, 0.0), self.start]))
 
     @property
     def nearest(self) -> tuple[int, ...]:
@@ -60,19 +65,17 @@ class ShapeMatch:
 
 def match_shapes(plate: SensedPlate, values: ComplexArray) -> ShapeMatch:
     """Compare values (f, e, s) with a rig's ERAs on plates of other modulus and stiffnesses."""
-    best: tuple[float, ShapeMatch] | None = None
-    for start in [(0.0, 0.0), *STARTS]:
-        mac = _mac(values, plate.responses(plate.moved(*start)))
-        found = ShapeMatch(mac, start)
-        score = float(
-            sum(typical(mac[:, i, j]) for i, j in enumerate(found.nearest) if _driven(mac, i))
-        )
+    tried = [
+        ShapeMatch(_mac(values, plate.responses(plate.moved(*start))), start)
+        for start in [(0.0, 0.0), *STARTS]
+    ]
+
+    def score(found: ShapeMatch) -> float:
+        alike = [typical(found.mac[:, i, j]) for i, j in enumerate(found.nearest)]
         # Values far from the rig's must be clearly better.
-        score -= 0.05 * sum(map(abs, start)) * values.shape[1]
-        if best is None or score > best[0]:
-            best = (score, found)
-    assert best is not None  # noqa: S101  the rig's own values are tried at least
-    return best[1]
+        return float(np.nansum(alike) - 0.05 * sum(map(abs, found.start)) * values.shape[1])
+
+    return best_by(tried, score)
 
 
 def match_responses(model: ComplexArray, values: ComplexArray) -> ShapeMatch:
@@ -83,10 +86,6 @@ def match_responses(model: ComplexArray, values: ComplexArray) -> ShapeMatch:
 def _mac(values: ComplexArray, model: ComplexArray) -> FloatArray:
     """MAC (f, e, e) of each channel with each ERA."""
     return modal_assurance(values[:, :, None], model[:, None])
-
-
-def _driven(mac: FloatArray, channel: int) -> bool:
-    return bool(np.isfinite(mac[:, channel]).any())
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from model.calibration.sensed_plate import SensedPlate
 from model.calibration.variable_projection import project_gains, row_rms
 from model.choice import best_by
 from model.diagnosis.assignment import ShapeMatch
-from model.diagnosis.plate_match import MAX_FIT_ERROR, Match, match_plate
-from model.diagnosis.verdict import Verdict, diagnose
+from model.diagnosis.plate_match import MAX_FIT_ERROR
+from model.diagnosis.verdict import Verdict, best_wiring, diagnose
 from model.errors import InputError
 from model.quantities import in_display_unit
 from model.rig.rig import Rig
@@ -129,18 +129,8 @@ def _check_phases_and_places(
     plate: SensedPlate, shapes: ShapeMatch, observation: Responses
 ) -> None:
     """Raise InputError for conjugated phases, and for sensors at each other's places."""
-    starts = tuple(dict.fromkeys([(0.0, 0.0), shapes.start]))
-    own = tuple(range(observation.values.shape[1]))
-
-    def best(values: ComplexArray) -> tuple[Match, tuple[int, ...]]:
-        found: list[tuple[Match, tuple[int, ...]]] = [
-            (match_plate(plate, values, drives=drives, starts=starts), drives)
-            for drives in dict.fromkeys([own, shapes.nearest])
-        ]
-        return best_by(found, lambda each: -each[0].cost)
-
-    match, drives = best(observation.values)
-    other, _ = best(observation.values.conj())
+    match, drives = best_wiring(plate, observation.values, shapes)
+    other, _ = best_wiring(plate, observation.values.conj(), shapes)
     if other.cost < match.cost - _CLEAR:
         raise InputError(
             "phases must be for exp(+i omega t), got conjugated ones, as it looks: with the signs "

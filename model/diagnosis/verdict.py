@@ -120,9 +120,9 @@ def diagnose(
         )
     plate = sensed_plate(rig, observation.points, observation.frequencies)
     dead = dead_channels(plate, observation)
-    sensors = observation.sensors
     observation, removed = usable_sensors(observation, dead)
-    plate = plate.at_some(np.isin(sensors, observation.sensors))
+    if removed:
+        plate = sensed_plate(rig, observation.points, observation.frequencies)
     shapes = match_shapes(plate, observation.values)
     if check is not None:
         check(plate, shapes, observation)
@@ -145,7 +145,11 @@ def diagnose(
             len(observation.sensors),
             observation.frequencies,
         )
-    match, drives, error = _best_match(plate, values, shapes)
+    match, drives = best_wiring(plate, values, shapes)
+    # With more noise than usual parameters are less certain.
+    error = float(np.clip(1.2 * match.median_error, MODEL_ERROR, 0.3))
+    if error > MODEL_ERROR:
+        match = match_plate(plate, values, drives=drives, model_error=error, starts=shapes.starts)
     off = off_scale(observation, values, match)
     if off and len(observation.sensors) - len(off) >= LEAST_SENSORS:
         wrong = np.isin(observation.sensors, [each.name for each in off])
@@ -186,32 +190,23 @@ def diagnose(
     )
 
 
-def _best_match(
-    plate: SensedPlate,
-    values: ComplexArray,
-    shape_match: ShapeMatch,
-) -> tuple[Match, tuple[int, ...], float]:
-    """Best plate, wiring and model error; the rig's wiring unless another is clearly better."""
+def best_wiring(
+    plate: SensedPlate, values: ComplexArray, shapes: ShapeMatch
+) -> tuple[Match, tuple[int, ...]]:
+    """Best plate and wiring for values (f, e, s): the rig's unless another is clearly better.
+
+    shapes: what they are most like.
+    """
     own = tuple(range(values.shape[1]))
-    starts = tuple(dict.fromkeys([(0.0, 0.0), shape_match.start]))
-
-    def matched(drives: Sequence[int], error: float) -> Match:
-        return match_plate(plate, values, drives=drives, model_error=error, starts=starts)
-
     nearest = tuple(
-        era if era == i or shape_match.confidence(i, era, i) >= _MIN_CONFIDENCE else i
-        for i, era in enumerate(shape_match.nearest)
+        era if era == i or shapes.confidence(i, era, i) >= _MIN_CONFIDENCE else i
+        for i, era in enumerate(shapes.nearest)
     )
-    drives, match = own, matched(own, MODEL_ERROR)
-    if nearest != own:
-        other = matched(nearest, MODEL_ERROR)
-        if other.cost < match.cost - _MIN_COST_REDUCTION:
-            drives, match = nearest, other
-    # With more noise than usual parameters are less certain.
-    error = float(np.clip(1.2 * match.median_error, MODEL_ERROR, 0.3))
-    if error > MODEL_ERROR:
-        match = matched(drives, error)
-    return match, drives, error
+    found = [
+        (match_plate(plate, values, drives=drives, starts=shapes.starts), drives)
+        for drives in dict.fromkeys([own, nearest])
+    ]
+    return best_by(found, lambda each: -each[0].cost - _MIN_COST_REDUCTION * (each[1] != own))
 
 
 def _phases(observation: Responses, match: Match, dead: NDArray[np.bool_]) -> list[ChannelPhase]:

@@ -17,7 +17,6 @@ from scipy.special import chdtrc
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.finger.grid import Grid
-from model.identification.derivatives import by_mass_at
 from model.identification.settled import Touched
 from model.identification.settled_update import State, Updated
 
@@ -57,9 +56,7 @@ class Taken:
         space = touched.space
         own = np.flatnonzero(space.of(*_KINDS))
         plate = touched.touched.at(np.concatenate([found.state.x, found.fingers]))
-        bases = touched.pattern.bases
-        by_mass = np.einsum("snp,n->sp", by_mass_at(plate, at)[0], bases)
-        _, masses = touched.as_numbers(plate.responses[0] @ bases, by_mass)
+        masses = touched.by_mass_at(plate, at)
         columns = np.hstack([found.slopes[:, own], masses])
         slopes = columns.T @ (found.precision @ found.innovation)
         curvatures = (columns * (found.precision @ columns)).sum(axis=0)

@@ -202,7 +202,8 @@ class PlateAt:
         w, values = model.omega[:, None], self.values
         self.base = values.stiffness + 1j * w * values.damping
         loads = [
-            _finger(*each, model.omega) for each in zip(self._tips, values.fingers, strict=True)
+            _finger(each.fingertip, logs, model.omega)
+            for each, logs in zip(model.fingers, values.fingers, strict=True)
         ]
         self.finger_slopes = [slopes for _, slopes in loads]
         held = [
@@ -265,10 +266,6 @@ class PlateAt:
         """Acceleration at each sensor per base displacement of each ERA (f, s, n) [1/s²]."""
         n = self.base.shape[1]
         return np.asarray(self.scale * self.receptance[:, self.model.observed, :n])
-
-    @property
-    def _tips(self) -> list[Fingertip]:
-        return [finger.fingertip for finger in self.model.fingers]
 
     def _functions(self) -> FreeReceptance:
         model, values = self.model, self.values

@@ -18,7 +18,6 @@ from model.arrays import FloatArray
 from model.choice import ranked_by
 from model.identification.alarm import PLACES
 from model.identification.alterations import Alteration, Altered, Crack, Hand, scores
-from model.identification.derivatives import by_mass_at
 from model.identification.least_squares import single_changes
 from model.identification.parameters import Space
 from model.identification.settled import Touched, finger_covariance
@@ -219,12 +218,11 @@ def _scan(
         P = linalg.block_diag(before.covariance, finger_covariance([each.pattern]))
         S = H @ P @ H.T + np.diag(each.std**2)
         at = each.touched.at(np.concatenate([before.x, fingers]))
-        if alteration is None:
-            bases = each.pattern.bases
-            columns = np.einsum("snp,n->sp", by_mass_at(at, points)[0], bases)
-            _, column = each.as_numbers(at.responses[0] @ bases, columns)
-        else:
-            column = scores(each, at, alteration, points)
+        column = (
+            each.by_mass_at(at, points)
+            if alteration is None
+            else scores(each, at, alteration, points)
+        )
         weighted = linalg.solve(S, column, assume_a="pos")
         slope += (each.pattern.numbers - predicted) @ weighted
         curvature += (column * weighted).sum(axis=0)

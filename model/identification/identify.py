@@ -1,7 +1,7 @@
 """Identification of a rig by responses measured in place."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -84,7 +84,8 @@ def identify(rig: Rig, measurement: Measurement, *, seed: int = 0) -> Identifica
             field=held_out.unexplained if held_out else 0.0,
         )
     if held_out:
-        posterior = posterior.widened(held_out.disagreement)
+        covariance = posterior.covariance + held_out.disagreement
+        posterior = replace(posterior, covariance=covariance)
     return Identification(
         rig,
         rig_with(rig, values, uncertainty),

@@ -114,11 +114,6 @@ class LivePlate:
         self._held: list[Touched] = []
         self._since_alarm = 0
 
-    @property
-    def has_changed(self) -> bool:
-        """Whether the plate has changed in a way that its parameters do not follow."""
-        return bool(self.known.change)
-
     def take(self, pattern: SettledPattern) -> Report:
         """Take a settled pattern: update the state, or hold it and explain what happened."""
         touched = Touched.of(self.known.model, pattern, _FINGER, noise=self._noise.relative)
@@ -133,15 +128,15 @@ class LivePlate:
         taken = Taken.of(touched, known.state, known.time, after, self._places)
         suspect = self._alarm.take(taken)
         if suspect is not None:
-            explanation, is_new = None, not self.has_changed
+            explanation, is_new = None, not self.known.change
             if known.is_explained and is_new:
                 self._go_back(suspect)
                 explanation = self._explained(pattern.time).explanation
             self._alarm.clear()
             return Report(after.nis, after.count, is_new, bool(self._held), explanation)
-        if self.has_changed and self._alarm.is_full:
+        if self.known.change and self._alarm.is_full:
             self.known = replace(self.known, change="")
-        if known.is_explained and not self.has_changed and not self._alarm.is_odd:
+        if known.is_explained and not self.known.change and not self._alarm.is_odd:
             self.known = replace(self.known, state=after.state, time=pattern.time)
             self._noise.take(after)
         return Report(after.nis, after.count, False, False, None)

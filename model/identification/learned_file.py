@@ -58,8 +58,8 @@ def save_learned(learned: LearnedPlate, file: Path) -> None:
     )
 
 
-def load_learned(file: Path, *, table: str | None = None) -> LearnedPlate:
-    """Read a learned plate of a table by its fingerprint, or of any.
+def load_learned(file: Path, *, table: str) -> LearnedPlate:
+    """Read a learned plate of a table by its fingerprint.
 
     Raises InputError for a damaged file or another version, OtherPlate for another table.
     """
@@ -84,7 +84,7 @@ def load_learned(file: Path, *, table: str | None = None) -> LearnedPlate:
     p = len(names)
     if version != _VERSION or x.shape != (p,) or covariance.shape != (p, p):
         raise InputError(f"{file}: version must be {_VERSION}; remove the file to learn anew")
-    if table is not None and found.table != table:
+    if found.table != table:
         raise OtherPlate(
             f"{file}: must be learned for this table, got one of another rig; remove the file to "
             "learn anew"

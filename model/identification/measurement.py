@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,18 +160,11 @@ class DeviceSettings:
     seed: int
 
 
-class PlateMeasurer(Protocol):
-    """Plays on all ERAs of a rig and measures its plate."""
-
-    def __call__(self, rig: Rig, settings: DeviceSettings, *, progress: Progress) -> MeasuredPlate:
-        """Raises InputError, LinkError."""
-
-
 _MEASURER = "sim.measuring.plate_measurement:measure_plate"
 """By name: this package does not import the one beside it."""
 
 
 def measure_by_device(rig: Rig, settings: DeviceSettings, *, progress: Progress) -> MeasuredPlate:
-    """Measure a plate by a sound card."""
-    measure: PlateMeasurer = resolve_name(_MEASURER)
-    return measure(rig, settings, progress=progress)
+    """Measure a plate by a sound card; raises InputError, LinkError."""
+    found: MeasuredPlate = resolve_name(_MEASURER)(rig, settings, progress=progress)
+    return found

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import FloatArray
 from model.identification.form_errors import MASS_CELLS
@@ -150,16 +150,22 @@ class Space:
         return replace(self, std=columns[0], lower=columns[1], upper=columns[2])
 
     def and_further(
-        self, kind: str, names: Sequence[str], std: float, bounds: FloatArray
+        self,
+        kind: str,
+        names: Sequence[str],
+        std: Number | None = None,
+        lower: ArrayLike = -np.inf,
+        upper: ArrayLike = np.inf,
     ) -> "Space":
-        """The same with further parameters of a kind at its end; bounds (2, n)."""
-        first, count = self.size, len(names)
+        """The same with further parameters of a kind at its end; std: by default the kind's."""
+        own = KINDS[kind].std if std is None else std
+        further = [np.broadcast_to(each, len(names)) for each in (own, lower, upper)]
         return Space(
             (*self.names, *names),
-            np.append(self.std, np.full(count, std)),
-            np.append(self.lower, bounds[0]),
-            np.append(self.upper, bounds[1]),
-            self.groups | {kind: slice(first, first + count)},
+            np.append(self.std, further[0]),
+            np.append(self.lower, further[1]),
+            np.append(self.upper, further[2]),
+            self.groups | {kind: slice(self.size, self.size + len(names))},
         )
 
     def of_kinds(self, known: Callable[[Kind], float]) -> FloatArray:
@@ -208,8 +214,20 @@ def space_of(
     beside ERAs of a plate with form errors.
     """
     plate, eras = rig.plate, [era.name for era in rig.eras]
-    builder = _Builder()
-    add = builder.add
+    none = np.zeros(0)
+    space = Space((), none, none, none, {})
+
+    def add(
+        kind: str,
+        names: Sequence[str],
+        std: Number | None = None,
+        *,
+        lower: ArrayLike = -np.inf,
+        upper: ArrayLike = np.inf,
+    ) -> None:
+        nonlocal space
+        space = space.and_further(kind, names, std, lower, upper)
+
     add("thickness", ["thickness"], uncertainty.thickness)
     add("modulus", ["modulus"], KINDS["modulus"].std * (uncertainty.thickness > 0))
     add("stiffness", [f"stiffness {name}" for name in eras], uncertainty.stiffness)
@@ -268,7 +286,7 @@ def space_of(
     add("foreign_mass", [f"mass {n}" for n in range(MASS_CELLS.cell_count) if has_form])
     add("side", ["length", "width"] if has_form else [])
     add("poisson", ["Poisson's ratio"] if has_form else [])
-    return builder.space()
+    return space
 
 
 def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:
@@ -283,33 +301,3 @@ def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:
         elif space.std[number] * (space.upper[number] - x[number]) < _AT_EDGE:
             moved[number] -= by
     return np.where(space.uncertain, moved, x)
-
-
-class _Builder:
-    """Collects the groups of a space in their order."""
-
-    def __init__(self) -> None:
-        self._names: list[str] = []
-        self._columns: list[FloatArray] = []
-        self._groups: dict[str, slice] = {}
-
-    def add(
-        self,
-        kind: str,
-        names: Sequence[str],
-        std: float | FloatArray | None = None,
-        *,
-        lower: Sequence[float] | FloatArray | float = -np.inf,
-        upper: Sequence[float] | FloatArray | float = np.inf,
-    ) -> None:
-        if std is None:
-            std = KINDS[kind].std
-        start, count = len(self._names), len(names)
-        self._names += names
-        self._groups[kind] = slice(start, start + count)
-        columns = [np.broadcast_to(np.asarray(each, float), count) for each in (std, lower, upper)]
-        self._columns.append(np.array(columns).reshape(3, count))
-
-    def space(self) -> Space:
-        std, lower, upper = np.concatenate(self._columns, axis=1)
-        return Space(tuple(self._names), std, lower, upper, self._groups)

@@ -42,10 +42,6 @@ class Posterior:
         covariance[np.ix_(free, free)] = linalg.inv(best.information[np.ix_(free, free)])
         return cls(space, best.x, covariance)
 
-    def widened(self, further: FloatArray) -> "Posterior":
-        """The same with a further covariance (p, p)."""
-        return Posterior(self.space, self.x, self.covariance + further)
-
     def within(self, space: Space) -> "Posterior":
         """The same in a space with further parameters, which are 0 and without variance."""
         own = [space.index(name) for name in self.space.names]

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.identification.derivatives import jacobian
-from model.identification.forward import ForwardModel, RestingFinger
+from model.identification.derivatives import by_mass_at, jacobian
+from model.identification.forward import ForwardModel, PlateAt, RestingFinger
 from model.identification.parameters import FINGER_PARTS, Space
 
 _OWN = 0.5  # of a finger's deviation as a whole
@@ -86,8 +86,7 @@ class Touched:
         """A model under the fingers of a pattern, of loads known to finger_std (of logarithms)."""
         count, space = len(FINGER_PARTS) * len(pattern.fingers), model.space
         names = [f"finger part {number}" for number in range(count)]
-        bounds = np.full((2, count), [[-np.inf], [np.inf]])
-        wider = space.and_further("fingers", names, finger_std, bounds)
+        wider = space.and_further("fingers", names, finger_std)
         touched = replace(
             model,
             frequencies=np.array([pattern.frequency]),
@@ -111,6 +110,11 @@ class Touched:
         values = plate.responses[0] @ self.pattern.bases
         changes = np.einsum("snp,n->sp", jacobian(plate)[0], self.pattern.bases)
         return self.as_numbers(values, changes)
+
+    def by_mass_at(self, plate: PlateAt, points: FloatArray) -> FloatArray:
+        """Change of the numbers of the pattern by a mass [kg] at points (m, 2) [m], (2 s, m)."""
+        changes = np.einsum("snp,n->sp", by_mass_at(plate, points)[0], self.pattern.bases)
+        return self.as_numbers(plate.responses[0] @ self.pattern.bases, changes)[1]
 
     def as_numbers(
         self, values: ComplexArray, changes: ComplexArray

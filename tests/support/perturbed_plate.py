@@ -9,6 +9,7 @@ from benchmarks.direct_plate import direct_acceleration
 from model.calibration.responses import Responses
 from model.fem.plate import assemble
 from model.rig.rig import Rig
+from model.structure.attachments import Gain
 
 # Relative to the rig, bolt masses in kg: what assembly and ageing do.
 STIFFNESS = (1.15, 0.9, 1.05, 0.82)
@@ -33,9 +34,7 @@ def perturbed(rig: Rig, *, frequencies: np.ndarray = FREQUENCIES, seed: int = 1)
     rng = np.random.default_rng(seed)
     eras = []
     for era, k, c, m in zip(rig.eras, STIFFNESS, DAMPING, BOLT_MASS, strict=True):
-        size = 1 + 0.08 * rng.standard_normal(len(frequencies))
-        phase = 0.1 * rng.standard_normal(len(frequencies))
-        gains = tuple(zip(frequencies.tolist(), size.tolist(), phase.tolist(), strict=True))
+        gains = random_gains(rng, frequencies, size=0.08, phase=0.1)
         eras.append(
             replace(
                 era,
@@ -51,6 +50,22 @@ def perturbed(rig: Rig, *, frequencies: np.ndarray = FREQUENCIES, seed: int = 1)
     return replace(rig, plate=plate, eras=tuple(eras))
 
 
+def random_gains(
+    rng: np.random.Generator, frequencies: np.ndarray, *, size: float, phase: float
+) -> tuple[Gain, ...]:
+    """Gains at frequencies, off by standard deviations of their size and of their phase [rad]."""
+    sizes = 1 + size * rng.standard_normal(len(frequencies))
+    phases = phase * rng.standard_normal(len(frequencies))
+    return tuple(zip(frequencies.tolist(), sizes.tolist(), phases.tolist(), strict=True))
+
+
+def noise_like(values: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
+    """Complex white noise, a share of each row's rms over the sensors."""
+    size = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
+    white = rng.standard_normal(values.shape) + 1j * rng.standard_normal(values.shape)
+    return np.asarray(share * size * white / np.sqrt(2))
+
+
 def measured(
     truth: Rig,
     *,
@@ -64,8 +79,7 @@ def measured(
     matrices = assemble(truth.plate, truth.mesh)
     strokes = np.array([era.stroke for era in truth.eras])[:, None]
     values = direct_acceleration(matrices, truth.eras, frequencies, POINTS) / strokes
-    size = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
+    heard = noise_like(values, noise, rng)
     for name, scale in (scales or {}).items():
         values[:, :, NAMES.index(name)] *= scale
-    white = rng.standard_normal(values.shape) + 1j * rng.standard_normal(values.shape)
-    return Responses(NAMES, POINTS, frequencies, values + noise * size * white / np.sqrt(2))
+    return Responses(NAMES, POINTS, frequencies, values + heard)

@@ -1,6 +1,8 @@
 """What estimator and daemon do with patterns, files, answers and messages they cannot use."""
 
 import pickle
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -23,11 +25,11 @@ from paper_plate import make_paper_rig
 from small_table import small_table
 
 
-def estimator(file: Path) -> Estimator:
+def estimator(file: Path, *, now: Callable[[], float] = time.monotonic) -> Estimator:
     """Of the paper's rig, with a sensor at each ERA."""
     rig = make_paper_rig(12, 9)
     sensors = tuple(Sensor(era.name, era.name) for era in rig.eras)
-    return Estimator(Start(rig, small_table(), sensors, "switched", file))
+    return Estimator(Start(rig, small_table(), sensors, "switched", file), now=now)
 
 
 def test_pattern_of_nothing_is_noted_and_leaves_no_file(tmp_path: Path) -> None:
@@ -63,10 +65,7 @@ def test_folder_without_room_is_noted_once(tmp_path: Path, monkeypatch: pytest.M
     def save(learned: LearnedTable) -> None:
         raise errors[0]
 
-    rig = make_paper_rig(12, 9)
-    sensors = tuple(Sensor(era.name, era.name) for era in rig.eras)
-    start = Start(rig, small_table(), sensors, "switched", tmp_path / "learned.npz")
-    found = Estimator(start, now=lambda: clock[0])
+    found = estimator(tmp_path / "learned.npz", now=lambda: clock[0])
     monkeypatch.setattr(LearnedTable, "save", save)
     monkeypatch.setattr(found, "_is_saved", False)
     notes = []

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import perturbed_plate
+from benchmarks.calibration.hidden_plates import gains_of, true_values
 from model.calibration.calibrate import calibrate
 from model.calibration.calibration_result import Calibration
 from model.calibration.responses import Responses
@@ -41,17 +42,6 @@ def fitted(rig: Rig, truth: Rig) -> Calibration:
 def calibrated(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Calibration:
     """As `era calibrate` does it."""
     return calibrate(rig, responses, check_consistency(rig, responses), all_scales=all_scales)
-
-
-def true_values(rig: Rig) -> list[float]:
-    """In the order of the parameters."""
-    values = [rig.plate.material.E, rig.plate.loss_factor]
-    return values + [v for era in rig.eras for v in (era.stiffness, era.damping, era.bolt_mass)]
-
-
-def gains_of(rig: Rig) -> np.ndarray:
-    """Complex gains, (f, eras)."""
-    return np.column_stack([era.gain(FREQUENCIES) for era in rig.eras])
 
 
 def test_calibrate_finds_every_parameter(truth, fitted):

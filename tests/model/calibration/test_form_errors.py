@@ -11,8 +11,8 @@ from benchmarks.calibration.hidden_plates import (
     SENSORS,
     draw_plate,
     gain_deviations,
+    gains_of,
     measure,
-    true_gains,
     true_values,
 )
 from model.arrays import FloatArray
@@ -180,8 +180,8 @@ def test_intervals_hold_the_truth_on_plates_with_form_errors(
         found = calibrate(rig, responses, check_consistency(rig, responses))
         assert found.outlier_count == 0
         assert found.scales == ()
-        gains.append(gain_deviations(found.rig, true_gains(hidden)))
-        for one, true in zip(found.parameters, true_values(hidden), strict=True):
+        gains.append(gain_deviations(found.rig, gains_of(hidden.rig)))
+        for one, true in zip(found.parameters, true_values(hidden.rig), strict=True):
             if one.standard_error is not None:
                 deviations.append(abs(one.value - true) / one.standard_error)
     assert len(deviations) > 12 * plates

@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.direct_plate import direct_acceleration
+import perturbed_plate
+from distorted_responses import DISTORTIONS
 from long_form import shortly
 from model.calibration.responses import Responses
 from model.calibration.sensed_plate import sensed_plate
@@ -20,17 +21,10 @@ from model.diagnosis.diagnosis_report import as_json, channel_table, verdict_row
 from model.diagnosis.verdict import Verdict, diagnose
 from model.errors import InputError
 from model.fem.mesh import Mesh
-from model.fem.plate import assemble
 from model.rig.rig import Rig
+from perturbed_plate import noise_like, random_gains
 
 FREQUENCIES = np.linspace(57.0, 487.0, 10)
-NX, NY = 4, 2
-
-
-def points(rig: Rig) -> np.ndarray:
-    """Eight places in the middle of as many cells."""
-    x, y = (np.arange(NX) + 0.5) / NX, (np.arange(NY) + 0.5) / NY
-    return np.array([[a * rig.plate.length, b * rig.plate.width] for b in y for a in x])
 
 
 def within_tolerance(rig: Rig, rng: np.random.Generator) -> Rig:
@@ -54,28 +48,13 @@ def within_tolerance(rig: Rig, rng: np.random.Generator) -> Rig:
     return replace(rig, plate=plate, eras=eras)
 
 
-def respond(truth: Rig, places: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Measured responses (f, e, s) [1/s²]."""
-    strokes = np.array([era.stroke for era in truth.eras])[:, None]
-    matrices = assemble(truth.plate, truth.mesh)
-    values = direct_acceleration(matrices, truth.eras, FREQUENCIES, places) / strokes
-    shape = (*values.shape[:2], 1)
-    values = values * (1 + 0.05 * rng.standard_normal(shape))
-    values = values * np.exp(1j * np.radians(5) * rng.standard_normal(shape))
-    return values + noise_like(values, 0.02, rng)
-
-
-def noise_like(values: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
-    """Complex white noise, a share of each row's rms over the sensors."""
-    size = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
-    white = rng.standard_normal(values.shape) + 1j * rng.standard_normal(values.shape)
-    return np.asarray(share * size * white / np.sqrt(2))
-
-
-def observe(places: np.ndarray, values: np.ndarray, *, has_phases: bool = True) -> Responses:
-    """Sensors P1, P2, ... at these places."""
-    names = tuple(f"P{number}" for number in range(1, len(places) + 1))
-    return Responses(names, places, FREQUENCIES, values, has_phases)
+def measured(truth: Rig, rng: np.random.Generator) -> Responses:
+    """Responses with the gains and the noise of every measurement."""
+    eras = tuple(
+        replace(era, gains=random_gains(rng, FREQUENCIES, size=0.05, phase=np.radians(5)))
+        for era in truth.eras
+    )
+    return perturbed_plate.measured(replace(truth, eras=eras), frequencies=FREQUENCIES, noise=0.02)
 
 
 def states(verdict: Verdict) -> dict[str, tuple[str, ...]]:
@@ -100,11 +79,10 @@ def solved_once():
 
 
 @pytest.fixture(scope="module")
-def built(coarse_rig: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """Places, and responses of one plate within tolerance."""
+def built(coarse_rig: Rig) -> Responses:
+    """Responses of one plate within tolerance."""
     rng = np.random.default_rng(7)
-    places = points(coarse_rig)
-    return places, respond(within_tolerance(coarse_rig, rng), places, rng)
+    return measured(within_tolerance(coarse_rig, rng), rng)
 
 
 @pytest.mark.parametrize("seed", shortly(range(2), [0]))
@@ -114,17 +92,16 @@ def test_diagnose_passes_a_plate_within_tolerance_and_finds_a_swap(coarse_rig, s
     A dead sensor and one that is upside down and half are named and left out of the first verdict.
     """
     rng = np.random.default_rng(1000 + seed)
-    places = points(coarse_rig)
-    values = respond(within_tolerance(coarse_rig, rng), places, rng)
-    broken = values.copy()
+    built = measured(within_tolerance(coarse_rig, rng), rng)
+    broken, values = built.values.copy(), built.values.copy()
     broken[:, :, 5] = 1e-9
     broken[:, :, 2] *= -0.5
-    well = diagnose(coarse_rig, observe(places, broken))
+    well = diagnose(coarse_rig, replace(built, values=broken))
     assert well.is_well
     assert [each.name for each in well.bad_sensors] == ["P6", "P3"]
     one, other = rng.choice(4, size=2, replace=False)
     values[:, [one, other]] = values[:, [other, one]]
-    swapped = diagnose(coarse_rig, observe(places, values))
+    swapped = diagnose(coarse_rig, replace(built, values=values))
     names = {coarse_rig.eras[one].name, coarse_rig.eras[other].name}
     assert [set(cycle) for cycle in swapped.swapped] == [names]
     (row,) = verdict_rows(swapped)
@@ -139,11 +116,10 @@ def test_diagnose_relates_gain_to_the_stroke_that_is_driven(coarse_rig, built):
 
     Nothing is wrong with the channels but where they are wired to.
     """
-    places, values = built
     sw, se, *others = coarse_rig.eras
     rig = replace(coarse_rig, eras=(sw, replace(se, stroke=2 * sw.stroke), *others))
-    exchanged = values[:, [1, 0, 2, 3]] * np.array([2, 1 / 2, 1, 1])[:, None]
-    verdict = diagnose(rig, observe(places, exchanged))
+    exchanged = built.values[:, [1, 0, 2, 3]] * np.array([2, 1 / 2, 1, 1])[:, None]
+    verdict = diagnose(rig, replace(built, values=exchanged))
     assert [c.drives for c in verdict.channels][:2] == ["SE", "SW"]
     assert states(verdict) == {"SW": ("other ERA",), "SE": ("other ERA",)}
     for channel in verdict.channels:
@@ -152,8 +128,7 @@ def test_diagnose_relates_gain_to_the_stroke_that_is_driven(coarse_rig, built):
 
 def test_diagnose_finds_a_cycle_of_three_channels(coarse_rig, built):
     """SW's channel drives SE, SE's NE, NE's SW: which permutation it is, is found."""
-    places, values = built
-    verdict = diagnose(coarse_rig, observe(places, values[:, [1, 2, 0, 3]]))
+    verdict = diagnose(coarse_rig, replace(built, values=built.values[:, [1, 2, 0, 3]]))
     assert verdict.swapped == (("SW", "SE", "NE"),)
     assert verdict_rows(verdict)[0].startswith("SWAPPED in a cycle")
     assert [c.drives for c in verdict.channels] == ["SE", "NE", "SW", "NW"]
@@ -161,13 +136,13 @@ def test_diagnose_finds_a_cycle_of_three_channels(coarse_rig, built):
 
 def test_diagnose_finds_dead_weak_and_inverted_channels(coarse_rig, built):
     """Each is named with its gain; a dead one whether sensors read nothing or noise."""
-    places, values = built
+    values = built.values
     rng = np.random.default_rng(3)
     broken = values.copy()
     broken[:, 0] *= 1e-4
     broken[:, 1] *= 0.4
     broken[:, 3] *= -1
-    verdict = diagnose(coarse_rig, observe(places, broken))
+    verdict = diagnose(coarse_rig, replace(built, values=broken))
     assert states(verdict) == {"SW": ("dead",), "SE": ("weak",), "NW": ("inverted",)}
     found = [row.partition(":")[0] for row in verdict_rows(verdict)]
     assert found == ["DEAD", "WEAK", "INVERTED"]
@@ -176,15 +151,15 @@ def test_diagnose_finds_dead_weak_and_inverted_channels(coarse_rig, built):
     assert verdict.plate_matches
     broken = values.copy()
     broken[:, 2] = noise_like(values, 0.1, rng)[:, 2]
-    assert states(diagnose(coarse_rig, observe(places, broken))) == {"NE": ("dead",)}
+    assert states(diagnose(coarse_rig, replace(built, values=broken))) == {"NE": ("dead",)}
 
 
 def test_diagnose_finds_a_channel_on_another_era(coarse_rig, built):
     """SW's plug is in NW's socket, and NW's hangs free: another ERA, and a dead channel."""
-    places, values = built
+    values = built.values
     broken = values.copy()
     broken[:, 0], broken[:, 3] = values[:, 3], 1e-6
-    verdict = diagnose(coarse_rig, observe(places, broken))
+    verdict = diagnose(coarse_rig, replace(built, values=broken))
     assert states(verdict) == {"SW": ("other ERA",), "NW": ("dead",)}
     assert verdict.channels[0].drives == "NW"
     assert verdict.swapped == ()
@@ -193,10 +168,10 @@ def test_diagnose_finds_a_channel_on_another_era(coarse_rig, built):
 
 def test_diagnose_finds_two_channels_on_one_era(coarse_rig, built):
     """SE's plug is beside SW's at 0.3 of its stroke: each channel has a gain of its own."""
-    places, values = built
+    values = built.values
     broken = values.copy()
     broken[:, 1] = 0.3 * values[:, 0]
-    channels = diagnose(coarse_rig, observe(places, broken)).channels
+    channels = diagnose(coarse_rig, replace(built, values=broken)).channels
     assert [each.drives for each in channels] == ["SW", "SW", "NE", "NW"]
     assert channels[1].gain == pytest.approx(0.3 * channels[0].gain, rel=0.02)
     assert channels[0].gain == pytest.approx(1.0, rel=0.1)
@@ -204,11 +179,11 @@ def test_diagnose_finds_two_channels_on_one_era(coarse_rig, built):
 
 def test_diagnose_judges_no_polarity_without_phases(coarse_rig, built):
     """Of a channel that is inverted all but its sign is found well."""
-    places, values = built
+    values = built.values
     rng = np.random.default_rng(5)
     turned = values * np.array([1, 1, 1, -1])[None, :, None]
     loose = turned * np.exp(1j * rng.uniform(0, 6, (*turned.shape[:2], 1)))
-    verdict = diagnose(coarse_rig, observe(places, loose, has_phases=False))
+    verdict = diagnose(coarse_rig, replace(built, values=loose, has_phases=False))
     assert verdict.is_well
     assert {channel.phase for channel in verdict.channels} == {None}
 
@@ -245,8 +220,7 @@ def test_diagnose_names_what_explains_another_plate(coarse_rig, what, value, wit
     """The first of the explanations is the truth, its value within what is uncertain otherwise."""
     rng = np.random.default_rng(11)
     truth = changed(within_tolerance(coarse_rig, rng), what)
-    places = points(coarse_rig)
-    verdict = diagnose(coarse_rig, observe(places, respond(truth, places, rng)))
+    verdict = diagnose(coarse_rig, measured(truth, rng))
     assert not verdict.plate_matches
     first = verdict.explanations[0]
     assert first.cause.key == what
@@ -258,9 +232,9 @@ def test_diagnose_finds_a_swap_on_another_plate(coarse_rig, monkeypatch):
     """Exchanged channels on a plate with other springs: both are found, of few sizes."""
     monkeypatch.setattr(causes, "_SIZES", (0.82, 1.21))
     rng = np.random.default_rng(13)
-    places = points(coarse_rig)
-    values = respond(changed(coarse_rig, "eras.stiffness"), places, rng)[:, [0, 2, 1, 3]]
-    verdict = diagnose(coarse_rig, observe(places, values))
+    built = measured(changed(coarse_rig, "eras.stiffness"), rng)
+    exchanged = replace(built, values=built.values[:, [0, 2, 1, 3]])
+    verdict = diagnose(coarse_rig, exchanged)
     assert verdict.swapped == (("SE", "NE"),)
     assert not verdict.plate_matches
     assert verdict.explanations[0].cause.key == "eras.stiffness"
@@ -273,8 +247,7 @@ def test_diagnose_finds_a_swap_on_another_plate(coarse_rig, monkeypatch):
 
 def test_diagnose_finds_all_channels_dead_when_nothing_moves(coarse_rig, built):
     """Each is dead, and nothing is known of the plate."""
-    places, values = built
-    verdict = diagnose(coarse_rig, observe(places, 1e-5 * values))
+    verdict = diagnose(coarse_rig, replace(built, values=1e-5 * built.values))
     assert set(states(verdict).values()) == {("dead",)}
     assert len(verdict_rows(verdict)) == 4
     assert len(channel_table(verdict)) == 5
@@ -283,21 +256,20 @@ def test_diagnose_finds_all_channels_dead_when_nothing_moves(coarse_rig, built):
 
 def test_diagnose_refuses_too_few_sensors_or_frequencies(coarse_rig, built):
     """Two sensors, three frequencies, or no channel at all."""
-    places, values = built
     with pytest.raises(InputError, match=r"at least 3 sensors .* got 2"):
-        diagnose(coarse_rig, observe(places[:2], values[:, :, :2]))
-    few = replace(observe(places, values[:3]), frequencies=FREQUENCIES[:3])
+        diagnose(coarse_rig, DISTORTIONS["two_sensors"](built))
+    few = replace(built, frequencies=FREQUENCIES[:3], values=built.values[:3])
     with pytest.raises(InputError, match="got 3"):
         diagnose(coarse_rig, few)
     with pytest.raises(InputError, match="driven"):
-        diagnose(coarse_rig, observe(places, np.full_like(values, np.nan)))
+        diagnose(coarse_rig, replace(built, values=np.full_like(built.values, np.nan)))
 
 
 def test_diagnose_skips_channels_that_were_not_driven(coarse_rig, built):
     """A channel without values is reported as such, the others are judged."""
-    places, values = built
+    values = built.values
     part = values.copy()
     part[:, 1:3] = np.nan
-    verdict = diagnose(coarse_rig, observe(places, part))
+    verdict = diagnose(coarse_rig, replace(built, values=part))
     assert states(verdict) == {"SE": ("not driven",), "NE": ("not driven",)}
     assert verdict.is_well

@@ -67,9 +67,9 @@ def test_hand_that_stays_is_no_sticker_and_leaves_again(hidden: Hidden, known: K
     (explanation,) = (each.explanation for each in reports if each.explanation)
     x, y = (0.01 * float(each) for each in explanation.found.split(" at ")[1][:-3].split(", "))
     assert (x, y) == pytest.approx(HAND, abs=0.01)
-    assert live.has_changed
+    assert live.known.change
     play(live, hidden, hidden.mounted, count=9)
-    assert not live.has_changed
+    assert not live.known.change
 
 
 @pytest.mark.long
@@ -92,7 +92,7 @@ def test_crack_is_named(hidden: Hidden, known: Known) -> None:
     play(live, hidden, hidden.mounted, count=10)
     reports = play(live, hidden, softened(hidden.mounted, EDGE), count=6, start=10)
     assert said(reports) == "a crack"
-    assert live.has_changed
+    assert live.known.change
 
 
 @pytest.mark.parametrize(("kind", "error"), [("crack", 0.15), ("hand", 0.02)])

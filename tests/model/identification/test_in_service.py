@@ -35,7 +35,7 @@ def test_loosened_mount_is_named_and_followed(hidden: Hidden, known: Known) -> N
     assert explanation.name == "stiffness NE"
     assert explanation.change == pytest.approx(np.log(0.8), abs=0.03)
     assert live.known.rig.eras[NE].stiffness == pytest.approx(loose.stiffness[NE], rel=0.02)
-    assert not live.has_changed
+    assert not live.known.change
 
 
 def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
@@ -101,5 +101,5 @@ def test_change_that_nothing_explains_is_said(hidden: Hidden, known: Known) -> N
     assert reports[1].alarm
     assert reports[-1].explanation is not None
     assert reports[-1].explanation.name == ""
-    assert live.has_changed
+    assert live.known.change
     assert live.known.state is before

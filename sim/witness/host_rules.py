@@ -175,9 +175,11 @@ class HostRules:
         """Note a status: whether it confirms a stop, or the end of a disarm.
 
         One that has latched nothing since it was switched on shows that it has restarted after a
-        stop that was confirmed, of which there is nothing left to clear.
+        stop that was confirmed, of which there is nothing left to clear. A host that has opened the
+        wire since knows a stop by what it shows alone: it may not have heard it.
         """
-        if session.first_stop is None and values.get("latch") == 0:
+        may_be_over = session.is_asked or values.get("latch") == 0
+        if session.first_stop is None and "state" in values and may_be_over:
             session.is_stopped = session.is_stopped and values["state"] in LATCHED
         if "levels" in values and not any(values["levels"]):
             session.is_disarming = False
@@ -317,6 +319,7 @@ class HostRules:
         elif name == "Stop":
             is_confirmed = session.is_stopped and session.first_stop is None
             session.is_stopped, session.stop_requested_at, session.session = True, None, None
+            session.is_asked = False
             if not (is_confirmed and session.amplifier.state in LATCHED):  # else by one before
                 session.first_stop = time if session.first_stop is None else session.first_stop
                 self._expect_confirmation(session, time, session.first_stop)

@@ -76,6 +76,7 @@ class WatchedWire:
         self._forget_pending(time)
         for session in self.sessions.values():
             session.is_open, session.is_identified, session.session = True, False, None
+            session.is_asked = True
             session.forget_amplifier()
 
     def closed(self, time: float) -> None:

@@ -58,9 +58,9 @@ class Talk:
         getattr(self.witness, what)(self.time, *arguments, **named)
         return self
 
-    def opened(self) -> "Talk":
-        """Let the host open the wire, whose amplifiers it does not know then."""
-        self.witness.opened("a", self.time)
+    def told_of(self, what: str) -> "Talk":
+        """Let the host have opened the wire, whose amplifiers it does not know then, or closed."""
+        getattr(self.witness, what)("a", self.time)
         return self
 
     def numbered(self, sequence: int) -> "Talk":
@@ -108,8 +108,10 @@ class Talk:
         self.rest(TOOK).replies(hand.NAK, (kind, code, 255), address=address)
         return self.rest(TOOK)
 
-    def identified(self, *, address: int = 1) -> "Talk":
-        """Let an amplifier identify itself, disarmed."""
+    def identified(
+        self, state: int = hand.SWITCHED_OFF, *, latch: int = 0, address: int = 1
+    ) -> "Talk":
+        """Let an amplifier identify itself in a state, disarmed."""
         self.sends(hand.HELLO, address=address)
         kind = hand.HELLO | hand.REPLY
         self.rest(TOOK).amplifier_bytes(
@@ -118,8 +120,7 @@ class Talk:
             )
         )
         self.exchange(hand.GET_CAPS, (), hand.capabilities(), address=address)
-        off = hand.status(hand.SWITCHED_OFF)
-        return self.exchange(hand.GET_STATUS, (), off, address=address)
+        return self.exchange(hand.GET_STATUS, (), hand.status(state, latch=latch), address=address)
 
     def armed(self, *, address: int = 1) -> "Talk":
         """Let it be identified and armed: session 9, watchdog 250 ms."""

@@ -186,6 +186,20 @@ def test_stop_is_over_where_the_amplifier_has_restarted(latch: int, broken: bool
     assert ("stop" in talk.found) is broken
 
 
+@pytest.mark.parametrize(
+    ("state", "broken"), [(hand.SWITCHED_OFF, []), (hand.STOPPED, ["latched", "stop"])]
+)
+def test_stop_that_was_not_heard_is_over_for_a_host_that_opens_the_wire_again(
+    state: int, broken: list[str]
+) -> None:
+    """It was lost on a disturbed wire; one that was heard shows, and must be cleared."""
+    talk = Talk().armed().told("faults", "a", are_on=True)
+    talk.sends(hand.STOP, (5,)).rest(0.3).told("faults", "a", are_on=False)
+    talk.told_of("closed").rest(0.6).told_of("opened").identified(state, latch=1)
+    talk.exchange(hand.ARM, (10, 250), hand.status(latch=1))
+    assert sorted({*talk.found}) == broken
+
+
 @pytest.mark.parametrize(("before", "broken"), [(0.06, ["answer"]), (0.0, ["credit"])])
 def test_status_of_an_amplifier_that_is_mute_gives_way(before: float, broken: list[str]) -> None:
     """What is mute has left a request without a reply; of another one the reply is awaited."""

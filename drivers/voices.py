@@ -17,7 +17,7 @@ from operator import attrgetter
 from drivers.protocol.sets import Command, Envelope
 from drivers.protocol.table import QUANTITIES, SHORTENED_FADE
 
-_STEP = QUANTITIES["envelope_step"]
+_PER_STEP = QUANTITIES["envelope_step"].per_unit
 _PER_FULL, _PER_DEGREE = QUANTITIES["level"].per_unit, QUANTITIES["phase"].per_unit
 _PER_HERTZ = QUANTITIES["frequency"].per_unit
 SAME = 1e-6
@@ -98,6 +98,8 @@ class Transition:
 
     def peak(self, time: float) -> float:
         """Return the largest magnitude from a time on."""
+        if time <= self.start:  # nearly always: just committed
+            return max(map(abs, (self.first, *self.knots, self.last)))
         return max(map(abs, self.points(time)))
 
     def slope(self, time: float) -> float:
@@ -111,7 +113,7 @@ class Transition:
 
 def along(envelope: Envelope, time: float, first: complex, last: complex) -> Transition:
     """Return a transition along an envelope, from a time [s] on."""
-    step = _STEP.from_wire(envelope.step)
+    step = envelope.step / _PER_STEP
     end = time + step * (len(envelope.knots) + 1)
     return Transition(time, step, first, last, end, amplitudes_of(envelope))
 

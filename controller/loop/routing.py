@@ -19,7 +19,8 @@ from model.vibration import excitation as physics
 Drive = Mapping[str, Tone]
 """What ERAs play, by name, without silent ones."""
 
-_FREQUENCY, _LEVEL, _PHASE = (QUANTITIES[name] for name in ("frequency", "level", "phase"))
+_PER_HERTZ, _PER_FULL = QUANTITIES["frequency"].per_unit, QUANTITIES["level"].per_unit
+_PER_DEGREE = QUANTITIES["phase"].per_unit
 
 
 def route(
@@ -97,9 +98,9 @@ def tones_by_era(
     return {
         name: Tone(
             channel.number,
-            _FREQUENCY.from_wire(command.frequency),
-            _LEVEL.from_wire(command.level),
-            _PHASE.from_wire(command.phase),
+            command.frequency / _PER_HERTZ,
+            command.level / _PER_FULL,
+            command.phase / _PER_DEGREE,
         )
         for name, channel in rig.wiring.items()
         if (command := playing.get((channel.amplifier, channel.number))) is not None

@@ -182,16 +182,18 @@ class Dialogue:
         cuts: list[Values] = []
         admitted: list[Staged] = []
 
-        def first() -> Values:
-            if not cuts:
-                admitted.append(self._admit(token, layers, cuts, now=now))
+        def part() -> Values:
+            if admitted:
+                return self.while_admitted(token, cuts[0])
+            admitted.append(self._admit(token, layers, cuts, now=now))
             return cuts[0]
 
+        def follows() -> bool:
+            del cuts[0]
+            return bool(cuts)
+
         priority = Priority.SILENCE if is_silence(layers) else Priority.SET
-        taken = await self.line.submit(self, priority, "Set", {}, make=first)
-        for part in cuts[1:]:
-            make = partial(self.while_admitted, token, part)
-            taken = await self.line.submit(self, priority, "Set", part, make=make)
+        taken = await self.line.submit(self, priority, "Set", {}, make=part, follows=follows)
         (staged,) = admitted
         if not (taken["played"] or (taken["staged"] and self._admitted is staged)):
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")

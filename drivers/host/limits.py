@@ -189,6 +189,7 @@ class Rounding:
 
     def _check_envelopes(self, tone: Tone) -> None:
         """Raise CommandRefused for an envelope of a tone that is not allowed."""
+        knots: list[tuple[int, ...]] = []
         for envelope in (tone.onset, tone.ending):
             if envelope is None:
                 continue
@@ -199,12 +200,13 @@ class Rounding:
             if (count := len(envelope.knots)) > (limit := self._can["knots"]):
                 text = f"knots of an envelope must be at most {limit}, got {count}"
                 raise _refused(tone.channel, text)
-            try:
-                KNOT.check_rows(envelope.knots)
-            except (TypeError, ValueError) as error:
-                raise _refused(tone.channel, f"knot of an envelope: {error}") from error
-            if (peak := envelope.peak) > self._limits.level:
-                raise self._level_refused(tone.channel, "level of a knot", peak / _LEVEL.per_unit)
+            knots += envelope.knots
+        try:
+            KNOT.check_rows(knots)
+        except (TypeError, ValueError) as error:
+            raise _refused(tone.channel, f"knot of an envelope: {error}") from error
+        if knots and (peak := max(knots)[0]) > self._limits.level:
+            raise self._level_refused(tone.channel, "level of a knot", peak / _LEVEL.per_unit)
 
 
 def _refused(channel: int, text: str) -> CommandRefused:

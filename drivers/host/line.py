@@ -44,7 +44,7 @@ class Line:
         self.name = name
         self.loss: str | None = None
         self.members: dict[int, Dialogue] = {}
-        self.seen: Callable[[str, int, str, object], None] = lambda *message: None
+        self.seen: Callable[[str, int, str, object], None] | None = None
         """Called with each message: out, in, event or none; address, name, content. Must return."""
         self._port = port
         self._queue = JobQueue()
@@ -67,16 +67,19 @@ class Line:
         make: Callable[[], Values] | None = None,
         timeout: float = REPLY_TIMEOUT,
         start: JointStart | None = None,
+        follows: Callable[[], bool] | None = None,
     ) -> "asyncio.Future[Values]":
         """Queue a request of an amplifier; the future has the values of its reply.
 
         Or raises LinkError, LinkTimeout, FrameError, CommandRefused; Preempted where another
         request came first. member: None for a broadcast, which has no reply: the future ends once
         it was sent. make: values of each attempt, made when its turn has come; raises
-        CommandRefused. start: with the commits of other lines.
+        CommandRefused. start: with the commits of other lines. follows: as of `Job`; the future has
+        the values of the last reply.
         """
         future = self._loop.create_future()
-        job = Job(member, priority, name, values, make, timeout, self.time(), future, start)
+        now = self.time()
+        job = Job(member, priority, name, values, make, timeout, now, future, start, follows)
         if trace.has_requests():
             future.add_done_callback(partial(_trace, job))
         if self.loss is not None:
@@ -101,7 +104,8 @@ class Line:
             trace.frame(Direction.IN, data, self.name, lambda: ", ".join(map(repr, arrivals)))
         for arrival in arrivals:
             if isinstance(arrival, Event | OtherHost | Several):
-                self.seen("event", arrival.address, type(arrival).__name__, arrival)
+                if self.seen is not None:
+                    self.seen("event", arrival.address, type(arrival).__name__, arrival)
                 if (member := self.members.get(arrival.address)) is not None:
                     member.note_unasked(arrival)
                 continue
@@ -113,8 +117,9 @@ class Line:
                 self._go_on(job, arrival.data)
             else:
                 self._current = None
-                address = BROADCAST if job.member is None else job.member.address
-                self.seen("in", address, type(arrival).__name__, arrival)
+                if self.seen is not None:
+                    address = BROADCAST if job.member is None else job.member.address
+                    self.seen("in", address, type(arrival).__name__, arrival)
                 self._end(job, arrival)
         if self._queue.jobs:
             self.pump()
@@ -168,7 +173,8 @@ class Line:
             if member is not None:
                 address = member.address
                 job.longer = member.next_request(job.name, job.values)
-            self.seen("out", address, job.name, job.values)
+            if self.seen is not None:
+                self.seen("out", address, job.name, job.values)
             data = self.wire.request(address, job.name, job.values)
             now = job.sent_at = self.time()
             begins = max(now, self._sent_until)  # behind what is still on its way
@@ -238,8 +244,12 @@ class Line:
             except Exception as error:  # whatever it is, no caller may wait for ever
                 self._fail(job, error)
                 return
-            if not job.result.done():
+            if job.result.done():  # its caller has gone
+                return
+            if job.follows is None or not job.follows():
                 job.result.set_result(arrival.values)
+            else:
+                self._send_next_part(job)
         elif isinstance(arrival, Broken):
             self._fail(job, FrameError(f"{self.name}: {arrival.reason}"))
         else:
@@ -255,6 +265,17 @@ class Line:
                 is_disarmed=arrival.code in _NOT_ARMED,
             )
             self._fail(job, refusal)
+
+    def _send_next_part(self, job: Job) -> None:
+        """Go on with a request in parts, in its turn where others wait."""
+        job.attempts, job.queued_at, job.had_no_reply = ATTEMPTS, self.time(), False
+        if not self._queue.jobs:
+            self._start(job)
+            self._schedule()
+        elif self._queue.supersedes(job):
+            self._fail(job, Preempted(SUPERSEDED))
+        else:
+            self._queue.add(job)
 
     def _repeat(self, job: Job, member: "Dialogue", *, pause: float = 0.0) -> None:
         """Queue a request again, unless another one of its amplifier comes before it."""
@@ -338,7 +359,8 @@ class Line:
         member = job.member
         if member is None:
             return
-        self.seen("none", member.address, "no reply", "")
+        if self.seen is not None:
+            self.seen("none", member.address, "no reply", "")
         was_cut = job.priority is Priority.READING and self.time() - job.sent_at < job.timeout
         if was_cut or self._must_yield(job):
             job.attempts += 1

@@ -7,12 +7,13 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkError
+from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkError, Preempted
 from drivers.host.group import Group
 from drivers.host.jobs import JointStart
 from drivers.host.sensors import read_measured
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope
+from drivers.protocol.table import MESSAGES
 from sim.amplifier.contract import Amplifier as FarEnd
 from virtual_loop import in_virtual_time
 from words_line import MemoryLine, grouped, layer, losing, tone, with_group
@@ -237,6 +238,40 @@ async def test_reading_that_gives_way_to_a_set_is_no_silence(
     await group.apply({"a": [layer(number, tone(level=0.05, onset=onset)) for number in range(4)]})
     assert not group.degraded
     await reading
+
+
+@grouped(("a",), wire="serial")
+async def test_heartbeats_and_stops_go_between_the_parts_of_a_set(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """What comes while a part is on the line is sent next; after a stop no other part is."""
+    (end,) = ends
+    end.outward = lambda _, data: [(0.002, data)]
+    onset = Envelope(20, ((100, 0),) * 12)
+    layers = {"a": [layer(number, tone(level=0.05, onset=onset)) for number in range(4)]}
+    kinds = [f"1:{MESSAGES[name].number}" for name in ("Set", "Ping", "Stop", "Commit")]
+    part, heartbeat, stop, commit = kinds
+
+    def sent() -> list[str]:
+        return [each for _, each in end.sent]
+
+    playing = asyncio.ensure_future(group.apply(layers))
+    await asyncio.sleep(0.001)
+    assert sent()[-1] == part
+    end.sent.clear()
+    await group.amplifiers["a"].ping()
+    await playing
+    assert sent()[:2] == [heartbeat, part]
+    assert sent()[-1] == commit
+    playing = asyncio.ensure_future(group.apply(layers))
+    await asyncio.sleep(0.001)
+    end.sent.clear()
+    await group.stop()
+    with pytest.raises(Preempted):
+        await playing
+    assert sent()[0] == stop
+    assert not {part, commit} & {*sent()}
+    assert end.far["a"].state == "QUICK_STOP_ACTIVE"
 
 
 @in_virtual_time

@@ -1,4 +1,4 @@
-"""Blocking work in daemon threads, which delay neither a cancellation nor the end of the program.
+"""Blocking work and event loops in daemon threads: no cancellation and no exit waits for them.
 
 A program waits for the threads of asyncio's own pool before it ends, which may take indefinitely if
 a connection or a disk hangs.
@@ -7,10 +7,11 @@ a connection or a disk hangs.
 import asyncio
 import logging
 import threading
-from collections.abc import Callable
+import weakref
+from collections.abc import Callable, Coroutine
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
-from typing import TypeVar
+from typing import Any, TypeVar
 
 CLOSE_TIMEOUT = 0.7
 """Longest time [s] to close a device; a remote one takes 0.4 s, a program has 1 s to end."""
@@ -62,3 +63,47 @@ async def close_in_thread(close: Callable[[], object], *, name: str) -> None:
             await in_thread(close, name=name)
     except TimeoutError:
         _logger.warning("%s: still closing after %g s, continuing without it", name, CLOSE_TIMEOUT)
+
+
+class LoopThread:
+    """An event loop in a daemon thread of a name, until `close` or until nothing refers to it."""
+
+    def __init__(self, name: str) -> None:
+        self._loop = asyncio.new_event_loop()
+        finished = asyncio.Event()
+        thread = threading.Thread(
+            target=_run_until, args=[self._loop, finished], name=name, daemon=True
+        )
+        thread.start()
+        self._end = weakref.finalize(self, _end, self._loop, finished, thread)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it still runs."""
+        return self._end.alive
+
+    def run(self, work: Coroutine[Any, Any, _T]) -> _T:
+        """Run a coroutine; cancel it if waiting is interrupted."""
+        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            return future.result()
+        except BaseException:
+            future.cancel()
+            raise
+
+    def close(self) -> None:
+        """End the thread."""
+        self._end()
+
+
+def _run_until(loop: asyncio.AbstractEventLoop, finished: asyncio.Event) -> None:
+    with asyncio.Runner(loop_factory=lambda: loop) as runner:
+        runner.run(finished.wait())
+
+
+def _end(
+    loop: asyncio.AbstractEventLoop, finished: asyncio.Event, thread: threading.Thread
+) -> None:
+    loop.call_soon_threadsafe(finished.set)
+    if thread is not threading.current_thread():
+        thread.join()

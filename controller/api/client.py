@@ -6,10 +6,7 @@ with Client.connect() as era:
         era.touch([(0.10, 0.05)])
 """
 
-import asyncio
 import functools
-import threading
-import weakref
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,6 +17,7 @@ from controller.api.calls import Calls
 from controller.api.client_protocol import RESPONSE_TIMEOUT, Notification, Unreachable
 from controller.api.jsonrpc import RpcError
 from controller.api.methods import DEFAULT_LEASE, METHODS, ArmResult
+from drivers.threads import LoopThread
 
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
@@ -40,7 +38,7 @@ def _blocking(
 class Client(Calls):
     """A client of the daemon, made by `connect`, for any thread; see `AsyncClient`."""
 
-    def __init__(self, client: AsyncClient, loop: "_LoopThread") -> None:
+    def __init__(self, client: AsyncClient, loop: LoopThread) -> None:
         self.path = client.path
         self._client = client
         self._loop = loop
@@ -58,7 +56,7 @@ class Client(Calls):
         Raises Unreachable if no daemon answers, one of another major version, or a process that is
         not to be believed.
         """
-        loop = _LoopThread()
+        loop = LoopThread("API")
         try:
             client = loop.run(AsyncClient.connect(path, name=name, timeout=timeout))
         except BaseException:
@@ -115,47 +113,3 @@ class Client(Calls):
 for _name in METHODS:
     if not hasattr(Client, _name):
         setattr(Client, _name, _blocking(getattr(AsyncClient, _name)))
-
-
-class _LoopThread:
-    """An event loop in a daemon thread, until `close` or until nothing refers to it."""
-
-    def __init__(self) -> None:
-        self._loop = asyncio.new_event_loop()
-        finished = asyncio.Event()
-        thread = threading.Thread(
-            target=_run_until, args=[self._loop, finished], name="API", daemon=True
-        )
-        thread.start()
-        self._end = weakref.finalize(self, _end, self._loop, finished, thread)
-
-    @property
-    def is_open(self) -> bool:
-        """Whether it still runs."""
-        return self._end.alive
-
-    def run(self, work: Coroutine[Any, Any, _T]) -> _T:
-        """Run a coroutine; cancel it if waiting is interrupted."""
-        future = asyncio.run_coroutine_threadsafe(work, self._loop)
-        try:
-            return future.result()
-        except BaseException:
-            future.cancel()
-            raise
-
-    def close(self) -> None:
-        """End the thread."""
-        self._end()
-
-
-def _run_until(loop: asyncio.AbstractEventLoop, finished: asyncio.Event) -> None:
-    with asyncio.Runner(loop_factory=lambda: loop) as runner:
-        runner.run(finished.wait())
-
-
-def _end(
-    loop: asyncio.AbstractEventLoop, finished: asyncio.Event, thread: threading.Thread
-) -> None:
-    loop.call_soon_threadsafe(finished.set)
-    if thread is not threading.current_thread():
-        thread.join()

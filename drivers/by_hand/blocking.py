@@ -9,11 +9,10 @@ falls silent.
 """
 
 import asyncio
-import threading
-from collections.abc import Coroutine, Sequence
+from collections.abc import Sequence
 from contextlib import AsyncExitStack
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any
 
 from drivers.by_hand.reaching import (
     capability_rows,
@@ -33,11 +32,10 @@ from drivers.host.stop import Stopped
 from drivers.host.timing import HEARTBEAT
 from drivers.protocol.sets import token_after
 from drivers.protocol.table import ENABLED
+from drivers.threads import LoopThread
 from registry.limits import GuardLimits
 
 _RAMP = 0.02  # s; long enough that neither start nor end of a vibration clicks
-
-_T = TypeVar("_T")
 
 
 class BlockingAmplifier:
@@ -51,11 +49,11 @@ class BlockingAmplifier:
         self._reached = reached(url, limits=limits, is_output=is_output)
         self._opened = AsyncExitStack()
         self._token = 1
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name=f"amplifier {url}")
+        self._name = f"amplifier {url}"
 
     def __enter__(self) -> "BlockingAmplifier":
-        self._thread.start()
+        self._loop = LoopThread(self._name)
+        self._wait = self._loop.run  # interrupted, it cancels: nothing feeds the watchdog further
         try:
             self._amplifier = self._wait(self._opened.enter_async_context(self._reached))
             self._wait(self._amplifier.open())
@@ -163,20 +161,10 @@ class BlockingAmplifier:
         finally:
             measuring.cancel()
 
-    def _wait(self, work: Coroutine[Any, Any, _T]) -> _T:
-        future = asyncio.run_coroutine_threadsafe(work, self._loop)
-        try:
-            return future.result()
-        except BaseException:  # also KeyboardInterrupt: nothing goes on feeding the watchdog
-            future.cancel()
-            raise
-
     def _end(self) -> None:
         try:
             self._wait(self._opened.aclose())
         finally:
-            self._loop.call_soon_threadsafe(self._loop.stop)
-            self._thread.join()
             self._loop.close()
 
 

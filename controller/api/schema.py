@@ -5,6 +5,8 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from controller.learning.learning_status import LearningState
+
 API_VERSION = "1.0"
 """major.minor: major versions are incompatible; a higher minor version only adds."""
 
@@ -50,18 +52,6 @@ def headline(state: DaemonStateName, cause: str) -> str:
     word = STATE_WORDS[state]
     return cause if cause.startswith(word) else f"{word}: {cause}"
 
-
-LearningStateName: TypeAlias = Literal[
-    "off",
-    "starting",
-    "following",
-    "explaining",
-    "changed",
-    "only_alarms",
-    "restarting",
-    "failed",
-]
-"""What happens to what settled patterns show of the plate."""
 
 Topic: TypeAlias = Literal[
     "state",
@@ -306,7 +296,7 @@ class LatencySummary(Message):
 class PlateEvent(Explained):
     """What is known of the plate has changed, or whether it is followed."""
 
-    state: LearningStateName
+    state: LearningState
     robust: bool = Field(
         description="whether answers are those of a plate that is not known: it has changed in an "
         "unknown way, or there was no estimator for a minute"

@@ -332,7 +332,7 @@ def learning_summary(
 def plate_event(status: LearningStatus) -> PlateEvent:
     """The event of topic `plate`."""
     return PlateEvent(
-        state=status.state.value,
+        state=status.state,
         cause=status.cause,
         remedy=status.remedy,
         robust=status.are_robust,

@@ -1,7 +1,7 @@
 """A surface layout: which regions of the plate have which effects."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +15,9 @@ from model.finger.perception import STRONG_DB_SL
 
 BUZZ = "buzz"
 """Name of the effect that plays without a layout."""
+
+ELSEWHERE = "elsewhere"
+"""Key of the effect outside of all regions, and what reports call the plate there."""
 
 
 def default_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, Effect]:
@@ -39,15 +42,22 @@ class SurfaceLayout:
             (region for region in reversed(self.regions) if region.shape.contains(x, y)), None
         )
 
+    def uses(self) -> Iterator[tuple[Region | None, str, str]]:
+        """Yield every effect of every region: the region, None outside of all, key and name."""
+        for region in self.regions:
+            for on in ("on_press", "on_move", "on_release"):
+                if (name := getattr(region, on)) is not None:
+                    yield region, on, name
+        if self.elsewhere is not None:
+            yield None, ELSEWHERE, self.elsewhere
+
     @property
     def max_db_sl(self) -> float:
         """The highest level of all effects; infinite for what the neighbours allow."""
         levels = [effect.max_db_sl(effect.level_db_sl) for effect in self.effects.values()]
         levels += [
             self.effects[name].max_db_sl(self.level_of(name, region))
-            for region in self.regions
-            for name in (region.on_press, region.on_move, region.on_release)
-            if name is not None
+            for region, _, name in self.uses()
         ]
         return max(levels, default=-math.inf)
 
@@ -67,18 +77,13 @@ class SurfaceLayout:
 
     def band_problems(self, frequencies: FloatArray) -> list[str]:
         """Return what a table of frequencies [Hz] plays instead of bands that it lacks."""
-        uses = [
-            (region.name, self.band_of(name, region))
-            for region in self.regions
-            for name in (region.on_press, region.on_move, region.on_release)
-            if name is not None
-        ]
-        if self.elsewhere is not None:
-            uses.append(("elsewhere", self.band_of(self.elsewhere, None)))
         problems = [
-            (where, band_problem(band, frequencies)) for where, band in uses if band is not None
+            f"{ELSEWHERE if region is None else region.name}: {problem}"
+            for region, _, name in self.uses()
+            if (band := self.band_of(name, region)) is not None
+            and (problem := band_problem(band, frequencies)) is not None
         ]
-        return [*dict.fromkeys(f"{where}: {problem}" for where, problem in problems if problem)]
+        return [*dict.fromkeys(problems)]
 
     def as_json(self) -> dict[str, Any]:
         """Return it as the API describes it."""

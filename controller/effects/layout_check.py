@@ -8,16 +8,13 @@ from typing import Any
 import numpy as np
 
 from controller.effects.band import band_problem
-from controller.effects.layout import SurfaceLayout
+from controller.effects.layout import ELSEWHERE, SurfaceLayout
 from controller.effects.region import Region
 from controller.effects.representative import strongest_target
 from controller.effects.simulated_touch import Position, SimulatedTouch, TouchSimulator
 from controller.loop.intent import Target
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
-
-ELSEWHERE = "elsewhere"
-"""Name of the plate outside of all regions in a report."""
 
 LEVEL_TOLERANCE, MARGIN_TOLERANCE = 2.0, 4.0
 """How far [dB] a level may be off, and above where it is promised on nine of ten plates."""
@@ -113,7 +110,7 @@ def check_layout(
     progress: called with the number of effects checked, and of all.
     """
     simulator = TouchSimulator(table)
-    parts = [*_parts(layout)]
+    parts = [*layout.uses()]
     checked = []
     count = max(1, min(MAX_TOUCHES, MAX_POSITIONS // max(1, len(parts))))
     for number, (region, on, name) in enumerate(parts):
@@ -121,17 +118,6 @@ def check_layout(
         checked.append(_check(layout, region, on, name, table, simulator, count))
     progress(len(parts), len(parts))
     return checked
-
-
-def _parts(layout: SurfaceLayout) -> Iterator[tuple[Region | None, str, str]]:
-    """Every effect of every region: the region, None outside of all, key and name."""
-    for region in layout.regions:
-        for on in ("on_press", "on_move", "on_release"):
-            name = getattr(region, on)
-            if name is not None:
-                yield region, on, name
-    if layout.elsewhere is not None:
-        yield None, ELSEWHERE, layout.elsewhere
 
 
 def _check(

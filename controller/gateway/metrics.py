@@ -18,9 +18,9 @@ from controller.api.schema import (
     AmplifierStatus,
     DaemonStateName,
     LatencySummary,
-    LearningStateName,
     LearningSummary,
 )
+from controller.learning.learning_status import LearningState
 
 _LINK_COUNTS = {
     "frames_out": "Frames sent to an amplifier.",
@@ -116,7 +116,7 @@ def _learning(learning: LearningSummary) -> Iterator[Metric]:
     yield _one_of(
         "era_learning_state",
         "1 for what happens to measured patterns.",
-        get_args(LearningStateName),
+        get_args(LearningState),
         learning.state,
     )
     yield _gauge(

@@ -20,7 +20,7 @@ from controller.learning.estimator_process import (
     EstimatorProcess,
     EstimatorTimeouts,
 )
-from controller.learning.learning_status import LearningState, LearningStatus
+from controller.learning.learning_status import BAD, LearningState, LearningStatus
 from controller.learning.messages import Answers, Estimate, Note, Ready, Refreshed, Start
 from controller.learning.settled_readings import SettledReadings
 from controller.loop.loop import Controller
@@ -43,7 +43,7 @@ _CHANGED_REMEDY = (
     "look for a loose mount, a crack or something on the plate; then identify it (era rig identify)"
     ", or discard what was learned (era forget)"
 )
-_UNUSUAL = (LearningState.CHANGED, LearningState.EXPLAINING, LearningState.FAILED)
+_UNUSUAL = ("changed", "explaining", "failed")
 _FAILED_REMEDY = "see the log above; era forget starts anew"
 
 _logger = logging.getLogger(__name__)
@@ -120,7 +120,7 @@ class Learning:
         Raises CommandError where nothing is learned, and where the file cannot be removed: then
         what was learned is still followed.
         """
-        if self.status.state is LearningState.OFF:
+        if self.status.state == "off":
             raise CommandError(f"nothing is learned of the plate: {self.status.cause}")
         await self._end("opening", "estimator", "readings", "shaping")
         self._estimator, self._readings, self._robust = None, None, None
@@ -152,11 +152,11 @@ class Learning:
                 check_common_start(self._controller.amplifiers)
                 found = await plate_sensors(self._rig, self._controller.amplifiers)
             except CommandError as error:
-                self._say(LearningState.OFF, str(error))
+                self._say("off", str(error))
                 return
             except DriverError as error:
                 self._say(
-                    LearningState.OFF,
+                    "off",
                     f"sensors not read: {error}; asking again every {_PAUSE:g} s",
                     "check the link and the supply of the amplifiers",
                 )
@@ -167,7 +167,7 @@ class Learning:
                 return
 
     def _start(self, sensors: Sequence[PlateSensor]) -> None:
-        self._say(LearningState.STARTING, "the estimator is starting")
+        self._say("starting", "the estimator is starting")
         start = Start(
             self._rig,
             replace(self._base),  # without what is prepared in it
@@ -206,7 +206,7 @@ class Learning:
         if "readings" not in self._tasks:
             self._spawn("readings", self._read(ready.settling))
         if ready.change:
-            self._say(LearningState.CHANGED, ready.change, _CHANGED_REMEDY)
+            self._say("changed", ready.change, _CHANGED_REMEDY)
         else:
             known = "what was learned before" if ready.answers else "the rig as built"
             self._say_followed(f"the plate is followed from {known} on")
@@ -215,12 +215,12 @@ class Learning:
         """Say that the plate is as known, or only watched."""
         if self._only_alarms:
             self._say(
-                LearningState.ONLY_ALARMS,
+                "only_alarms",
                 f"answers stay as built: {self._only_alarms}",
                 "identify the plate (era rig identify)",
             )
         else:
-            self._say(LearningState.FOLLOWING, cause)
+            self._say("following", cause)
 
     def _hand(self, pattern: SettledPattern) -> None:
         is_taken = self._estimator is not None and self._estimator.hand(pattern)
@@ -238,14 +238,14 @@ class Learning:
             self._correct(estimate.answers, are_robust=bool(estimate.change))
             self._estimated(clock.now() - estimate.time)
         if estimate.change:
-            if estimate.explanation or self.status.state is not LearningState.CHANGED:
-                self._say(LearningState.CHANGED, estimate.change, _CHANGED_REMEDY)
+            if estimate.explanation or self.status.state != "changed":
+                self._say("changed", estimate.change, _CHANGED_REMEDY)
         elif estimate.explanation:
-            self._say(LearningState.FOLLOWING, f"the plate has changed: {estimate.explanation}")
+            self._say("following", f"the plate has changed: {estimate.explanation}")
         elif estimate.is_held:
-            if self.status.state is not LearningState.EXPLAINING:
+            if self.status.state != "explaining":
                 cause = "the plate is not as known; the next patterns tell what has changed"
-                self._say(LearningState.EXPLAINING, cause)
+                self._say("explaining", cause)
         elif estimate.alarm:
             cause = f"the plate is not as the rig says (alarm {self.status.alarms})"
             self._say(self.status.state, cause, self.status.remedy, is_alarm=True)
@@ -274,10 +274,10 @@ class Learning:
         self._note_lost(waiting=0 if self._estimator is None else self._estimator.waiting)
         self._await_outage()
         if is_final:
-            self._say(LearningState.FAILED, f"estimator: {reason}", _FAILED_REMEDY)
+            self._say("failed", f"estimator: {reason}", _FAILED_REMEDY)
         else:
             self._count(restarts=1)
-            self._say(LearningState.RESTARTING, f"estimator: {reason}; retrying")
+            self._say("restarting", f"estimator: {reason}; retrying")
 
     def _await_outage(self) -> None:
         """Answer robustly after a while, unless the plate is watched again by then."""
@@ -308,8 +308,8 @@ class Learning:
     ) -> None:
         """Note a state, and tell of it."""
         self.status = replace(self.status, state=state, cause=cause, remedy=remedy)
-        level = logging.WARNING if state.is_bad or is_alarm else logging.INFO
-        _logger.log(level, "plate: %s: %s", state.value, cause, extra={"topic": "plate"})
+        level = logging.WARNING if state in BAD or is_alarm else logging.INFO
+        _logger.log(level, "plate: %s: %s", state, cause, extra={"topic": "plate"})
         self._changed(self.status)
 
     def _count(self, **counts: int) -> None:
@@ -331,7 +331,7 @@ class Learning:
             await work
         except Exception as error:
             _logger.exception("plate: %s failed", name)
-            self._say(LearningState.FAILED, failure_text(error), _FAILED_REMEDY)
+            self._say("failed", failure_text(error), _FAILED_REMEDY)
 
     async def _read(self, settling: float) -> None:
         """Read what settles; what fails is said, and started anew."""
@@ -350,7 +350,7 @@ class Learning:
                 _logger.exception("plate: readings failed")
                 self._readings = None
                 self._say(
-                    LearningState.FAILED,
+                    "failed",
                     f"readings: {failure_text(error)}; retrying every {_PAUSE:g} s",
                     _FAILED_REMEDY,
                 )

@@ -1,25 +1,22 @@
 """What is known of a plate that is learned, for status, events and metrics."""
 
 from dataclasses import dataclass
-from enum import Enum
+from typing import Literal, TypeAlias
 
+LearningState: TypeAlias = Literal[
+    "off",
+    "starting",
+    "following",
+    "explaining",
+    "changed",
+    "only_alarms",
+    "restarting",
+    "failed",
+]
+"""What happens to what settled patterns show of the plate."""
 
-class LearningState(Enum):
-    """What happens to what is measured; the values are those of the API."""
-
-    OFF = "off"
-    STARTING = "starting"
-    FOLLOWING = "following"
-    EXPLAINING = "explaining"
-    CHANGED = "changed"
-    ONLY_ALARMS = "only_alarms"
-    RESTARTING = "restarting"
-    FAILED = "failed"
-
-    @property
-    def is_bad(self) -> bool:
-        """Whether somebody should look after the plate or the estimator."""
-        return self in (LearningState.CHANGED, LearningState.RESTARTING, LearningState.FAILED)
+BAD: tuple[LearningState, ...] = ("changed", "restarting", "failed")
+"""States in which somebody should look after the plate or the estimator."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +30,7 @@ class LearningStatus:
     the last estimate, None before the first.
     """
 
-    state: LearningState = LearningState.OFF
+    state: LearningState = "off"
     cause: str = "amplifiers not asked for their sensors yet"
     remedy: str | None = None
     readings: int = 0

@@ -11,14 +11,14 @@ import re
 import sys
 import zipfile
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, entry_points, requires, version
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from packaging.requirements import Requirement
-from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
 
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
@@ -188,7 +188,7 @@ def shown(text: str, *, home: Path, is_dump: bool = False) -> str:
 
     home: the folder that is replaced by ~; is_dump: of messages on a link.
     """
-    keys = (_keys_of_dumps() if is_dump else _keys(*_OF_FILES)) - _PRIVATE
+    keys = (_keys_of_dumps() if is_dump else _keys_of_files()) - _PRIVATE
 
     def entry(found: re.Match[str]) -> str:
         key, separator, value = found.groups()
@@ -223,19 +223,8 @@ def _fields_of(record: Record) -> set[str]:
 
 
 @cache
-def _keys(*models: Any) -> frozenset[str]:
-    """Every key of these models at any depth, and of URLs."""
-    found, pending, seen = {*_OTHERS}, [*models], set[int]()
-    while pending:
-        each = pending.pop()
-        if id(each) in seen:
-            continue
-        seen.add(id(each))
-        pending += get_args(each)
-        if is_dataclass(each):
-            found.update(field.name for field in fields(each))
-        elif isinstance(each, type) and issubclass(each, BaseModel):
-            for name, field in each.model_fields.items():
-                found.add(field.alias or name)
-                pending.append(field.annotation)
-    return frozenset(found)
+def _keys_of_files() -> frozenset[str]:
+    """Every key of the files and of the status at any depth, and of URLs."""
+    _, schema = models_json_schema([(each, "validation") for each in _OF_FILES])
+    known = (each.get("properties", ()) for each in schema["$defs"].values())
+    return frozenset(_OTHERS).union(*known)

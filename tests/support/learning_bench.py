@@ -22,7 +22,6 @@ from controller.daemon.daemon import Daemon
 from controller.demo.touch_row import FingerVibration, steady_contrast_db
 from controller.learning.estimator_process import EstimatorTimeouts
 from controller.learning.learning import Learning
-from controller.learning.learning_status import LearningState
 from daemon_bench import daemon_at, far_end, ready
 from drivers import clock
 from model.rig.rig import Rig
@@ -71,7 +70,7 @@ class LearningBench:
         if learning is None or learning.estimator_pid is None or not self.stands:
             return False
         status = learning.status
-        is_starting = status.state in (LearningState.STARTING, LearningState.RESTARTING)
+        is_starting = status.state in ("starting", "restarting")
         return is_starting or status.estimates + status.discarded < status.readings
 
     async def learning(self) -> LearningSummary:

@@ -12,7 +12,8 @@ from controller.daemon.api_service import ApiService
 from controller.daemon.api_views import amplifier_statuses
 from controller.daemon.children import gateway_options, keep_gateway, read_in_child
 from controller.daemon.config import DaemonConfig, changed_keys, reload_problem
-from controller.daemon.log import FaultDumps, LogThread
+from controller.daemon.dumps import FaultDumps
+from controller.daemon.log import LogThread
 from controller.daemon.publisher import EventPublisher
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.socket_lock import SocketLock

@@ -25,7 +25,7 @@ from controller.api.jsonrpc import RpcError
 from controller.api.methods import StatusResult
 from controller.daemon.config import is_daemon_document
 from controller.daemon.config_sections import DaemonSection
-from controller.daemon.log import DUMP_PATTERN
+from controller.daemon.dumps import DUMP_PATTERN
 from controller.effects.layout_file import LayoutSection
 from drivers.errors import LinkError
 from drivers.protocol.records import Record, Rows

@@ -14,16 +14,14 @@ from pathlib import Path
 
 import pytest
 
-from controller.daemon.log import (
+from controller.daemon.dumps import (
     DUMP_PATTERN,
     MAX_DUMPS,
     FaultDumps,
-    JsonFormatter,
-    LogThread,
     MessageRecord,
-    RateLimitFilter,
     write_dump,
 )
+from controller.daemon.log import JsonFormatter, LogThread, RateLimitFilter
 from controller.daemon.publisher import LatencyStatistics
 from controller.daemon.service_manager import ServiceManager
 from controller.daemon.states import DaemonState, Operation
@@ -303,7 +301,7 @@ def test_dumps_use_one_thread_when_disk_hangs(
 
     dumps = FaultDumps(tmp_path)
     with monkeypatch.context() as patched, caplog.at_level(logging.WARNING):
-        patched.setattr("controller.daemon.log.write_dump", hang)
+        patched.setattr("controller.daemon.dumps.write_dump", hang)
         for now[0] in (0.0, 10.0, 20.0):
             dumps.state_changed(Operation(), FAULT)
         assert hangs.wait(20)

@@ -68,9 +68,8 @@ class StatusResult(Playing, Explained):
     lost_for_s: float | None = Field(
         description="how long a link has been lost; null if all are up"
     )
-    watchdog_s: float | None = Field(
-        description="time without heartbeats after which an armed amplifier silences itself; null "
-        "if one has no watchdog"
+    watchdog_s: float = Field(
+        description="time without heartbeats after which an armed amplifier silences itself"
     )
     armed_by: str | None
     lease_left_s: float | None

@@ -56,11 +56,7 @@ def _loss(status: StatusResult) -> str | None:
     """What is to be assumed of amplifiers that are lost, if any are."""
     if status.lost_for_s is None:
         return None
-    watchdog = (
-        "one without a watchdog plays on until it is switched off"
-        if status.watchdog_s is None
-        else f"its watchdog silences it after {status.watchdog_s:g} s without heartbeats"
-    )
+    watchdog = f"its watchdog silences it after {status.watchdog_s:g} s without heartbeats"
     if status.assume_energised:
         return f"ASSUME ENERGISED: a lost amplifier may still be playing; {watchdog}"
     return f"unreachable for {status.lost_for_s:.1f} s: {watchdog}, unconfirmed"

@@ -58,6 +58,7 @@ class SurfaceLayout:
         levels += [
             self.effects[name].max_db_sl(self.level_of(name, region))
             for region, _, name in self.uses()
+            if region is not None
         ]
         return max(levels, default=-math.inf)
 

@@ -13,7 +13,6 @@ import math
 import os
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from urllib.parse import parse_qsl
 
 from controller.sources.slots import (
@@ -56,20 +55,14 @@ def eviocgmtslots(size: int) -> int:
 GRAB = _request(_WRITE, 0x90, _INT.size)  # EVIOCGRAB: exclusive access
 
 
-@dataclass(frozen=True)
-class InputEvent:
-    """One event: its type (EV_...), code and value."""
+def parse_events(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield type (EV_...), code and value of the complete events in data read from a device.
 
-    kind: int
-    code: int
-    value: int
-
-
-def parse_events(data: bytes) -> Iterator[InputEvent]:
-    """Yield the complete events in data read from a device; the kernel never splits one."""
+    The kernel never splits one.
+    """
     whole = len(data) // _EVENT.size * _EVENT.size
     for _, _, kind, code, value in _EVENT.iter_unpack(data[:whole]):
-        yield InputEvent(kind, code, value)
+        yield kind, code, value
 
 
 class InputDevice:
@@ -123,7 +116,7 @@ class InputDevice:
         states = zip(*map(self._slot_values, SLOT_AXES), strict=True)
         return {slot: SlotState(*state) for slot, state in enumerate(states)}
 
-    def read(self) -> list[InputEvent]:
+    def read(self) -> list[tuple[int, int, int]]:
         """Return the pending events; raises OSError if the device is unplugged."""
         try:
             data = os.read(self._descriptor, _EVENT.size * _EVENTS_AT_ONCE)
@@ -253,7 +246,7 @@ class EvdevSource(TouchSource):
                     continue
                 readable.clear()
                 for event in panel.read():
-                    report = reader.feed(event.kind, event.code, event.value)
+                    report = reader.feed(*event)
                     if report is None:
                         continue
                     if report.is_partial:

@@ -92,7 +92,7 @@ function showBanner() {
   } else if (state === "COMM_LOST") {
     reason = "link-lost";
     text = `The link to an amplifier is lost${since}. It may still be energised`;
-    text += watchdog === null ? "; one without a watchdog plays on until it is switched off." : watchdog ? `; its watchdog silences it after ${watchdog}\u00a0s, unconfirmed.` : ".";
+    text += watchdog ? `; its watchdog silences it after ${watchdog}\u00a0s, unconfirmed.` : ".";
   } else if (daemon?.rig.simulated) {
     reason = "simulated";
     text = "Simulated amplifiers: nothing vibrates.";

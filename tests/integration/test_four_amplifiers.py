@@ -112,7 +112,7 @@ async def test_loss_of_one_of_four_silences_all(arranged: str, lost: str) -> Non
         touch(four)
         await four.hold(0.3)
         assert all(level > 0 for each in four.levels().values() for level in each)
-        four.disturb()
+        four.witness.disturb()
         four.far.devices[lost].inject_fault(FaultWindow("hang"))
         holding = asyncio.create_task(four.hold(0.6))
         await asyncio.sleep(OWN)

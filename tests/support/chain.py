@@ -21,9 +21,8 @@ from newest_contact import BuzzNewestContact
 from rig_on_wire import FarSide, far_side
 from sim.far_ends.wires import Wire
 from sim.plant.imperfections import Imperfections
-from sim.witness.witness import OperatorCommand, Witness
-from virtual_loop import VirtualLoop
-from witness_config import witness_config
+from sim.witness.witness import OperatorCommand
+from witness_config import LoopWitness
 
 Position = tuple[float, float]
 _REPORT = 0.010  # s; between two frames of the panel
@@ -40,7 +39,7 @@ class Chain:
 
     far: FarSide
     operation: MemoryMachine
-    witness: Witness
+    witness: LoopWitness
     controller: Controller
     at: dict[int, Position] = field(default_factory=dict)
     is_felt: bool = True
@@ -68,20 +67,12 @@ class Chain:
         plate: the rig of the far side, if it is another; judged: by what the witness judges, as for
         `witness_config`; layers: of each amplifier; options: as a `Controller` takes them.
         """
-        loop = asyncio.get_running_loop()
-        assert isinstance(loop, VirtualLoop)
         operation = live_in_memory()
         far_end = far_side(wires, plate or rig, seed=1, imperfections=imperfections)
         async with far_end as far:
             for amplifier in far.bench.amplifiers.values():
                 amplifier.capabilities["layers"] = layers
-            witness = Witness(witness_config(far.urls, **(judged or {})))
-            loop.seen = lambda link, toward, data: witness.record_bytes(
-                link,
-                toward,  # type: ignore[arg-type]
-                clock.now(),
-                data,
-            )
+            witness = LoopWitness(far.urls, **(judged or {}))
             controller = Controller(
                 rig,
                 table,
@@ -89,6 +80,7 @@ class Chain:
                 urls=far.urls,
                 **{"intent_source": BuzzNewestContact(), **options},
             )
+            witness.follow(controller)
             chain = cls(far, operation, witness, controller)
             controller.observers.append(
                 Observer(pattern_applied=chain.applied.append, silenced=chain.silenced.append)
@@ -115,8 +107,6 @@ class Chain:
 
     async def open(self) -> None:
         """Open all wires, and start the control loop."""
-        for link in self.witness.wires:
-            self.witness.opened(link, clock.now())
         await self.controller.open()
         self.run()
 
@@ -126,7 +116,6 @@ class Chain:
 
     async def operate(self, command: OperatorCommand) -> Any:
         """Carry out an operator's command; returns what the control loop says of it."""
-        self.witness.operator_command(clock.now(), command)
         return await getattr(self.controller, command)()
 
     def report(self) -> None:
@@ -152,17 +141,10 @@ class Chain:
         """Level of each channel now, by amplifier."""
         return {name: self.far.summary(name).levels for name in self.far.devices}
 
-    def disturb(self, *, are_on: bool = True) -> None:
-        """Tell the witness that faults begin or end; one wire's may show on each."""
-        for link in self.witness.wires:
-            self.witness.faults(clock.now(), link, are_on=are_on)
-
     async def close(self) -> None:
         """Disarm and close all, and end the control loop."""
-        self.witness.operator_command(clock.now(), "disarm")
+        self.witness.commanded("disarm")
         await self.controller.close()
-        for link in self.witness.wires:
-            self.witness.closed(link, clock.now())
         if self.running is not None:
             self.running.cancel()
             await asyncio.gather(self.running, return_exceptions=True)

@@ -10,9 +10,9 @@ import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 
@@ -33,10 +33,9 @@ from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from rig_files import write_rig
 from rig_on_wire import WIRES, FarSide, far_side
-from sim.witness.witness import OperatorCommand, Witness
 from small_table import small_table
 from virtual_loop import VirtualLoop
-from witness_config import tell_first, witness_config
+from witness_config import LoopWitness, tell_first
 
 PATIENCE = 180.0  # s; generous, for a loaded machine
 PLACE = (0.1, 0.1)
@@ -171,21 +170,10 @@ async def daemon_at(
         assert witness.frames
 
 
-def judged(daemon: Daemon, far: FarSide) -> Witness:
+def judged(daemon: Daemon, far: FarSide) -> LoopWitness:
     """A witness of a daemon's lines in virtual time, which is told of commands, fingers, faults."""
-    loop = asyncio.get_running_loop()
-    assert isinstance(loop, VirtualLoop)
-    witness = Witness(witness_config(far.urls))
-    loop.seen = lambda link, toward, data: witness.record_bytes(
-        link,
-        toward,  # type: ignore[arg-type]
-        clock.now(),
-        data,
-    )
-    controller, down = daemon._controller, dict[str, list[tuple[str, int]]]()
-    for command in get_args(OperatorCommand):
-        tell = partial(witness.operator_command, command=command)
-        tell_first(controller, command, lambda *_, tell=tell: tell(clock.now()))
+    witness, down = LoopWitness(far.urls), dict[str, list[tuple[str, int]]]()
+    witness.follow(daemon._controller)
 
     def touched(frame: TouchFrame) -> None:
         down[frame.source] = [(frame.source, touch.id) for touch in frame.touches]
@@ -193,15 +181,9 @@ def judged(daemon: Daemon, far: FarSide) -> Witness:
             clock.now(), [one for each in down.values() for one in each], is_answerable=False
         )
 
-    tell_first(controller, "deliver", touched)
-    for link in witness.wires:
-        witness.opened(link, clock.now())
+    tell_first(daemon._controller, "deliver", touched)
     for device in far.devices.values():
-        tell_first(
-            device,
-            "inject_fault",
-            lambda *_: [witness.faults(clock.now(), each, are_on=True) for each in witness.wires],
-        )
+        tell_first(device, "inject_fault", lambda *_: witness.disturb())
     return witness
 
 

@@ -9,11 +9,11 @@ import hashlib
 import logging
 import random
 from collections import Counter
-from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, TextIO, get_args
+from typing import Any, TextIO
 
 from controller.api.jsonrpc import RpcError
 from controller.daemon.states import DaemonEvent, DaemonState, Trigger
@@ -29,12 +29,10 @@ from paper_plate import make_paper_rig
 from rig_on_wire import after_each, far_side, on_two_amplifiers
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.wires import Wire
-from sim.witness.witness import OperatorCommand
 from small_table import small_table
 from soak_judges import Checks, SoakWitness, SourceContacts
 from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual
-from witness_config import tell_first
 
 _RELEASE = 0.020  # s; from the last finger up to zero
 _ON_THE_WIRE = 0.002  # s; through driver, adapter and back
@@ -90,15 +88,9 @@ def run_plan(plan: Plan, *, trace: TextIO | None = None) -> Outcome:
     counts: Counter[str] = Counter(f"on {line.kind}" for line in plan.lines)
     run = _Run(plan, written, counts)
 
-    def seen(link: str, toward: str, data: bytes) -> None:
-        counts["pieces on the wires"] += 1
-        counts["bytes on the wires"] += len(data)
-        run.note("bytes", link, toward, data.hex())
-        run.witness.seen(link, toward, data)
-
     with _errors_of(run):
         try:
-            run_virtual(run.main(), rng=random.Random(plan.seed + 1), seen=seen)
+            run_virtual(run.main(), rng=random.Random(plan.seed + 1))
         except Stuck as problem:
             run.violations.append(str(problem))
     return Outcome(plan.seed, written.digest, run.violations, counts, plan.lasts, plan.busy)
@@ -146,7 +138,6 @@ class _Run:
         async with far_side(wires, self.rig, seed=self.plan.seed) as far:
             self.far = far
             self.witness = SoakWitness(
-                loop,
                 far.urls,
                 self.contacts,
                 channels=1 + max(channel.number for channel in self.rig.wiring.values()),
@@ -154,6 +145,7 @@ class _Run:
                 heartbeat=self._release(_BYTES_BETWEEN_FEEDS)
                 + any(line.kind == "modbus-rtu" for line in lines) * _GAPS_BETWEEN_FEEDS,
             )
+            loop.seen = self._seen
             self.checks = Checks(
                 far.bench, begin=loop.time(), contacts=self.contacts, sense=self.witness.sense
             )
@@ -195,18 +187,16 @@ class _Run:
                 refused=lambda why: self.note("observer refused", why),
             )
         )
-        for command in get_args(OperatorCommand):
-            tell_first(controller, command, partial(self.witness.operator_command, command))
-        tell_first(controller, "open", self.witness.opens)
-        controller.release = partial(self._released, controller.release)  # type: ignore[method-assign]
+        self.witness.follow(controller)
         controller.run = partial(self._run_on, controller.run)  # type: ignore[method-assign]
         self.hosting = asyncio.create_task(supervisor.run(controller))
 
-    async def _released(self, release: Callable[[], Awaitable[None]]) -> None:
-        try:
-            await release()
-        finally:
-            self.witness.closes()
+    def _seen(self, link: str, toward: str, data: bytes) -> None:
+        """Note bytes on a wire."""
+        self.counts["pieces on the wires"] += 1
+        self.counts["bytes on the wires"] += len(data)
+        self.note("bytes", link, toward, data.hex())
+        self.witness.seen(link, toward, data)
 
     def _link_changed(self, change: str, lost: Sequence[str], message: str) -> None:
         self.note("link", change, message)
@@ -369,10 +359,10 @@ class _Run:
             self.turning.clear()
             try:
                 await asyncio.sleep(_ON_THE_WIRE)
-                self.witness.set_stalled(True)
+                self.witness.set_stalled(self.loop.time())
                 await asyncio.sleep(lasts)
             finally:
-                self.witness.set_stalled(False)
+                self.witness.set_stalled(self.loop.time(), False)
                 self.turning.set()
 
     def _applied(self, applied: Applied) -> None:

@@ -17,9 +17,8 @@ from drivers.protocol.table import MESSAGES, STATES
 from sim.amplifier.contract import Amplifier
 from sim.bench.bench import Bench
 from sim.faults.fault_window import FaultWindow
-from sim.witness.witness import OperatorCommand, Witness
-from virtual_loop import START, VirtualLoop
-from witness_config import sense, witness_config
+from virtual_loop import START
+from witness_config import LoopWitness, sense
 
 CONTACT_TIMEOUT = 0.150  # s; a source without news for so long has lost its fingers
 _GLIMPSE = 0.005  # s; a finger that is gone sooner may have come and gone between two cycles,
@@ -79,16 +78,16 @@ _RAMP = 0.040  # s; along which what plays may fall silent after the last lift
 _ENDED = 1e-6  # s; after a lease has ended
 
 
-class SoakWitness:
+class SoakWitness(LoopWitness):
     """A witness on all wires of a run, by amplifiers' URLs; channels: how many each has.
 
+    It hears only what a host hears that has the wires open.
     release [s]: from the last lift to the command of silence, on the slowest wire of them;
     heartbeat [s]: that a sign of life may be late by.
     """
 
     def __init__(
         self,
-        loop: VirtualLoop,
         urls: Mapping[str, str],
         contacts: SourceContacts,
         *,
@@ -103,81 +102,60 @@ class SoakWitness:
             "stop": release,
             "heartbeat": _HEARTBEAT + heartbeat,
         }
-        self._loop = loop
-        self._witness = Witness(witness_config(urls, channels=channels, times_s=times))
-        self._open: set[str] = set()
+        super().__init__(urls, channels=channels, times_s=times)
         self._contacts = contacts
         self._active_faults = 0
-        self._witness.contacts(loop.time(), ())
+        self.contacts(self.loop.time(), ())
         self.closes()
 
     def seen(self, link: str, toward: str, data: bytes) -> None:
-        """Pass bytes on, unless no host has the link open."""
-        if link in self._open:
-            self._witness.record_bytes(link, toward, self._loop.time(), data)  # type: ignore[arg-type]
+        """Hear bytes, unless no host has the link open."""
+        if self._is_open:
+            super().seen(link, toward, data)
 
     def opens(self) -> None:
         """A host is about to open all wires."""
-        for link in self._witness.wires:
-            self._open.add(link)
-            self._witness.opened(link, self._loop.time())
+        self._is_open = True
+        super().opens()
 
     def closes(self) -> None:
         """The host has closed all, or died."""
-        for link in self._witness.wires:
-            self._open.discard(link)
-            self._witness.closed(link, self._loop.time())
-
-    def operator_command(self, what: OperatorCommand) -> None:
-        """An operator wants this."""
-        self._witness.operator_command(self._loop.time(), what)
-
-    def set_stalled(self, is_stalled: bool) -> None:
-        """The control loop stands still from now on, or goes on."""
-        self._witness.set_stalled(self._loop.time(), is_stalled)
+        self._is_open = False
+        super().closes()
 
     def touched(self, *, must_be_felt: bool) -> None:
         """Show the contacts, of which a source has sent a frame."""
-        now = self._loop.time()
-        self._witness.contacts(now, self._contacts.at(now), is_answerable=must_be_felt)
+        now = self.loop.time()
+        self.contacts(now, self._contacts.at(now), is_answerable=must_be_felt)
         if (end := self._contacts.next_end(now)) < math.inf:
-            self._loop.call_at(end + _ENDED, self._expire_contacts)
+            self.loop.call_at(end + _ENDED, self._expire_contacts)
 
     def inject_fault(self, window: FaultWindow) -> None:
         """A fault begins. What it does to one wire, a controller of all may show on each."""
         self._active_faults += 1
-        self._report_disturbance()
+        self.disturb()
         lasts = window.lasts + (window.delay if window.fault == "delay" else 0.0)
-        self._loop.call_later(lasts, self._over)
+        self.loop.call_later(lasts, self._over)
 
     def sense(self, name: str, amplifier: Amplifier) -> None:
         """Show what an amplifier plays now."""
-        sense(self._witness, self._loop.time(), name, amplifier)
+        sense(self, self.loop.time(), name, amplifier)
 
     def found(self) -> Sequence[str]:
         """What it has found until now, with the frames around it."""
         return [
             f"{one.time_s - START:.6f} {one.wire} {one.invariant}: {one.sentence}"
             + "".join(f"\n        {frame}" for frame in one.frames)
-            for one in self._witness.finish(self._loop.time())
+            for one in self.finish(self.loop.time())
         ]
 
-    @property
-    def frames(self) -> int:
-        """How many it has seen."""
-        return self._witness.frames
-
     def _expire_contacts(self) -> None:
-        now = self._loop.time()
-        self._witness.contacts(now, self._contacts.at(now))
+        now = self.loop.time()
+        self.contacts(now, self._contacts.at(now))
 
     def _over(self) -> None:
         self._active_faults -= 1
-        self._report_disturbance()
-
-    def _report_disturbance(self) -> None:
-        for link in self._witness.wires:
-            self._witness.faults(self._loop.time(), link, are_on=self._active_faults > 0)
+        self.disturb(are_on=self._active_faults > 0)
 
 
 AUDIBLE = 1e-3  # of full stroke; below it a ramp counts as ended

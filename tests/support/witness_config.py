@@ -1,11 +1,16 @@
-"""Configure a witness by the URLs of amplifiers, and show it what they play."""
+"""A witness of amplifiers by their URLs, and of a control loop in virtual time."""
 
-from collections.abc import Callable, Mapping
-from typing import Any
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
+from typing import Any, get_args
 
+from controller.loop.loop import Controller
+from drivers import clock
 from sim.amplifier.contract import Amplifier
-from sim.witness.witness import Witness
+from sim.witness.witness import OperatorCommand, Witness
 from sim.witness_relay import parse_endpoint
+from virtual_loop import VirtualLoop
 
 
 def witness_config(
@@ -43,6 +48,56 @@ def sense(witness: Witness, now: float, name: str, amplifier: Amplifier) -> None
         if tone.transition.last
     }
     witness.levels(now, name, levels, frequencies=frequencies)
+
+
+class LoopWitness(Witness):
+    """A witness of all wires of a control loop, in virtual time, by the URLs of its amplifiers.
+
+    judged: by what it judges, as for `witness_config`.
+    """
+
+    def __init__(self, urls: Mapping[str, str], **judged: Any) -> None:
+        super().__init__(witness_config(urls, **judged))
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualLoop)
+        self.loop = loop
+        loop.seen = self.seen
+
+    def seen(self, link: str, toward: str, data: bytes) -> None:
+        """Hear bytes."""
+        self.record_bytes(link, toward, clock.now(), data)  # type: ignore[arg-type]
+
+    def follow(self, controller: Controller) -> None:
+        """Hear of each command, opening and closing of a control loop."""
+        for command in get_args(OperatorCommand):
+            tell_first(controller, command, partial(self.commanded, command))
+        tell_first(controller, "open", self.opens)
+        controller.release = partial(self._released, controller.release)  # type: ignore[method-assign]
+
+    def commanded(self, command: OperatorCommand) -> None:
+        """An operator's command is about to be carried out."""
+        self.operator_command(clock.now(), command)
+
+    def opens(self) -> None:
+        """A host is about to open all wires."""
+        for link in self.wires:
+            self.opened(link, clock.now())
+
+    def closes(self) -> None:
+        """The host has closed all, or died."""
+        for link in self.wires:
+            self.closed(link, clock.now())
+
+    async def _released(self, release: Callable[[], Awaitable[None]]) -> None:
+        try:
+            await release()
+        finally:
+            self.closes()
+
+    def disturb(self, *, are_on: bool = True) -> None:
+        """Faults begin or end; one wire's may show on each."""
+        for link in self.wires:
+            self.faults(clock.now(), link, are_on=are_on)
 
 
 def tell_first(owner: Any, method: str, tell: Callable[..., object]) -> None:

@@ -23,7 +23,6 @@ from drivers.garbage_collection import no_long_collections
 from drivers.host.amplifier import Amplifier
 from drivers.host.timing import HEARTBEAT, loss_detection_time
 from long_form import shortly
-from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from rig_on_wire import WIRES, HostedRig, rig_on_wire
 from sim.far_ends.wires import Wire
@@ -49,12 +48,8 @@ at_every_speed = pytest.mark.parametrize("wire", shortly(ALL_WIRES, SHORT_WIRES)
 
 
 @asynccontextmanager
-async def linked(
-    wire: str, rig: Rig, *, watchdog: float = WATCHDOG, in_memory: bool = True
-) -> AsyncIterator[HostedRig]:
+async def linked(wire: str, rig: Rig, *, watchdog: float = WATCHDOG) -> AsyncIterator[HostedRig]:
     """The paper's amplifier behind a wire, armed and beaten by nobody."""
-    if in_memory:
-        live_in_memory()
     async with rig_on_wire(rig, ALL_WIRES[wire], watchdog=watchdog) as hosted:
         await hosted.group.arm()
         yield hosted
@@ -167,7 +162,7 @@ def in_use() -> tuple[int, int, int]:
 async def test_replugging_leaks_nothing(wire: str, coarse_rig: Rig) -> None:
     """Real ports: unplug, plug in, reopen: descriptors, threads and tasks stay constant."""
     before = (math.inf,) * 3
-    async with linked(wire, coarse_rig, watchdog=2.0, in_memory=False) as hosted:
+    async with linked(wire, coarse_rig, watchdog=2.0) as hosted:
         with no_long_collections():  # of the suite's own objects
             for number in range(10):
                 fault(hosted, "unplug")

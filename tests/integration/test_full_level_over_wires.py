@@ -4,15 +4,13 @@ from dataclasses import replace
 
 import pytest
 
+from chain import Chain
 from controller.diagnosis.tone_player import TonePlayer
-from controller.loop.loop import Controller
 from drivers.errors import LinkError
 from drivers.opening import Lines
 from long_form import shortly
-from memory_machine import live_in_memory
 from model.rig.rig import Rig
-from newest_contact import BuzzNewestContact
-from rig_on_wire import WIRES, far_side
+from rig_on_wire import WIRES
 from set_table import SetTable
 from virtual_loop import in_virtual_time
 
@@ -25,18 +23,11 @@ async def test_motion_and_output_are_not_taken_for_each_other(
     wire: str, of_amplifier: bool, of_rig: bool, coarse_rig: Rig
 ) -> None:
     """An amplifier opens, for touches and for measurements, where its full level is the rig's."""
-    live_in_memory()
     rigs = {False: coarse_rig, True: replace(coarse_rig, outputs=frozenset(coarse_rig.amplifiers))}
     rig = rigs[of_rig]
-    async with far_side(WIRES[wire], rigs[of_amplifier]) as far:
-        controller = Controller(
-            rig,
-            SetTable({}, rig.plate),
-            lines=Lines,
-            intent_source=BuzzNewestContact(),
-            urls=far.urls,
-        )
-        player = TonePlayer(rig, Lines, far.urls)
+    table = SetTable({}, rig.plate)
+    async with Chain.on(WIRES[wire], rig, table, plate=rigs[of_amplifier]) as chain:
+        controller, player = chain.controller, TonePlayer(rig, Lines, chain.far.urls)
         if of_amplifier is of_rig:
             await controller.open()
             await controller.close()

@@ -20,7 +20,6 @@ from drivers.by_hand.reaching import random_session
 from drivers.contents import Layer, Tone
 from drivers.opening import Lines
 from drivers.protocol.table import STATES
-from memory_machine import live_in_memory
 from model.errors import InputError
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
@@ -59,7 +58,6 @@ async def _drive(url: str) -> None:
 @in_virtual_time
 async def test_relay_shows_a_session_to_the_witness(wire: str, coarse_rig: Rig) -> None:
     """A session passes at a limit of 0.5, and breaks a limit of 0.3."""
-    live_in_memory()
     for level, broken in ((0.5, set()), (0.3, {"limits"})):
         async with far_side(WIRES[wire], coarse_rig) as far:
             witness = _witness(far.url, level=level)

@@ -15,7 +15,7 @@ from controller.loop.observer import Applied, Observer, Silenced
 from controller.sources.touch import Touch, TouchFrame
 from drivers import clock
 from drivers.opening import Lines
-from memory_machine import MemoryMachine, live_in_memory
+from memory_machine import MemoryMachine
 from model.rig.rig import Rig
 from newest_contact import BuzzNewestContact
 from rig_on_wire import FarSide, far_side
@@ -67,7 +67,6 @@ class Chain:
         plate: the rig of the far side, if it is another; judged: by what the witness judges, as for
         `witness_config`; layers: of each amplifier; options: as a `Controller` takes them.
         """
-        operation = live_in_memory()
         far_end = far_side(wires, plate or rig, seed=1, imperfections=imperfections)
         async with far_end as far:
             for amplifier in far.bench.amplifiers.values():
@@ -81,7 +80,8 @@ class Chain:
                 **{"intent_source": BuzzNewestContact(), **options},
             )
             witness.follow(controller)
-            chain = cls(far, operation, witness, controller)
+            assert far.machine is not None
+            chain = cls(far, far.machine, witness, controller)
             controller.observers.append(
                 Observer(pattern_applied=chain.applied.append, silenced=chain.silenced.append)
             )

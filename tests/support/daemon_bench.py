@@ -27,7 +27,6 @@ from controller.daemon.socket_lock import SocketLock
 from controller.sources.touch import TouchFrame
 from drivers import clock
 from drivers.host.amplifier import WATCHDOG
-from memory_machine import live_in_memory
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
@@ -111,8 +110,6 @@ async def far_end(
 ) -> AsyncIterator[FarSide]:
     """The example's amplifier on a serial line; changes: replacements in the rig's text."""
     rig = load_rig(write_rig(folder / "bench.yaml", *changes))
-    if isinstance(asyncio.get_running_loop(), VirtualLoop):
-        live_in_memory()
     async with far_side(WIRES["serial"], rig) as far:
         yield far
 

@@ -14,6 +14,7 @@ from drivers.host.amplifier import WATCHDOG
 from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.protocol.records import Values
+from memory_machine import MemoryMachine, live_in_memory
 from model.rig.rig import Channel, Rig
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
@@ -23,15 +24,20 @@ from sim.bench.bench import Bench
 from sim.far_ends.wires import Wire, open_wires
 from sim.faults.fault_window import Faults
 from sim.plant.imperfections import Imperfections
+from virtual_loop import VirtualLoop
 
 
 @dataclass
 class FarSide:
-    """The far side of a wire: URLs and devices by the amplifiers' names, and the bench behind."""
+    """The far side of a wire: URLs and devices by the amplifiers' names, and the bench behind.
+
+    machine: whose lines they are in virtual time.
+    """
 
     urls: Mapping[str, str]
     devices: Mapping[str, AmplifierDevice]
     bench: Bench
+    machine: MemoryMachine | None
 
     @property
     def url(self) -> str:
@@ -79,13 +85,15 @@ async def far_side(
 ) -> AsyncIterator[FarSide]:
     """The amplifiers of a rig behind a wire, without faults until a test injects them.
 
-    wire: of all of them, or of each by name.
+    wire: of all of them, or of each by name; of memory in virtual time.
     """
+    is_virtual = isinstance(asyncio.get_running_loop(), VirtualLoop)
+    machine = live_in_memory() if is_virtual else None
     bench, devices = make_bench(rig, seed=seed, imperfections=imperfections)
     wires = dict.fromkeys(bench.amplifiers, wire) if isinstance(wire, Wire) else wire
     async with open_wires(wires, [*devices.values()]) as urls:
         try:
-            yield FarSide(urls, devices, bench)
+            yield FarSide(urls, devices, bench, machine)
         finally:
             for device in devices.values():
                 device.close()
@@ -181,7 +189,7 @@ async def rig_on_wire(
         lines = Lines()
         try:
             group = await _opened_group(lines, far.urls, watchdog)
-            yield HostedRig(far.urls, far.devices, far.bench, lines, group, watchdog)
+            yield HostedRig(far.urls, far.devices, far.bench, far.machine, lines, group, watchdog)
         finally:
             await lines.close()
 

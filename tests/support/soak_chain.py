@@ -23,7 +23,6 @@ from controller.loop.observer import Applied, Observer
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from drivers.opening import Lines
-from memory_machine import live_in_memory
 from newest_contact import BuzzNewestContact
 from paper_plate import make_paper_rig
 from rig_on_wire import after_each, far_side, on_two_amplifiers
@@ -115,7 +114,6 @@ class _Run:
         assert isinstance(loop, VirtualLoop)
         self.loop = loop
         loop.set_exception_handler(self._unhandled)
-        self.operation = live_in_memory()
         rig = make_paper_rig(12, 9)
         self.rig = rig if self.plan.amplifiers == 1 else on_two_amplifiers(rig)
         self.contacts = SourceContacts()
@@ -325,7 +323,8 @@ class _Run:
 
     async def _kill(self) -> None:
         """Kill the host's process, and start another."""
-        self.operation.kill_host()
+        assert self.far.machine is not None
+        self.far.machine.kill_host()
         self.loop.kill_hosts()
         self.witness.closes()
         work = [self.hosting, *self.supervisor._tasks]

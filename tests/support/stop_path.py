@@ -16,15 +16,9 @@ from typing import Any
 
 import controller
 import drivers
-from controller.daemon.config import load_daemon_config
-from controller.daemon.daemon import Daemon
-from controller.daemon.log import LogThread
-from controller.daemon.service_manager import ServiceManager
-from controller.daemon.states import DaemonEvent, Trigger
-from controller_bench import BenchLines, FarEnd
-from daemon_bench import READY, daemon_table, until, write_daemon
+from daemon_bench import ready_daemon, until
 from served_api import Wire, request
-from virtual_loop import run_virtual
+from virtual_loop import VirtualLoop, run_virtual
 
 _OWN = tuple(str(Path(package.__path__[0])) for package in (controller, drivers))
 
@@ -59,43 +53,32 @@ class Chain:
 
 
 async def _stopped(folder: Path) -> tuple[tuple[str, ...], int]:
-    far_end = FarEnd(channels=8)
-    config = load_daemon_config(write_daemon(folder, {"main": "sim://"}))
-    daemon = Daemon(
-        config,
-        daemon_table(),
-        log=LogThread(folder / "log"),
-        manager=ServiceManager({}),
-        dashboard=None,
-        lines=lambda: BenchLines({"main": far_end}),
-    )
-    running = asyncio.create_task(daemon._supervisor.run(daemon._controller))
-    await until(lambda: daemon._supervisor.operation.state.value == READY)
-    await daemon._supervisor.handle(DaemonEvent(Trigger.ARM))
-    client, wire = daemon._server._make_connection(0), Wire()
-    client.connection_made(wire)
-    await asyncio.sleep(0.01)
-    chain, written, calls = Chain(asyncio.get_running_loop()), list[tuple[str, ...]](), 0
-    write = far_end.write
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    async with ready_daemon(folder) as (bench, era):
+        await era.arm("a test", lease_s=60)
+        client, wire = bench.daemon._server._make_connection(0), Wire()
+        client.connection_made(wire)
+        await asyncio.sleep(0.01)
+        chain, written, calls = Chain(loop), list[tuple[str, ...]](), 0
+        seen = loop.seen
 
-    def first(data: bytes) -> None:
-        written.append(chain.here(sys._getframe(1)))
-        sys.setprofile(None)
-        write(data)
+        def first(*message: Any) -> None:
+            written.append(chain.here(sys._getframe(1)))
+            sys.setprofile(None)
+            seen(*message)
 
-    def count(frame: types.FrameType, event: str, _: object) -> None:
-        nonlocal calls
-        calls += event == "call" and frame.f_code.co_filename.startswith(_OWN)
+        def count(frame: types.FrameType, event: str, _: object) -> None:
+            nonlocal calls
+            calls += event == "call" and frame.f_code.co_filename.startswith(_OWN)
 
-    far_end.write = first  # type: ignore[method-assign]
-    line = request("stop", id=1)
-    client.get_buffer(len(line))[: len(line)] = line
-    sys.setprofile(count)
-    client.buffer_updated(len(line))
-    await until(lambda: wire.waiting)
-    assert '"result"' in wire.waiting.decode(), wire.waiting
-    await daemon._supervisor.close("done")
-    await running
+        loop.seen = first
+        line = request("stop", id=1)
+        client.get_buffer(len(line))[: len(line)] = line
+        sys.setprofile(count)
+        client.buffer_updated(len(line))
+        await until(lambda: wire.waiting)
+        assert '"result"' in wire.waiting.decode(), wire.waiting
     return written[0], calls
 
 

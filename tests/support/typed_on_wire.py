@@ -8,7 +8,6 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from controller.cli.commands import app
-from memory_machine import live_in_memory
 from model.rig.rig import Rig
 from rig_on_wire import WIRES, far_side
 from virtual_loop import run_virtual
@@ -21,7 +20,6 @@ def typed_on_wire(patch: pytest.MonkeyPatch, on: Rig, *arguments: str) -> Result
     """Type `era rig` with these arguments, on this plate; raises the command's error."""
 
     async def beside(main: Coroutine[Any, Any, Any]) -> Any:
-        live_in_memory()
         async with far_side(WIRES["serial"], on):
             return await main
 

@@ -21,11 +21,10 @@ from controller.daemon.supervisor import Supervisor
 from controller.loop.loop import Controller
 from controller.loop.observer import Observer
 from controller.sources.touch import Touch, TouchFrame
-from controller_bench import BenchLines, FarEnd, make_bench
+from controller_bench import FarEnd, make_bench
 from drivers.errors import CommandRefused, LinkError
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import FAULTS, STATES
-from newest_contact import BuzzNewestContact
 from virtual_loop import run_virtual
 
 Step = str | Mapping[str, Any]
@@ -278,7 +277,6 @@ async def watched(
     amplifiers: one unless more are named; refuses: whether it refuses all requests at first; wire:
     the kind of their lines.
     """
-    bench = make_bench(*amplifiers, wire=wire)
     loop = asyncio.get_running_loop()
 
     def heard(name: str, value: object) -> None:
@@ -295,19 +293,14 @@ async def watched(
         cycle_completed=lambda: heard("cycles", loop.time()),
         refused=lambda reason: heard("refusals", reason),
     )
-    controller = Controller(
-        bench.rig,
-        bench.table,
-        lines=lambda: BenchLines(dict(zip(bench.rig.amplifiers, bench.far_ends, strict=True))),
-        intent_source=BuzzNewestContact(),
-        connected=supervisor.connected,
-        observer=supervisor.observer(),
+    bench = make_bench(
+        *amplifiers, wire=wire, connected=supervisor.connected, observer=supervisor.observer()
     )
-    controller.observers.append(observer)
-    daemon = Watched(supervisor, controller, bench.far_ends)
+    bench.controller.observers.append(observer)
+    daemon = Watched(supervisor, bench.controller, bench.far_ends)
     if refuses:
         daemon.refuse("GetCaps")
-    running = asyncio.create_task(supervisor.run(controller))
+    running = asyncio.create_task(supervisor.run(bench.controller))
     await supervisor.started.wait()
     await asyncio.sleep(0.005)
     try:

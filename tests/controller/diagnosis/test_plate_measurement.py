@@ -18,7 +18,6 @@ from controller.diagnosis.tone_player import TonePlayer
 from drivers.errors import CommandRefused
 from drivers.host.sensors import Reading, SensorReading, measure_tones
 from drivers.opening import Lines
-from memory_machine import live_in_memory
 from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.identify import identify
@@ -118,7 +117,6 @@ def test_two_amplifiers_hear_each_other_where_they_start_together(
     """On one bus all responses, on two wires those to an amplifier's own: as a direct solution."""
 
     async def run() -> MeasuredPlate:
-        live_in_memory()
         wires = SHARED_WIRES if is_shared else WIRES
         async with far_side(wires[wire], on_two_amplifiers(truth)) as far:
             return await measured(on_two_amplifiers(rig), far)
@@ -150,7 +148,6 @@ def test_interrupted_measurement_ends_silent(is_cancelled: bool, rig: Rig, truth
     """By Ctrl-C, as a cancelled task, or by an error of the caller; `measured` sees to silence."""
 
     async def run() -> None:
-        live_in_memory()
         async with far_side(WIRES["serial"], truth) as far:
 
             def interrupt(done: int, of: int) -> None:
@@ -170,7 +167,6 @@ def test_overloaded_sensor_is_named(rig: Rig, truth: Rig) -> None:
     """One accelerometer beside the feet with a range of 1 mm/s²."""
 
     async def run() -> None:
-        live_in_memory()
         async with far_side(WIRES["serial"], truth) as far:
             Accelerometers(far.bench).place([Accelerometer("A", 0.1, 0.1, reach=1e-3)])
             await measured(rig, far)
@@ -234,7 +230,6 @@ def test_identified_rig_is_the_truth_and_its_patterns_have_more_contrast(
     """Parameters agree within three standard errors; contrast in time rises by 6 dB and more."""
 
     async def run() -> tuple[MeasuredPlate, list[float], Rig, list[float]]:
-        live_in_memory()
         async with far_side(WIRES["serial"], truth) as far:
             taken = await measured(rig, far)
             found = identify(rig, taken.measurement)

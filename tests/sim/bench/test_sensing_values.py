@@ -12,7 +12,6 @@ from drivers.host.sensors import measure_tones, read_sensors
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import READING_STATES
-from memory_machine import live_in_memory
 from model.fem.plate import assemble
 from model.rig.rig import Rig
 from plate_in_time import apart
@@ -60,7 +59,6 @@ async def test_host_measures_at_the_feet_what_the_model_says(coarse_rig: Rig) ->
     """
     frequencies = [110.0 + 20 * number for number in range(16)]
     x = np.linspace(0.02, 0.28, 28)
-    live_in_memory()
     async with rig_on_wire(coarse_rig, WIRES["serial"]) as rig:
         rig.bench.place_sensors([Accelerometer("", each, 0.11) for each in x])
         await rig.group.arm()

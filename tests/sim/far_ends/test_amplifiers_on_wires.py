@@ -9,7 +9,6 @@ import pytest
 from drivers import clock
 from drivers.errors import CommandRefused, LinkError
 from drivers.protocol.table import FAULTS, STATES
-from memory_machine import live_in_memory
 from model.errors import InputError
 from model.rig.rig import Rig
 from rig_on_wire import SHARED_WIRES, WIRES, layer, on_two_amplifiers, rig_on_wire
@@ -101,7 +100,6 @@ async def test_broadcast_commit_starts_all_at_one_moment(
 
     And however much either has sent before.
     """
-    live_in_memory()
     rig_of_two = on_two_amplifiers(coarse_rig)
     async with rig_on_wire(rig_of_two, replace(wire, shared=True)) as rig:
         loop, exchange = asyncio.get_running_loop(), rig.bench.exchange
@@ -129,7 +127,6 @@ async def test_node_that_has_restarted_is_mute_until_it_is_identified(
     coarse_rig: Rig, name: str
 ) -> None:
     """Its network state is lost with its supply, and heartbeats with it."""
-    live_in_memory()
     async with rig_on_wire(coarse_rig, WIRES[name]) as rig:
         main = rig.group.amplifiers["main"]
         rig.devices["main"].inject_fault(FaultWindow("reboot", lasts=0.2))
@@ -162,7 +159,6 @@ def test_fault_silences_and_its_amplifier_is_found_again(
 
     @in_virtual_time
     async def run() -> None:
-        live_in_memory()
         async with rig_on_wire(coarse_rig, wire) as rig:
             await rig.group.arm()
             await rig.group.apply({"main": [layer((0, 110.0, 1.0))]})
@@ -195,7 +191,6 @@ async def test_hung_amplifier_of_a_line_leaves_the_other_to_be_stopped(
     coarse_rig: Rig, name: str
 ) -> None:
     """East hangs: west is silent within 50 ms of the stop, east by its watchdog."""
-    live_in_memory()
     async with rig_on_wire(on_two_amplifiers(coarse_rig), SHARED_WIRES[name]) as rig:
         await rig.group.arm()
         played = [layer((0, 110.0, 0.5))]
@@ -221,7 +216,6 @@ async def test_frames_take_their_time_on_a_slow_line(coarse_rig: Rig, kind: str,
 
     Request and reply have 19 words and 8 to 9 bytes more each way on a serial line.
     """
-    live_in_memory()
     async with rig_on_wire(coarse_rig, Wire(kind, speed=9600), watchdog=2.0) as rig:
         main = rig.group.amplifiers["main"]
         begin = clock.now()

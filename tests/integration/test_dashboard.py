@@ -17,7 +17,7 @@ import pytest_asyncio
 
 import dashboard_pictures
 import patient_daemon
-from chromium import Browser, Page, open_browser
+from chromium import Browser, Page
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.effects.layout_kind import LAYOUT
@@ -69,20 +69,6 @@ def gateway(daemon: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     """Its gateway."""
     with gateway_process(tmp_path_factory.mktemp("gateway"), daemon) as made:
         yield made
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def browser(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Browser]:
-    """A browser for all tests."""
-    async with open_browser(tmp_path_factory.mktemp("profile")) as browser:
-        yield browser
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def tab(browser: Browser) -> AsyncIterator[Page]:
-    """A fresh tab."""
-    async with browser.open_page() as page:
-        yield page
 
 
 @pytest.fixture

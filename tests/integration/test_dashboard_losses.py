@@ -2,16 +2,14 @@
 
 import asyncio
 import signal
-from collections.abc import AsyncIterator
 from itertools import pairwise
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
-import pytest_asyncio
 
 import dashboard_pictures
-from chromium import Browser, Page, open_browser
+from chromium import Page
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import DaemonStateName
 from controller.api.topics import Hub, LayoutEvent, StateEvent
@@ -29,20 +27,6 @@ EVENTS = "[...document.querySelectorAll('#log li')].map(e => e.innerText)"
 NOTES = "document.querySelectorAll('#log li:first-child .note').length"
 TILE = "document.querySelector('.tile')?.innerText ?? ''"
 PROBES = (Path(dashboard_pictures.__file__).with_name("page_probes.js")).read_text(encoding="utf-8")
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def browser(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Browser]:
-    """A browser for all tests."""
-    async with open_browser(tmp_path_factory.mktemp("profile")) as browser:
-        yield browser
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def tab(browser: Browser) -> AsyncIterator[Page]:
-    """A fresh tab."""
-    async with browser.open_page() as page:
-        yield page
 
 
 async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -88,29 +89,19 @@ def test_files_of_writers_that_were_killed_are_removed(tmp_path: Path) -> None:
     assert other.exists()
 
 
-class Taking:
-    """A controller that keeps what it answers by."""
-
-    def __init__(self) -> None:
-        self.taken: list[LocalizationTable] = []
-
-    def replace_answers(self, table: LocalizationTable, timing: Timing | None) -> None:
-        """Note a table."""
-        self.taken.append(table)
-
-
 def test_answers_of_another_table_are_refused() -> None:
     """By its fingerprint, and nothing is replaced; those of the own one are, and can be reset."""
-    base, controller = small_table(), Taking()
+    base, taken = small_table(), list[LocalizationTable]()
+    controller = SimpleNamespace(replace_answers=lambda table, timing: taken.append(table))
     in_use = AnswersInUse(cast(Controller, controller), base, Timing(base))
     other = replace(base, masses=(), eras=base.eras[::-1])
     with pytest.raises(InputError, match="table"):
         in_use.replace(Answers(other.fingerprint, other, is_complete=True))
-    assert controller.taken == []
+    assert taken == []
     own = replace(base)
     in_use.replace(Answers(base.fingerprint, own, is_complete=False))
     in_use.reset()
-    assert controller.taken == [own, base]
+    assert taken == [own, base]
 
 
 def test_message_has_its_length_before_it() -> None:

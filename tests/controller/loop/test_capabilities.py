@@ -102,12 +102,6 @@ def test_capabilities_refuse_an_unplayable_drive_mode() -> None:
         playback_capabilities(rig(), plain, drive_mode="phased")
 
 
-def test_capabilities_refuse_a_channel_that_is_not_there() -> None:
-    """ERA A is wired to channel 3 of an amplifier that has two."""
-    with pytest.raises(InputError, match=r"ERA A .*0 to 1 on amplifier left, got 3; .*rig file"):
-        playback_capabilities(rig(), both(Opened(channels=2)))
-
-
 def test_capabilities_are_the_tightest_limits() -> None:
     """Of the rig and all amplifiers: 50 Hz and half of full level, and 300 Hz."""
     left = Opened(frequency_min=1000, level_max=5000)

@@ -11,9 +11,9 @@ from driven_bases import FINGERTIP, faded_base, resting, shaped_base
 from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.finger.perception import felt_part
-from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_plate
+from model.reduction.reduced_plate import ReducedPlate, modal_matrices
 from model.rig.rig import Rig
-from model.structure.attachments import FingertipLoad, footprints_of
+from model.structure.attachments import FingertipLoad
 from model.transients.base_motion import Term
 from sim.plant.plant import Plant
 from sim.plant.sampled import SampledPlant
@@ -26,12 +26,6 @@ BASES = (
 )
 PLACES = ((0.11, 0.07), (0.25, 0.15), (0.3048, 0.1))
 ONE, THREE = resting(PLACES[0]), resting(*PLACES)
-
-
-@pytest.fixture(scope="module")
-def reduced(coarse_rig: Rig) -> ReducedPlate:
-    """The paper's plate on its own mesh."""
-    return reduce_plate(coarse_rig.plate, coarse_rig.mesh, footprints_of(coarse_rig.eras))
 
 
 def vibrating(reduced: ReducedPlate, rig: Rig, *, until: float = 0.05) -> Plant:

@@ -11,9 +11,9 @@ from model.errors import InputError
 from model.fem.plate import assemble
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold, mean_level_db_sl
-from model.reduction.reduced_plate import ReducedPlate, reduce_plate
+from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
-from model.structure.attachments import Fingertip, FingertipLoad, footprints_of
+from model.structure.attachments import Fingertip, FingertipLoad
 from model.table.question import Question
 from model.transients.base_motion import BaseEnvelope, shaped
 from model.transients.measures import Transients
@@ -108,12 +108,6 @@ TARGET, QUIET = (0.10, 0.03), (0.22, 0.16)
 FINGERS = Question((TARGET,), (QUIET,))
 HEAVY = Fingertip(stiffness=5000.0, damping=20.0, contact_mass=0.005)
 EXCITATION = {"SW": Tone(110.0, 1e-5), "NE": Tone(250.0, 5e-6, math.pi / 2)}
-
-
-@pytest.fixture(scope="module")
-def reduced(coarse_rig: Rig) -> ReducedPlate:
-    """The paper's plate, for forces at its ERAs."""
-    return reduce_plate(coarse_rig.plate, coarse_rig.mesh, footprints_of(coarse_rig.eras))
 
 
 def steady(rig: Rig, place: tuple[float, float], *loads: FingertipLoad) -> np.ndarray:

@@ -210,6 +210,10 @@ class Playing(Message):
     drive: dict[str, PlayedTone] = Field(
         description="of the newest content, by ERA, without silent ones"
     )
+    layers: dict[str, dict[str, PlayedTone]] = Field(
+        default_factory=dict,
+        description="what plays of each content, by layer, then as `drive`; they add up",
+    )
     robust_felt_contrast_db: float | None = Field(None, description=PROMISED)
     predicted_felt_contrast_db: float | None = Field(None, description="the same, nominal")
     robust_contrast_db: float | None = Field(

@@ -24,7 +24,6 @@ from controller.api.schema import (
     LatencySummary,
     Message,
     PlateEvent,
-    PlayedTone,
     Playing,
     Topic,
 )
@@ -51,10 +50,6 @@ class ContactsEvent(Message):
 class PatternEvent(Playing):
     """A pattern that the amplifiers confirmed."""
 
-    layers: dict[str, dict[str, PlayedTone]] = Field(
-        default_factory=dict,
-        description="what plays of each content, by layer, then as `drive`; they add up",
-    )
     latency_ms: float | None = Field(
         description="from the touch to the last byte of the command; null if none was needed"
     )

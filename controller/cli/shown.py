@@ -31,10 +31,11 @@ def show_status(status: StatusResult) -> str:
         *_given(("  silent: {}", silent if status.contacts else None)),
         *([] if status.learning is None else _learning(status.learning)),
     ]
-    for era, tone in status.drive.items():
-        lines.append(
-            f"  ERA {era}: {tone.frequency_hz:g} Hz, level {tone.level:.3f}, {tone.phase_deg:g} deg"
-        )
+    lines += [
+        f"  ERA {era}: {tone.frequency_hz:g} Hz, level {tone.level:.3f}, {tone.phase_deg:g} deg"
+        for drive in status.layers.values()
+        for era, tone in drive.items()
+    ]
     lines += map(_amplifier, status.amplifiers)
     latency = status.latency_ms
     if latency.median is not None:
@@ -67,6 +68,7 @@ def _contact(contact: ContactStatus) -> str:
     details = _given(
         (" {:.1f} dB SL", contact.level_db_sl),
         (", at least {:.1f} dB over the others", contact.robust_felt_contrast_db),
+        (", {:g} Hz", contact.frequency_hz),
         (", effect {}", contact.effect),
         (", feels {}", None if contact.feels == contact.effect else contact.feels),
         (", others at most {:.1f} dB SL", contact.foreign_level_db_sl),

@@ -129,6 +129,7 @@ class ApiService:
             lease_left_s=lease.expires_at - now if lease else None,
             contacts=view.statuses_now(self._controller.table),
             drive=view.drive() if pattern else {},
+            layers=view.layers() if pattern else {},
             silence_reason=view.silenced.reason if view.silenced and lease else None,
             **predicted_of(view.applied if pattern else None),
             amplifiers=self._publisher.amplifiers(),

@@ -89,9 +89,7 @@ class PlateView:
                 for contact in applied.contacts
             ],
             drive=self.drive(),
-            layers={
-                str(number): played_tones(one.drive) for number, one in applied.contents.items()
-            },
+            layers=self.layers(),
             **predicted_of(applied),
             latency_ms=None if applied.latency is None else 1e3 * applied.latency,
         )
@@ -113,6 +111,11 @@ class PlateView:
     def drive(self) -> dict[str, PlayedTone]:
         """The tones of the newest content, by ERA."""
         return {} if self.applied is None else played_tones(self.applied.drive)
+
+    def layers(self) -> dict[str, dict[str, PlayedTone]]:
+        """The tones of every content, by layer, then by ERA."""
+        contents = {} if self.applied is None else self.applied.contents
+        return {str(number): played_tones(each.drive) for number, each in contents.items()}
 
 
 def predicted_of(applied: Applied | None) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from typing import IO, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from model.arguments import shown
 from model.files.regular_file import regular_file
 
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
@@ -71,9 +72,8 @@ def read_arrays(path: Path, types: Mapping[str, str], *, max_bytes: int) -> dict
     with open(path, "rb", opener=regular_file) as file, zipfile.ZipFile(file) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         if sorted(members) != sorted(types) or len(archive.infolist()) != len(types):
-            raise ValueError(
-                f"members must be {', '.join(sorted(types))}, got {', '.join(sorted(members)) or 0}"
-            )
+            given = shown(", ".join(sorted(members)))
+            raise ValueError(f"members must be {', '.join(sorted(types))}, got {given}")
         if any(info.compress_type != zipfile.ZIP_STORED for info in members.values()):
             raise ValueError("members must not be compressed")
         if any(info.flag_bits & _ENCRYPTED for info in members.values()):

@@ -30,6 +30,8 @@ from model.table.request import (
 )
 from model.table.table import LocalizationTable
 
+_SAME_LEVEL = 0.1  # dB
+
 
 def answer(
     table: LocalizationTable,
@@ -56,12 +58,20 @@ def answer(
     check_requests(requests, fingers, table.plate)
     answering = _Answering(table, tuple(requests), tuple(fingers), apart_hz, bands_may_swap)
     found = with_modulation(table, answering.answer(min_contrast_db), playable=playable)
-    steady = [
-        f"content of {_at(layer.request)} is steady"
-        for layer in found.layers
-        if layer.request.modulation_hz is not None and layer.excitation and not layer.side_bands
+    played = [each for each in found.layers if each.excitation]
+    changed = [
+        f"content of {_at(each.request)} is steady"
+        for each in played
+        if each.request.modulation_hz is not None and not each.side_bands
     ]
-    return replace(found, applied=(*found.applied, *steady)) if steady else found
+    changed += [
+        f"content of {_at(each.request)} is lowered to {each.promised_level_db_sl:.1f} dB SL, "
+        "all that the ERAs' stroke allows"
+        for each in played
+        if each.promised_level_db_sl < each.request.level_db_sl - _SAME_LEVEL
+        and each.verdict != "shared"
+    ]
+    return replace(found, applied=(*found.applied, *changed)) if changed else found
 
 
 @dataclass(frozen=True)

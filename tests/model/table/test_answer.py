@@ -145,7 +145,7 @@ def test_frequencies_are_apart_and_within_their_bands():
 def test_two_contents_of_one_frequency_are_said_to_be_near():
     """Where the bands leave no choice."""
     found = answer(smooth_table(), [Request(at, (90, 95)) for at in (NEAR, FAR)])
-    assert "nearer" in found.applied[-1]
+    assert "nearer" in found.applied[0]
 
 
 def test_contents_of_one_frequency_may_meet_in_phase():
@@ -219,6 +219,7 @@ def test_a_louder_content_does_not_starve_a_softer_one():
     found = answer(table, requests, min_contrast_db=-99)
     loud = found.layers[0].promised_level_db_sl
     assert soft < loud < 70 - 0.5
+    assert [f"{loud:.1f} dB SL" in each for each in found.applied] == [True]
     assert found.layers[1].promised_level_db_sl == pytest.approx(soft, abs=1e-3)
     assert found.stroke_factor == pytest.approx(10 ** ((loud - 70) / 20), rel=1e-3)
     full = [

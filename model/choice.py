@@ -6,10 +6,10 @@ it, and the first of them is chosen.
 """
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import IntArray
 
@@ -27,10 +27,7 @@ def best_of(scores: ArrayLike) -> int:
 def best_along(scores: ArrayLike, axis: int) -> IntArray:
     """Index of the first of the highest scores along an axis."""
     values = np.asarray(scores)
-    best = values.max(axis=axis, keepdims=True)
-    with np.errstate(invalid="ignore"):  # infinite: equal only to itself
-        is_best = (values == best) | (values >= best - NEARLY * np.abs(best))
-    return np.asarray(is_best.argmax(axis=axis))
+    return np.asarray(_are_near(values, values.max(axis=axis, keepdims=True)).argmax(axis=axis))
 
 
 def best_first(scores: ArrayLike) -> IntArray:
@@ -41,11 +38,14 @@ def best_first(scores: ArrayLike) -> IntArray:
     values = np.asarray(scores)
     order = np.argsort(-values, kind="stable")
     ordered = values[order]
-    above, below = ordered[:-1], ordered[1:]
-    with np.errstate(invalid="ignore"):  # infinite: equal only to itself
-        is_near = (below == above) | (below >= above - NEARLY * np.abs(above))
-    run = np.concatenate([[0], np.cumsum(~is_near)])[: len(order)]
+    run = np.concatenate([[0], np.cumsum(~_are_near(ordered[1:], ordered[:-1]))])[: len(order)]
     return np.asarray(order[np.lexsort((order, run))])
+
+
+def _are_near(values: NDArray[Any], better: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether values are nearly as high as better ones; infinite ones are equal to themselves."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray((values == better) | (values >= better - NEARLY * np.abs(better)))
 
 
 def best_few(scores: ArrayLike, count: int) -> IntArray:

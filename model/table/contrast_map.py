@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import FloatArray, nullable
 from model.errors import InputError
 from model.files.csv_file import Columns, as_frame
 from model.finger.fingertip import FINGERTIP_RADIUS
@@ -58,8 +58,8 @@ class ContrastMap:
             "x_m": self.x.tolist(),
             "y_m": self.y.tolist(),
             "quiet_m": [list(at) for at in self.quiet],
-            "promised_contrast_db": {mode: _rows(of) for mode, of in self.promised_db.items()},
-            "nominal_contrast_db": {mode: _rows(of) for mode, of in self.nominal_db.items()},
+            "promised_contrast_db": {mode: nullable(of) for mode, of in self.promised_db.items()},
+            "nominal_contrast_db": {mode: nullable(of) for mode, of in self.nominal_db.items()},
         }
 
 
@@ -102,7 +102,3 @@ def map_contrast(
         {mode: fields[row, 0] for row, mode in enumerate(modes)},
         {mode: fields[row, 1] for row, mode in enumerate(modes)},
     )
-
-
-def _rows(field: FloatArray) -> list[list[float | None]]:
-    return [[value if math.isfinite(value) else None for value in row] for row in field.tolist()]

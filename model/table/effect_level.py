@@ -84,7 +84,6 @@ class EffectLevels:
 
     def __init__(self, table: LocalizationTable) -> None:
         self._table, self._plate = table, table.in_time
-        self._strokes = {era.name: era.stroke for era in table.eras}
 
     def gains_db(
         self, excitation: Excitation, question: Question, *, ramp: float, duration: float
@@ -194,7 +193,7 @@ class EffectLevels:
 
     def _largest(self, excitation: Excitation) -> float:
         """The highest level 0..1 of an ERA."""
-        return max(tone.amplitude / self._strokes[name] for name, tone in excitation.items())
+        return max(tone.amplitude / self._table.strokes[name] for name, tone in excitation.items())
 
     def _headroom_db(self, excitation: Excitation, limits: DriveLimits) -> float:
         """By how much [dB] a drive may be raised."""
@@ -204,7 +203,7 @@ class EffectLevels:
             if tone.amplitude > 0
         ]
         power = sum(
-            (tone.amplitude / self._strokes[name]) ** 2 for name, tone in excitation.items()
+            (tone.amplitude / self._table.strokes[name]) ** 2 for name, tone in excitation.items()
         )
         # A little less, so that rounding to the steps of a wire stays within.
         return float(decibels(min([*room, math.sqrt(limits.power / power)]))) - 1e-3

@@ -144,8 +144,7 @@ def _drawn(
 
 def _at_level(pattern: Pattern, table: LocalizationTable, level: float) -> Pattern:
     """The pattern with its loudest ERA at a level: contrasts stay."""
-    strokes = {era.name: era.stroke for era in table.eras}
-    loudest = max(tone.amplitude / strokes[name] for name, tone in pattern.excitation.items())
+    loudest = max(each["level"] for each in table.drive_of(pattern.excitation).values())
     return pattern.scaled(float(decibels(np.array(level / loudest))))
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from model.arrays import nullable
 from model.drive_modes import UNRESTRICTED
 from model.errors import InputError, first_problem
 from model.finger.perception import STRONG_DB_SL
@@ -196,10 +197,10 @@ def answer_as_json(
                 "drive": {} if layer.verdict == "shared" else table.drive_of(tones),
                 "level_db_sl": layer.level_db_sl if tones else None,
                 "promised_level_db_sl": layer.promised_level_db_sl if tones else None,
-                "felt_contrast_db": _finite(layer.felt_contrast_db),
-                "median_felt_contrast_db": _finite(layer.median_felt_contrast_db),
-                "robust_felt_contrast_db": _finite(layer.promised_contrast_db),
-                "foreign_level_db_sl": _finite(layer.foreign_level_db_sl),
+                "felt_contrast_db": nullable(layer.felt_contrast_db),
+                "median_felt_contrast_db": nullable(layer.median_felt_contrast_db),
+                "robust_felt_contrast_db": nullable(layer.promised_contrast_db),
+                "foreign_level_db_sl": nullable(layer.foreign_level_db_sl),
                 "verdict": layer.verdict,
                 "side_bands": []
                 if layer.verdict == "shared"
@@ -218,16 +219,11 @@ def answer_as_json(
     return {
         "layers": layers,
         "quiet": quiet,
-        "robust_worst_db": _finite(found.promised_worst_db),
+        "robust_worst_db": nullable(found.promised_worst_db),
         "stroke_factor": found.stroke_factor,
         "applied": list(found.applied),
         "solve_time_s": elapsed,
     }
-
-
-def _finite(value: float | None) -> float | None:
-    """A level or contrast as JSON has it: none of what is not felt at all."""
-    return value if value is not None and math.isfinite(value) else None
 
 
 def _envelopes_as_json(
@@ -236,20 +232,20 @@ def _envelopes_as_json(
     """Return level 0..1 of the stroke and phase at the start and at every knot, by ERA."""
     if envelopes is None:
         return None
-    strokes = {era.name: era.stroke for era in table.eras}
+
+    def shown(name: str, amplitude: complex) -> dict[str, float]:
+        level = abs(amplitude) / table.strokes[name]
+        return {"level": level, "phase_deg": math.degrees(cmath.phase(amplitude))}
+
     return {
         name: {
             "frequency_hz": envelope.frequency,
             "step_s": envelope.step,
-            "start": _as_level_and_phase(envelope.start, stroke=strokes[name]),
-            "knots": [_as_level_and_phase(knot, stroke=strokes[name]) for knot in envelope.knots],
+            "start": shown(name, envelope.start),
+            "knots": [shown(name, knot) for knot in envelope.knots],
         }
         for name, envelope in envelopes.items()
     }
-
-
-def _as_level_and_phase(amplitude: complex, *, stroke: float) -> dict[str, float]:
-    return {"level": abs(amplitude) / stroke, "phase_deg": math.degrees(cmath.phase(amplitude))}
 
 
 def query_one(table: LocalizationTable, values: Mapping[str, Any]) -> dict[str, Any]:

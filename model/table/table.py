@@ -194,13 +194,17 @@ class LocalizationTable:
             return np.empty((0, len(self.omega)))
         return self.raster.at(self.shapes, np.array(points)).astype(float)
 
+    @cached_property
+    def strokes(self) -> dict[str, float]:
+        """Stroke of each ERA [m], by its name."""
+        return {era.name: era.stroke for era in self.eras}
+
     def drive_of(self, excitation: Excitation) -> dict[str, dict[str, float]]:
         """Frequency, level 0..1 of the stroke and phase of an excitation, by ERA."""
-        strokes = {era.name: era.stroke for era in self.eras}
         return {
             name: {
                 "frequency_hz": tone.frequency,
-                "level": tone.amplitude / strokes[name],
+                "level": tone.amplitude / self.strokes[name],
                 "phase_deg": math.degrees(tone.phase),
             }
             for name, tone in excitation.items()

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.arrays import FloatArray
+from model.arrays import FloatArray, nullable
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
@@ -79,10 +79,10 @@ class WeakCells:
         return {
             "grid": str(self.grid),
             "centres_m": self.centres.tolist(),
-            "median_contrast_db": _finite(self.median_db),
-            "tenth_percentile_contrast_db": _finite(self.tenth_db),
-            "median_contrast_error_db": _finite(self.errors_db[0]),
-            "tenth_percentile_contrast_error_db": _finite(self.errors_db[1]),
+            "median_contrast_db": nullable(self.median_db),
+            "tenth_percentile_contrast_db": nullable(self.tenth_db),
+            "median_contrast_error_db": nullable(self.errors_db[0]),
+            "tenth_percentile_contrast_error_db": nullable(self.errors_db[1]),
             "is_weak": self.weak.tolist(),
             "is_feasible": self.feasible.tolist(),
         }
@@ -261,7 +261,3 @@ def _questions(target: FloatArray, places: FloatArray) -> list[Question]:
         Question((at,), ((float(x), float(y)),), level_db_sl=WANTED_LEVEL_DB_SL)
         for x, y in places[far]
     ]
-
-
-def _finite(values: FloatArray) -> list[float | None]:
-    return [value if np.isfinite(value) else None for value in values.tolist()]

@@ -121,7 +121,8 @@ def study_convergence(
     resolve. progress is called with the number of solved meshes, the reference first, and of all.
     """
     high = rig.limits.frequency_max
-    checked, points = np.asarray(frequencies, dtype=float), _raster(rig.plate)
+    checked, sides = np.asarray(frequencies, dtype=float), (rig.plate.length, rig.plate.width)
+    points = lattice(*(np.linspace(0, side, n) for side, n in zip(sides, _RASTER, strict=True)))
     if (checked > high).any():
         raise InputError(
             f"frequencies must be at most the rig's limits.frequency of {high:g} Hz, got "
@@ -197,12 +198,6 @@ def _natural_frequencies(rig: Rig, free: FreePlate) -> FloatArray:
 
 def _solved(rig: Rig, mesh: PlateMesh) -> FreePlate:
     return solve_free_plate(rig.plate, mesh, frequency_max=rig.limits.frequency_max)
-
-
-def _raster(plate: Plate) -> FloatArray:
-    x = np.linspace(0, plate.length, _RASTER[0])
-    y = np.linspace(0, plate.width, _RASTER[1])
-    return lattice(x, y)
 
 
 _ACCURACY = 0.005  # of polynomials before their two further degrees

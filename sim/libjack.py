@@ -4,11 +4,8 @@ import ctypes
 import ctypes.util
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import cache
-
-import numpy as np
-from numpy.typing import NDArray
 
 from drivers.errors import LinkError
 from model.errors import InputError
@@ -48,8 +45,6 @@ _FUNCTIONS = {  # name: (result, arguments)
     "jack_set_info_function": (None, (_Pointer,)),
 }
 _SILENT = ctypes.CFUNCTYPE(None, _Text)(lambda _text: None)  # kept, since libjack calls it
-_PROCESS = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_uint32, _Pointer)
-_SHUTDOWN = ctypes.CFUNCTYPE(None, _Pointer)
 
 
 @cache
@@ -95,7 +90,6 @@ class JackClient:
         self.pointer = int(client)
         self.rate = int(libjack().jack_get_sample_rate(client))
         self.block = int(libjack().jack_get_buffer_size(client))
-        self._callbacks: list[object] = []  # kept, since libjack calls them
 
     def ports_of(self, other: str, flag: int) -> list[str]:
         """Ports of a client by its name, or of the hardware (""), with IS_INPUT or IS_OUTPUT."""
@@ -145,25 +139,6 @@ class JackClient:
         if None in ports:
             raise LinkError("jack: the server has no more ports; start it with a larger -p (ports)")
         return ports
-
-    def process(self, callback: Callable[[int], None], *, lost: Callable[[], None]) -> None:
-        """Let the server call with the frames of each block; lost: called when it has gone."""
-
-        def called(frames: int, _ignored: object) -> int:
-            callback(frames)
-            return 0
-
-        kept = _PROCESS(called), _SHUTDOWN(lambda _ignored: lost())
-        self._callbacks += kept
-        libjack().jack_set_process_callback(self.pointer, ctypes.cast(kept[0], _Pointer), None)
-        libjack().jack_on_shutdown(self.pointer, ctypes.cast(kept[1], _Pointer), None)
-
-    @staticmethod
-    def samples(port: int, frames: int) -> NDArray[np.float32]:
-        """The samples (frames,) of a port, in place; within a callback only."""
-        address = libjack().jack_port_get_buffer(port, frames)
-        pointer = ctypes.cast(address, ctypes.POINTER(ctypes.c_float))
-        return np.ctypeslib.as_array(pointer, (frames,))
 
     def activate(self) -> None:
         """Begin to be called; raises LinkError."""

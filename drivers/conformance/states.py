@@ -178,9 +178,6 @@ def silence(subject: Subject) -> Rows:
     ]
 
 
-_TRIP = 0.005  # s; until it trips
-
-
 async def _trips(subject: Subject, time: float, *sets: LayerSet) -> None:
     """Play sets and starve it: it trips at its time [s], is silent 5 ms later, and lists it."""
     first: Rows = [partial(subject.arm, time), *sets]

@@ -4,6 +4,7 @@ On a shared line amplifiers have one address each, and send no events.
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 
 from drivers.codec.serial_line.frame import (
     NEUTRAL,
@@ -65,17 +66,24 @@ class SerialAmplifiers(FarEnd):
             if frame.type == HELLO:
                 payload = pack_identity(amplifier.identity)
                 return frame._replace(kind=HELLO | REPLY, payload=payload, version=NEUTRAL)
-            payload = self._payload(frame, amplifier, now)
+            payload = self._payload(frame, frame.address, now)
         except Refusal as refusal:
             payload = pack_words(nak_of(refusal, frame.type))
             version = NEUTRAL if refusal.code == "UNSUPPORTED_VERSION" else VERSION
             return frame._replace(kind=NAK | REPLY, payload=payload, version=version)
         return frame._replace(kind=frame.kind | REPLY, payload=payload)
 
-    def _payload(self, frame: Frame, amplifier: AmplifierPort, now: float) -> bytes:
-        name, values = _request(frame)
-        reply = amplifier.handle(name, values, now)
-        self._note_address(frame.address, name, values)
+    def _payload(self, frame: Frame, address: int, now: float) -> bytes:
+        """Carry out a request by the amplifier at an address; returns the payload of its reply.
+
+        Raises Refusal.
+        """
+        if frame.version != VERSION:
+            raise Refusal(f"version must be {VERSION}, got {frame.version}", "UNSUPPORTED_VERSION")
+        name, values = read_request(frame.type, unpack_words(frame.payload))
+        reply = self._amplifiers[address].handle(name, values, now)
+        if name == "SetAddress":
+            self._amplifiers[values["address"]] = self._amplifiers.pop(address)
         return pack_words(BY_NUMBER[frame.type].reply.pack(reply))
 
     def _broadcast(self, frame: Frame, now: float) -> None:
@@ -83,19 +91,9 @@ class SerialAmplifiers(FarEnd):
         if message is None or not message.is_broadcast:
             return
         for address, amplifier in [*self._amplifiers.items()]:
-            if not amplifier.is_answering:
-                continue
-            try:
-                name, values = _request(frame)
-                amplifier.handle(name, values, now)
-                self._note_address(address, name, values)
-            except Refusal:
-                continue
-
-    def _note_address(self, address: int, name: str, values: Values) -> None:
-        """Note the address that an amplifier has taken."""
-        if name == "SetAddress":
-            self._amplifiers[values["address"]] = self._amplifiers.pop(address)
+            if amplifier.is_answering:
+                with suppress(Refusal):
+                    self._payload(frame, address, now)
 
     def _send_event(self, event: Values, now: float) -> None:
         ((address, amplifier),) = self._amplifiers.items()
@@ -104,10 +102,3 @@ class SerialAmplifiers(FarEnd):
         self._events = (self._events + 1) & 0xFFFF
         payload = pack_words(EVENT_RECORD.pack(event))
         self._send(encode_frame(Frame(EVENT, address, self._events, payload, VERSION)))
-
-
-def _request(frame: Frame) -> tuple[str, Values]:
-    """Read a request; raises Refusal."""
-    if frame.version != VERSION:
-        raise Refusal(f"version must be {VERSION}, got {frame.version}", "UNSUPPORTED_VERSION")
-    return read_request(frame.type, unpack_words(frame.payload))

@@ -25,14 +25,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.protocol.table import MESSAGES, STATES
 from virtual_loop import in_virtual_time
-from words_line import KINDS, MemoryLine, grouped, layer, losing, tone, unaltered, with_group
-
-
-@pytest.fixture(params=KINDS)
-def wire(request: pytest.FixtureRequest) -> str:
-    """Every kind of wire."""
-    return str(request.param)
-
+from words_line import MemoryLine, grouped, layer, losing, tone, unaltered, with_group
 
 LINES = {"alone": (("a",),), "each its own": (("a",), ("b",)), "shared": (("a", "b"),)}
 

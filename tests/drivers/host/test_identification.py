@@ -14,12 +14,6 @@ from virtual_loop import in_virtual_time, run_virtual
 from words_line import KINDS, LIMITS, MemoryLine, group_of, unaltered
 
 
-@pytest.fixture(params=KINDS)
-def wire(request: pytest.FixtureRequest) -> str:
-    """Every kind of wire."""
-    return str(request.param)
-
-
 def loud(level: float) -> Layer:
     """A tone of 100 Hz on the first channel."""
     return Layer(0, (Tone(0, 100.0, level),), 0.001)

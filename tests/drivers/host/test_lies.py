@@ -39,12 +39,6 @@ CAPABILITIES = {
 }
 
 
-@pytest.fixture(params=KINDS)
-def wire(request: pytest.FixtureRequest) -> str:
-    """Every kind of wire."""
-    return str(request.param)
-
-
 @pytest.fixture
 def altered(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, int, int], None]:
     """A function that has all replies of a record say a value in a word."""

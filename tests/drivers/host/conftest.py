@@ -1,0 +1,11 @@
+"""What tests of hosts share."""
+
+import pytest
+
+from words_line import KINDS
+
+
+@pytest.fixture(params=KINDS)
+def wire(request: pytest.FixtureRequest) -> str:
+    """Every kind of wire."""
+    return str(request.param)

@@ -23,52 +23,24 @@ _REMEDY = "repair or remove that package"
 
 
 @dataclass(frozen=True)
-class Instance:
-    """Requirement that a plug-in is an instance of a class."""
-
-    of: type
-
-    def is_met_by(self, found: object) -> bool:
-        """Whether an object satisfies the requirement."""
-        return isinstance(found, self.of)
-
-    def __str__(self) -> str:
-        return f"an instance of {self.of.__name__}"
-
-
-@dataclass(frozen=True)
-class Derived:
-    """Requirement that a plug-in is a class derived from another."""
-
-    of: type
-
-    def is_met_by(self, found: object) -> bool:
-        """Whether an object satisfies the requirement."""
-        return isinstance(found, type) and issubclass(found, self.of)
-
-    def __str__(self) -> str:
-        return f"a class derived from {self.of.__name__}"
-
-
-@dataclass(frozen=True)
 class PluginRegistry(Generic[_T]):
     """Objects of one kind by name.
 
-    what: the kind, for error messages; group: of its entry points; required: of these;
-    error: the class of errors raised; own: objects of this project without an entry point; called:
-    returns the name of an object, if it has one; problem: returns what is wrong with an object, or
-    None; hint: the end of the message for an unknown name. If the name is the scheme of a URL,
-    ending: what follows the scheme; example: such a URL.
+    what: the kind, for error messages; group: of its entry points; base: what these must be derived
+    from, or, if is_instance, be an instance of; error: the class of errors raised; own: objects of
+    this project without an entry point; called: returns the name of an object, if it has one; hint:
+    the end of the message for an unknown name. If the name is the scheme of a URL, ending: what
+    follows the scheme; example: such a URL.
     """
 
     what: str
     group: str
-    required: Instance | Derived
+    base: type
     _: KW_ONLY
     error: type[Exception]
+    is_instance: bool = False
     own: Mapping[str, _T] = field(default_factory=dict)
     called: Callable[[_T], str] | None = None
-    problem: Callable[[_T], str | None] | None = None
     hint: str = ""
     ending: str = ""
     example: str = ""
@@ -122,16 +94,15 @@ class PluginRegistry(Generic[_T]):
     def _loaded(self, point: EntryPoint, within: str) -> _T:
         with self._attributed(point, within):
             loaded: _T = point.load()
-        if not self.required.is_met_by(loaded):
-            leads = loaded.__name__ if isinstance(loaded, type) else type(loaded).__name__
-            self._refuse(point, within, f"leads to {leads}, not to {self.required}")
+        leads = loaded if isinstance(loaded, type) else type(loaded)
+        if isinstance(loaded, type) is self.is_instance or not issubclass(leads, self.base):
+            kind = "an instance of" if self.is_instance else "a class derived from"
+            wanted = f"{kind} {self.base.__name__}"
+            self._refuse(point, within, f"leads to {leads.__name__}, not to {wanted}")
         with self._attributed(point, within):
             called = point.name if self.called is None else self.called(loaded)
-            problem = None if self.problem is None else self.problem(loaded)
         if called != point.name:
             self._refuse(point, within, f"is called {called!r}, unlike its entry point")
-        if problem is not None:
-            self._refuse(point, within, f"breaks its contract: {problem}")
         return loaded
 
     @contextmanager

@@ -4,12 +4,12 @@ from operator import attrgetter
 
 from controller.effects.effect import Effect
 from model.errors import InputError
-from registry.plugins import Derived, PluginRegistry
+from registry.plugins import PluginRegistry
 
 _KINDS: PluginRegistry[type[Effect]] = PluginRegistry(
     "kind of effect",
     "era_haptics.effects",
-    Derived(Effect),
+    Effect,
     error=InputError,
     called=attrgetter("kind"),
 )

@@ -13,7 +13,7 @@ from urllib.parse import parse_qsl
 
 from model.errors import InputError
 from model.structure.plate import Plate
-from registry.plugins import Derived, PluginRegistry
+from registry.plugins import PluginRegistry
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ def number_option(options: str, name: str, *, default: float) -> float:
 _SOURCES: PluginRegistry[Callable[[str], TouchSource]] = PluginRegistry(
     "touch source",
     "era_haptics.touch_sources",
-    Derived(TouchSource),
+    TouchSource,
     error=InputError,
     ending=":",
     example="tuio:127.0.0.1:3333",

@@ -11,12 +11,12 @@ from drivers.wires.address import WireAddress
 from drivers.wires.can_bus import PythonCanAddress, SlcanAddress, SocketcandAddress
 from drivers.wires.modbus import ModbusAddress
 from drivers.wires.serial_line import SerialAddress
-from registry.plugins import Derived, PluginRegistry
+from registry.plugins import PluginRegistry
 
 _WIRES: PluginRegistry[Callable[[str], WireAddress]] = PluginRegistry(
     "wire",
     "era_haptics.wires",
-    Derived(WireAddress),
+    WireAddress,
     error=CommandError,
     own={
         "can+python-can": PythonCanAddress,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from model.errors import InputError
 from model.structure.plate import Material
-from registry.plugins import Instance, PluginRegistry
+from registry.plugins import PluginRegistry
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,9 @@ KNOWN_MATERIALS = {known.material.name: known for known in _KNOWN}
 _MATERIALS: PluginRegistry[KnownMaterial] = PluginRegistry(
     "material",
     "era_haptics.materials",
-    Instance(KnownMaterial),
+    KnownMaterial,
     error=InputError,
+    is_instance=True,
     own=KNOWN_MATERIALS,
     called=lambda known: known.material.name,
     hint="; any other can be given by its numbers, {E: 70 GPa, rho: 2700, nu: 0.33}",

@@ -12,10 +12,9 @@ import pytest
 
 from controller.cli.main import run
 from controller.effects.buzz import Buzz
-from controller.effects.effect import Effect
+from controller.effects.effect import Effect, effect_kind, effect_kinds
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.effects.registry import effect_kind, effect_kinds
 from controller.sources.contacts import Contact, ContactKey
 from controller.sources.touch import open_source
 from controller.sources.tuio import TuioSource

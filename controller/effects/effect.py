@@ -1,8 +1,9 @@
-"""Base classes of effects: their parameters in a layout, and their course at one finger."""
+"""Effects: their parameters in a layout, their course at one finger, and their kinds by name."""
 
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import BeforeValidator
@@ -13,8 +14,10 @@ from controller.loop.intent import Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
 from model.config.sections import Quantity
 from model.config.units import FREQUENCY, RATIO
+from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.table.request import MAX_MODULATION, MIN_MODULATION
+from registry.plugins import PluginRegistry
 
 NEIGHBOURS: Literal["neighbours"] = "neighbours"
 """The level `as strong as the neighbours allow`."""
@@ -166,3 +169,22 @@ class Effect(TunedSection, ABC):
     def max_db_sl(self, level_db_sl: float | None) -> float:
         """Return the highest level [dB SL] in a run at a level; infinite for None."""
         return math.inf if level_db_sl is None else level_db_sl
+
+
+_KINDS: PluginRegistry[type[Effect]] = PluginRegistry(
+    "kind of effect",
+    "era_haptics.effects",
+    Effect,
+    error=InputError,
+    called=attrgetter("kind"),
+)
+
+
+def effect_kinds() -> tuple[str, ...]:
+    """Return the names of all installed kinds without loading any."""
+    return _KINDS.names()
+
+
+def effect_kind(name: str) -> type[Effect]:
+    """Return the kind of a name; raises InputError if it is unknown or its plug-in fails."""
+    return _KINDS.find(name)

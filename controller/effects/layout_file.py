@@ -1,4 +1,4 @@
-"""Reading and checking the file of a surface layout."""
+"""The file of a surface layout: read, checked, and a kind of configuration for `era config`."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -6,11 +6,11 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from controller.effects.band import TunedSection
-from controller.effects.effect import Effect, Level
+from controller.effects.effect import Effect, Level, effect_kind, effect_kinds
 from controller.effects.layout import BUZZ, SurfaceLayout, default_effects
 from controller.effects.region import Region
-from controller.effects.registry import effect_kind
 from model.config.document import Document, KeyPath, read_document
+from model.config.kinds import CheckedFile, ConfigKind
 from model.config.sections import Section, Validation
 from model.config.shapes import ShapedSection
 from model.errors import InputError
@@ -187,3 +187,29 @@ def _region(name: str, section: RegionSection) -> Region:
         may_share=section.may_share,
         is_protected=section.protected,
     )
+
+
+def _checked(document: Document) -> CheckedFile:
+    """Read a layout; raises ConfigError. Its fit on a plate shows in the daemon's file."""
+    layout = layout_of(document, None)
+    return CheckedFile(
+        f"good: regions {', '.join(region.name for region in layout.regions) or 'none'}; "
+        f"effects {', '.join(layout.effects)}; elsewhere {layout.elsewhere or 'nothing'}. "
+        "Check the daemon's file that names it to see whether it fits the plate",
+    )
+
+
+def _keys() -> dict[str, Any]:
+    """The JSON schema of a layout; the kinds of effects are under `$defs`."""
+    schema = LayoutSection.model_json_schema()
+    kinds = {f"effect {name}": effect_kind(name).model_json_schema() for name in effect_kinds()}
+    return {**schema, "$defs": {**schema.get("$defs", {}), **kinds}}
+
+
+LAYOUT = ConfigKind(
+    "A surface layout of era-haptics",
+    recognises=is_layout_document,
+    check=_checked,
+    example_file=Path(__file__).with_name("example.yaml"),
+    keys=_keys,
+)

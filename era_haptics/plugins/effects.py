@@ -1,8 +1,7 @@
 """Interfaces for effects: entry points `era_haptics.effects`."""
 
-from controller.effects.effect import Effect, EffectRun, Level, NoSensation, Sensation
+from controller.effects.effect import Effect, EffectRun, Level, NoSensation, Sensation, effect_kind
 from controller.effects.region import Region
-from controller.effects.registry import effect_kind
 from controller.loop.intent import Pulse
 from controller.sources.contacts import Contact, ContactKey
 from model.config.sections import Quantity

@@ -51,7 +51,7 @@ class ConfigKind:
 
 _KINDS = {
     "daemon": "controller.daemon.config_kind:DAEMON",
-    "layout": "controller.effects.layout_kind:LAYOUT",
+    "layout": "controller.effects.layout_file:LAYOUT",
     DEFAULT_KIND: "model.rig.kind:RIG",
 }
 """Where each is, by name: this package does not import those above it."""

@@ -92,11 +92,6 @@ class CoherentResult:
         is_missed = (self.score == 0) & (self.missed > self.score.max(initial=0))
         return np.asarray(is_missed.nonzero()[0])
 
-    @property
-    def is_level_limited(self) -> bool:
-        """Whether there are such frequencies."""
-        return len(self.level_limited) > 0
-
 
 def search(forms: Forms) -> CoherentResult:
     """Find the best weights at each frequency, brought within full stroke where they must."""

@@ -88,11 +88,6 @@ class PlateOnEras:
         return cls(plate, first, *found)
 
     @property
-    def thickness_count(self) -> int:
-        """Number of thicknesses."""
-        return int(self.receptance.shape[1])
-
-    @property
     def fields(self) -> Complex64Array:
         """Accelerations of the reduced coordinates by each ERA at full stroke, (f, n, r)."""
         plate = self.plate

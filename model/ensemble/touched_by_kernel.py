@@ -101,7 +101,7 @@ def plates_structure(on: PlateOnEras) -> Plates:
     if kept is not None:
         return kept
     plate = on.plate
-    (b, r), t = plate.shapes.shape, on.thickness_count
+    (b, r), t = plate.shapes.shape, on.receptance.shape[1]
     found = Plates(plate.era_count, b, 0, r, t, plate.uncertainty.fingertip)
     found.point(
         **{name: getattr(on, name) for name in _OF_CASES},

@@ -271,7 +271,8 @@ def unit_accelerations(
     (f, a) and the forces applied to them (f, a, eras), by omega (f,) [rad/s].
     """
     stiffness = attached_stiffness(eras, loads, omega)
-    applied = on_diagonal(drive_forces(eras, omega), rows=stiffness.shape[1])
+    each_alone = np.eye(stiffness.shape[1], len(eras))
+    applied = np.asarray(each_alone * drive_forces(eras, omega)[:, None])
     return np.asarray(-(omega**2)[:, None, None] * moved(stiffness, applied))
 
 
@@ -287,8 +288,3 @@ def coupled_forces(
     unit = np.eye(receptance.shape[-1], dtype=receptance.real.dtype)
     system = unit + dynamic_stiffness[..., None] * receptance
     return np.asarray(np.linalg.solve(system, applied))
-
-
-def on_diagonal(values: ComplexArray, *, rows: int) -> ComplexArray:
-    """One column for each value (..., m): zero but for the value in its own row, (..., rows, m)."""
-    return np.asarray(np.eye(rows, values.shape[-1]) * values[..., None, :])

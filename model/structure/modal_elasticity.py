@@ -95,13 +95,10 @@ class ModalElasticity:
             plate, eigenvalues * factors[0], factors[1], losses * factors.prod(axis=0), dispersion
         )
 
-    def loss_ratios(self, omega: FloatArray) -> FloatArray:
-        """Loss factor of each mode at omega (f,) [rad/s] over the plate's, (f, r)."""
-        return np.multiply.outer(_powers(self.plate, omega), self.relative_loss)
-
     def loss_factors(self, omega: FloatArray) -> FloatArray:
         """Loss factor of each mode at omega (f,) [rad/s], (f, r)."""
-        return np.asarray(self.plate.loss_factor * self.loss_ratios(omega))
+        of_modes = np.multiply.outer(_powers(self.plate, omega), self.relative_loss)
+        return np.asarray(self.plate.loss_factor * of_modes)
 
     def stiffness(self, omega: FloatArray) -> ComplexArray:
         """Complex stiffness (1 + i eta) lambda of each mode at omega (f,), (f, r) [rad²/s²].

@@ -107,7 +107,7 @@ def _candidates(
             rest = None if contents.background is None or others else contents.background[here.rows]
             asked = here.of(stream.targets, others, level, rest)
             searched, forms = search_to_level(asked)
-            is_limited |= searched.is_level_limited or forms is not asked
+            is_limited |= len(searched.level_limited) > 0 or forms is not asked
             ways = [searched]
             if 1 <= len(others) <= MAX_FINGERS_BY_POINT and searched.score.any():
                 ways.append(search(here.by_point(forms, others)))

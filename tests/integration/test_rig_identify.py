@@ -72,13 +72,13 @@ def test_plate_that_is_not_explained_is_refused_and_nothing_written(
 ) -> None:
     """Exit status 1, nothing promised, and what was at the output stays."""
     rig, new = write_rig(tmp_path / "rig.yaml", mesh="auto"), tmp_path / "rig2.yaml"
-    new.write_text("mine")
+    new.write_text(before := "# Fitted by `era rig identify`:\n")
     monkeypatch.setattr("model.identification.identify.MAX_CHI2", 1e-3)
     result = identify(rig, "--url", PORT, "-o", str(new), "--yes", "--quick", "--json")
     told = json.loads(result.stdout)
     assert result.exit_code == 1
     assert (told["explained"], told["expected_contrast"], told["files"]) == (False, [], [])
-    assert new.read_text() == "mine"
+    assert new.read_text() == before
 
 
 def test_bad_input_is_refused_before_anything_plays(tmp_path: Path, identify: Identify) -> None:

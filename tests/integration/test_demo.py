@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -21,6 +21,7 @@ from controller.cli.main import run
 from controller.demo.recorder import TouchRecorder
 from controller.demo.run import Scene, layout_of_people
 from controller.sources.capture import read_capture
+from gateway_bench import wait_for
 from installed_program import ERA
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
@@ -153,12 +154,11 @@ def test_far_end_ends_when_the_demo_is_killed(capture, environment, tmp_path):
     ) as process:
         far_end = far_end_of(process.pid)
         process.kill()
-    for _ in range(1200):
-        if not is_running(far_end):
-            return
-        time.sleep(0.05)
-    os.kill(far_end, signal.SIGKILL)
-    raise AssertionError("the far end was still there after a minute")
+    try:
+        wait_for(lambda: not is_running(far_end), timeout=60)
+    finally:
+        with suppress(ProcessLookupError):
+            os.kill(far_end, signal.SIGKILL)
 
 
 def is_running(pid):
@@ -171,12 +171,8 @@ def is_running(pid):
 
 def far_end_of(pid):
     """The process that a running demonstration started for its amplifiers."""
-    for _ in range(1200):
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-        if children:
-            return int(children[0])
-        time.sleep(0.05)
-    raise AssertionError("the demonstration started no process")
+    children = Path(f"/proc/{pid}/task/{pid}/children")
+    return int(wait_for(lambda: children.read_text().split(), timeout=60)[0])
 
 
 def test_page_and_daemon(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ import shlex
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
@@ -189,13 +188,11 @@ def _without_uvicorn(stack: contextlib.ExitStack, _: io.StringIO) -> None:
 def _disarmed(stack: contextlib.ExitStack) -> Client:
     """A client of the running daemon, which is disarmed first."""
     client = stack.enter_context(Client.connect(Path(_SOCKET), name="another"))
-    while client.status().state == "NOT_READY":
-        time.sleep(0.005)
+    wait_for(lambda: client.status().state != "NOT_READY")
     with contextlib.suppress(RpcError):  # it may be stopped
         client.disarm()
     client.clear()
-    while client.status().state != "READY_TO_SWITCH_ON":
-        time.sleep(0.005)
+    wait_for(lambda: client.status().state == "READY_TO_SWITCH_ON")
     return client
 
 

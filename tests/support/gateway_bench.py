@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from controller.api.client import Client
 from controller.api.connection import Connection
@@ -52,6 +53,7 @@ from model.table.file import save_table
 from model.table.table import LocalizationTable
 from rig_files import write_rig
 
+T = TypeVar("T")
 TOKEN = "a-token-of-these-tests-only"
 
 
@@ -339,12 +341,13 @@ def raise_priority(process: int) -> None:
         os.setpriority(os.PRIO_PROCESS, process, -10)
 
 
-def wait_for(condition: Callable[[], object], *, timeout: float = PATIENCE) -> None:
-    """Wait until a condition holds; fails after a timeout [s]."""
+def wait_for(condition: Callable[[], T], *, timeout: float = PATIENCE) -> T:
+    """Wait until a condition holds, and return what it is then; fails after a timeout [s]."""
     end = time.monotonic() + timeout
-    while not condition():
+    while not (found := condition()):
         assert time.monotonic() < end, "timeout"
         time.sleep(0.01)
+    return found
 
 
 def wait_for_state(era: Client, *states: str) -> str:

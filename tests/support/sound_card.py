@@ -5,11 +5,9 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -109,11 +107,3 @@ def host(url: str, channels: int) -> Iterator["subprocess.Popen[str]"]:
         yield process
         with contextlib.suppress(ProcessLookupError):
             process.send_signal(signal.SIGKILL)
-
-
-def until(is_true: Any, *, timeout: float = START) -> None:
-    """Wait for a condition; AssertionError if it never holds."""
-    end = time.monotonic() + timeout
-    while not is_true():
-        assert time.monotonic() < end
-        time.sleep(0.01)

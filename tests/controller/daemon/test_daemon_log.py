@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,6 +28,7 @@ from controller.daemon.states import DaemonState, Operation
 from controller_bench import BenchLines, FarEnd
 from drivers import clock
 from drivers.host.wire import Reply
+from gateway_bench import wait_for
 from registry.limits import GuardLimits
 from virtual_loop import in_virtual_time
 
@@ -78,14 +79,6 @@ def logger() -> Iterator[logging.Logger]:
     made.handlers.clear()
 
 
-def wait_until(holds: Callable[[], object]) -> None:
-    """Wait for what a thread does."""
-    deadline = time.monotonic() + 20
-    while not holds():
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
-
-
 def test_log_does_not_block_while_disk_hangs(
     logger: logging.Logger, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,7 +124,7 @@ def test_log_is_reopened_after_rotation(logger: logging.Logger, tmp_path: Path) 
     thread = LogThread(file)
     logger.addHandler(thread)
     logger.warning("before")
-    wait_until(lambda: file.exists() and file.read_text("utf-8"))
+    wait_for(lambda: file.exists() and file.read_text("utf-8"))
     file.rename(rotated)
     logger.warning("after")
     thread.close()

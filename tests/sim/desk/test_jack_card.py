@@ -14,12 +14,13 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import LinkError
+from gateway_bench import wait_for
 from installed_program import ERA
 from model.errors import InputError
 from sim.measuring.sound_card import SoundCard, open_card
 from sim.soft_amp.output import open_output
 from sim.soft_amp.settings import Protocol, Settings
-from sound_card import JackServer, capture_on, jack_server, until
+from sound_card import JackServer, capture_on, jack_server
 
 pytestmark = [
     pytest.mark.real_time,
@@ -114,7 +115,7 @@ def test_measurement_without_its_server_is_lost(
         looking = capture_on(name, "looking", 1)  # once the server is up
         with ThreadPoolExecutor() as thread:
             measuring = thread.submit(measure, server, "jack", tmp_path)
-            until(lambda: looking.is_played_to("era-measure:in_13"))  # the last to be connected
+            wait_for(lambda: looking.is_played_to("era-measure:in_13"))  # the last to be connected
             looking.close()  # libjack does not bear to close a client of a server that is gone
             server.process.terminate()  # one that is killed occupies one of JACK's eight places
             ended = time.monotonic()

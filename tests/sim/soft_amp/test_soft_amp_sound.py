@@ -13,10 +13,11 @@ import pytest
 from benchmarks.desk.capture import Capture
 from drivers.opening import Lines
 from drivers.protocol.table import FAULTS, STATES
+from gateway_bench import wait_for
 from model.errors import InputError
 from sim.soft_amp.output import open_output
 from sim.soft_amp.settings import Protocol, Settings
-from sound_card import BLOCK, RATE, SoftAmp, capture_on, host, jack_server, until
+from sound_card import BLOCK, RATE, SoftAmp, capture_on, host, jack_server
 from steady_host import WATCHDOG, linear_amplifier
 
 pytestmark = [
@@ -57,7 +58,7 @@ def test_samples_are_those_of_the_page(sound: tuple[Capture, dict[str, str]], am
     """Level x sin(2 pi f t + phase) within 0.1 dB, and within 0.1 degrees between channels."""
     capture, _ = sound
     with host(amp.url, CHANNELS) as playing:
-        until(capture.is_sounding)
+        wait_for(capture.is_sounding)
         _wait_for_samples(capture, 0.3)  # 0.2 s of soft start and ramp
         samples = capture.samples(RATE // 10)
         turning = np.exp(-2j * np.pi * 1000 * np.arange(len(samples)) / RATE)
@@ -67,7 +68,7 @@ def test_samples_are_those_of_the_page(sound: tuple[Capture, dict[str, str]], am
         np.testing.assert_allclose(steps, 30, atol=0.1)
         playing.kill()
         killed = capture.position
-        until(lambda: not capture.is_sounding())
+        wait_for(lambda: not capture.is_sounding())
         assert capture.end_of_sound() - killed < RATE * (WATCHDOG + SILENCE)
 
 
@@ -78,11 +79,11 @@ async def test_killed_or_stopped_player_is_silent_and_then_in_fault(
     """No sound once it is gone; its line stays, reports the fault, and is disarmed once cleared."""
     capture, _ = sound
     with host(amp.url, CHANNELS):
-        until(capture.is_sounding)
+        wait_for(capture.is_sounding)
         player, reopened = amp.player, amp.log.count("open again")
         os.kill(player, how)
         done = capture.position
-        until(lambda: amp.log.count("open again") > reopened)
+        wait_for(lambda: amp.log.count("open again") > reopened)
         assert capture.end_of_sound() - done < RATE * SILENCE
         assert amp.player != player
     lines = Lines()
@@ -136,7 +137,7 @@ def test_all_of_it_killed_is_silent(
     # PortAudio leaves samples out where the machine stalls.
     soft_amp = SoftAmp(*options, "--max-gaps", "63", environment=sound[1], log=tmp_path / "log")
     with host(soft_amp.url, 2):
-        until(capture.is_sounding)
+        wait_for(capture.is_sounding)
         player = Path(f"/proc/{soft_amp.player}")
         _wait_for_samples(capture, 1.2)  # 0.2 s of soft start and ramp
         forces = 2 * capture.samples(RATE) ** 2 - 1  # u = sqrt((1 + force) / 2)
@@ -145,7 +146,7 @@ def test_all_of_it_killed_is_silent(
         np.testing.assert_allclose(np.median(levels, axis=0), 0.5, rtol=0.011)
         soft_amp.process.kill()
         killed = capture.position
-        until(lambda: not player.exists())
+        wait_for(lambda: not player.exists())
         assert capture.end_of_sound() - killed < RATE * SILENCE
     soft_amp.end()
     capture.close()
@@ -153,4 +154,4 @@ def test_all_of_it_killed_is_silent(
 
 def _wait_for_samples(capture: Capture, seconds: float) -> None:
     end = capture.position + RATE * seconds
-    until(lambda: capture.position > end)
+    wait_for(lambda: capture.position > end)

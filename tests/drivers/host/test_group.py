@@ -123,28 +123,27 @@ async def test_stop_overtakes_what_is_queued(group: Group, ends: list[MemoryLine
     assert ends[0].levels("a") == [0.0, 0.0]
 
 
-def test_stop_does_not_wait_for_a_reply_that_is_lost(wire: str) -> None:
+@grouped(("a",))
+async def test_stop_does_not_wait_for_a_reply_that_is_lost(
+    group: Group, ends: list[MemoryLine], wire: str
+) -> None:
     """It is sent within 9 ms of the request, which is given up.
 
     On RTU within 8 ms of when the response to a write of 11 characters would have ended.
     """
     latest = 0.009 + (19 * 11 / 115_200 + 2 * 0.00175 if wire == "rtu" else 0.0)
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        (host,) = group.amplifiers.values()
-        ends[0].outward = lambda name, data: []
-        reading = asyncio.ensure_future(host.read_status())
-        await asyncio.sleep(0.001)
-        began = ends[0].loop.time()
-        stopping = asyncio.ensure_future(group.stop())
-        await asyncio.sleep(0.02)
-        sent = next(at for at, each in ends[0].sent if each == "1:8" and at >= began)
-        assert sent - began <= latest
-        ends[0].outward = lambda name, data: [(0.0002, data)]
-        assert (await stopping)["a"].is_confirmed
-        await reading
-
-    with_group(test, wire, ("a",))
+    (host,) = group.amplifiers.values()
+    ends[0].outward = lambda name, data: []
+    reading = asyncio.ensure_future(host.read_status())
+    await asyncio.sleep(0.001)
+    began = ends[0].loop.time()
+    stopping = asyncio.ensure_future(group.stop())
+    await asyncio.sleep(0.02)
+    sent = next(at for at, each in ends[0].sent if each == "1:8" and at >= began)
+    assert sent - began <= latest
+    ends[0].outward = lambda name, data: [(0.0002, data)]
+    assert (await stopping)["a"].is_confirmed
+    await reading
 
 
 @grouped(("a",))

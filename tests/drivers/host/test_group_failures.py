@@ -16,7 +16,7 @@ from drivers.protocol.sets import Envelope
 from drivers.protocol.table import MESSAGES
 from sim.amplifier.contract import Amplifier as FarEnd
 from virtual_loop import in_virtual_time
-from words_line import MemoryLine, grouped, layer, losing, tone, with_group
+from words_line import MemoryLine, grouped, layer, losing, tone
 
 
 def altered(
@@ -85,30 +85,29 @@ async def test_stop_is_sent_to_each_where_the_broadcast_fails(
     assert (ends[0].levels("a"), ends[0].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
 
 
-def test_arm_that_was_busy_after_a_lost_reply_does_not_stay_armed() -> None:
+@grouped(("a",), wire="serial")
+async def test_arm_that_was_busy_after_a_lost_reply_does_not_stay_armed(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """The first attempt has armed it, the repeated ones are refused: it is disarmed."""
+    await group.disarm()
+    ends[0].far["a"].session = 1  # that of the test never changes, and is not taken twice
+    asked = 0
 
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        await group.disarm()
-        ends[0].far["a"].session = 1  # that of the test never changes, and is not taken twice
-        asked = 0
+    def busy(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
+        nonlocal asked
+        if name == "Arm":
+            asked += 1
+            if asked > 1:
+                raise Refusal("busy", "BUSY")
+        return handle(name, values, now)
 
-        def busy(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
-            nonlocal asked
-            if name == "Arm":
-                asked += 1
-                if asked > 1:
-                    raise Refusal("busy", "BUSY")
-            return handle(name, values, now)
-
-        ends[0].outward = losing("Arm", count=2)  # its event, and the reply
-        altered(ends[0].far["a"], busy)
-        with pytest.raises(CommandRefused):
-            await group.arm()
-        assert asked > 1
-        assert ends[0].far["a"].state != "OPERATION_ENABLED"
-
-    with_group(test, "serial", ("a",))
+    ends[0].outward = losing("Arm", count=2)  # its event, and the reply
+    altered(ends[0].far["a"], busy)
+    with pytest.raises(CommandRefused):
+        await group.arm()
+    assert asked > 1
+    assert ends[0].far["a"].state != "OPERATION_ENABLED"
 
 
 @grouped(("a",), ("b",), wire="serial")

@@ -9,7 +9,6 @@ import pytest
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, DriverError, LinkTimeout, Preempted
 from drivers.host.can_wire import CanWire
-from drivers.host.group import Group
 from drivers.host.jobs import JointStart
 from drivers.host.modbus_wire import ModbusWire
 from drivers.host.serial_wire import SerialWire
@@ -92,9 +91,7 @@ async def test_commit_that_fails_in_its_turn_keeps_the_others_back(
 ) -> None:
     """A port does not take it: of the slower line, and of the one that was free last."""
     ends = [timed_line(name, each) for name, each in zip(names, "ab", strict=True)]
-    group = Group({name: host for end in ends for name, host in end.hosts.items()}, watchdog=1.0)
-    await group.open()
-    await group.arm()
+    group = await group_of(*ends, watchdog=1.0)
     write = ends[fails].write
 
     def block(data: bytes) -> None:

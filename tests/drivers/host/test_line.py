@@ -6,22 +6,21 @@ import pytest
 
 from drivers.contents import Layer, Tone
 from drivers.errors import CommandRefused, LinkTimeout
+from drivers.host.group import Group
 from drivers.host.jobs import Job, JobQueue, Priority
 from drivers.host.serial_wire import SerialWire
 from drivers.protocol.records import Refusal, Values
 from virtual_loop import in_virtual_time
-from words_line import KINDS, MemoryLine, unaltered
+from words_line import KINDS, MemoryLine, grouped, unaltered
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@in_virtual_time
-async def test_request_that_has_waited_for_50_ms_goes_before_newer_heartbeats(kind: str) -> None:
+@pytest.mark.parametrize("wire", KINDS)
+@grouped(("a", "b"))
+async def test_request_that_has_waited_for_50_ms_goes_before_newer_heartbeats(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """With a heartbeat queued whenever one is answered; without that rule it waits for ever."""
-    end = MemoryLine(kind, "a", "b")
-    first, second = end.hosts.values()
-    await first.open()
-    await second.open()
-    await first.arm(77)
+    (end,), (first, second) = ends, group.amplifiers.values()
     end.outward = lambda name, data: [(0.004, data)]
 
     async def beat() -> None:
@@ -39,14 +38,12 @@ async def test_request_that_has_waited_for_50_ms_goes_before_newer_heartbeats(ki
     await asyncio.wait(beating)
 
 
-@in_virtual_time
-async def test_heartbeat_waits_for_one_request_that_has_waited() -> None:
+@grouped(("a", "b"), wire="serial")
+async def test_heartbeat_waits_for_one_request_that_has_waited(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """Of eight statuses that nobody has answered for 50 ms, each of 20 ms on the line."""
-    end = MemoryLine("serial", "a", "b")
-    first, second = end.hosts.values()
-    await first.open()
-    await second.open()
-    await first.arm(77)
+    (end,), (first, second) = ends, group.amplifiers.values()
     end.outward = lambda name, data: [(0.02, data)]
     reading = [asyncio.ensure_future(second.read_status()) for _ in range(8)]
     await asyncio.sleep(0.065)
@@ -91,14 +88,13 @@ async def test_read_behind_a_write_whose_response_was_found_late_is_awaited() ->
     assert host.counts.retries == 0
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@in_virtual_time
-async def test_refusal_after_no_reply_says_that_it_may_have_played(kind: str) -> None:
+@pytest.mark.parametrize("wire", KINDS)
+@grouped(("a",))
+async def test_refusal_after_no_reply_says_that_it_may_have_played(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """The reply to a commit is lost, and the commit that is repeated is refused; then one alone."""
-    end = MemoryLine(kind, "a")
-    (host,) = end.hosts.values()
-    await host.open()
-    await host.arm(77)
+    (end,), (host,) = ends, group.amplifiers.values()
     await host.stage(5, [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)])
     far = end.far["a"]
     handle, commits = far.handle, iter([True])

@@ -14,7 +14,7 @@ from drivers.host.serial_wire import SerialWire
 from drivers.host.wire import Wire
 from drivers.protocol.sets import Envelope
 from virtual_loop import in_virtual_time
-from words_line import MemoryLine, grouped, layer, tone, with_group
+from words_line import KINDS, MemoryLine, group_of, grouped, layer, tone
 
 REACTION = 0.0099  # s; a reply may begin 10 ms after its request (docs/decisions/0061)
 
@@ -71,11 +71,8 @@ async def armed(name: str, *amplifiers: str) -> tuple[Group, MemoryLine, Paced]:
     kind, make, bits, gap = LINES[name]
     end = MemoryLine(kind, *amplifiers)
     end.line.wire = make()
-    group = Group(end.hosts, watchdog=2.0, draw=lambda low, high: 77)
     paced = Paced(end, int(name.split()[-1]), bits, gap)
-    await group.open()
-    await group.arm()
-    return group, end, paced
+    return await group_of(end, watchdog=2.0), end, paced
 
 
 @pytest.mark.parametrize("name", LINES)
@@ -158,32 +155,29 @@ async def test_frames_that_a_can_adapter_has_kept_feed_once_more(
     assert end.levels("a") == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("kind", ["serial", "tcp", "can"])
+@pytest.mark.parametrize("wire", ["serial", "tcp", "can"])
 @pytest.mark.parametrize("missed", [(0.001, 0.028), (0.012, 0.015), (0.001, 0.5)])
-def test_time_that_this_process_misses_is_no_time_of_the_amplifier(
-    kind: str, missed: tuple[float, float]
+@grouped(("a",))
+async def test_time_that_this_process_misses_is_no_time_of_the_amplifier(
+    group: Group, ends: list[MemoryLine], missed: tuple[float, float]
 ) -> None:
     """From a moment [s] after a request on for a time: a reply of 8 ms then is no timeout."""
+    (end,) = ends
+    after, lasts = missed
+    end.outward = lambda name, data: [(0.008 if after < 0.008 else 0.016, data)]
 
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        (end,) = ends
-        after, lasts = missed
-        end.outward = lambda name, data: [(0.008 if after < 0.008 else 0.016, data)]
+    def stand_still() -> None:
+        """The amplifier runs in the same process, so that it does not reply meanwhile."""
+        timers = [each for each in end.loop._scheduled if not each.cancelled()]  # type: ignore[attr-defined]
+        for each in timers:
+            if each._callback in (end._arrived, end.line.received):
+                end.loop.call_at(each.when() + lasts, each._callback, *each._args)
+                each.cancel()
+        end.loop.now += lasts  # type: ignore[attr-defined]
 
-        def stand_still() -> None:
-            """The amplifier runs in the same process, so that it does not reply meanwhile."""
-            timers = [each for each in end.loop._scheduled if not each.cancelled()]  # type: ignore[attr-defined]
-            for each in timers:
-                if each._callback in (end._arrived, end.line.received):
-                    end.loop.call_at(each.when() + lasts, each._callback, *each._args)
-                    each.cancel()
-            end.loop.now += lasts  # type: ignore[attr-defined]
-
-        end.loop.call_later(after, stand_still)
-        await group.amplifiers["a"].read_status()
-        assert end.retries == 0
-
-    with_group(test, kind, ("a",))
+    end.loop.call_later(after, stand_still)
+    await group.amplifiers["a"].read_status()
+    assert end.retries == 0
 
 
 @grouped(("a",), wire="serial")
@@ -244,30 +238,29 @@ async def test_port_that_takes_nothing_leaves_an_amplifier_degraded(
     assert (await group.stop())["a"].is_confirmed
 
 
-@pytest.mark.parametrize("kind", ["serial", "can", "tcp", "rtu"])
-def test_commit_of_a_set_that_is_given_up_is_not_sent(kind: str) -> None:
+@pytest.mark.parametrize("wire", KINDS)
+@grouped(("a", "b"))
+async def test_commit_of_a_set_that_is_given_up_is_not_sent(
+    group: Group, ends: list[MemoryLine]
+) -> None:
     """It waits behind a reading of the line that two amplifiers share."""
-
-    async def test(group: Group, ends: list[MemoryLine]) -> None:
-        (end,) = ends
-        await group.apply({each: [layer(0, tone())] for each in "ab"})
-        applying = asyncio.ensure_future(
-            group.apply({each: [Layer(0, (tone(level=0.3),), 0.001)] for each in "ab"})
-        )
-        end.outward = lambda name, data: [(0.02 if name == "GetStatus" else 0.0002, data)]
-        for _ in range(1000):
-            await asyncio.sleep(0.0001)
-            if end.sent[-1][1] == "2:5":
-                break
-        reading = asyncio.ensure_future(group.amplifiers["a"].read_status())
-        await asyncio.sleep(0.005)
-        end.sent.clear()
-        group.abort_exchange()
-        with pytest.raises(DriverError):
-            await applying
-        await reading
-        await asyncio.sleep(0.01)
-        assert end.sent == []
-        assert (end.levels("a"), end.levels("b")) == ([0.5, 0.0], [0.5, 0.0])
-
-    with_group(test, kind, ("a", "b"))
+    (end,) = ends
+    await group.apply({each: [layer(0, tone())] for each in "ab"})
+    applying = asyncio.ensure_future(
+        group.apply({each: [Layer(0, (tone(level=0.3),), 0.001)] for each in "ab"})
+    )
+    end.outward = lambda name, data: [(0.02 if name == "GetStatus" else 0.0002, data)]
+    for _ in range(1000):
+        await asyncio.sleep(0.0001)
+        if end.sent[-1][1] == "2:5":
+            break
+    reading = asyncio.ensure_future(group.amplifiers["a"].read_status())
+    await asyncio.sleep(0.005)
+    end.sent.clear()
+    group.abort_exchange()
+    with pytest.raises(DriverError):
+        await applying
+    await reading
+    await asyncio.sleep(0.01)
+    assert end.sent == []
+    assert (end.levels("a"), end.levels("b")) == ([0.5, 0.0], [0.5, 0.0])

@@ -5,9 +5,9 @@ import contextlib
 import signal
 import socket
 import sys
-import time
 from pathlib import Path
 
+import httpx
 import pytest
 
 from controller.api.async_client import AsyncClient
@@ -73,21 +73,16 @@ async def test_start_that_is_stuck_ends_by_sigterm(tmp_path: Path) -> None:
             process.kill()
 
 
-async def _get(port: int, path: str, *, host: str = "localhost") -> str:
-    """Get a page as soon as it is served."""
-    end = time.monotonic() + PATIENCE
-    while True:
-        try:
-            reader, writer = await asyncio.open_connection("127.0.0.1", port)
-            break
-        except OSError:
-            assert time.monotonic() < end, "page not served"
-            await asyncio.sleep(0.05)
-    writer.write(f"GET {path} HTTP/1.0\r\nHost: {host}\r\n\r\n".encode())
-    text = (await asyncio.wait_for(reader.read(), PATIENCE)).decode()
-    writer.close()
-    await writer.wait_closed()
-    return text
+def serves(port: int) -> bool:
+    """Whether connections are accepted."""
+    with socket.socket() as client:
+        return client.connect_ex(("127.0.0.1", port)) == 0
+
+
+async def page(port: int, path: str) -> str:
+    """Get a page."""
+    url = f"http://127.0.0.1:{port}{path}"
+    return (await asyncio.to_thread(httpx.get, url, timeout=PATIENCE)).text
 
 
 async def test_dashboard_process_ends_with_killed_daemon(tmp_path: Path) -> None:
@@ -101,23 +96,10 @@ async def test_dashboard_process_ends_with_killed_daemon(tmp_path: Path) -> None
             assert daemon.process.stdout is not None
             line = await asyncio.wait_for(daemon.process.stdout.readline(), PATIENCE)
             assert line.decode().startswith(f"dashboard: http://127.0.0.1:{port}/")
-            host = f"127.0.0.1:{port}"
-            assert "<html" in await _get(port, "/", host=host)
-            while "era_up 1.0" not in (metrics := await _get(port, "/metrics", host=host)):
+            await until(lambda: serves(port))
+            assert "<html" in await page(port, "/")
+            while "era_up 1.0" not in (metrics := await page(port, "/metrics")):
                 assert "era_up 0.0" in metrics  # not connected to the daemon yet
             daemon.process.kill()
             await daemon.process.wait()
-            end = time.monotonic() + PATIENCE
-            while await _serves(port):
-                assert time.monotonic() < end, "gateway outlived its daemon"
-
-
-async def _serves(port: int) -> bool:
-    """Whether connections are accepted, some time later."""
-    await asyncio.sleep(0.05)
-    try:
-        _, writer = await asyncio.open_connection("127.0.0.1", port)
-    except OSError:
-        return False
-    writer.close()
-    return True
+            await until(lambda: not serves(port))

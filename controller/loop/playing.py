@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from controller.loop.content import Content
-from controller.loop.intent import Pulse, Target
+from controller.loop.intent import Target
 from controller.loop.plate_set import PlateSet
 from controller.loop.routing import Drive, restarted_by, tones_by_era
 from controller.sources.contacts import MAX_CONTACT_TIMEOUT, Contact, ContactKey
@@ -205,15 +205,16 @@ class Playing:
 
 def all_left(targets: Targets, now: float) -> list[float]:
     """Return how long [s] each target is driven from a time [s]; infinite without a pulse."""
-    return [_left(target.pulse, now) for _, target in targets]
-
-
-def _left(pulse: Pulse | None, now: float) -> float:
-    if pulse is None:
-        return math.inf
-    if pulse.started_at is None:
-        return pulse.duration
-    return max(pulse.end - now, _MIN_LEFT)
+    left = []
+    for _, target in targets:
+        pulse = target.pulse
+        if pulse is None:
+            left.append(math.inf)
+        elif pulse.started_at is None:
+            left.append(pulse.duration)
+        else:
+            left.append(max(pulse.end - now, _MIN_LEFT))
+    return left
 
 
 def _shortest(played: Played, number: int) -> float:

@@ -126,10 +126,11 @@ class Selector:
         their change arrived.
         """
         by_key = {target.key: target for target in intent.targets}
-        targets = tuple((each, by_key[each.key]) for each in contacts if each.key in by_key)
+        # Lists: a generator would be a call for each.
+        targets = tuple([(each, by_key[each.key]) for each in contacts if each.key in by_key])
         served, skipped = _within_layers(targets, capabilities)
-        lasting = tuple(each for each in served if not each[1].is_short)
-        short = tuple(each for each in served if each[1].is_short)
+        lasting = tuple([each for each in served if not each[1].is_short])
+        short = tuple([each for each in served if each[1].is_short])
         self.triggered_at = math.inf
         self._protected = intent.protected
         self._adopt(lasting, contacts)
@@ -140,7 +141,7 @@ class Selector:
             for contact, target in short
             if contact.key in pulses and pulses[contact.key].targets[0][1] == target
         }
-        new = tuple(each for each in short if each[0].key not in self._short)
+        new = tuple([each for each in short if each[0].key not in self._short])
         is_kept = not lasting or self._fits(self._lasting, lasting, contacts)
         is_due = self.due < math.inf and self.due <= triggered_at
         is_rested = bool(lasting) and is_due and is_kept and not self._thread.is_busy
@@ -217,13 +218,17 @@ class Selector:
         Several in the thread, and what comes while it is busy, which has the table for itself:
         pulses first, which would be late. pulses: before these.
         """
-        if self._thread.is_busy and short:
+        is_busy = self._thread.is_busy
+        if is_busy and short:
             lasting = None
-        if self._thread.is_busy and self._is_requested(lasting, short, contacts):
+        if is_busy and self._is_requested(lasting, short, contacts):
             return
         table, levels, shape = self._table, self._levels, self._shape
         before, protected = self._lasting, self._protected
-        is_moving = lasting is not None and not is_rested and self._has_moved(lasting, contacts)
+        takes_long = lasting is not None and not _is_quick(lasting, protected)
+        is_moving = False
+        if lasting is not None and takes_long and not is_rested:
+            is_moving = self._has_moved(lasting, contacts)
         if lasting is not None:
             self.due = triggered_at + _RESTS_AFTER if is_moving else math.inf
 
@@ -259,10 +264,9 @@ class Selector:
                 )
             return _Chosen(found, new, triggered_at, is_rested)
 
-        if not self._thread.is_busy:
+        if not is_busy:
             self._chosen_last = _NOTHING
-        takes_long = lasting is not None and not _is_quick(lasting, protected)
-        if self._thread.is_busy or takes_long:
+        if is_busy or takes_long:
             self._requested = Selection(lasting or (), contacts, protected=protected), short
             self._thread.compute(chosen)
             return
@@ -311,7 +315,7 @@ class Selector:
 
     def _has_moved(self, lasting: Targets, contacts: Sequence[Contact]) -> bool:
         """Whether those that felt several contents feel them still, in other places."""
-        if _is_quick(lasting, self._protected) or not _is_for(self._lasting, contacts):
+        if not _is_for(self._lasting, contacts):
             return False
         of_any_level = [
             {replace(target, level_db_sl=None) for target in _intents(targets)}
@@ -342,8 +346,10 @@ def _sum_db(levels: Iterable[float]) -> float:
 
 def _is_quick(lasting: Targets, protected: frozenset[ContactKey]) -> bool:
     """Whether it is one steady content that no finger must not notice."""
-    keys = {contact.key for contact, _ in lasting}
-    return len(lasting) == 1 and protected <= keys and lasting[0][1].modulation_hz is None
+    if len(lasting) != 1:
+        return False
+    ((contact, target),) = lasting
+    return protected <= {contact.key} and target.modulation_hz is None
 
 
 def _plays(pulse: Selection, now: float) -> bool:
@@ -461,9 +467,9 @@ def _lasting_of(
     is_moving: bool,
 ) -> Selection:
     """Choose for all targets that last; any failure is their reason for silence."""
-    keys = {contact.key for contact, _ in lasting}
     if _is_quick(lasting, protected):
         return _alone(table, levels, *lasting[0], contacts, capabilities, before, protected)
+    keys = {contact.key for contact, _ in lasting}
     quiet = tuple(each for each in contacts if each.key not in keys)
     felt = {content.key: content for content in before.contents}
     try:

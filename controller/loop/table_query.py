@@ -102,11 +102,11 @@ def query_table(
 
 def question_of(contact: Contact, quiet: Sequence[Contact], **others: Any) -> Question:
     """Return the question for a target among quiet contacts; others: of its fields."""
-    loads = tuple(each.load for each in (contact, *quiet))
+    loads = [contact.load, *[each.load for each in quiet]]
     return Question(
         targets=((contact.x, contact.y),),
-        quiet=tuple((each.x, each.y) for each in quiet),
-        loads=() if all(load == 1 for load in loads) else loads,
+        quiet=tuple([(each.x, each.y) for each in quiet]),
+        loads=() if loads.count(1) == len(loads) else tuple(loads),
         **others,
     )
 

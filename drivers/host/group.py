@@ -156,7 +156,7 @@ class Group(Members):
 
     async def _beat(self) -> None:
         for each in self.amplifiers.values():  # before the others are waited for: they stop then
-            if is_lost(each):
+            if (each.silence_cause or each.line.loss) and is_lost(each):
                 raise LinkTimeout(each.line.loss or each.silence_cause)
         feeding: list[Awaitable[Values]] = []
         for name, each in self.amplifiers.items():

@@ -229,10 +229,6 @@ class Rest:
 
     name: str
 
-    def pack(self, values: Mapping[str, Any], words: list[int]) -> None:
-        """Append the words."""
-        words.extend(values[self.name])
-
     def unpack(self, words: Sequence[int], at: int, values: Values) -> int:
         """Take the words."""
         values[self.name] = list(words[at:])
@@ -264,7 +260,7 @@ class Record:
 
         ValueError for one out of range, KeyError for none.
 
-        Numbers and shared words, nearly all, without a call: every set has dozens of them.
+        Numbers and words, nearly all, without a call: every set has dozens of them.
         """
         for values, field in product(rows, self.fields):
             if isinstance(field, Number):
@@ -282,6 +278,8 @@ class Record:
                         raise ValueError(f"{name} must be below {1 << bits}, got {value}")
                     word = word << bits | value
                 words.append(word)
+            elif isinstance(field, Rest):
+                words.extend(values[field.name])
             else:
                 field.pack(values, words)
         return words

@@ -108,13 +108,11 @@ def phases_of_drive(observation: Responses, predicted: ComplexArray) -> list[Cha
         finite = np.isfinite(measured) & np.isfinite(model)
         inner = (np.where(finite, np.conj(model), 0) * np.where(finite, measured, 0)).sum(axis=1)
         inner = inner[np.abs(inner) > 0]
-        if len(inner) == 0:
-            found.append(ChannelPhase())
-            continue
-        mean = complex(np.mean(inner / np.abs(inner)))
+        mean = complex(np.mean(inner / np.abs(inner))) if len(inner) else 0j
         angle = math.degrees(np.angle(mean))
-        if abs(mean) < _MIN_COHERENCE:
-            found.append(ChannelPhase(None, 0, abs(mean)))
-        else:
-            found.append(ChannelPhase(angle, 1 if abs(angle) < 90 else -1, abs(mean)))
+        found.append(
+            ChannelPhase(angle, 1 if abs(angle) < 90 else -1, abs(mean))
+            if abs(mean) >= _MIN_COHERENCE
+            else ChannelPhase(confidence=abs(mean))
+        )
     return found

@@ -279,13 +279,12 @@ def _cycles(
 ) -> tuple[tuple[str, ...], ...]:
     """Cycles of channels that drive each other's ERAs."""
     found: list[tuple[str, ...]] = []
-    seen: set[int] = set()
     for start in range(len(drives)):
         cycle = [start]
-        while drives[cycle[-1]] != start and drives[cycle[-1]] not in cycle:
-            cycle.append(drives[cycle[-1]])
-        closed = drives[cycle[-1]] == start and len(cycle) > 1
-        if closed and not seen & set(cycle) and not dead[cycle].any():
-            seen |= set(cycle)
+        while (after := drives[cycle[-1]]) not in cycle:
+            cycle.append(after)
+        # Each is found once from every channel in it.
+        is_first = after == start == min(cycle)
+        if is_first and len(cycle) > 1 and not dead[cycle].any():
             found.append(tuple(rig.eras[number].name for number in cycle))
     return tuple(found)

@@ -57,18 +57,13 @@ class Explanation:
         """Whether the state has taken up the change."""
         return bool(self.name) and not self.found
 
-    @property
-    def amount(self) -> str:
-        """The change with its unit."""
-        if self.name == BY_MASS:
-            return f"{1000 * self.change:+.3g} g"
-        return f"{100 * np.expm1(self.change):+.2g} %"
-
     def __str__(self) -> str:
         if self.found:
             return f"{self.name}, {self.found}"
+        if self.name == BY_MASS:
+            return f"{self.name} by {1000 * self.change:+.3g} g"
         if self.name:
-            return f"{self.name} by {self.amount}"
+            return f"{self.name} by {100 * np.expm1(self.change):+.2g} %"
         return f"the plate has changed, most as if {self.resembles} had"
 
 

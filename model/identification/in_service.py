@@ -112,7 +112,7 @@ class LivePlate:
         self._places = PLACES.centres(known.before.plate)
         self._noise = NoiseLevel()
         self._held: list[Touched] = []
-        self._since_alarm = 0
+        self._suspects = 0
 
     def take(self, pattern: SettledPattern) -> Report:
         """Take a settled pattern: update the state, or hold it and explain what happened."""
@@ -122,7 +122,6 @@ class LivePlate:
         known, drifted = self.known, self._drifted(pattern.time)
         if self._held:
             self._held.append(touched)
-            self._since_alarm += 1
             return self._explained(pattern.time)
         after = update(drifted, [touched], evaluations=_EVALUATIONS, theory=self._theory)
         taken = Taken.of(touched, known.state, known.time, after, self._places)
@@ -144,12 +143,12 @@ class LivePlate:
     def _go_back(self, suspect: list[Taken]) -> None:
         """Return to the state before the first suspect pattern, and hold them."""
         self.known = replace(self.known, state=suspect[0].before, time=suspect[0].time)
-        self._held, self._since_alarm = [each.touched for each in suspect], 0
+        self._held, self._suspects = [each.touched for each in suspect], len(suspect)
 
     def _explained(self, time: float) -> Report:
         """Explain what was held, early if it is certain."""
         count, drifted = len(self._held), self._drifted(time)
-        is_full = count >= _HELD and self._since_alarm >= _AFTER_ALARM
+        is_full = count >= max(_HELD, self._suspects + _AFTER_ALARM)
         found = explain(drifted, self._held) if count >= _EARLY else None
         if is_full and found and not found.name:
             # The first of them may be from before the change.

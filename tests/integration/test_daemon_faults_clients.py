@@ -9,11 +9,18 @@ from pathlib import Path
 
 import pytest
 
-import patient_daemon
 from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import RpcError
-from daemon_bench import PATIENCE, far_end, holding, until
-from daemon_process import DaemonProcess, Journal, daemon_process, loudness, play, plays_on, run_era
+from daemon_bench import PATIENCE, far_end, until
+from daemon_process import (
+    DaemonProcess,
+    daemon_process,
+    loudness,
+    play,
+    playing_daemon,
+    plays_on,
+    run_era,
+)
 from floods import flood
 from long_form import shortly
 
@@ -43,26 +50,20 @@ async def stop_by_new_client(daemon: DaemonProcess) -> None:
 
 async def test_daemon_plays_on_with_idle_and_unreading_clients(tmp_path: Path) -> None:
     """With 2000 idle and 10 unreading ones memory is bounded, and a new client can stop it."""
-    async with (
-        far_end(tmp_path) as far,
-        daemon_process(tmp_path, far, program=patient_daemon.PROGRAM) as daemon,
-    ):
-        journal = Journal(far)
-        async with await daemon.client() as era, holding(era):
-            await play(era, far)
-            before = resident(daemon.process.pid)
-            async with (
-                flood("unreading", daemon.socket, 10),
-                flood("idle", daemon.socket, 2000) as idle,
-            ):
-                await plays_on("clients connecting", daemon, era, journal)
-                assert idle.stdout is not None
-                line = await asyncio.wait_for(idle.stdout.readline(), 3 * PATIENCE)
-                assert int(line) == 2000
-                await plays_on("2000 idle, 10 unreading", daemon, era, journal)
-                await stop_by_new_client(daemon)
-                assert resident(daemon.process.pid) - before < MAX_GROWTH
-            await play(era, far)
+    async with playing_daemon(tmp_path) as (daemon, era, journal):
+        before = resident(daemon.process.pid)
+        async with (
+            flood("unreading", daemon.socket, 10),
+            flood("idle", daemon.socket, 2000) as idle,
+        ):
+            await plays_on("clients connecting", daemon, era, journal)
+            assert idle.stdout is not None
+            line = await asyncio.wait_for(idle.stdout.readline(), 3 * PATIENCE)
+            assert int(line) == 2000
+            await plays_on("2000 idle, 10 unreading", daemon, era, journal)
+            await stop_by_new_client(daemon)
+            assert resident(daemon.process.pid) - before < MAX_GROWTH
+        await play(era, daemon.far)
 
 
 async def test_stops_are_served_while_clients_connect_again_and_again(tmp_path: Path) -> None:
@@ -82,19 +83,13 @@ async def test_stops_are_served_while_clients_connect_again_and_again(tmp_path: 
 @pytest.mark.parametrize("kind", shortly(["garbage", "asking"], ["asking"]))
 async def test_daemon_plays_on_when_clients_flood(tmp_path: Path, kind: str) -> None:
     """With malformed or endless requests any client can stop it, and the log stays short."""
-    async with (
-        far_end(tmp_path) as far,
-        daemon_process(tmp_path, far, program=patient_daemon.PROGRAM) as daemon,
-    ):
-        journal = Journal(far)
-        async with await daemon.client() as era, holding(era):
-            await play(era, far)
-            before = resident(daemon.process.pid)
-            async with flood(kind, daemon.socket, 4), flood(kind, daemon.socket, 5):
-                await plays_on(f"clients flood: {kind}", daemon, era, journal)
-                await stop_by_new_client(daemon)
-            await play(era, far)
-            assert resident(daemon.process.pid) - before < MAX_GROWTH
+    async with playing_daemon(tmp_path) as (daemon, era, journal):
+        before = resident(daemon.process.pid)
+        async with flood(kind, daemon.socket, 4), flood(kind, daemon.socket, 5):
+            await plays_on(f"clients flood: {kind}", daemon, era, journal)
+            await stop_by_new_client(daemon)
+        await play(era, daemon.far)
+        assert resident(daemon.process.pid) - before < MAX_GROWTH
         assert not daemon.has_logged("Traceback")
         assert not daemon.has_logged("no json")
         assert len(daemon.log) < 200  # invalid requests do not fill the disk

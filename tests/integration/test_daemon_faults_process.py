@@ -29,6 +29,7 @@ from daemon_process import (
     disarmed,
     loudness,
     play,
+    playing_daemon,
     plays_on,
     ready,
     silent_from,
@@ -109,31 +110,24 @@ async def test_daemon_loses_only_log_lines_when_disk_is_full(tmp_path: Path) -> 
     Once there is space, the log continues.
     """
     more = "log: {file: era.log}\ndumps: {folder: dumps}\n"
-    program = patient_daemon.PROGRAM
-    async with (
-        far_end(tmp_path) as far,
-        daemon_process(tmp_path, far, more, program=program, waits=False) as daemon,
-    ):
-        await until(lambda: (tmp_path / "era.sock").is_socket())
-        pid, journal = daemon.process.pid, Journal(far)
-        async with await daemon.client() as era, holding(era):
-            await play(era, far)
-            before = limited(pid, resource.RLIMIT_FSIZE, 0)
-            size = (tmp_path / "era.log").stat().st_size
-            dumps = {*(tmp_path / "dumps").glob("*")}  # of a reply lost before, on a busy machine
-            assert size > 0
-            await plays_on("disk full", daemon, era, journal)
-            far.device.inject_fault(FaultWindow("arc"))
-            await until_state(era, "FAULT")
-            assert loudness(far) == 0
-            far.device.recover()
-            os.kill(pid, signal.SIGHUP)
-            await plays_on("disk full, after a fault", daemon, era, journal)
-            assert (tmp_path / "era.log").stat().st_size == size
-            assert not {*(tmp_path / "dumps").glob("*")} - dumps
-            resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
-            await disarmed(era)
-            await until(lambda: (tmp_path / "era.log").stat().st_size > size)
+    async with playing_daemon(tmp_path, more, waits=False) as (daemon, era, journal):
+        pid, far = daemon.process.pid, daemon.far
+        before = limited(pid, resource.RLIMIT_FSIZE, 0)
+        size = (tmp_path / "era.log").stat().st_size
+        dumps = {*(tmp_path / "dumps").glob("*")}  # of a reply lost before, on a busy machine
+        assert size > 0
+        await plays_on("disk full", daemon, era, journal)
+        far.device.inject_fault(FaultWindow("arc"))
+        await until_state(era, "FAULT")
+        assert loudness(far) == 0
+        far.device.recover()
+        os.kill(pid, signal.SIGHUP)
+        await plays_on("disk full, after a fault", daemon, era, journal)
+        assert (tmp_path / "era.log").stat().st_size == size
+        assert not {*(tmp_path / "dumps").glob("*")} - dumps
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
+        await disarmed(era)
+        await until(lambda: (tmp_path / "era.log").stat().st_size > size)
 
 
 @pytest.mark.alone
@@ -166,15 +160,9 @@ async def test_daemon_replays_nothing_when_starved(tmp_path: Path) -> None:
 
 async def test_daemon_plays_on_and_stops_without_descriptors(tmp_path: Path) -> None:
     """A connected client stops it; with descriptors again, new clients connect."""
-    more, program = "dumps: {folder: dumps}\n", patient_daemon.PROGRAM
-    async with (
-        far_end(tmp_path) as far,
-        daemon_process(tmp_path, far, more, program=program) as daemon,
-        await daemon.client() as era,
-        holding(era),
-    ):
-        pid, journal = daemon.process.pid, Journal(far)
-        await play(era, far)
+    more = "dumps: {folder: dumps}\n"
+    async with playing_daemon(tmp_path, more) as (daemon, era, journal):
+        pid = daemon.process.pid
         before = limited(pid, resource.RLIMIT_NOFILE, max(descriptors(pid)) + 1)
         waiting = []
         try:
@@ -185,7 +173,7 @@ async def test_daemon_plays_on_and_stops_without_descriptors(tmp_path: Path) -> 
             await plays_on("no descriptors left", daemon, era, journal)
             await era.stop()
             stopped = time.monotonic()
-            await until(lambda: loudness(far) == 0)
+            await until(lambda: loudness(daemon.far) == 0)
             assert not journal.raising_since(stopped)
             await ready(era)
         finally:

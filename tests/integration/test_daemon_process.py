@@ -15,21 +15,16 @@ from daemon_bench import PATIENCE, far_end, until, until_state, write_daemon
 from daemon_process import (
     ERA,
     daemon_process,
-    playing,
+    playing_daemon,
     run_era,
 )
-from patient_daemon import PROGRAM
 
 pytestmark = pytest.mark.real_time
 
 
 async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> None:
     """Exit status 2 with the process id of the first; at another socket it waits for the link."""
-    async with (
-        far_end(tmp_path) as far,
-        daemon_process(tmp_path, far, program=PROGRAM) as daemon,
-        playing(daemon) as era,
-    ):
+    async with playing_daemon(tmp_path) as (daemon, era, _):
         status, _, err = await run_era("daemon", tmp_path / "daemon.yaml")
         assert status == 2
         assert f"process {daemon.process.pid}" in err
@@ -45,7 +40,7 @@ async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> 
         _, log = await other.communicate()
         assert b"Traceback" not in log
         assert (await era.status()).state == "OPERATION_ENABLED"
-        await until(lambda: any(far.summary().levels))
+        await until(lambda: any(daemon.far.summary().levels))
 
 
 async def test_start_that_is_stuck_ends_by_sigterm(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from daemon_bench import (
     ENABLED,
     PATIENCE,
     daemon_table,
+    far_end,
     holding,
     ready,
     until,
@@ -32,6 +33,7 @@ from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import unpack_layers
 from installed_program import ERA
 from model.table.file import save_table
+from patient_daemon import PROGRAM
 from rig_on_wire import FarSide
 from sim.amplifier.contract import Amplifier
 
@@ -237,16 +239,6 @@ async def run_era(*arguments: object) -> tuple[int, str, str]:
     return process.returncode, out.decode(), err.decode()
 
 
-@asynccontextmanager
-async def playing(daemon: DaemonProcess) -> AsyncIterator[AsyncClient]:
-    """A client with a finger for which the amplifier plays."""
-    async with await daemon.client() as era:
-        await ready(era)
-        await era.arm("test", lease_s=60)
-        async with holding(era, far=daemon.far):
-            yield era
-
-
 async def disarmed(era: AsyncClient) -> None:
     """Disarm and wait until ready; a loss of the link disarms as well."""
     with contextlib.suppress(RpcError):
@@ -273,6 +265,25 @@ async def play(era: AsyncClient, far: FarSide) -> None:
             await until(lambda: loudness(far) > 0, patience=2.0)
             return
     raise AssertionError("nothing is played")
+
+
+@asynccontextmanager
+async def playing_daemon(
+    folder: Path, more: str = "", *, waits: bool = True
+) -> AsyncIterator[tuple[DaemonProcess, AsyncClient, Journal]]:
+    """A daemon that waits for a busy machine, as of `daemon_process`, and plays for a finger.
+
+    With the client that holds it down, and what the amplifier is asked.
+    """
+    async with (
+        far_end(folder) as far,
+        daemon_process(folder, far, more, program=PROGRAM, waits=waits) as daemon,
+    ):
+        journal = Journal(far)
+        await until(daemon.socket.is_socket)
+        async with await daemon.client() as era, holding(era):
+            await play(era, far)
+            yield daemon, era, journal
 
 
 async def plays_on(

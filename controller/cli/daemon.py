@@ -152,7 +152,7 @@ def touch(
     socket: Socket = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Put fingers on the plate for a while, and show the status in the middle of it.
+    """Put fingers on the plate for a while, and show the status.
 
     Each feels what the layout has at its place; without a layout the last one feels a buzz, and
     the others are quiet. With --replay send a recorded TUIO stream to the daemon at its pace.

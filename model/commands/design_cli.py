@@ -90,7 +90,7 @@ def design(
     mesh: MeshOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find or rank places of ERAs for the best promised felt contrast."""
+    """Find or rank places of ERAs for the best promised contrast."""
     from model.config.document import read_document
     from model.design.area import area_of
     from model.design.contacts import contact_rule

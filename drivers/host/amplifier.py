@@ -174,7 +174,7 @@ class Amplifier(Dialogue):
         achieved = achieved_layer(one, shown)
         if problem is None:
             self._misachieved = 0
-            self.ledger.playback.correct(achieved, token)
+            self.ledger.correct(one, achieved, token)
             return achieved
         self._misachieved += 1
         if self._misachieved >= MAX_CONTRADICTIONS:

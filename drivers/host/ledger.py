@@ -136,6 +136,17 @@ class Ledger:
             self._budget.restore(self.doubt.before)
             self.doubt = None
 
+    def correct(self, sent: LayerSet, achieved: LayerSet, token: int) -> None:
+        """Go on with a layer of the set with this token as the amplifier says it plays it.
+
+        Its frequencies, if allowed, are sent from now on in place of those that it rounds, so that
+        it and the ledger keep the phase of the same tones.
+        """
+        self.playback.correct(achieved, token)
+        for one, played in zip(sent.commands, achieved.commands, strict=True):
+            if self.limits.frequency_min <= played.frequency <= self.limits.frequency_max:
+                self._rounding.achieved[one.channel, one.frequency] = played.frequency
+
     def silenced(self, ramp: float, sent_at: float, now: float) -> None:
         """Note that all layers fall silent along a ramp [s], by a request sent at a time [s]."""
         self.doubt = None

@@ -108,6 +108,8 @@ class Rounding:
         self._layers: int = capabilities["layers"]
         self._ramp_max = _RAMP.from_wire(capabilities["ramp_max"])
         self._level_max = limits.level / _LEVEL.per_unit
+        self.achieved: dict[tuple[int, int], int] = {}
+        """Frequencies that the amplifier plays in place of others, by channel and frequency."""
 
     def layers(self, layers: Sequence[Layer]) -> tuple[LayerSet, ...]:
         """Return layers in integers of the wire; raises CommandRefused with channel and reason."""
@@ -175,7 +177,7 @@ class Rounding:
             self._check_envelopes(tone)
         return Command(
             channel,
-            frequency,
+            self.achieved.get((channel, frequency), frequency),
             min(round(level * _LEVEL.per_unit), limits.level),
             phase,
             bool(tone.keep_phase),

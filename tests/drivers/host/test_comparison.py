@@ -78,6 +78,31 @@ async def test_ledger_goes_on_with_what_was_achieved(kind: str) -> None:
 
 
 @in_virtual_time
+async def test_phase_is_kept_of_a_frequency_that_the_amplifier_rounds() -> None:
+    """101.3 Hz in steps of 1.5 Hz from 0 on are 102: sent so from then on, the tone goes on."""
+    end = MemoryLine("serial", "a")
+    far, (host,) = end.far["a"], end.hosts.values()
+    far.capabilities = {**far.capabilities, "frequency_step": 30}
+    group = await group_of(end)
+    commit, take = far.playback.commit, far._take
+
+    def rounded(layers: tuple[LayerSet, ...], token: int, time: float) -> None:
+        (one,) = layers
+        (only,) = one.commands
+        exact = replace(only, frequency=30 * round(only.frequency / 30))
+        commit([replace(one, commands=(exact,))], token, time)
+
+    far.playback.commit = rounded  # type: ignore[method-assign]
+    far._take = lambda part, now: {**take(part, now), "exact": 0}  # type: ignore[method-assign]
+    for level in (0.5, 0.4):
+        again = Tone(0, 101.3, level, keep_phase=True)
+        played = await group.apply({"a": [Layer(0, (again,), 0.02)]})
+        assert played.layers["a"][0].commands[0].frequency == 2040
+        for playback in (far.playback, host.ledger.playback):
+            assert [voice.frequency for voice in playback.all_voices[0]] == [102.0]
+
+
+@in_virtual_time
 async def test_layers_that_play_on_are_no_contradiction_where_sets_are_inexact() -> None:
     """Renewed, or still waiting for an onset: they show an earlier set, however often."""
     end = MemoryLine("serial", "a")

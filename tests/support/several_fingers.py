@@ -13,6 +13,8 @@ from chain import Chain, Position
 from committed_sets import CommittedSets
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
+from controller.loop.capabilities import PlaybackCapabilities
+from controller.loop.envelopes import RAMPS_ONLY
 from model.finger.perception import detection_threshold
 from model.table.build import build_table
 from model.table.table import LocalizationTable
@@ -29,6 +31,18 @@ LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)
 def table() -> LocalizationTable:
     """The paper's plate at 29 frequencies."""
     return build_table(smooth_rig(), frequencies=np.linspace(40.0, 320.0, 29))
+
+
+def playable(layers: int = 8) -> PlaybackCapabilities:
+    """What amplifiers of that plate can play, of so many layers, with ramps alone."""
+    return PlaybackCapabilities(
+        "phased",
+        ("phased",),
+        (40.0, 320.0),
+        {era.name: era.stroke for era in table().eras},
+        RAMPS_ONLY,
+        layers=layers,
+    )
 
 
 @dataclass

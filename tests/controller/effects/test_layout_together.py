@@ -17,18 +17,15 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.layout_together import Together, check_together, close_pairs, matrix_of
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
-from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.content import Prediction
-from controller.loop.envelopes import RAMPS_ONLY
 from controller.loop.intent import HapticIntent
 from controller.loop.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
 from model.config.shapes import Rectangle
-from model.drive_modes import DRIVE_MODES
 from model.table.answer import answer
 from model.table.effect_level import EffectLevels
 from model.table.request import Request
-from several_fingers import table
+from several_fingers import playable, table
 
 SIZE = 0.03
 WEST, EAST, NEXT, NORTH = (0.03, 0.06), (0.2448, 0.06), (0.075, 0.06), (0.1374, 0.18)
@@ -53,22 +50,14 @@ def fingers_at(places: Sequence[tuple[float, float]]) -> list[Contact]:
 
 def promised_by_the_loop(contacts: Sequence[Contact], intent: HapticIntent) -> list[float]:
     """Contrast that the control loop promises each finger, of amplifiers with eight layers."""
-    capabilities = PlaybackCapabilities(
-        DRIVE_MODES[-1],
-        DRIVE_MODES,
-        (40.0, 320.0),
-        {era.name: era.stroke for era in table().eras},
-        RAMPS_ONLY,
-        layers=8,
-    )
 
     async def predicted() -> tuple[Prediction, ...]:
         arrived = asyncio.Event()
         selector = Selector(table(), EffectLevels(table()), arrived=arrived.set)
-        selector.select(contacts, intent, capabilities)
+        selector.select(contacts, intent, playable())
         if selector.is_choosing:
             await arrived.wait()
-        return selector.select(contacts, intent, capabilities).predictions
+        return selector.select(contacts, intent, playable()).predictions
 
     found = asyncio.run(predicted())
     by_key = {each.contact.key: each.promised_contrast_db or math.nan for each in found}

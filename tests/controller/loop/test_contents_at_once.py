@@ -14,9 +14,7 @@ from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
-from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.decision import ENDED, Decider
-from controller.loop.envelopes import RAMPS_ONLY
 from controller.loop.intent import Target
 from controller.loop.joint_answer import query_jointly
 from controller.loop.observer import Applied
@@ -31,7 +29,7 @@ from model.arrays import Complex64Array
 from model.config.shapes import Rectangle
 from model.errors import InputError
 from model.table.pattern import Pattern
-from several_fingers import ABOVE, LEFT, RIGHT, fingers_on, table
+from several_fingers import ABOVE, LEFT, RIGHT, fingers_on, playable, table
 from virtual_loop import in_virtual_time
 
 LAYOUT = SurfaceLayout(
@@ -511,18 +509,6 @@ async def test_status_says_what_each_finger_feels() -> None:
         assert len({contact.frequency_hz for contact in event.contacts}) == 3
 
 
-def capabilities() -> PlaybackCapabilities:
-    """Amplifiers of four layers with ramps alone."""
-    return PlaybackCapabilities(
-        "phased",
-        ("phased",),
-        (40.0, 320.0),
-        {era.name: era.stroke for era in table().eras},
-        RAMPS_ONLY,
-        layers=4,
-    )
-
-
 def test_a_content_whose_own_contrast_is_not_why_it_is_held_back_says_so() -> None:
     """Both in one narrow band: the first would have had 3 dB beside it, it 16 itself."""
     contacts = [
@@ -530,7 +516,7 @@ def test_a_content_whose_own_contrast_is_not_why_it_is_held_back_says_so() -> No
         for n, at in enumerate(((0.06, 0.06), (0.2, 0.1)))
     ]
     targets = [(each, Target(each.key, 20.0, band=(99.0, 101.0))) for each in contacts]
-    found = query_jointly(table(), targets, (), capabilities(), before={}, shape=unshaped)
+    found = query_jointly(table(), targets, (), playable(4), before={}, shape=unshaped)
     (held_back,) = found.not_served
     assert held_back.promised_contrast_db is not None
     assert held_back.promised_contrast_db > 12
@@ -542,12 +528,12 @@ def test_a_kept_frequency_keeps_its_phase_at_the_finger() -> None:
     """As it moves by 1 cm and another joins, at its new place; by the fields of the table."""
     contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
     targets = [(each, Target(each.key, 14.0)) for each in contacts]
-    first = query_jointly(table(), targets, (), capabilities(), before={}, shape=unshaped)
+    first = query_jointly(table(), targets, (), playable(4), before={}, shape=unshaped)
     before = {each.key: each for each in first.contents}
     moved = replace(contacts[0], x=contacts[0].x + 0.01)
     third = Contact(ContactKey("a", 2), *ABOVE, since=0.0)
     joined = [(moved, targets[0][1]), targets[1], (third, Target(third.key, 14.0))]
-    second = query_jointly(table(), joined, (), capabilities(), before=before, shape=unshaped)
+    second = query_jointly(table(), joined, (), playable(4), before=before, shape=unshaped)
     places = [(each.x, each.y) for each, _ in joined]
     fields = table().unit_fields(np.array(places), contacts=places)
     kept = 0

@@ -7,23 +7,15 @@ import pytest
 
 from controller.loop.capabilities import PlaybackCapabilities
 from controller.loop.content import Selection
-from controller.loop.envelopes import RAMPS_ONLY
 from controller.loop.intent import HapticIntent, Pulse, Target
 from controller.loop.joint_answer import query_jointly
 from controller.loop.selection import Selector, unshaped
 from controller.sources.contacts import Contact, ContactKey
 from model.table.effect_level import EffectLevels
-from several_fingers import LEFT, RIGHT, table
+from several_fingers import LEFT, RIGHT, playable, table
 
 CONTACTS = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
-FREE = PlaybackCapabilities(
-    "phased",
-    ("phased",),
-    (40.0, 320.0),
-    {era.name: era.stroke for era in table().eras},
-    RAMPS_ONLY,
-    layers=8,
-)
+FREE = playable()
 
 
 def chosen(capabilities: PlaybackCapabilities, *targets: Target) -> Selection:

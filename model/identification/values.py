@@ -112,7 +112,7 @@ def plate_with(plate: Plate, values: Values) -> Plate:
         plate.scaled(modulus=values.modulus, thickness=values.thickness),
         loss_factor=max(values.loss_factor, 0.0),
         loss_exponent=values.loss_exponent,
-        mode_deviations=tuple((float(a), float(b)) for a, b in deviations if len(deviations)),
+        mode_deviations=tuple((float(a), float(b)) for a, b in deviations if deviations.any()),
     )
 
 

@@ -54,6 +54,11 @@ def test_calibrate_finds_every_parameter(truth, fitted):
         assert one.standard_error < 0.02 * true
 
 
+def test_calibrate_states_no_modes_of_a_plate_without_form_errors(fitted):
+    """A rig whose modes are those of theory has no rows of ones for them."""
+    assert fitted.rig.plate.mode_deviations == ()
+
+
 def test_calibrate_finds_gains(truth, fitted):
     """Gains 8 % and 6 degrees off are known to 1 % in the median, 4 % at worst.
 

@@ -97,8 +97,8 @@ class PluginRegistry(Generic[_T]):
         leads = loaded if isinstance(loaded, type) else type(loaded)
         if isinstance(loaded, type) is self.is_instance or not issubclass(leads, self.base):
             kind = "an instance of" if self.is_instance else "a class derived from"
-            wanted = f"{kind} {self.base.__name__}"
-            self._refuse(point, within, f"leads to {leads.__name__}, not to {wanted}")
+            expected = f"{kind} {self.base.__name__}"
+            self._refuse(point, within, f"leads to {leads.__name__}, not to {expected}")
         with self._attributed(point, within):
             called = point.name if self.called is None else self.called(loaded)
         if called != point.name:

@@ -137,8 +137,8 @@ class Altered(Touched):
         """A pattern whose plate was altered."""
         names = [f"{each} of {alteration.name}" for each in ("x", "y", *alteration.own)]
         free = len(alteration.own)
-        least, most = [-1.5] * 2 + [_LEAST] * free, [1.5] * 2 + [np.inf] * free
-        wider = touched.space.and_further("alteration", names, 1.0, least, most)
+        low, high = [-1.5] * 2 + [_LEAST] * free, [1.5] * 2 + [np.inf] * free
+        wider = touched.space.and_further("alteration", names, 1.0, low, high)
         return cls(touched.pattern, wider, touched.touched, touched.noise, alteration=alteration)
 
     @property

@@ -1,6 +1,7 @@
 """Settled patterns of a hidden plate, whose theory is not the model's, at random touches."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,13 +15,15 @@ from model.structure.attachments import Fingertip
 FREQUENCIES = np.linspace(40.0, 500.0, 27)
 SECONDS = 12.0  # between patterns
 
+_Found = TypeVar("_Found")
+
 
 def settled_patterns(
     hidden: Hidden,
     plate: Mounted,
     *,
     count: int,
-    start: int,
+    start: int = 0,
     noise: float = 0.01,
     heaviest: float | None = None,
 ) -> Iterator[SettledPattern]:
@@ -43,3 +46,15 @@ def settled_patterns(
         values = values + noise * np.abs(values) * (parts[0] + 1j * parts[1])
         fingers = tuple(RestingFinger(x, y, Fingertip()) for x, y in places.tolist())
         yield SettledPattern(number * SECONDS, frequency, bases, values, fingers)
+
+
+def played(
+    take: Callable[[SettledPattern], _Found],
+    hidden: Hidden,
+    plate: Mounted,
+    *,
+    count: int,
+    start: int = 0,
+) -> list[_Found]:
+    """What is found of each of some patterns."""
+    return [take(each) for each in settled_patterns(hidden, plate, count=count, start=start)]

@@ -13,7 +13,7 @@ from model.identification.alterations import Alteration, Altered, Crack, Hand, a
 from model.identification.identify import Identification
 from model.identification.in_service import Known, LivePlate, Report
 from model.identification.settled import Touched
-from settled_patterns import settled_patterns
+from settled_patterns import played, settled_patterns
 
 HAND = np.array([0.25, 0.05])
 EDGE = (0.188, 0.211, 0.0, 0.069, 0.5)  # m, and the share of its rigidity that is lost
@@ -44,13 +44,6 @@ def softened(plate: Mounted, soft: tuple[float, float, float, float, float]) -> 
     return replace(plate, plate=replace(plate.plate, soft=soft))
 
 
-def play(
-    live: LivePlate, hidden: Hidden, plate: Mounted, *, count: int, start: int = 0
-) -> list[Report]:
-    """Reports of patterns."""
-    return [live.take(each) for each in settled_patterns(hidden, plate, count=count, start=start)]
-
-
 def said(reports: Iterable[Report]) -> str:
     """The name of what was found first."""
     return next(each.explanation.name for each in reports if each.explanation)
@@ -62,13 +55,13 @@ def test_hand_that_stays_is_no_sticker_and_leaves_again(hidden: Hidden, known: K
     live = LivePlate(known)
     own = {each.name: getattr(hidden.mounted, each.name) for each in fields(Mounted)}
     rested = Rested(**own)
-    reports = play(live, hidden, rested, count=6)
+    reports = played(live.take, hidden, rested, count=6)
     assert said(reports) == "a hand"
     (explanation,) = (each.explanation for each in reports if each.explanation)
     x, y = (0.01 * float(each) for each in explanation.found.split(" at ")[1][:-3].split(", "))
     assert (x, y) == pytest.approx(HAND, abs=0.01)
     assert live.known.change
-    play(live, hidden, hidden.mounted, count=9)
+    played(live.take, hidden, hidden.mounted, count=9)
     assert not live.known.change
 
 
@@ -78,8 +71,7 @@ def test_heavy_sticker_is_no_hand(hidden: Hidden, known: Known) -> None:
     sticker = np.array([*HAND, 10e-3])
     plate = replace(hidden.mounted, masses=np.vstack([hidden.mounted.masses, sticker]))
     live = LivePlate(known)
-    reports = map(live.take, settled_patterns(hidden, plate, count=6, start=0))
-    assert said(reports) == "a mass"
+    assert said(played(live.take, hidden, plate, count=6)) == "a mass"
 
 
 @pytest.mark.long
@@ -89,8 +81,8 @@ def test_crack_is_named(hidden: Hidden, known: Known) -> None:
     After ten patterns, which have told the gains of the sensors.
     """
     live = LivePlate(known)
-    play(live, hidden, hidden.mounted, count=10)
-    reports = play(live, hidden, softened(hidden.mounted, EDGE), count=6, start=10)
+    played(live.take, hidden, hidden.mounted, count=10)
+    reports = played(live.take, hidden, softened(hidden.mounted, EDGE), count=6, start=10)
     assert said(reports) == "a crack"
     assert live.known.change
 
@@ -126,7 +118,7 @@ def test_numbers_change_with_place_and_values_of_an_alteration(
 ) -> None:
     """As extrapolated differences of the numbers, to 0.2 % of each column's largest."""
     model = found.fitted.problem.model
-    (pattern,) = settled_patterns(hidden, hidden.mounted, count=1, start=0)
+    (pattern,) = settled_patterns(hidden, hidden.mounted, count=1)
     touched = Altered.by(alteration, Touched.of(model, pattern, 0.5))
     p, fingers = model.space.size, np.zeros(4 * len(pattern.fingers))
     start = np.array([0.3, -0.4, *alteration.start(1.0)])

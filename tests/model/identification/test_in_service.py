@@ -6,30 +6,21 @@ import numpy as np
 import pytest
 
 from benchmarks.identification.hidden import Hidden
-from benchmarks.identification.thin_plate import Mounted
-from model.identification.in_service import Known, LivePlate, Report
-from settled_patterns import settled_patterns
+from model.identification.in_service import Known, LivePlate
+from settled_patterns import played, settled_patterns
 
 NE = 2  # number of that ERA
-
-
-def play(
-    live: LivePlate, hidden: Hidden, plate: Mounted, *, count: int, start: int
-) -> list[Report]:
-    """Reports of patterns at random touches of two to four fingers of unknown loads."""
-    patterns = settled_patterns(hidden, plate, count=count, start=start)
-    return [live.take(pattern) for pattern in patterns]
 
 
 def test_loosened_mount_is_named_and_followed(hidden: Hidden, known: Known) -> None:
     """Quiet patterns raise no alarm; a mount 20 % softer does within 8, and is named NE."""
     live = LivePlate(known)
-    quiet = play(live, hidden, hidden.mounted, count=10, start=0)
+    quiet = played(live.take, hidden, hidden.mounted, count=10)
     assert not any(report.alarm for report in quiet)
     assert np.mean([report.nis / report.count for report in quiet]) < 1.5
     factors = np.where(np.arange(4) == NE, 0.8, 1.0)
     loose = replace(hidden.mounted, stiffness=factors * hidden.mounted.stiffness)
-    after = play(live, hidden, loose, count=8, start=10)
+    after = played(live.take, hidden, loose, count=8, start=10)
     assert any(report.alarm for report in after)
     (explanation,) = (each.explanation for each in after if each.explanation)
     assert explanation.name == "stiffness NE"
@@ -60,10 +51,10 @@ def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
 def test_sticker_is_named_in_its_place(hidden: Hidden, known: Known) -> None:
     """3 g are named a mass within ten patterns, to 0.6 g and 1.5 cm."""
     live = LivePlate(known)
-    play(live, hidden, hidden.mounted, count=10, start=0)
+    played(live.take, hidden, hidden.mounted, count=10)
     sticker = np.array([0.11, 0.16, 3e-3])
     changed = replace(hidden.mounted, masses=np.vstack([hidden.mounted.masses, sticker]))
-    after = play(live, hidden, changed, count=10, start=10)
+    after = played(live.take, hidden, changed, count=10, start=10)
     (explanation,) = (each.explanation for each in after if each.explanation)
     assert explanation.name == "a mass"
     added = live.known.rig.masses[-1]
@@ -82,7 +73,7 @@ def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, known: Know
     """After an identification with chi² above 2 patterns leave the state as it was."""
     live = LivePlate(replace(known, is_explained=False))
     before = live.known.state
-    play(live, hidden, hidden.mounted, count=2, start=0)
+    played(live.take, hidden, hidden.mounted, count=2)
     assert live.known.state is before
 
 
@@ -97,7 +88,7 @@ def test_change_that_nothing_explains_is_said(hidden: Hidden, known: Known) -> N
         gain=mounted.gain * [1.0, 0.5j, 1.0, 1.0],
     )
     before = live.known.state
-    reports = play(live, hidden, odd, count=6, start=0)
+    reports = played(live.take, hidden, odd, count=6)
     assert reports[1].alarm
     assert reports[-1].explanation is not None
     assert reports[-1].explanation.name == ""

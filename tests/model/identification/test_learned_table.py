@@ -16,7 +16,7 @@ from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.table.build import build_table
 from model.table.table import LocalizationTable
-from settled_patterns import settled_patterns
+from settled_patterns import played, settled_patterns
 
 TONES = np.array([85.0, 150.0, 215.0, 330.0])
 POINTS = np.array([[0.06, 0.05], [0.15, 0.11], [0.26, 0.17], [0.22, 0.04]])
@@ -47,12 +47,10 @@ def test_answers_follow_a_loosened_mount(
 ) -> None:
     """Fields that a loose mount puts off by over a tenth are within a third of that afterwards."""
     learned = LearnedTable(table, known)
-    for pattern in settled_patterns(hidden, hidden.mounted, count=12, start=0):
-        learned.take(pattern)
+    played(learned.take, hidden, hidden.mounted, count=12)
     loose = loosened(hidden.mounted)
     stale = learned.current
-    for pattern in settled_patterns(hidden, loose, count=14, start=12):
-        learned.take(pattern)
+    played(learned.take, hidden, loose, count=14, start=12)
     assert not learned.change
     assert error(stale, loose) > 0.1
     assert error(learned.current, loose) < error(stale, loose) / 3
@@ -64,14 +62,10 @@ def test_answers_wait_for_an_explanation(
 ) -> None:
     """A quiet pattern gives a new table, odd ones that raise an alarm none."""
     learned = LearnedTable(table, known)
-    quiet = [
-        learned.take(each) for each in settled_patterns(hidden, hidden.mounted, count=12, start=0)
-    ]
+    quiet = played(learned.take, hidden, hidden.mounted, count=12)
     assert all(each.table is not None for each in quiet)
     odd = replace(hidden.mounted, stiffness=hidden.mounted.stiffness * [0.5, 1.0, 2.0, 1.0])
-    first, second = (
-        learned.take(each) for each in settled_patterns(hidden, odd, count=2, start=12)
-    )
+    first, second = played(learned.take, hidden, odd, count=2, start=12)
     assert second.report.alarm
     assert first.table is None
     assert second.table is None
@@ -84,14 +78,13 @@ def test_unexplained_change_widens_the_errors_of_answers(
     """Answers then are robust to the errors of a plate that was not measured, also when resumed."""
     file = tmp_path / "learned.npz"
     learned = LearnedTable(table, known, file=file)
-    for pattern in settled_patterns(hidden, hidden.mounted, count=12, start=0):
-        learned.take(pattern)
+    played(learned.take, hidden, hidden.mounted, count=12)
     odd = replace(
         hidden.mounted,
         stiffness=hidden.mounted.stiffness * [0.5, 1.0, 2.0, 1.0],
         gain=hidden.mounted.gain * [1.0, 0.5j, 1.0, 1.0],
     )
-    last = [learned.take(each) for each in settled_patterns(hidden, odd, count=7, start=12)][-1]
+    last = played(learned.take, hidden, odd, count=7, start=12)[-1]
     assert last.report.explanation is not None
     assert last.report.explanation.resembles
     assert last.table is learned.current
@@ -108,7 +101,7 @@ def test_pattern_that_no_table_follows_leaves_the_state(
 ) -> None:
     """State, answers and time are those before a refused pattern, and the next one is taken."""
     learned = LearnedTable(table, known)
-    first, second, third = settled_patterns(hidden, hidden.mounted, count=3, start=0)
+    first, second, third = settled_patterns(hidden, hidden.mounted, count=3)
     learned.take(first)
     state, current = learned.live.known, learned.current
 
@@ -130,8 +123,7 @@ def test_what_was_learned_is_resumed_for_its_table_only(
     """The same state and answers come back; another rig's table and a damaged file are refused."""
     file = tmp_path / "learned.npz"
     learned = LearnedTable.resumed(table, known, file=file)
-    for pattern in settled_patterns(hidden, hidden.mounted, count=3, start=0):
-        learned.take(pattern)
+    played(learned.take, hidden, hidden.mounted, count=3)
     learned.live.known = replace(learned.live.known, change="a crack")
     learned.save()
     robust = LearnedTable.resumed(table, known, file=file)

@@ -79,7 +79,7 @@ INLINE void lagrange(float *to, double x, int count) {
 /* Shapes under fingertips centred at places (k, 2) [m], and weights of the points in the mean over each. */
 SHARED tips read_tips(const raster *on, const double *places, size_t k, arena *memory) {
     const size_t r = on->r, few = on->few, fine = on->fine, count = few + fine, patch = on->side_x * on->side_y;
-    const size_t padded = (r + LANES - 1) / LANES * LANES;
+    const size_t half = patch / 2, padded = (r + LANES - 1) / LANES * LANES;
     tips to = {floats(memory, k * few * r), floats(memory, k * fine * r), floats(memory, k * few),
                floats(memory, k * fine), floats(memory, k * r)};
     const arena mark = *memory;
@@ -122,17 +122,16 @@ SHARED tips read_tips(const raster *on, const double *places, size_t k, arena *m
             for (int y = 0; y < side[1]; y++)
                 for (int x = 0; x < side[0]; x++) share[y * side[0] + x] = along_y[y] * along_x[x];
             for (size_t at = 0; at < padded; at += LANES) {
-                lanes even = {0}, odd = {0};
-                for (size_t j = 0; j < patch; j += 2) {
-                    lanes from;
+                lanes first = {0}, second = {0}, from;
+                for (size_t j = 0; j < patch - half; j++) { /* not even and odd: of other signs, these would cancel */
+                    memcpy(&from, near + (half + j) * padded + at, sizeof from);
+                    second += share[half + j] * from;
+                    if (j == half) break;
                     memcpy(&from, near + j * padded + at, sizeof from);
-                    even += share[j] * from;
-                    if (j + 1 == patch) break;
-                    memcpy(&from, near + (j + 1) * padded + at, sizeof from);
-                    odd += share[j + 1] * from;
+                    first += share[j] * from;
                 }
-                even += odd;
-                memcpy(found + at, &even, sizeof even);
+                first += second;
+                memcpy(found + at, &first, sizeof first);
             }
             memcpy(i < few ? to.few + (finger * few + i) * r : to.fine + (finger * fine + i - few) * r, found,
                    r * sizeof(float));

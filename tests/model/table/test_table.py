@@ -159,6 +159,24 @@ def test_read_fingertips_reads_the_points_and_weights_of_the_disc():
     np.testing.assert_allclose(tips.few_weights[0], [0.5, *[0.125] * 4], atol=1e-6)
 
 
+@pytest.mark.usefixtures("kernels_or_numpy")
+def test_read_fingertips_reads_waves_on_a_fine_raster_at_the_edges():
+    """Within 1e-4 of a wave at 3 mm, where the polynomials of twelve points are large."""
+    table = smooth_table()
+    sides = length, width = table.plate.length, table.plate.width
+    raster = Raster(*(round(side / 0.003) + 1 for side in sides), length, width)
+    waves = np.array([[20.0, 9.0], [-13.0, 25.0], [5.0, 40.0]])  # rad/m
+    table = replace(table, raster=raster, shapes=np.cos(raster.points @ waves.T).astype("f4"))
+    along = np.linspace(0.0, 0.006, 25)
+    places = [
+        (x, y) for x in [*along, *(length - along)] for y in (0.001, width / 2, width - 0.002)
+    ]
+    points = np.array([fingertip_points(x, y, table.plate) for x, y in places])
+    tips = table.read_fingertips(places)
+    np.testing.assert_allclose(tips.fine, np.cos(points @ waves.T), atol=1e-4)
+    np.testing.assert_allclose(tips.few, np.cos(points[:, [0, 9, 12, 15, 18]] @ waves.T), atol=1e-4)
+
+
 def test_background_is_the_mean_over_cells_beyond_five_centimetres():
     """The power of a drive there, cell by cell, and everywhere on a plate without such cells."""
     table = smooth_table()

@@ -34,4 +34,4 @@ class Judge(ExpectedAmplifier):
         if problem := achieved_problem(one, shown, self.can, is_exact=False):
             rule, what, must, seen = problem
             self.report(rule, 0.0, f"{what} in layer {one.layer}", must=must, seen=seen)
-        return achieved_layer(one, shown)
+        return achieved_layer(one, shown, self.can)

@@ -55,11 +55,19 @@ def achieved_problem(
     return None
 
 
-def achieved_layer(one: LayerSet, reply: Values) -> LayerSet:
-    """Return a layer as it plays by a reply: other levels, frequencies and phases."""
+def achieved_layer(one: LayerSet, reply: Values, can: Values) -> LayerSet:
+    """Return a layer as it plays by a reply: other levels, frequencies and phases.
+
+    can: capabilities. A tone at level 0, to which an onset may lead, stays as it is where its
+    frequency is no rounding of it: an amplifier may say any.
+    """
     found = {each["channel"]: {name: each[name] for name in TONE} for each in reply["commands"]}
-    silent = {"level": 0}
-    commands = [replace(tone, **found.get(tone.channel, silent)) for tone in one.commands]
+    commands = []
+    for tone in one.commands:
+        got = found.get(tone.channel, {"level": 0})
+        error = abs(got.get("frequency", tone.frequency) - tone.frequency)
+        is_any = not tone.level and error > can["frequency_step"]
+        commands.append(tone if is_any else replace(tone, **got))
     return replace(one, commands=tuple(commands))
 
 

@@ -171,7 +171,7 @@ class Amplifier(Dialogue):
         problem = achieved_problem(
             one, shown, self.capabilities, is_exact=False, slack=_WIRE_ROUNDING
         )
-        achieved = achieved_layer(one, shown)
+        achieved = achieved_layer(one, shown, self.capabilities)
         if problem is None:
             self._misachieved = 0
             self.ledger.correct(one, achieved, token)

@@ -102,6 +102,30 @@ async def test_phase_is_kept_of_a_frequency_that_the_amplifier_rounds() -> None:
             assert [voice.frequency for voice in playback.all_voices[0]] == [102.0]
 
 
+@pytest.mark.parametrize("said", [0, 1200])
+@in_virtual_time
+async def test_any_frequency_may_be_said_of_a_tone_at_level_0(said: int) -> None:
+    """A pulse of 170 Hz leads to level 0, which does not drive: none of its kind plays at 60 Hz."""
+    end = MemoryLine("serial", "a")
+    far = end.far["a"]
+    group = await group_of(end)
+    take, handle = far._take, far.handle
+
+    def handled(name: str, values: Values, now: float) -> Values:
+        reply = handle(name, values, now)
+        if name == "GetAchieved":
+            reply["commands"] = [{**each, "frequency": said} for each in reply["commands"]]
+        return reply
+
+    far._take = lambda part, now: {**take(part, now), "exact": 0}  # type: ignore[method-assign]
+    far.handle = handled  # type: ignore[method-assign]
+    pulse = Tone(0, 170.0, 0.0, onset=Envelope(100, ((300, 0),)))
+    for _ in range(2):
+        played = await group.apply({"a": [Layer(0, (pulse,), 0.001)]})
+        assert played.layers["a"][0].commands[0].frequency == 3400
+        assert {voice.frequency for voice in far.playback.all_voices[0]} == {170.0}
+
+
 @in_virtual_time
 async def test_layers_that_play_on_are_no_contradiction_where_sets_are_inexact() -> None:
     """Renewed, or still waiting for an onset: they show an earlier set, however often."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 NO_FIT = 1
 """Exit status where a fit does not explain the measurement."""
 
-_HEADING = re.compile(rb"# .* by `era (calibrate|rig identify)`:$|$")
+_HEADING = re.compile(rb"# .* by `era (calibrate|rig identify)`:\s*$|\Z")
 """First line of a rig that was fitted, or of an empty file."""
 
 
@@ -35,7 +35,7 @@ def check_rig_output(output: Path, *taken: Path) -> None:
             raise InputError(f"--output must differ from {file}; choose another name")
     if output.is_file():
         with output.open("rb") as stream:
-            is_fitted = _HEADING.match(stream.readline().rstrip()) is not None
+            is_fitted = _HEADING.match(stream.readline()) is not None
         check_replaceable(output, is_own=is_fitted, what="rig that `era` fitted")
 
 

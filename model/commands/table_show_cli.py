@@ -95,7 +95,6 @@ def verify(
             f"the table must come before the rig: era table verify {rig_file} {table_file}"
         )
     if device is not None:
-        from model.commands.table_show_cli import verify_by_measuring
         from model.table.table_check import CheckSettings
 
         if sensors_file is None:
@@ -106,7 +105,7 @@ def verify(
                 f"era table verify {table_file} RIG.yaml --device {device} --url {url}"
             )
         settings = CheckSettings(device, sensors_file, url, samples, seed, level)
-        verify_by_measuring(table_file, rig_file, settings, picture=picture, as_json=as_json)
+        _verify_by_measuring(table_file, rig_file, settings, picture=picture, as_json=as_json)
         return
     for option, given in (("--sensors", sensors_file), ("--url", url), ("--picture", picture)):
         if given is not None:
@@ -251,7 +250,7 @@ def _show_verification(found: "Verification") -> None:
     )
 
 
-def verify_by_measuring(
+def _verify_by_measuring(
     table_file: Path,
     rig_file: Path | None,
     settings: "CheckSettings",

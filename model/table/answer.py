@@ -18,7 +18,7 @@ from model.choice import best_by, best_of
 from model.errors import InputError
 from model.table.contents import Contents, Stream, Tones
 from model.table.contents_kernel import choose_tones
-from model.table.modulation import with_modulation
+from model.table.modulation import SAME_LEVEL, with_modulation
 from model.table.request import (
     ANY_BAND,
     APART_HZ,
@@ -29,8 +29,6 @@ from model.table.request import (
     check_requests,
 )
 from model.table.table import LocalizationTable
-
-_SAME_LEVEL = 0.1  # dB
 
 
 def answer(
@@ -68,7 +66,7 @@ def answer(
         f"content of {_at(each.request)} is lowered to {each.promised_level_db_sl:.1f} dB SL, "
         "all that the ERAs' stroke allows"
         for each in played
-        if each.promised_level_db_sl < each.request.level_db_sl - _SAME_LEVEL
+        if each.promised_level_db_sl < each.request.level_db_sl - SAME_LEVEL
         and each.verdict != "shared"
     ]
     return replace(found, applied=(*found.applied, *changed)) if changed else found

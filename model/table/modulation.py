@@ -13,12 +13,12 @@ from functools import cache
 import numpy as np
 
 from model.arrays import FloatArray, IntArray
-from model.choice import best_of
+from model.choice import NEARLY, best_of
 from model.finger.perception import decibels
 from model.table.contents import Stream, Tones
 from model.table.contents_kernel import choose_tones
 from model.table.fingers_on_plate import FingersOnPlate
-from model.table.promised import promised
+from model.table.promised import promised, share_stroke
 from model.table.request import APART_HZ, MIN_CONTRAST_DB, Answer
 from model.table.table import LocalizationTable
 
@@ -26,6 +26,7 @@ _SHARES = np.array([1.0, 0.5, 0.5])  # amplitudes of carrier and side bands
 _ALL_DB = 20 * math.log10(float(np.linalg.norm(_SHARES)))  # of all three above the carrier
 _NEAR = 2  # carriers tried on each side of the steady one, by frequencies of the table
 _SAME = 0.5  # Hz; by which both side bands may differ in distance from the carrier
+SAME_LEVEL = 0.1  # dB
 _ROUNDING_DB = 1e-3  # of a promise that stays the same
 
 
@@ -39,7 +40,7 @@ def with_modulation(
 
     playable: lowest and highest frequency [Hz] of side bands. These are as far below as above the
     carrier, where the table has a frequency nearest to the modulation, and APART_HZ from all tones
-    of other contents. A shared content is steady.
+    of other contents. A shared content is steady. Levels are lowered to what the stroke allows.
     """
     for number, stream in enumerate(found.contents.streams):
         request, tones = found.requests[stream.targets[0]], found.tones
@@ -68,6 +69,7 @@ def with_modulation(
             np.append(owners[kept], [number] * len(own)),
             np.append(np.array(tones.gains)[kept], shares),
         )
+        modulated = _within_stroke(table, modulated)
         if _is_served(modulated, found):
             found = modulated
     return found
@@ -142,6 +144,23 @@ def _contrast_db(tones: Sequence[Tones]) -> float:
     own = np.array([each.worst_db for each in tones])
     leaks = (_SHARES**2 * 10 ** (-own / 10))[np.isfinite(own)]
     return _ALL_DB - float(decibels(np.sqrt(leaks.sum()))) if len(leaks) else math.inf
+
+
+def _within_stroke(table: LocalizationTable, found: Answer) -> Answer:
+    """The answer with contents lowered to what the stroke allows of all tones together."""
+    tones, streams = found.tones, found.contents.streams
+    rows, owners, gains = (np.array(each) for each in (tones.rows, tones.owners, tones.gains))
+    drives = np.zeros((len(streams), len(table.eras)))
+    np.add.at(drives, owners, gains[:, None] * np.abs(tones.weights))
+    reached = [min(tones.level_db_sl[finger][1] for finger in each.targets) for each in streams]
+    levels = np.maximum(10 ** (np.array(reached) / 20), 1e-9)  # silent ones
+    priorities = [each.priority for each in streams]
+    factors, factor = share_stroke(np.ones(len(streams)), drives, levels, priorities)
+    if factor < 1 - NEARLY:
+        found = _with_tones(table, found, rows, tones.weights, owners, gains * factors[owners])
+    least_db = float(decibels(levels * factors / found.contents.levels).min())
+    of_all = 1.0 if least_db > -SAME_LEVEL else 10 ** (least_db / 20)
+    return replace(found, tones=replace(found.tones, stroke_factor=of_all))
 
 
 def _with_tones(

@@ -1,6 +1,7 @@
 """Modulated contents: a carrier and two side bands, by plates solved exactly."""
 
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -228,3 +229,26 @@ def test_all_tones_of_two_contents_are_apart(table, modulation):
             gaps.append(min(abs(a - b) for a in one for b in other))
     assert len(gaps) >= 4
     assert min(gaps) >= 30.0
+
+
+@pytest.mark.parametrize("priorities", [[1], [1, 1], [1, 2]])
+def test_side_bands_are_within_the_stroke(table, priorities):
+    """At their peaks the amplitudes of all tones of an ERA add up to its stroke at most."""
+    places = contact_sets(1, fingers=3, seed=4)[0]
+    requests = [
+        Request(at, level_db_sl=40.0, priority=priority, modulation_hz=10.0)
+        for at, priority in zip(places[:2], priorities, strict=False)
+    ]
+    others = [Finger(at) for at in places[len(requests) :]]
+    found = answer(table, requests, others, min_contrast_db=-99.0)
+    assert any(layer.side_bands for layer in found.layers)
+    stroke = dict.fromkeys(table.strokes, 0.0)
+    for layer in found.layers:
+        for name, tone in chain(
+            *(tones.items() for tones in (layer.excitation, *layer.side_bands))
+        ):
+            stroke[name] += tone.amplitude / table.strokes[name]
+    assert max(stroke.values()) == pytest.approx(1.0, abs=1e-5)
+    levels = [layer.promised_level_db_sl for layer in found.layers]
+    assert found.stroke_factor == pytest.approx(10 ** ((min(levels) - 40.0) / 20), rel=1e-4)
+    assert "is lowered to" in found.applied[-1]

@@ -351,7 +351,7 @@ class Decider:
                 number,
                 content.pattern,
                 content.question,
-                playing=before[number].drive if number in before else {},
+                playing=before[number].continued if number in before else {},
                 valid_for=playing.lasts(content, now),
                 restarts=content.key[0] in restarting,
                 is_shaped=not content.targets[0][1].is_short,

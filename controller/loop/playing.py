@@ -51,6 +51,16 @@ class PlayedContent:
     renewable_until: float = math.inf
     ends_at: float = math.inf
 
+    @property
+    def continued(self) -> Drive:
+        """What plays, at the frequencies that were asked for, which wire and amplifier round."""
+        asked = self.pattern.excitation
+        return {
+            name: replace(tone, frequency=asked[name].frequency)
+            for name, tone in self.drive.items()
+            if name in asked
+        }
+
 
 class Playing:
     """The layers of the amplifiers; count: how many there are, expiry_of: a contact [s]."""
@@ -196,7 +206,7 @@ class Playing:
         found = set()
         for number, content in numbers.items() if voiced else ():
             before = self.contents.get(number)
-            drive = {} if before is None else before.drive
+            drive = {} if before is None else before.continued
             is_continued = not restarted_by(content.pattern.excitation, drive)
             if content.key[0] in voiced and number not in unchanged and not is_continued:
                 found.add(content.key[0])

@@ -119,6 +119,18 @@ async def test_controller_keeps_phase_when_a_finger_moves() -> None:
         ]
 
 
+@in_virtual_time
+async def test_controller_keeps_phase_at_a_frequency_that_the_wire_rounds() -> None:
+    """101.33 Hz are 101.35 Hz in its steps of 0.05 Hz: what plays is what was asked for before."""
+    async with running() as bench:
+        bench.table.excitation = {"SW": Tone(101.33, 30e-6)}
+        await bench.hold(FINGER, seconds=0.1)
+        await bench.hold((1, 0.6, 0.5), seconds=0.1)
+        tones = [each.commands[0] for each in bench.far_end.sets() if not each.is_silent]
+        assert [tone.frequency for tone in tones] == [101.35, 101.35]
+        assert [tone.keep_phase for tone in tones] == [False, True]
+
+
 @pytest.mark.parametrize("kind", ["Set", "Commit", "GetStatus", "Ping"])
 @in_virtual_time
 async def test_controller_silences_a_lift_while_a_reply_is_awaited(kind: str) -> None:

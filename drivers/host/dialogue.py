@@ -183,9 +183,10 @@ class Dialogue:
         admitted: list[Staged] = []
 
         def part() -> Values:
-            if admitted:
-                return self.while_admitted(token, cuts[0])
-            admitted.append(self._admit(token, layers, cuts, now=now))
+            if not admitted:
+                admitted.append(self._admit(token, layers, cuts, now=now))
+            elif priority is Priority.SET:  # silence is never too late
+                self.while_admitted(token, cuts[0])
             return cuts[0]
 
         def follows() -> bool:

@@ -239,6 +239,21 @@ async def test_reading_that_gives_way_to_a_set_is_no_silence(
     await reading
 
 
+@grouped(("a", "b", "c"), wire="serial")
+async def test_silence_is_repeated_however_long_the_others_of_a_line_keep_it(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """No reply for 130 ms, and 30 ms for each of three: behind 0.1 s it is sent, not refused."""
+    (end,) = ends
+    await group.apply({name: [layer(0, tone())] for name in "abc"})
+    since = end.loop.time()
+    end.outward = lambda _, data: [] if end.loop.time() < since + 0.13 else [(0.0, data)]
+    await group.apply({name: [layer(0)] for name in "abc"})
+    assert group.is_armed
+    await asyncio.sleep(0.05)
+    assert [end.levels(name) for name in "abc"] == [[0.0, 0.0]] * 3
+
+
 @grouped(("a",), wire="serial")
 async def test_heartbeats_and_stops_go_between_the_parts_of_a_set(
     group: Group, ends: list[MemoryLine]

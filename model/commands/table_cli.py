@@ -225,6 +225,8 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
             for answer in query_batch(table, lines, defaults):
                 has_failed = has_failed or "error" in answer
                 print(json.dumps(answer), flush=is_piped)
+    except BrokenPipeError:
+        raise  # of who reads the answers
     except OSError as error:
         raise InputError(
             f"--batch {batch} cannot be read: {error.strerror}; give a file of JSON lines"

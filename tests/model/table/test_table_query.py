@@ -1,12 +1,15 @@
 """Questions to the table from the command line and from Python."""
 
+import errno
 import json
 import re
+from unittest.mock import Mock
 
 import pytest
 from typer.testing import CliRunner
 
 from model.cli import app
+from model.commands.table_cli import query
 from model.errors import InputError
 from model.table.file import save_table
 from model.table.query import query_batch
@@ -78,6 +81,16 @@ def test_batch_reads_standard_input(table_file):
     result = RUNNER.invoke(app, ["table", "query", str(table_file), "--batch", "-"], input=line)
     assert result.exit_code == 0
     assert json.loads(result.stdout)["mode"] == "phased"
+
+
+def test_batch_is_not_blamed_where_its_reader_closes(table_file, tmp_path, monkeypatch):
+    """As in `era table query TABLE --batch FILE | head`: the error is of the answers' pipe."""
+    batch = tmp_path / "b.jsonl"
+    batch.write_text('{"target": [0.1, 0.1]}\n')
+    broken = Mock(side_effect=BrokenPipeError(errno.EPIPE, "Broken pipe"))
+    monkeypatch.setattr("builtins.print", broken)
+    with pytest.raises(BrokenPipeError):
+        query(table_file, batch=batch)
 
 
 def test_batch_takes_options_as_defaults_of_its_lines(table_file, tmp_path):

@@ -66,34 +66,37 @@ class SerialAmplifiers(FarEnd):
             if frame.type == HELLO:
                 payload = pack_identity(amplifier.identity)
                 return frame._replace(kind=HELLO | REPLY, payload=payload, version=NEUTRAL)
-            payload = self._payload(frame, frame.address, now)
+            payload = self._payload(frame, amplifier, now)
         except Refusal as refusal:
             payload = pack_words(nak_of(refusal, frame.type))
             version = NEUTRAL if refusal.code == "UNSUPPORTED_VERSION" else VERSION
             return frame._replace(kind=NAK | REPLY, payload=payload, version=version)
         return frame._replace(kind=frame.kind | REPLY, payload=payload)
 
-    def _payload(self, frame: Frame, address: int, now: float) -> bytes:
-        """Carry out a request by the amplifier at an address; returns the payload of its reply.
+    def _payload(self, frame: Frame, amplifier: AmplifierPort, now: float) -> bytes:
+        """Carry out a request by an amplifier; returns the payload of its reply.
 
         Raises Refusal.
         """
         if frame.version != VERSION:
             raise Refusal(f"version must be {VERSION}, got {frame.version}", "UNSUPPORTED_VERSION")
         name, values = read_request(frame.type, unpack_words(frame.payload))
-        reply = self._amplifiers[address].handle(name, values, now)
+        reply = amplifier.handle(name, values, now)
         if name == "SetAddress":
-            self._amplifiers[values["address"]] = self._amplifiers.pop(address)
+            self._amplifiers = {
+                values["address"] if each is amplifier else address: each
+                for address, each in self._amplifiers.items()
+            }
         return pack_words(BY_NUMBER[frame.type].reply.pack(reply))
 
     def _broadcast(self, frame: Frame, now: float) -> None:
         message = BY_NUMBER.get(frame.type)
         if message is None or not message.is_broadcast:
             return
-        for address, amplifier in [*self._amplifiers.items()]:
+        for amplifier in self._amplifiers.values():
             if amplifier.is_answering:
                 with suppress(Refusal):
-                    self._payload(frame, address, now)
+                    self._payload(frame, amplifier, now)
 
     def _send_event(self, event: Values, now: float) -> None:
         ((address, amplifier),) = self._amplifiers.items()

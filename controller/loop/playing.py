@@ -54,11 +54,11 @@ class PlayedContent:
     @property
     def continued(self) -> Drive:
         """What plays, at the frequencies that were asked for, which wire and amplifier round."""
-        asked = self.pattern.excitation
+        requested = self.pattern.excitation
         return {
-            name: replace(tone, frequency=asked[name].frequency)
+            name: replace(tone, frequency=requested[name].frequency)
             for name, tone in self.drive.items()
-            if name in asked
+            if name in requested
         }
 
 

@@ -57,6 +57,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.Request: {
         "at": TARGET, "band_hz": (40.0, 90.0), "level_db_sl": 20.0, "priority": 0, "load": 1.0,
         "content": "click", "min_contrast_db": 12.0, "max_foreign_db_sl": -10.0,
+        "modulation_hz": 20.0,
     },
     era.Finger: {"at": TARGET, "load": 1.0, "max_foreign_db_sl": -10.0},
 }  # fmt: skip

@@ -120,7 +120,7 @@ def _inverse_filter(case: _Case) -> Excitation:
 def _paper(case: _Case) -> Excitation:
     known = replace(case.table, uncertainty=Uncertainty.none())
     found = known.query(replace(case.question, drive_mode="switched")).excitation
-    strokes = {era.name: era.stroke for era in case.table.eras}
+    strokes = case.table.strokes
     return {name: replace(tone, amplitude=strokes[name]) for name, tone in found.items()}
 
 
@@ -197,7 +197,7 @@ def entry(name: str, plates: list[str]) -> dict[str, object]:
     found, patterns = data_set(), {}
     for plate in plates:
         table = build_table(found.plates[plate].rig, drive_mode="phased")
-        strokes = {era.name: era.stroke for era in table.eras}
+        strokes = table.strokes
         for contacts in found.plates[plate].sets:
             question = contacts.question(level_db_sl=found.level_db_sl)
             rng = np.random.default_rng([5, contacts.number])

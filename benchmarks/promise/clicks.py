@@ -79,7 +79,7 @@ def clicks_on(table: "LocalizationTable", sets: int, seed: int) -> Clicks:
     from model.table.random_contacts import random_contacts
 
     rng, levels, found = np.random.default_rng(seed), EffectLevels(table), []
-    full = DriveLimits({era.name: era.stroke for era in table.eras})
+    full = DriveLimits(table.strokes)
     for number in range(sets):
         places = random_contacts(rng, 2 + number % 3, table.plate, margin=0.013)
         question = Question(places[:1], places[1:], LEVEL_DB_SL)

@@ -66,7 +66,7 @@ class TouchSimulator:
             drive_mode=DRIVE_MODES[-1],
             playable=DRIVE_MODES,
             frequencies=(float(table.frequencies[0]), float(table.frequencies[-1])),
-            max_amplitudes={era.name: era.stroke for era in table.eras},
+            max_amplitudes=table.strokes,
             envelope_support=RAMPS_ONLY,
         )
 

@@ -68,7 +68,7 @@ def query_jointly(
     kept = _kept(requests, targets, before)
     kept_within = math.inf if is_moving else KEPT_WITHIN
     found = _answer(table, requests, fingers, kept, kept_within, playable)
-    strokes = {era.name: era.stroke for era in table.eras}
+    strokes = table.strokes
     free, factor = found, _factor_within(found, capabilities, strokes)
     if factor < 1 - NEARLY:
         gains_db = _gains_db(requests, found, capabilities, strokes)
@@ -108,15 +108,17 @@ def query_jointly(
                 and other not in unfelt
             ]
             served = [(contact, target, layer), *sharing]
-            voices = [layer.excitation, *layer.side_bands]
+            voices = [
+                replace(layer, excitation=tones) for tones in (layer.excitation, *layer.side_bands)
+            ]
             is_continued = all(
                 (then := before.get((contact.key, voice))) is not None
-                and then.frequency == replace(layer, excitation=tones).frequency
-                for voice, tones in enumerate(voices)
+                and then.frequency == each.frequency
+                for voice, each in enumerate(voices)
             )
             carrier = before.get((contact.key, 0))
-            for voice, tones in enumerate(voices):
-                pattern = _pattern(table, replace(layer, excitation=tones), capabilities)
+            for voice, each in enumerate(voices):
+                pattern = _pattern(table, each, capabilities)
                 pattern = pattern.scaled(change) if change else pattern
                 if carrier is not None or layer.side_bands:
                     then = carrier if is_continued else None

@@ -444,7 +444,7 @@ def _power_left(
     table: LocalizationTable, pattern: Pattern, contents: Sequence[Content], max_power: float
 ) -> float:
     """Return the factor on a pattern for the power that contents leave, their peaks together."""
-    strokes = {era.name: era.stroke for era in table.eras}
+    strokes = table.strokes
     taken = dict.fromkeys(strokes, 0.0)
     for content in contents:
         for name, tone in content.pattern.excitation.items():

@@ -116,6 +116,13 @@ class _Commands(TyperGroup):
         others = set(self.commands).difference(*listed.values())
         return {**listed, "Others": sorted(others)}
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        """Find a command; where an option was meant, as in `era version`, say so."""
+        option = f"--{args[0]}"
+        if any(option in parameter.opts for parameter in self.get_params(ctx)):
+            ctx.fail(f"No such command {args[0]!r}. Did you mean {option}?")
+        return super().resolve_command(ctx, args)
+
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write a list of commands for each section."""
         width = max(len(name) for name in self.commands)

@@ -113,6 +113,7 @@ def test_run_runs_a_command_and_returns_zero(
         (["ends", "interrupt"], 130, ""),
         (["ends", "abort"], 130, ""),
         (["god"], 2, "Did you mean 'good'? See  era --help"),
+        (["version"], 2, "Did you mean --version? See  era --help"),
         (["good", "--nmber", "1"], 2, "era good --help"),
         (["good", "--number", "x"], 2, "era good --help"),
         (["ends"], 2, "era ends --help"),

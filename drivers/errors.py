@@ -22,6 +22,9 @@ class DriverError(Exception):
 class LinkError(DriverError, ConnectionError):
     """The wire, the adapter or the amplifier on it cannot be reached."""
 
+    lost: tuple[str, ...] = ()
+    """Names of the amplifiers that are lost, where several are driven and these are known."""
+
 
 class LinkTimeout(LinkError, TimeoutError):
     """The amplifier did not reply in time."""

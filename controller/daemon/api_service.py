@@ -244,7 +244,7 @@ class ApiService:
     def _play(self, client: Connection, params: PlayParams) -> Empty:
         """Start an effect at the contact nearest to a position, at its own level or below."""
         operation = self._supervisor.operation
-        if operation.state is not _ENABLED or self._controller.degraded:
+        if operation.state is not _ENABLED or self._controller.group.degraded:
             raise _wrong_state(operation)
         effects = self._layout.layout.effects
         effect = effects.get(params.effect)

@@ -1,7 +1,7 @@
 """The state of the control loop and the amplifiers as messages of the API."""
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
@@ -24,6 +24,7 @@ from controller.api.schema import (
 )
 from controller.api.topics import ContactsEvent, PatternEvent, SilenceEvent
 from controller.daemon.config import DaemonConfig
+from controller.daemon.states import Loss
 from controller.effects.layout import SurfaceLayout
 from controller.learning.learning_status import LearningStatus
 from controller.loop.leak import leaks_db_sl
@@ -243,13 +244,14 @@ def amplifier_statuses(
     urls: Mapping[str, str],
     *,
     are_open: bool,
-    missing: Collection[str],
+    lost: Loss | None,
 ) -> list[AmplifierStatus]:
     """Describe all amplifiers from their last statuses, without sending a request.
 
-    are_open: whether all are open together; else their last statuses are left out. missing: names
-    of those whose loss has closed the others.
+    are_open: whether all are open together; else their last statuses are left out. lost: the loss
+    that has closed the others.
     """
+    missing = () if lost is None else lost.names
     return [
         _amplifier_status(
             name,

@@ -86,8 +86,8 @@ class Daemon:
             amplifiers=lambda: amplifier_statuses(
                 self._controller.amplifiers,
                 config.urls,
-                are_open=self._controller.is_open,
-                missing=self._controller.missing,
+                are_open=self._controller.group.is_open,
+                lost=self._supervisor.operation.lost,
             ),
             effect_of=self._layout.effect_of,
             layout=config.layout,

@@ -37,6 +37,7 @@ _EPOCHS = 2**31  # of which a daemon begins at one by chance: exact as numbers o
 _MAX_READ_BACKS = 15
 _WATCHDOG_MARGIN = 0.1  # s; of an amplifier that another host may have armed
 LEASE_OVER = DaemonEvent(Trigger.LEASE_LOST, "the arming lease was not renewed", "arm again")
+_NOT_CONNECTED = Stopped(False, -math.inf, "the amplifier is not connected")
 SEARCHING = "check cables and supply; the daemon reconnects by itself and stays disarmed"
 
 LinkChange = Literal["degraded", "restored", "lost", "retry", "reopened"]
@@ -111,6 +112,12 @@ class Operator:
         lease = self.operation.lease
         if lease is not None and lease.token == token:
             self.post(DaemonEvent(Trigger.LEASE_LOST, cause, "arm again"))
+
+    def note_lost(self, names: tuple[str, ...]) -> None:
+        """Note which amplifiers are lost now, where that is known."""
+        lost = self.operation.lost
+        if names and lost is not None:
+            self.operation = replace(self.operation, lost=lost._replace(names=names))
 
     def tick(self) -> None:
         """End the lease if it has expired, else look again when it will have."""
@@ -260,7 +267,8 @@ class Operator:
 
     async def _stopped(self, stopping: Awaitable[Mapping[str, Stopped]]) -> Mapping[str, Stopped]:
         """Await a stop of all amplifiers; one that is lost is a lost link."""
-        outcomes = await stopping
+        stopped = await stopping
+        outcomes = {name: stopped.get(name, _NOT_CONNECTED) for name in self._controller.urls}
         try:
             await self._check_links()
         except Exception:
@@ -342,12 +350,13 @@ class Operator:
         """Handle a loss; concurrent reports of the same loss wait until it is handled."""
         async with self._loss_lock:
             group = self._controller.group
-            lost = [name for name in group.amplifiers if name in (*group.lost_by, *group.degraded)]
+            lost = *group.lost_by, *group.degraded
             text = str(error)
             if self.operation.state is not DaemonState.COMM_LOST:
                 self._link_changed("lost", lost, text)
             cause = f"amplifier {', '.join(lost)}: {text}" if lost else text
-            await self.handle(DaemonEvent(Trigger.LINK_LOST, cause, SEARCHING))
+            event = DaemonEvent(Trigger.LINK_LOST, cause, SEARCHING, amplifiers=lost)
+            await self.handle(event)
 
 
 def _log_transition(before: Operation, after: Operation) -> None:

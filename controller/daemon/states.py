@@ -89,29 +89,36 @@ class Lease:
 class DaemonEvent:
     """An event with its cause and a remedy for the user.
 
-    energised_until [s]: when what was lost must be silent.
+    amplifiers: names of those that are lost, or do not reply; energised_until [s]: when what was
+    lost must be silent.
     """
 
     trigger: Trigger
     cause: str = ""
     remedy: str | None = None
     lease: Lease | None = None
+    amplifiers: tuple[str, ...] = ()
     energised_until: float = -math.inf
 
 
 class Loss(NamedTuple):
-    """A loss of amplifiers: since when [s], and when they must be silent [s]."""
+    """A loss of amplifiers: since when [s], when they must be silent [s], and their names.
+
+    All others were closed because of these; no names: it is not known which are lost.
+    """
 
     at: float
     energised_until: float
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Operation:
     """The operation of the plate: its state and everything that the next transition depends on.
 
-    is_latched: a clear is required before arming; lost: while amplifiers cannot be reached; lease:
-    of who armed, in the states of ENERGISED alone. epoch: rises with every change of state, and
+    is_latched: a clear is required before arming; lost: while amplifiers cannot be reached;
+    degraded: names of armed ones that do not reply but may still play, as said last; lease: of who
+    armed, in the states of ENERGISED alone. epoch: rises with every change of state, and
     with a stop, fault or loss that changes none: what began before must not go on.
     """
 
@@ -120,6 +127,7 @@ class Operation:
     remedy: str | None = None
     is_latched: bool = False
     lost: Loss | None = None
+    degraded: tuple[str, ...] = ()
     lease: Lease | None = None
     epoch: int = 0
 
@@ -267,8 +275,10 @@ def _with_event(operation: Operation, event: DaemonEvent, now: float) -> Operati
             return replace(operation, is_latched=True)
         case Trigger.NOT_FOUND | Trigger.LINK_LOST if operation.lost is None:
             is_latched = operation.is_latched or operation.state in ENERGISED
-            lost = Loss(now, event.energised_until)
+            lost = Loss(now, event.energised_until, event.amplifiers)
             return replace(operation, lost=lost, is_latched=is_latched)
+        case Trigger.LINK_CHANGED:
+            return replace(operation, degraded=event.amplifiers)
         case _:
             return operation
 
@@ -294,6 +304,7 @@ def _enter(before: Operation, updated: Operation, to: DaemonState, event: Daemon
         remedy=remedy,
         is_latched=is_latched,
         lost=updated.lost if to is DaemonState.COMM_LOST else None,
+        degraded=(),
         lease=updated.lease if to in ENERGISED else None,
     )
 

@@ -25,6 +25,7 @@ from controller.loop.observer import Observer
 from drivers import clock
 from drivers.errors import CommandRefused, DriverError, FrameError, LinkError
 from drivers.host.amplifier import Amplifier
+from drivers.host.members import GroupState
 from drivers.pauses import pauses
 from drivers.protocol.records import Values
 from drivers.protocol.table import FAULTS, NO_CHANNEL, name_of
@@ -32,6 +33,8 @@ from model.errors import InputError
 
 STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
 _RECHECK = 0.05  # s; of whether the watchdog of a lost amplifier has passed
+
+_SILENT = (GroupState.DISARMED, GroupState.STOPPED)
 
 _logger = logging.getLogger(__name__)
 
@@ -55,7 +58,6 @@ class Supervisor(Operator):
         self._alive = alive
         self.started = asyncio.Event()  # the amplifiers are open, or searched for
         self._closing = asyncio.Event()
-        self._is_degraded = False  # as reported last
 
     def observer(self) -> Observer:
         """The first observer of the control loop: of refusals, losses and cycles."""
@@ -140,7 +142,8 @@ class Supervisor(Operator):
             await self._controller.open()
         except (LinkError, CommandRefused, FrameError) as error:
             self._link_changed("retry", (), str(error))
-            event = DaemonEvent(Trigger.NOT_FOUND, str(error), SEARCHING)
+            lost = error.lost if isinstance(error, LinkError) else ()
+            event = DaemonEvent(Trigger.NOT_FOUND, str(error), SEARCHING, amplifiers=lost)
         if self._closing.is_set():
             await self._controller.close()
         else:
@@ -179,7 +182,7 @@ class Supervisor(Operator):
             await self._pause(pause)
         while self.assume_energised(clock.now()) and not self._closing.is_set():
             await self._pause(_RECHECK)
-        if self._controller.is_open:  # none was lost again
+        if self._controller.group.is_open:  # none was lost again
             await self.handle(DaemonEvent(Trigger.RECONNECTED))
 
     async def _reopen(self) -> bool:
@@ -189,6 +192,8 @@ class Supervisor(Operator):
             await self._controller.disarm()  # a short loss may not have expired the watchdog
         except (DriverError, InputError) as error:
             self._link_changed("retry", (), str(error))
+            if isinstance(error, LinkError):
+                self.note_lost(error.lost)
             await self._controller.release()
             return False
         self._link_changed("reopened", (), "all amplifiers reply again and are disarmed")
@@ -212,7 +217,7 @@ class Supervisor(Operator):
                     await self._changed.wait()
                     self._changed.clear()
                 return
-        if not self._controller.is_open or self._controller.group.is_armed:
+        if self._controller.group.state not in _SILENT:
             return
         try:
             await self._check_disarmed()
@@ -244,27 +249,23 @@ class Supervisor(Operator):
     def _check_own_stop(self, cause: str) -> None:
         """Post a fault where the loop itself has stopped the amplifiers of an armed plate."""
         is_armed = self.operation.state is DaemonState.OPERATION_ENABLED
-        group = self._controller.group
-        is_stopped = is_armed and self._controller.is_open and not group.is_armed
-        if is_stopped:
+        if is_armed and self._controller.group.state in _SILENT:
             self.post(DaemonEvent(Trigger.FAULT, cause, ACKNOWLEDGE))
 
     def _check_degraded(self) -> None:
         """Say that armed amplifiers have ceased to reply, or that all reply again."""
-        degraded = self._controller.degraded
-        if self.operation.state is not DaemonState.OPERATION_ENABLED:
-            self._is_degraded = False
-            return
-        if bool(degraded) is self._is_degraded or self._controller.group.lost_by:
+        group, operation = self._controller.group, self.operation
+        degraded = group.degraded
+        is_said = bool(degraded) is bool(operation.degraded)
+        if operation.state is not DaemonState.OPERATION_ENABLED or is_said or group.lost_by:
             return  # of one that is lost the next heartbeat says so
-        self._is_degraded = bool(degraded)
         change: LinkChange = "restored"
         level, remedy = logging.INFO, "era disarm, or era stop"
         cause = "all amplifiers reply again and play what they should"
         if degraded:
             change, level, remedy = "degraded", logging.WARNING, "check cables and supply"
             cause = f"amplifier {', '.join(degraded)} does not reply; nothing new is played"
-        self.post(DaemonEvent(Trigger.LINK_CHANGED, cause, remedy))
+        self.post(DaemonEvent(Trigger.LINK_CHANGED, cause, remedy, amplifiers=degraded))
         _logger.log(level, "link: %s: %s", change, cause, extra={"topic": "link"})
         self._link_changed(change, degraded, cause)
 

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import math
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from typing import Any
 
 from controller.loop.capabilities import playback_capabilities
@@ -75,11 +75,11 @@ class Controller:
         self._rig = rig
         self.table = table
         """The table that answers."""
-        self._urls = dict(rig.amplifiers if urls is None else urls)
-        if self._urls.keys() != rig.amplifiers.keys():
+        self.urls = dict(rig.amplifiers if urls is None else urls)
+        if self.urls.keys() != rig.amplifiers.keys():
             raise InputError(
                 f"amplifiers must be those of the rig ({', '.join(sorted(rig.amplifiers))}), got "
-                f"{', '.join(sorted(self._urls)) or 'none'}"
+                f"{', '.join(sorted(self.urls)) or 'none'}"
             )
         self._make_lines = lines
         self._lines_if_open: Lines | None = None
@@ -89,8 +89,6 @@ class Controller:
         """Watchdog of armed amplifiers [s]."""
         self.group = Group({}, watchdog=watchdog)
         """All amplifiers together."""
-        self.missing: frozenset[str] = frozenset()
-        """Names of amplifiers whose loss, or absence, has closed all others."""
         self.amplifiers: dict[str, Amplifier] = {}
         """Amplifiers by name, as identified last; empty before."""
         self.observers = [observer]
@@ -109,19 +107,9 @@ class Controller:
         self._expiry: asyncio.TimerHandle | None = None
 
     @property
-    def is_open(self) -> bool:
-        """Whether all amplifiers are open together, armed or not, and none was lost."""
-        return self.group.is_open
-
-    @property
     def is_released(self) -> bool:
         """Whether all lines are closed."""
         return self._lines_if_open is None
-
-    @property
-    def degraded(self) -> tuple[str, ...]:
-        """Names of amplifiers that do not reply but may still play; nothing new is played then."""
-        return self.group.degraded
 
     @property
     def is_preparing(self) -> bool:
@@ -162,7 +150,7 @@ class Controller:
         self._is_closed = False
         lines = self._lines_if_open = self._make_lines()
         try:
-            amplifiers = {name: await self._amplifier(lines, name) for name in self._urls}
+            amplifiers = {name: await self._amplifier(lines, name) for name in self.urls}
             self._connected(amplifiers)
             async with self._sending:  # to those of before
                 self.group = Group(amplifiers, watchdog=self.watchdog)  # a stop reaches them now
@@ -187,21 +175,20 @@ class Controller:
         except BaseException:
             await self.release()
             raise
-        self.missing = frozenset()
         self._decider_if_open = decider
 
     async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
         """Open the line of an amplifier; raises LinkError, CommandError."""
         try:
             return await lines.amplifier(
-                self._urls[name],
+                self.urls[name],
                 self._rig.limits,
                 name=name,
                 serial_number=self._serial_numbers.get(name),
                 is_output=name in self._rig.outputs,
             )
-        except LinkError:
-            self.missing = frozenset({name})
+        except LinkError as error:
+            error.lost = (name,)
             raise
 
     async def arm(self) -> None:
@@ -221,14 +208,7 @@ class Controller:
 
     def stop(self) -> Coroutine[Any, Any, Mapping[str, Stopped]]:
         """Quick-stop every amplifier; latched until `clear`; see `Group.stop`."""
-        return self._with_missing(self.group.stop())
-
-    async def _with_missing(
-        self, stopping: Awaitable[Mapping[str, Stopped]]
-    ) -> Mapping[str, Stopped]:
-        stopped = await stopping
-        unknown = Stopped(False, -math.inf, "the amplifier is not connected")
-        return {name: stopped.get(name, unknown) for name in self._urls}
+        return self.group.stop()
 
     async def clear(self) -> None:
         """Acknowledge stops, and faults whose cause has gone; nothing arms by itself."""
@@ -242,8 +222,6 @@ class Controller:
 
     async def release(self) -> None:
         """Ramp to zero in 50 ms, confirm it by reading back, disarm and close all lines."""
-        if self._lines_if_open is not None and self.group.lost_by:
-            self.missing = frozenset(self.group.lost_by)
         lines = self._lines_if_open  # those of now: others may be opened meanwhile
         try:
             await self.group.close(CLOSING_RAMP)

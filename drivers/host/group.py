@@ -53,7 +53,6 @@ class Group(Members):
         self._arming = asyncio.Lock()  # a second arm waits for the first
         self._closing = asyncio.Lock()  # a second close waits for the first
         self._silencing: set[asyncio.Future[Any]] = set()  # stops and disarms in progress
-        self._stopped = 0  # epoch of the last stop, until it is cleared
         self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # of stops
         self._running_due: dict[str, float] = {}  # statuses just before a heartbeat
         self._readings: dict[str, asyncio.Future[Values]] = {}  # of amplifiers that do not reply
@@ -68,12 +67,12 @@ class Group(Members):
 
         Raises LinkError, and CommandError for a wire that is too slow for the watchdog.
         """
-        stopped = self._stopped  # each amplifier says itself what it has latched before
+        before = self.epoch
         await self.all([each.open() for each in self.amplifiers.values()])
         for amplifier in self.amplifiers.values():
             check_watchdog(self._watchdog, amplifier.exchange_time("Set"))
-        self.state = GroupState.DISARMED
-        self._note_cleared(stopped)
+        # Each amplifier says itself what it has latched before.
+        self.state = GroupState.DISARMED if self.epoch == before else GroupState.STOPPED
 
     async def arm(self) -> None:
         """Switch the high voltage on at level zero: on all amplifiers, or none stays armed.
@@ -84,12 +83,12 @@ class Group(Members):
         """
         before = self.epoch
         async with self._arming:
-            if self.state in (GroupState.CLOSED, GroupState.LOST):
+            if not self.is_open:
                 raise CommandError(
                     f"amplifiers must be open to be armed, got {self.state.name}; close and open "
                     "all of them again"
                 )
-            if self._stopped:  # an amplifier that restarted does not know
+            if self.state is GroupState.STOPPED:  # an amplifier that restarted does not know
                 raise CommandRefused("a stop must be cleared before arming; clear, then arm again")
             if self._silencing:  # the result would depend on the order of frames
                 raise CommandRefused(
@@ -204,7 +203,8 @@ class Group(Members):
         some names, None for all. It goes on to its end if its caller is cancelled.
         """
         self._leave_armed()
-        self._stopped = self.epoch
+        if self.is_open:
+            self.state = GroupState.STOPPED
         for line in {each.line for each in self.amplifiers.values()}:
             if len(line.members) > 1:
                 try:
@@ -250,22 +250,18 @@ class Group(Members):
         """
         if self._silencing:
             raise Preempted("amplifiers are being stopped or disarmed; clear again afterwards")
-        stopped = self._stopped
+        before = self.epoch
         try:
             await self.all([each.clear() for each in self.amplifiers.values()])
         except LinkError:
             await self.stop()
             raise
         except CommandRefused as error:
-            if self._stopped != stopped:  # the stop of now is another one
+            if self.epoch != before:  # the stop of now is another one
                 raise Preempted("a stop came first; find the cause, then clear again") from error
             raise
-        self._note_cleared(stopped)
-
-    def _note_cleared(self, stopped: int) -> None:
-        """Note that the last stop is cleared, if it is that of an epoch."""
-        if self._stopped == stopped:
-            self._stopped = 0
+        if self.epoch == before and self.state is GroupState.STOPPED:
+            self.state = GroupState.DISARMED
 
     async def statuses(self) -> dict[str, Values]:
         """Read the status of every amplifier, by name; again while one does not reply.

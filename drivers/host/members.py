@@ -54,10 +54,14 @@ class Played:
 
 
 class GroupState(Enum):
-    """State of all amplifiers together: CLOSED until opened and in the end, LOST by a LinkError."""
+    """State of all amplifiers together: CLOSED until opened and in the end, LOST by a LinkError.
+
+    STOPPED: disarmed by a stop, which is to be cleared before they are armed.
+    """
 
     CLOSED = auto()
     DISARMED = auto()
+    STOPPED = auto()
     ARMED = auto()
     LOST = auto()
 
@@ -111,7 +115,7 @@ class Members:
     @property
     def is_open(self) -> bool:
         """Whether all reply as far as is known: neither closed nor lost."""
-        return self.state in (GroupState.DISARMED, GroupState.ARMED)
+        return self.state not in (GroupState.CLOSED, GroupState.LOST)
 
     @property
     def is_armed(self) -> bool:
@@ -136,6 +140,7 @@ class Members:
     def note(self, error: BaseException) -> None:
         """Note an error of a request: it may show that an amplifier is lost."""
         if isinstance(error, LinkError) and not self.is_degraded_only(error):
+            error.lost = tuple(self.lost_by)
             self.lose()
 
     def check_none_since(self, before: int) -> None:

@@ -81,7 +81,7 @@ class Watched:
     @property
     def degraded(self) -> list[str]:
         """Amplifiers that do not reply but may play."""
-        return [*self.controller.degraded]
+        return [*self.controller.group.degraded]
 
     @property
     def is_armed(self) -> bool:

@@ -104,10 +104,13 @@ def test_step_returns_latched_when_link_lost_while_energised(state: DaemonState)
     """A loss while energised leads to FAULT, so that it must be acknowledged before arming."""
     before = Operation(state, is_latched=state in LATCHED)
     unplugged = DaemonEvent(
-        Trigger.LINK_LOST, "unplugged", "look at cables", energised_until=ENERGISED_UNTIL
+        Trigger.LINK_LOST,
+        *("unplugged", "look at cables"),
+        amplifiers=("main",),
+        energised_until=ENERGISED_UNTIL,
     )
     lost, _ = step(before, unplugged, LOST_AT)
-    assert lost.lost == (LOST_AT, ENERGISED_UNTIL)
+    assert lost.lost == (LOST_AT, ENERGISED_UNTIL, ("main",))
     back, _ = step(lost, DaemonEvent(Trigger.RECONNECTED), ENERGISED_UNTIL)
     assert back.state is DaemonState.FAULT
     assert back.cause.endswith("unplugged")

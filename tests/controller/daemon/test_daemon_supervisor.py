@@ -1,6 +1,7 @@
 """The supervisor in virtual time, with a control loop and an obedient amplifier."""
 
 import asyncio
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from controller.loop.loop import Controller
 from controller_bench import ENABLED as ARMED
 from controller_bench import STOPPED
 from drivers.errors import CommandRefused
+from drivers.host.stop import Stopped
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_after
 from virtual_loop import in_virtual_time
@@ -32,9 +34,10 @@ def slow_down(controller: Controller, *, stop: float) -> None:
     """Let stopping the amplifiers take so long [s]."""
     stop_now = controller.stop
 
-    async def slow_stop() -> None:
-        await stop_now()
+    async def slow_stop() -> Mapping[str, Stopped]:
+        stopped = await stop_now()
         await asyncio.sleep(stop)
+        return stopped
 
     controller.stop = slow_stop
 

@@ -17,7 +17,7 @@ from controller_bench import (
     make_bench,
     running,
 )
-from drivers.errors import CommandError, CommandRefused
+from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.host.members import GroupState
 from drivers.protocol.records import Refusal, Values
 from model.errors import InputError
@@ -102,7 +102,7 @@ async def test_unexpected_exception_stops_all(kind: str) -> None:
         with pytest.raises(ZeroDivisionError):
             await bench.ended()
         assert bench.states() == {STOPPED}
-        assert bench.controller.group.state is GroupState.DISARMED
+        assert bench.controller.group.state is GroupState.STOPPED
 
 
 @in_virtual_time
@@ -116,7 +116,7 @@ async def test_stop_is_latched_until_clear() -> None:
         assert bench.far_end.state not in (STOPPED, ENABLED)
         with pytest.raises(CommandRefused):
             await bench.controller.arm()
-        assert bench.controller.group.state is GroupState.DISARMED
+        assert bench.controller.group.state is GroupState.STOPPED
         await bench.controller.clear()
         await bench.controller.arm()
         await bench.touches(FINGER, rest=0.01)
@@ -136,7 +136,7 @@ async def test_arm_is_refused_while_silencing(order: str) -> None:
     with pytest.raises(CommandRefused, match="arm again"):
         await bench.controller.arm()
     await silencing
-    assert bench.controller.group.state is GroupState.DISARMED
+    assert not bench.controller.group.is_armed
     assert [far_end.requests("Arm") for far_end in bench.far_ends] == [[], []]
     await bench.controller.clear()
     await bench.controller.arm()
@@ -238,6 +238,25 @@ async def test_close_waits_for_zero_then_stops(
 
 
 @in_virtual_time
+async def test_error_of_opening_names_the_amplifier_that_cannot_be_reached() -> None:
+    """By a line that cannot be opened, or by no reply; not those that were open before."""
+    bench = make_bench("a", "b")
+    await bench.controller.open()
+    bench.far_ends[1].is_deaf = True
+    await bench.controller.release()
+    with pytest.raises(LinkError) as mute:
+        await bench.controller.open()
+
+    def refuse() -> None:
+        raise LinkError("no such device")
+
+    bench.far_ends[1].connect = refuse  # type: ignore[method-assign, assignment]
+    with pytest.raises(LinkError) as gone:
+        await bench.controller.open()
+    assert (mute.value.lost, gone.value.lost) == (("b",), ("b",))
+
+
+@in_virtual_time
 async def test_controller_refuses_amplifiers_that_do_not_fit_the_rig() -> None:
     """Other names, or fewer channels; nothing stays open."""
     bench = make_bench(channels=1)
@@ -302,8 +321,7 @@ async def test_silencing_wins_over_arming(silencing: str, is_armed: bool) -> Non
     await getattr(bench.controller, silencing)()
     with pytest.raises(CommandRefused, match="arm again"):
         await arming
-    assert bench.controller.group.state is (
-        GroupState.CLOSED if silencing == "close" else GroupState.DISARMED
-    )
+    left = {"disarm": GroupState.DISARMED, "stop": GroupState.STOPPED, "close": GroupState.CLOSED}
+    assert bench.controller.group.state is left[silencing]
     if silencing != "close":
         assert ENABLED not in bench.states()

@@ -5,17 +5,14 @@ function of type 4 for every sensor and ERA, acceleration over displacement, wit
 positions in dataset 15 or 2411; the reference node is the ERA, by its name or position.
 """
 
-import csv
-import io
 import math
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from model.calibration.responses import MeasuredValue, Responses
 from model.errors import InputError
-from model.files.csv_file import write_columns
+from model.files.csv_file import read_lines, write_columns
 from model.files.uff import (
     ACCELERATION,
     DISPLACEMENT,
@@ -23,7 +20,6 @@ from model.files.uff import (
     FREQUENCY_RESPONSE,
     Function,
     Universal,
-    read_bytes,
     read_universal,
     write_universal,
 )
@@ -32,7 +28,6 @@ from model.rig.rig import Rig
 COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
 ERA_COLUMNS = ("era_x_m", "era_y_m")  # optional
 _UP = 3  # +z
-_MAX_NAMED = 3  # unknown columns in an error
 # Labels of m/s² and m without punctuation.
 _ACCELERATION_UNITS = ("", "m/s2", "m/sec2", "m/ss", "ms-2", "ms2")
 _DISPLACEMENT_UNITS = ("", "m", "meter", "metre")
@@ -96,72 +91,21 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig) -> None:
 
 
 def _read_csv(path: Path) -> list[MeasuredValue]:
-    try:
-        text = read_bytes(path).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: text must be UTF-8; save it as CSV in UTF-8") from error
-    rows = csv.reader(io.StringIO(text), strict=True)
     found = []
-    try:
-        header = [name.strip() for name in next(rows)]
-        _check_header(path, header)
-        numeric = [*COLUMNS[2:], *(name for name in ERA_COLUMNS if name in header)]
-        for row in rows:
-            if not row:
-                continue
-            line = rows.line_num
-            if len(row) != len(header):
-                raise InputError(
-                    f"{path}:{line}: line must have {len(header)} values as the first line has, "
-                    f"got {len(row)}; the file is damaged"
-                )
-            cell = dict(zip(header, row, strict=True))
-            x, y, frequency, real, imaginary, *at_era = (
-                _number(path, line, name, cell[name]) for name in numeric
-            )
-            era, sensor = cell["era"].strip(), cell["sensor"].strip()
-            if not (era and sensor):
-                raise InputError(f"{path}:{line}: era and sensor must have names")
-            if frequency <= 0:
-                raise InputError(f"{path}:{line}: frequency_hz must be positive, got {frequency:g}")
-            era_point = (at_era[0], at_era[1]) if at_era else None
-            value = complex(real, imaginary)
-            place = f"{path}:{line}"
-            found.append(MeasuredValue(era, sensor, (x, y), era_point, frequency, value, place))
-    except csv.Error as error:
-        raise InputError(
-            f"{path}:{rows.line_num}: invalid CSV ({error}); check quotes and the end of the file"
-        ) from error
-    if not found:
-        raise InputError(f"{path}:1: at least one line of values must follow, got none")
+    for line in read_lines(path, COLUMNS, optional=ERA_COLUMNS):
+        at_era = [line.number(name) for name in ERA_COLUMNS if name in line.cells]
+        if len(at_era) == 1:
+            raise InputError(f"{path}:1: {' and '.join(ERA_COLUMNS)} must be given together")
+        x, y, frequency, real, imaginary = map(line.number, COLUMNS[2:])
+        era, sensor = line.cells["era"], line.cells["sensor"]
+        if not (era and sensor):
+            raise InputError(f"{line.place}: era and sensor must have names")
+        if frequency <= 0:
+            raise InputError(f"{line.place}: frequency_hz must be positive, got {frequency:g}")
+        era_point = (at_era[0], at_era[1]) if at_era else None
+        value = complex(real, imaginary)
+        found.append(MeasuredValue(era, sensor, (x, y), era_point, frequency, value, line.place))
     return found
-
-
-def _check_header(path: Path, header: Sequence[str]) -> None:
-    missing = [name for name in COLUMNS if name not in header]
-    unknown = [name for name in header if name not in (*COLUMNS, *ERA_COLUMNS)]
-    if missing or unknown or len(set(header)) < len(header):
-        problems = [f"{', '.join(missing)} missing"] if missing else []
-        more = f" and {len(unknown) - _MAX_NAMED} more" if len(unknown) > _MAX_NAMED else ""
-        named = ", ".join(repr(name[:30]) for name in unknown[:_MAX_NAMED])
-        problems += [f"{named}{more} unknown"] if unknown else []
-        problems += ["a column is repeated"] if not problems else []
-        raise InputError(
-            f"{path}:1: columns must be {', '.join(COLUMNS)}, optionally {', '.join(ERA_COLUMNS)}, "
-            f"got {'; '.join(problems)}"
-        )
-    if sum(name in header for name in ERA_COLUMNS) == 1:
-        raise InputError(f"{path}:1: {' and '.join(ERA_COLUMNS)} must be given together")
-
-
-def _number(path: Path, line: int, name: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputError(f"{path}:{line}: {name} must be a finite number, got {text[:30]!r}")
-    return value
 
 
 def _read_uff(path: Path) -> list[MeasuredValue]:

@@ -1,8 +1,10 @@
-"""Columns of numbers as a CSV file, and as a pandas DataFrame."""
+"""CSV files: columns of numbers as one and as a pandas DataFrame, and lines of named columns."""
 
 import csv
 import io
+import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
@@ -13,6 +15,9 @@ from numpy.typing import NDArray
 
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
+from model.files.uff import read_bytes
+
+_MAX_NAMED = 3  # unknown columns in an error
 
 Column: TypeAlias = Sequence[object] | NDArray[np.generic]
 
@@ -46,3 +51,77 @@ def as_frame(columns: Columns) -> Any:
     except ModuleNotFoundError as error:
         raise InputError("pandas must be installed for to_frame: pip install pandas") from error
     return pandas.DataFrame(dict(columns))
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a file: its file and number, for errors, and the text of each column."""
+
+    place: str
+    cells: Mapping[str, str]
+
+    def number(self, column: str, default: float | None = None) -> float:
+        """The number in a column, or what stands for a column that the file does not have.
+
+        Raises InputError for anything but a finite number.
+        """
+        if default is not None and column not in self.cells:
+            return default
+        text = self.cells[column]
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError(f"{self.place}: {column} must be a finite number, got {text[:30]!r}")
+        return value
+
+
+def read_lines(path: Path, columns: Sequence[str], *, optional: Sequence[str] = ()) -> list[Line]:
+    """Read a file whose first line names its columns, in any order; empty lines are skipped.
+
+    Raises InputError with file and line for missing, unknown and repeated columns, lines of
+    another length, and a file without any.
+    """
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: text must be UTF-8; save it as CSV in UTF-8") from error
+    rows = csv.reader(io.StringIO(text), strict=True, skipinitialspace=True)
+    lines = []
+    try:
+        header = [name.strip() for name in next(rows, ())]
+        _check_header(path, header, columns, optional)
+        for row in filter(None, rows):
+            place = f"{path}:{rows.line_num}"
+            if len(row) != len(header):
+                raise InputError(
+                    f"{place}: line must have {len(header)} values as the first line has, got "
+                    f"{len(row)}; the file is damaged"
+                )
+            cells = map(str.strip, row)
+            lines.append(Line(place, dict(zip(header, cells, strict=True))))
+    except csv.Error as error:
+        raise InputError(
+            f"{path}:{rows.line_num}: invalid CSV ({error}); check quotes and the end of the file"
+        ) from error
+    if not lines:
+        raise InputError(f"{path}:1: at least one line of values must follow, got none")
+    return lines
+
+
+def _check_header(
+    path: Path, header: Sequence[str], columns: Sequence[str], optional: Sequence[str]
+) -> None:
+    missing = [name for name in columns if name not in header]
+    unknown = [name for name in header if name not in (*columns, *optional)]
+    if missing or unknown or len(set(header)) < len(header):
+        problems = [f"{', '.join(missing)} missing"] if missing else []
+        more = f" and {len(unknown) - _MAX_NAMED} more" if len(unknown) > _MAX_NAMED else ""
+        named = ", ".join(repr(name[:30]) for name in unknown[:_MAX_NAMED])
+        problems += [f"{named}{more} unknown"] if unknown else []
+        problems += ["a column is repeated"] if not problems else []
+        raise InputError(
+            f"{path}:1: columns must be {', '.join(columns)}, optionally {', '.join(optional)}, "
+            f"got {'; '.join(problems)}"
+        )

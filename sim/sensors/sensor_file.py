@@ -3,15 +3,12 @@
 CSV with the columns below, in any order. Columns `gain` and `full_scale_v` may be left out.
 """
 
-import csv
-import io
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from model.errors import InputError
-from model.files.uff import read_bytes
+from model.files.csv_file import Line, read_lines
 from model.structure.plate import Plate
 from sim.plant.fingers import check_on_plate
 
@@ -35,61 +32,23 @@ class WiredSensor:
 
 def read_sensors(path: Path, plate: Plate) -> tuple[WiredSensor, ...]:
     """Read the accelerometers of a plate; raises InputError with file and line."""
-    try:
-        text = read_bytes(path).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: text must be UTF-8; save it as CSV in UTF-8") from error
-    rows = csv.DictReader(io.StringIO(text), strict=True, skipinitialspace=True)
     sensors: list[WiredSensor] = []
-    try:
-        _check_columns(path, [*(rows.fieldnames or ())])
-        for row in rows:
-            sensors.append(_sensor(f"{path}:{rows.line_num}", row, sensors, plate))
-    except csv.Error as error:
-        raise InputError(
-            f"{path}:{rows.line_num}: invalid CSV ({error}); check quotes and the end of the file"
-        ) from error
-    if not sensors:
-        raise InputError(f"{path}:1: at least one line of a sensor must follow, got none")
+    for line in read_lines(path, COLUMNS, optional=tuple(OPTIONAL)):
+        sensors.append(_sensor(line, sensors, plate))
     return tuple(sensors)
 
 
-def _check_columns(path: Path, names: Sequence[str]) -> None:
-    missing = [name for name in COLUMNS if name not in names]
-    unknown = [name for name in names if name not in (*COLUMNS, *OPTIONAL)]
-    if missing or unknown or len(set(names)) < len(names):
-        raise InputError(
-            f"{path}:1: columns must be {', '.join(COLUMNS)}, optionally {', '.join(OPTIONAL)}, "
-            f"once each, got {', '.join(names)[:80] or 'none'}"
-        )
-
-
-def _sensor(
-    place: str, row: Mapping[str, str | None], before: Sequence[WiredSensor], plate: Plate
-) -> WiredSensor:
-    def number(column: str) -> float:
-        text = row.get(column) if column in row else str(OPTIONAL[column])
-        try:
-            value = float(text or "")
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise InputError(
-                f"{place}: {column} must be a finite number, got {(text or '')[:30]!r}"
-            )
-        return value
-
-    name = (row["sensor"] or "").strip()
+def _sensor(line: Line, before: Sequence[WiredSensor], plate: Plate) -> WiredSensor:
+    place, name = line.place, line.cells["sensor"]
     if not name or any(name == other.name for other in before):
         raise InputError(f"{place}: sensor must be a name that no other has, got {name!r}")
-    x, y, channel = number("x_m"), number("y_m"), number("input")
+    x, y, channel, sensitivity = map(line.number, ("x_m", "y_m", "input", "mv_per_m_s2"))
     check_on_plate(f"{place}: sensor {name}", (x, y), plate)
     if channel != int(channel) or channel < 1 or any(channel == other.input for other in before):
         raise InputError(
             f"{place}: input must be a number from 1 that no other sensor has, got {channel:g}"
         )
-    gain, full_scale = number("gain"), number("full_scale_v")
-    sensitivity = number("mv_per_m_s2")
+    gain, full_scale = (line.number(column, default) for column, default in OPTIONAL.items())
     for column, value in (("gain", gain), ("full_scale_v", full_scale)):
         if value <= 0:
             raise InputError(f"{place}: {column} must be above zero, got {value:g}")

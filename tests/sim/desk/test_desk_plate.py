@@ -85,12 +85,13 @@ def test_fingers_are_swapped_without_a_jump(truth: Truth, model: DeskModel) -> N
         ("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,0.1,1,10\nP2,0.2,0.1,1,10\n", ":3:"),
         ("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,0.1,1,0\n", ":2:"),
         ("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,x,1,10\n", ":2:"),
+        ("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,0.1,1,10,2\n", ":2:"),
     ],
 )
 def test_sensor_files_are_refused_with_their_line(
     rig: Rig, tmp_path: Path, text: str, place: str
 ) -> None:
-    """A missing column, off the plate, an input twice, no sensitivity, no number."""
+    """A missing column, off the plate, an input twice, no sensitivity, no number, one too many."""
     path = tmp_path / "sensors.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=f"sensors.csv{place}"):

@@ -17,7 +17,7 @@ from model.spectral.direct import Responder, direct_spectral_acceleration
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import (
     Era,
-    Load,
+    Support,
     attached_stiffness,
     drive_forces,
     footprints_of,
@@ -39,7 +39,7 @@ def direct_acceleration(
     frequencies: FloatArray,
     points: FloatArray,
     *,
-    loads: Sequence[Load] = (),
+    loads: Sequence[Support] = (),
 ) -> ComplexArray:
     """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and driven ERA: (f, eras, p).
 
@@ -50,7 +50,7 @@ def direct_acceleration(
     observe = matrices.deflection_at(points)
     result = np.empty((len(frequencies), len(eras), observe.shape[0]), dtype=complex)
     omegas = 2 * np.pi * np.asarray(frequencies, dtype=float)
-    attached, forces = attached_stiffness(eras, loads, omegas), drive_forces(eras, omegas)
+    attached, forces = attached_stiffness(omegas, eras, loads), drive_forces(omegas, eras)
     losses = loss_factors(matrices.plate, omegas)
     for row, (omega, loss) in enumerate(zip(omegas, losses, strict=True)):
         dynamic_stiffness = (

@@ -22,7 +22,6 @@ from model.structure.attachments import (
     PointLoad,
     attached_stiffness,
     drive_forces,
-    full_strokes,
 )
 from model.structure.modal_elasticity import Dispersion, ModalElasticity, modal_receptance
 from model.structure.plate import Plate
@@ -57,7 +56,8 @@ def mounts_of(
     k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))
     by_damping = math.log(uncertainty.damping) * 1j * w[:, None] * c
     by_stiffness = np.broadcast_to(uncertainty.stiffness * k, by_damping.shape)
-    each = attached_stiffness(eras, masses, w), drive_forces(eras, w), full_strokes(eras, w)
+    strokes = np.array([era.base(w) for era in eras]).T
+    each = attached_stiffness(w, eras, masses), drive_forces(w, eras), strokes
     single = (part.astype(np.complex64) for part in (*each, by_stiffness, by_damping))
     return Mounts(-(w**2).astype(np.float32), *single)
 

@@ -114,7 +114,7 @@ class ForwardModel:
     @cached_property
     def fixed_stiffness(self) -> ComplexArray:
         """Dynamic stiffness of the rig's own masses (f, m) [N/m]."""
-        return attached_stiffness((), self.rig.masses, self.omega)
+        return attached_stiffness(self.omega, self.rig.masses)
 
     @cached_property
     def drive_gains(self) -> ComplexArray:

@@ -23,8 +23,8 @@ from model.reduction.spectral_modes import SpectralModes
 from model.reduction.truncation import RESIDUAL_ORDER
 from model.spectral.mesh import PlateMesh
 from model.structure.attachments import (
-    Era,
-    Load,
+    Source,
+    Support,
     attached_stiffness,
     coupled_forces,
     footprints_of,
@@ -53,22 +53,25 @@ class FreePlate:
 
     def acceleration(
         self,
-        eras: Sequence[Era],
+        sources: Sequence[Source],
         frequencies: FloatArray,
         points: FloatArray,
         *,
-        loads: Sequence[Load] = (),
+        loads: Sequence[Support] = (),
     ) -> ComplexArray:
-        """Acceleration [m/s²] at points [m] (p, 2) per frequency [Hz] (f,) and ERA: (f, eras, p).
+        """Acceleration [m/s²] at points [m] (p, 2) per frequency [Hz] (f,) and source: (f, n, p).
 
-        Each ERA alone at full stroke and phase zero, the others at rest. Raises InputError for a
+        Each alone at full level and phase zero, the others at rest. Raises InputError for a
         frequency that is not above zero, above frequency_max or above what the mesh carries, and
         for points off the plate.
         """
         omega = self._omega(frequencies)
-        at = footprints_of(eras, loads)
+        at = footprints_of(sources, loads)
         return unit_accelerations(
-            eras, loads, omega, lambda held, driven: self._moved(omega, at, held, driven, points)[1]
+            sources,
+            loads,
+            omega,
+            lambda held, driven: self._moved(omega, at, held, driven, points)[1],
         )
 
     def receptances(
@@ -77,7 +80,7 @@ class FreePlate:
         points: FloatArray,
         frequencies: FloatArray,
         *,
-        loads: Sequence[Load] = (),
+        loads: Sequence[Support] = (),
         thickness: FloatArray | float = 1.0,
     ) -> tuple[ComplexArray, ComplexArray]:
         """Receptances [m/N] between places (..., f, c, c), and from them to points (..., f, c, p).
@@ -88,7 +91,7 @@ class FreePlate:
         """
         omega, count = self._omega(frequencies), len(places)
         footprints = np.vstack([as_footprints(places), footprints_of(loads)])
-        stiffness = np.pad(attached_stiffness((), loads, omega), ((0, 0), (count, 0)))
+        stiffness = np.pad(attached_stiffness(omega, loads), ((0, 0), (count, 0)))
         applied = np.eye(len(footprints), count, dtype=complex)
         to_places, to_points = self._moved(
             omega, footprints, stiffness, applied, points, thickness=np.asarray(thickness)

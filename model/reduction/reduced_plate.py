@@ -194,7 +194,7 @@ def modal_matrices(
     support the plate.
     """
     check_supported(reduced.plate, eras, loads=loads)
-    fixed = [*(PointLoad.of_era(era) for era in eras), *loads]
+    fixed = [*(era.support for era in eras), *loads]
     phi = (
         reduced.at(footprints_of(fixed, contacts))
         if attachment_shapes is None

@@ -20,7 +20,6 @@ from model.rig.parts import (
 )
 from model.rig.rig import Channel, Rig
 from model.rig.sections import RigSection
-from model.structure.attachments import PointLoad
 
 
 def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
@@ -73,7 +72,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
         limits=limits_of(section.limits),
         masses=(
             *(mass_of(mass, plate) for mass in section.masses.values()),
-            *map(PointLoad.of_era, supports.values()),
+            *(era.support for era in supports.values()),
         ),
         supports=tuple(supports),
         laminate=laminate_of(section.plate),

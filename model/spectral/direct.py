@@ -18,8 +18,8 @@ from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralPlate
 from model.spectral.stiffness import air_motion, along_mass
 from model.structure.attachments import (
-    Era,
-    Load,
+    Source,
+    Support,
     coupled_forces,
     footprints_of,
     unit_accelerations,
@@ -39,21 +39,21 @@ Of ERAs, frequencies (f,) [Hz], points (p, 2) [m], and loads by name.
 def direct_spectral_acceleration(
     plate: Plate,
     mesh: SpectralMesh,
-    eras: Sequence[Era],
+    sources: Sequence[Source],
     frequencies: FloatArray,
     points: FloatArray,
     *,
-    loads: Sequence[Load] = (),
+    loads: Sequence[Support] = (),
 ) -> ComplexArray:
-    """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and driven ERA: (f, eras, p).
+    """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and source: (f, n, p).
 
-    Each ERA alone at full stroke and phase zero, the others at rest. Raises InputError for a
+    Each alone at full level and phase zero, the others at rest. Raises InputError for a
     frequency that the mesh cannot carry, and for a plate whose modes were measured.
     """
     if plate.mode_deviations:
         raise InputError("a direct solution has no modes, which plate.modes would change")
     mesh.check_frequencies(plate, frequencies)
-    attached = footprints_of(eras, loads)
+    attached = footprints_of(sources, loads)
     everywhere = np.concatenate([attached, as_footprints(points)])
     degrees, count = (mesh.nx, mesh.ny), len(attached)
     bases = deflections_by_class((plate.length, plate.width), degrees, everywhere)
@@ -70,7 +70,7 @@ def direct_spectral_acceleration(
             receptance[number] += shapes @ np.linalg.solve(D, shapes[:count].T)
     between, to_points = np.split(receptance, [count], axis=1)
     return unit_accelerations(
-        eras, loads, omega, lambda *by: (to_points @ coupled_forces(between, *by)).swapaxes(1, 2)
+        sources, loads, omega, lambda *by: (to_points @ coupled_forces(between, *by)).swapaxes(1, 2)
     )
 
 

@@ -1,8 +1,9 @@
 """What is attached to the plate at points: actuators (ERAs), masses, and fingertips.
 
-An ERA is a spring, a damper and a bolt between the plate and a base that moves. Pressed on the
-plate, a fingertip is a contact mass that moves with it, and a spring and a damper (the pulp) to the
-phalanx, which a joint holds. The phalanx is not at rest: at 60, 100 and 250 Hz the real part of the
+All of it supports the plate with a dynamic stiffness; a source also drives it with a force. An ERA
+is a spring, a damper and a bolt between the plate and a base that moves. Pressed on the plate, a
+fingertip is a contact mass that moves with it, and a spring and a damper (the pulp) to the phalanx,
+which a joint holds. The phalanx is not at rest: at 60, 100 and 250 Hz the real part of the
 dynamic stiffness is 69, -87 and -358 N/m where a phalanx at rest gives 972, 921 and 507. How well
 the values are known: docs/concepts/people.md.
 
@@ -13,7 +14,7 @@ import cmath
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,35 @@ from model.errors import InputError
 
 Gain: TypeAlias = tuple[float, float, float]
 """Frequency [Hz], magnitude, phase [rad]."""
+
+
+class Support(Protocol):
+    """What reacts to the plate's motion at x, y [m], without energy of its own.
+
+    It acts on a disc of radius foot [m], 0 for a point.
+    """
+
+    @property
+    def x(self) -> float:
+        """Place along the length [m]."""
+
+    @property
+    def y(self) -> float:
+        """Place along the width [m]."""
+
+    @property
+    def foot(self) -> float:
+        """Radius of the disc [m]."""
+
+    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """Force on it per displacement [N/m] at omega [rad/s], of its shape."""
+
+
+class Source(Support, Protocol):
+    """What drives the plate, and supports it: an ERA, or a force with an impedance."""
+
+    def force(self, omega: FloatArray) -> ComplexArray:
+        """Force [N] at full level on a plate that is held, at omega [rad/s], of its shape."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +101,23 @@ class Era:
         values = np.array([cmath.rect(size, phase) for _, size, phase in self.gains])
         found = np.interp(np.abs(frequencies), measured, values)
         return np.asarray(np.where(np.asarray(frequencies) < 0, found.conj(), found))
+
+    @property
+    def support(self) -> "PointLoad":
+        """The ERA at rest, as a load of the plate."""
+        return PointLoad(self.x, self.y, self.stiffness, self.damping, self.bolt_mass, self.foot)
+
+    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """D = k_b + i omega c - omega² m_b [N/m] at omega [rad/s], of its shape."""
+        return self.support.dynamic_stiffness(omega)
+
+    def base(self, omega: FloatArray) -> ComplexArray:
+        """Amplitude of the base at full stroke [m] at omega [rad/s], its own gain included."""
+        return np.asarray(self.stroke * self.gain(omega / (2 * np.pi)))
+
+    def force(self, omega: FloatArray) -> ComplexArray:
+        """Force (k_b + i omega c) times the base's motion at full stroke [N] (paper Eq. 25)."""
+        return np.asarray((self.stiffness + 1j * omega * self.damping) * self.base(omega))
 
 
 def damping_from_ratio(
@@ -208,71 +255,42 @@ class PointLoad:
         """D = k + i omega c - omega² m [N/m], of the shape of omega [rad/s]."""
         return np.asarray(self.stiffness + 1j * omega * self.damping - omega**2 * self.mass)
 
-    @classmethod
-    def of_era(cls, era: Era) -> "PointLoad":
-        """An ERA at rest, as a load of the plate."""
-        return cls(era.x, era.y, era.stiffness, era.damping, era.bolt_mass, era.foot)
-
 
 Complex = TypeVar("Complex", bound="np.complexfloating[Any, Any]")
-Load: TypeAlias = PointLoad | FingertipLoad
-"""A passive load of the plate."""
 
 
-def footprints_of(*attached: Iterable[Era | Load]) -> FloatArray:
-    """Footprints x, y, radius [m] of ERAs and loads, one group after the other, (n, 3)."""
+def footprints_of(*attached: Iterable[Support]) -> FloatArray:
+    """Footprints x, y, radius [m] of what is attached, one group after the other, (n, 3)."""
     places = [[each.x, each.y, each.foot] for group in attached for each in group]
     return np.array(places, dtype=float).reshape(-1, 3)
 
 
-def dynamic_stiffness(
-    stiffness: FloatArray | float,
-    damping: FloatArray | float,
-    mass: FloatArray | float,
-    omega: FloatArray | float,
-) -> ComplexArray:
-    """D = k + i omega c - omega² m [N/m]; the arguments broadcast against each other."""
-    k, c, m, w = (np.asarray(value, dtype=float) for value in (stiffness, damping, mass, omega))
-    return np.asarray(k + 1j * w * c - w**2 * m)
+def attached_stiffness(omega: FloatArray, *attached: Iterable[Support]) -> ComplexArray:
+    """Dynamic stiffness [N/m] at omega (f,) [rad/s], one group after the other, (f, n)."""
+    found = [each.dynamic_stiffness(omega) for group in attached for each in group]
+    return np.array(found, dtype=complex).reshape(-1, len(omega)).T.copy()
 
 
-def attached_stiffness(
-    eras: Sequence[Era], loads: Sequence[Load], omega: FloatArray
-) -> ComplexArray:
-    """Dynamic stiffness [N/m] of ERAs and loads at omega (f,) [rad/s], (f, eras + loads)."""
-    parameters = [(era.stiffness, era.damping, era.bolt_mass) for era in eras]
-    stiffness, damping, mass = np.array(parameters, dtype=float).reshape(-1, 3).T
-    at_eras = dynamic_stiffness(stiffness, damping, mass, omega[:, None])
-    return np.column_stack([at_eras, *(load.dynamic_stiffness(omega) for load in loads)])
-
-
-def drive_forces(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
-    """Force of each ERA at full stroke, its own gain included [N], (f, eras) (paper Eq. 25)."""
-    k, c = np.array([(era.stiffness, era.damping) for era in eras], dtype=float).reshape(-1, 2).T
-    return np.asarray(dynamic_stiffness(k, c, 0.0, omega[:, None]) * full_strokes(eras, omega))
-
-
-def full_strokes(eras: Sequence[Era], omega: FloatArray) -> ComplexArray:
-    """Amplitude of each ERA's base at full stroke, its own gain included [m], (f, eras)."""
-    strokes = np.array([era.stroke for era in eras])
-    gains = np.array([era.gain(omega / (2 * np.pi)) for era in eras], dtype=complex)
-    return np.asarray(strokes * gains.reshape(len(eras), len(omega)).T)
+def drive_forces(omega: FloatArray, sources: Sequence[Source]) -> ComplexArray:
+    """Force of each source at full level [N] at omega (f,) [rad/s], (f, sources)."""
+    found = [each.force(omega) for each in sources]
+    return np.array(found, dtype=complex).reshape(-1, len(omega)).T.copy()
 
 
 def unit_accelerations(
-    eras: Sequence[Era],
-    loads: Sequence[Load],
+    sources: Sequence[Source],
+    loads: Sequence[Support],
     omega: FloatArray,
     moved: Callable[[ComplexArray, ComplexArray], ComplexArray],
 ) -> ComplexArray:
-    """Acceleration [m/s²] of a plate by each ERA alone at full stroke, (f, eras, p).
+    """Acceleration [m/s²] of a plate by each source alone at full level, (f, sources, p).
 
-    moved: displacement (f, eras, p) of the plate, of the dynamic stiffnesses of ERAs and loads
-    (f, a) and the forces applied to them (f, a, eras), by omega (f,) [rad/s].
+    moved: displacement (f, sources, p) of the plate, of the dynamic stiffnesses of sources and
+    loads (f, a) and the forces applied to them (f, a, sources), by omega (f,) [rad/s].
     """
-    stiffness = attached_stiffness(eras, loads, omega)
-    each_alone = np.eye(stiffness.shape[1], len(eras))
-    applied = np.asarray(each_alone * drive_forces(eras, omega)[:, None])
+    stiffness = attached_stiffness(omega, sources, loads)
+    each_alone = np.eye(stiffness.shape[1], len(sources))
+    applied = np.asarray(each_alone * drive_forces(omega, sources)[:, None])
     return np.asarray(-(omega**2)[:, None, None] * moved(stiffness, applied))
 
 

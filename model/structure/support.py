@@ -51,7 +51,7 @@ def _attached(
 
     In units of the plate's sides, in which both tilts have the size of the heave.
     """
-    attached = [*map(PointLoad.of_era, eras), *loads]
+    attached = [*(era.support for era in eras), *loads]
     mounts = [(at.x, at.y, at.stiffness, at.mass) for at in attached]
     x, y, stiffness, mass = np.array(mounts, dtype=float).reshape(-1, 4).T
     p = np.stack([np.ones_like(x), x / plate.length - 0.5, y / plate.width - 0.5])

@@ -19,7 +19,6 @@ from model.structure.attachments import (
     FingertipLoad,
     attached_stiffness,
     coupled_forces,
-    dynamic_stiffness,
     fingertip_loads,
 )
 from model.structure.modal_elasticity import modal_receptance
@@ -165,10 +164,10 @@ def accelerations_on(
     w, eras = table.attached.omega[rows], table.eras
     k, c, bolts = (np.array([getattr(era, key) for era in eras]) for key in _ERA_KEYS)
     damping = plates.damping[:, None, None] * c
-    springs = dynamic_stiffness(plates.stiffness[:, None] * k, damping, 0.0, w[:, None])
+    springs = plates.stiffness[:, None] * k + 1j * w[:, None] * damping
     loads = plates.load[:, : len(fingers)]
     factors = np.pad(loads, ((0, 0), (len(table.masses), 0)), constant_values=1.0)
-    resting = attached_stiffness((), [*table.masses, *fingers], w)
+    resting = attached_stiffness(w, table.masses, fingers)
     at_eras = springs - (w**2)[:, None] * bolts
     stiffness = np.concatenate([at_eras, factors[:, None] * resting], axis=-1)
     nominal = table.attached.modal[rows]

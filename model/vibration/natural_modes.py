@@ -73,7 +73,7 @@ def natural_modes(
         return _simply_supported(rig, count, chosen)
     attached = list(rig.masses)
     if support == "eras":
-        attached += [PointLoad.of_era(era) for era in rig.eras]
+        attached += [era.support for era in rig.eras]
     gap = rig.plate.air_gap
     # Air sealed in resists motion up and down; it only flows to and fro under tilts.
     rigid = RIGID_BODY_MODES - (gap is not None and gap.closed) if support == "free" else 0

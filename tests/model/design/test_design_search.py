@@ -51,7 +51,7 @@ def dense_score(
     ]
     eras = [replace(rig.eras[0], name=str(n), x=x, y=y) for n, (x, y) in enumerate(places)]
     omega = 2 * np.pi * frequencies
-    z, force = attached_stiffness(eras, (), omega), drive_forces(eras, omega)
+    z, force = attached_stiffness(omega, eras), drive_forces(omega, eras)
     assert rig.fingertip is not None
     tip = rig.fingertip.dynamic_stiffness(omega)
     sigma2, found = rig.uncertainty.gain_variance, []

@@ -15,7 +15,7 @@ from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
-from model.structure.attachments import Fingertip, FingertipLoad, Load, PointLoad
+from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, Support
 from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import Bond, Laminate, Layer, Material
 
@@ -50,7 +50,7 @@ def somewhere(space: Space, seed: int) -> FloatArray:
     return inwards(space, x, by=0.6)
 
 
-def direct(rig: Rig, loads: list[Load]) -> ComplexArray:
+def direct(rig: Rig, loads: list[Support]) -> ComplexArray:
     """Responses at ERAs and pad per base displacement (f, s, n), from the rig solved directly."""
     assert isinstance(rig.mesh, SpectralMesh)
     points = np.array([*((era.x, era.y) for era in rig.eras), (PAD.x, PAD.y)])
@@ -89,7 +89,7 @@ def test_deviating_rig_is_solved_without_solving_it_again(rig: Rig, model: Forwa
         loss_exponent=values.loss_exponent,
     )
     ((mass, at_x, at_y),) = values.masses
-    loads: list[Load] = [
+    loads: list[Support] = [
         PointLoad(at_x, at_y, mass=mass),
         FingertipLoad(FINGER.x, FINGER.y, FINGER.fingertip),
     ]

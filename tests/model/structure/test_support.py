@@ -1,15 +1,17 @@
 """Supports, loads at points and under fingertips, and the areas that they have."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_responder
+from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.fem.mesh import Mesh
 from model.reduction.free_plate import solve_free_plate
+from model.rig.meshes import mesh_of
 from model.structure.attachments import Era, Fingertip, PointLoad
 from model.structure.footprint import mean_over
 from model.structure.plate import Material, Plate
@@ -169,3 +171,35 @@ def test_reduction_with_feet_equals_a_factor_for_each_frequency(on_feet):
     respond = direct_responder(on_feet.plate, on_feet.mesh)
     exact = respond(*arguments, loads=on_feet.masses)
     np.testing.assert_allclose(found, exact, rtol=1e-3, atol=1e-4 * abs(exact).max())
+
+
+@dataclass(frozen=True)
+class Exciter:
+    """A voice coil on a suspension to the ground: a force [N], whatever the plate does."""
+
+    x: float
+    y: float
+    stiffness: float
+    damping: float
+    mass: float
+    foot: float = 0.0
+
+    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """Of the suspension and the coil."""
+        return self.stiffness + 1j * omega * self.damping - omega**2 * self.mass
+
+    def force(self, omega: FloatArray) -> ComplexArray:
+        """Two newtons at any frequency."""
+        return np.full(len(omega), 2.0 + 0j)
+
+
+def test_forces_with_an_impedance_drive_a_rigid_plate_as_newton_has_it() -> None:
+    """F = (k - omega² m) z with all springs, dampers and masses in one, in the plate's middle."""
+    rigid = replace(PLATE, material=replace(PLATE.material, E=1e16))
+    exciter = Exciter(0.15, 0.1, stiffness=2e3, damping=3.0, mass=0.05)
+    free = solve_free_plate(rigid, mesh_of("auto", rigid, frequency_max=200.0), frequency_max=200.0)
+    frequencies = np.array([20.0, 60.0, 100.0])
+    found = free.acceleration([exciter], frequencies, np.array([[0.02, 0.18]]), loads=CORNERS)
+    w = 2 * np.pi * frequencies
+    together = 4 * (17e3 + 1j * w) + 2e3 + 3j * w - w**2 * (PLATE.mass + 0.05)
+    np.testing.assert_allclose(found[:, 0, 0], -(w**2) * 2.0 / together, rtol=1e-4)

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from python_page import named
+
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")
@@ -107,7 +109,7 @@ def test_page_documents_every_name() -> None:
     """Exactly the exported names."""
     import era_haptics as era
 
-    documented = set(re.findall(r"^\.\. auto\w+:: era_haptics\.(\w+)", PAGE, re.MULTILINE))
+    documented = named(PAGE)
     errors = set(re.findall(r"`(\w+)`", PAGE.partition("| exception")[2].partition("\n## ")[0]))
     assert documented | (errors & set(era.__all__)) == set(era.__all__)
     assert documented & errors == set()

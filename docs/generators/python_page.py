@@ -1,0 +1,143 @@
+"""The entries of docs/reference/python-api.md: signatures and docstrings of `era_haptics`.
+
+`python docs/generators/python_page.py` writes them anew, each block up to the next section, below
+the comment that has its names: `<!-- api: query; Rig: era, fingerprint; Client(): * -->` is a
+function, a class with two of its members, and one that is made elsewhere, with all of its members.
+Functions are a list, a class has a heading and a list of its members.
+"""
+
+import ast
+import inspect
+import re
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import era_haptics
+
+WRITER = "docs/generators/python_page.py"
+PAGE = Path(__file__).parents[1] / "reference" / "python-api.md"
+
+_BLOCK = re.compile(r"(<!-- api: (.+?) -->\n\n).*?(?=\n## |\Z)", re.DOTALL)
+_WIDTH = 120
+
+Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def written(page: str) -> str:
+    """The page with every block as its comment and the source have it."""
+    return _BLOCK.sub(lambda block: block[1] + "\n".join(_entries(block[2])) + "\n", page)
+
+
+def named(page: str) -> set[str]:
+    """The names that the page has entries for."""
+    entries = ";".join(block[2] for block in _BLOCK.finditer(page)).split(";")
+    return {entry.partition(":")[0].strip(" ()") for entry in entries}
+
+
+def _entries(names: str) -> Iterator[str]:
+    """The lines of a block."""
+    is_list = True
+    for place, entry in enumerate(names.split(";")):
+        name, _, members = entry.strip().partition(":")
+        tree = _tree(getattr(era_haptics, name.strip("()")))
+        if isinstance(tree, ast.ClassDef):
+            yield from [""] if place else []
+            yield from _class(tree, members.replace(",", " ").split(), name.endswith("()"))
+        elif isinstance(tree, Function):
+            yield from [] if is_list else [""]
+            yield from _item(tree)
+        is_list = not isinstance(tree, ast.ClassDef)
+
+
+def _tree(thing: Any) -> ast.stmt:
+    """The source of a function, or of a class with that of the coroutines that it wraps."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(thing))).body[0]
+    if isinstance(tree, ast.ClassDef):
+        tree.body = [_unwrapped(thing, member) for member in tree.body]
+        for base in thing.__bases__:
+            tree.body += _of_stub(base)
+    return tree
+
+
+def _of_stub(base: type) -> list[ast.stmt]:
+    """The members of a class in the stub file of its module, if there is one."""
+    stub = Path(inspect.getfile(base)).with_suffix(".pyi") if base is not object else Path("none")
+    if not stub.is_file():
+        return []
+    (found,) = (
+        each
+        for each in ast.parse(stub.read_text("utf-8")).body
+        if isinstance(each, ast.ClassDef) and each.name == base.__name__
+    )
+    return found.body
+
+
+def _unwrapped(kind: type, member: ast.stmt) -> ast.stmt:
+    """A member of a class; as a plain function, if it is one that wraps a coroutine function."""
+    if not isinstance(member, ast.Assign):
+        return member
+    wrapper = getattr(kind, ast.unparse(member.targets[0]))
+    if not hasattr(wrapper, "__wrapped__"):
+        return member
+    tree = _tree(wrapper.__wrapped__)
+    return ast.FunctionDef(**{name: getattr(tree, name) for name in tree._fields})
+
+
+def _class(tree: ast.ClassDef, members: list[str], is_made_elsewhere: bool) -> Iterator[str]:
+    """A class with its fields; below its text those of its members that are named, `*` for all."""
+    fields, listed = [], []
+    for member in tree.body:
+        if isinstance(member, ast.AnnAssign) and not ast.unparse(member.target).startswith("_"):
+            fields.append(ast.unparse(member))
+        elif isinstance(member, Function):
+            if member.name == "__init__" and not is_made_elsewhere:
+                fields.append(ast.unparse(member.args).removeprefix("self, "))
+            if not member.name.startswith("_") and {member.name, "*"} & set(members):
+                listed.append(member)
+    yield from [f"### {tree.name}", ""]
+    yield from _text(tree, f"`{tree.name}({', '.join(fields)})`: " if fields else "", "")
+    described = [member for member in listed if ast.get_docstring(member)]
+    yield from [""] if listed else []
+    for member in described:
+        yield from _item(member)
+    others = [f"`{_signature(each)}`" for each in listed if each not in described]
+    yield from _wrapped(f"- {', '.join(others)}: as in the API.", "  ") if others else []
+
+
+def _item(tree: Function) -> Iterator[str]:
+    """A function or a property as an item of a list."""
+    yield from _text(tree, f"- `{_signature(tree)}`: ", "  ")
+
+
+def _signature(tree: Function) -> str:
+    """A function or a property as it is used."""
+    result = "" if tree.returns is None else f" -> {ast.unparse(tree.returns)}"
+    decorators = {ast.unparse(each) for each in tree.decorator_list}
+    if decorators & {"property", "cached_property"}:
+        return tree.name + result.replace(" -> ", ": ")
+    arguments = re.sub(r"^(self|cls)(, )?", "", ast.unparse(tree.args))
+    keyword = "async " if isinstance(tree, ast.AsyncFunctionDef) else ""
+    return f"{keyword}{tree.name}({arguments}){result}"
+
+
+def _text(tree: ast.ClassDef | Function, start: str, indent: str) -> list[str]:
+    """The docstring as one filled paragraph; items of a list are parts of a sentence."""
+    text = re.sub(r"(?<=[^.])\n\n(?=[A-Z])", ". ", ast.get_docstring(tree) or "")
+    text = re.sub(r"\n+- ", "; ", text).replace(".; ", ". ")
+    return _wrapped(start + text, indent)
+
+
+def _wrapped(text: str, indent: str) -> list[str]:
+    return textwrap.wrap(
+        " ".join(text.split()),
+        _WIDTH,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+if __name__ == "__main__":
+    PAGE.write_text(written(PAGE.read_text("utf-8")), "utf-8")

@@ -1,0 +1,29 @@
+"""The entries of the reference of the Python API against the code."""
+
+import pytest
+
+from python_page import PAGE, WRITER, written
+
+
+def test_page_is_as_written_from_the_code() -> None:
+    """Written anew by the program that wrote it."""
+    page = PAGE.read_text("utf-8")
+    assert written(page) == page, f"python {WRITER}"
+
+
+@pytest.mark.parametrize(
+    "fact",
+    [
+        "Raises InputError for a missing, damaged or foreign file.",  # errors of a function
+        "slew [1/s]: highest rise of a level;",  # units of a class's fields
+        "peak acceleration [m/s²] at raster points x (nx,), y (ny,) [m]",  # shapes
+        "- `disarm() -> None`: Fall silent, then switch the high voltage off.",  # a method
+        "- `usable_level_db_sl: float`: Highest level",  # a property
+        "- `async events() -> AsyncIterator[Notification]`: Yield notifications",  # a coroutine
+        "`stop(*, client: str | None=None) -> StopResult`",  # a method of the stub
+        "`SolvedPlate(rig: Rig, *, seed: int | None=None)`: A rig's plate",  # a constructor
+    ],
+)
+def test_page_has_what_docstrings_say(fact: str) -> None:
+    """As it is read in a checkout: shapes, units and errors, not first sentences alone."""
+    assert fact.casefold() in " ".join(PAGE.read_text("utf-8").casefold().split())

@@ -8,6 +8,8 @@ from controller.sources.contacts import Contact, ContactKey
 from model.table.pattern import Pattern
 from model.table.question import Question
 
+Targets = tuple[tuple[Contact, Target], ...]
+
 OWN, SHARED, HELD_BACK = "own", "shared", "held back"
 
 
@@ -45,10 +47,10 @@ class Content:
     the finger's content, which has no predictions.
     """
 
-    targets: tuple[tuple[Contact, Target], ...]
+    targets: Targets
     question: Question
     pattern: Pattern
-    predictions: tuple[Prediction, ...]
+    predictions: tuple[Prediction, ...] = ()
     voice: int = 0
 
     @property
@@ -74,7 +76,7 @@ class Selection:
     notice those of others.
     """
 
-    targets: tuple[tuple[Contact, Target], ...]
+    targets: Targets
     quiet: tuple[Contact, ...]
     contents: tuple[Content, ...] = ()
     reason: str | None = None

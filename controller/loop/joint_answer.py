@@ -7,7 +7,8 @@ latter counts: another frequency begins with an onset, for which the next place 
 
 import cmath
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -18,7 +19,7 @@ from controller.loop.content import HELD_BACK, SHARED, Content, Prediction, Sele
 from controller.loop.intent import Target
 from controller.loop.table_query import playable_band, question_of
 from controller.sources.contacts import Contact, ContactKey
-from model.arrays import Complex64Array, FloatArray
+from model.arrays import Complex64Array
 from model.choice import NEARLY
 from model.finger.perception import FELT_DB_SL, decibels
 from model.table import request
@@ -69,7 +70,12 @@ def query_jointly(
     kept_within = math.inf if is_moving else KEPT_WITHIN
     found = _answer(table, requests, fingers, kept, kept_within, playable)
     strokes = table.strokes
-    free, factor = found, _factor_within(found, capabilities, strokes)
+
+    def within(found: Answer) -> float:
+        tones = [each for layer in found.layers for each in _tones_of(layer)]
+        return factor_within(amplitudes_of(tones), capabilities, strokes)
+
+    free, factor = found, within(found)
     if factor < 1 - NEARLY:
         gains_db = _gains_db(requests, found, capabilities, strokes)
         lowered = with_gains(table, found, gains_db)
@@ -79,7 +85,7 @@ def query_jointly(
             ]
             lowered = answer(table, softer, fingers, playable=playable)
         found = lowered
-        factor = _factor_within(found, capabilities, strokes)
+        factor = within(found)
     change = float(decibels(factor))
     unfelt = {
         number
@@ -236,13 +242,19 @@ def _worst(found: Answer) -> float:
     return math.inf if found.promised_worst_db is None else found.promised_worst_db
 
 
-def _factor_within(
-    found: Answer, capabilities: PlaybackCapabilities, strokes: Mapping[str, float]
+def amplitudes_of(excitations: Iterable[Excitation]) -> dict[str, float]:
+    """The amplitudes [m] of excitations together, by ERA."""
+    total = defaultdict[str, float](float)
+    for tones in excitations:
+        for name, tone in tones.items():
+            total[name] += tone.amplitude
+    return total
+
+
+def factor_within(
+    total: Mapping[str, float], capabilities: PlaybackCapabilities, strokes: Mapping[str, float]
 ) -> float:
-    """The factor, 1 at most, by which all contents together are within the amplifiers' limits."""
-    total = dict.fromkeys(strokes, 0.0)
-    for _, name, amplitude in _amplitudes(found):
-        total[name] += amplitude
+    """The factor, 1 at most, by which amplitudes [m] are within the amplifiers' limits."""
     share, power = 1.0, 0.0
     for name, amplitude in total.items():
         share = max(share, amplitude / capabilities.max_amplitudes[name])
@@ -250,22 +262,9 @@ def _factor_within(
     return 1.0 / max(share, math.sqrt(power / capabilities.max_power))
 
 
-def _shares(found: Answer, amplitudes: Mapping[str, float]) -> FloatArray:
-    """Each layer's greatest shares of amplitudes [m] by ERA (layers, eras), 0 of no content."""
-    names = [*amplitudes]
-    full = np.zeros((len(found.layers), len(names)))
-    for number, name, amplitude in _amplitudes(found):
-        full[number, names.index(name)] += amplitude / amplitudes[name]
-    return full
-
-
-def _amplitudes(found: Answer) -> Iterator[tuple[int, str, float]]:
-    """Layer, ERA and amplitude [m] of every tone that plays; fingers that share have one layer."""
-    for number, layer in enumerate(found.layers):
-        if layer.verdict not in (HELD_BACK, SHARED):
-            for tones in (layer.excitation, *layer.side_bands):
-                for name, tone in tones.items():
-                    yield number, name, tone.amplitude
+def _tones_of(layer: Layer) -> tuple[Excitation, ...]:
+    """What plays of a layer; fingers that share have one."""
+    return () if layer.verdict in (HELD_BACK, SHARED) else (layer.excitation, *layer.side_bands)
 
 
 def _gains_db(
@@ -279,10 +278,12 @@ def _gains_db(
     As the stroke is shared: those of lower priority are lowered first, of equal ones the louder.
     Power counts in shares of what all together would have.
     """
-    levels = _shares(found, strokes)
+    each_layer = [amplitudes_of(_tones_of(each)) for each in found.layers]
+    amplitudes = np.array([[each[name] for name in strokes] for each in each_layer])
+    levels = amplitudes / [*strokes.values()]
     norms = np.linalg.norm(levels, axis=1)
     power = norms * np.linalg.norm(levels.sum(axis=0)) / norms.sum()
-    full = _shares(found, capabilities.max_amplitudes)
+    full = amplitudes / [capabilities.max_amplitudes[name] for name in strokes]
     limited = np.column_stack([full, power / math.sqrt(capabilities.max_power)])
     served = np.flatnonzero(norms).tolist()
     promised = np.array([found.layers[at].promised_level_db_sl for at in served])
@@ -350,8 +351,6 @@ def _content(
     question = question_of(
         first, [*others, *quiet], level_db_sl=pattern.level_db_sl, drive_mode=pattern.drive_mode
     )
-    frequencies = {tone.frequency for tone in pattern.excitation.values()}
-    (frequency,) = frequencies if len(frequencies) == 1 else (None,)
     change = float(decibels(factor))
     predictions = tuple(
         Prediction(
@@ -361,7 +360,7 @@ def _content(
             held_back=None if layer is served[0][2] else f"shares the content of {first.key}",
             promised_contrast_db=layer.promised_contrast_db,
             foreign_level_db_sl=_changed(layer.foreign_level_db_sl, change),
-            frequency=frequency,
+            frequency=layer.frequency,
             content=served[0][1].content,
         )
         for contact, _, layer in served

@@ -25,14 +25,14 @@ class AnswerThread(Generic[T]):
 
     @property
     def is_busy(self) -> bool:
-        """Whether a question is being answered, so that no other must use the table."""
-        return self._answer is not None and not self._answer.done()
+        """Whether an answer is not taken yet: until then no other may use the table."""
+        return self._answer is not None
 
     def compute(self, question: Callable[[], T]) -> None:
         """Compute in the thread, which must not be busy."""
         loop = asyncio.get_running_loop()
         self._answer = loop.run_in_executor(self._pool, question)
-        self._answer.add_done_callback(self._done)
+        self._answer.add_done_callback(lambda _: self._arrived())
         self._limit = loop.call_later(_TIME_LIMIT, self._late)
 
     def take(self) -> T | None:
@@ -40,20 +40,20 @@ class AnswerThread(Generic[T]):
 
         Raises TimeoutError while an answer has been computed for more than 1 s.
         """
-        if self._is_late:
-            raise TimeoutError(f"answer must take less than {_TIME_LIMIT:g} s, is still computed")
         answer = self._answer
-        if answer is None or not answer.done():
+        if answer is None:
             return None
-        self._answer = None
+        if not answer.done():
+            if self._is_late:
+                raise TimeoutError(
+                    f"answer must take less than {_TIME_LIMIT:g} s, is still computed"
+                )
+            return None
+        self._answer, self._is_late = None, False
+        if self._limit is not None:
+            self._limit.cancel()
         return None if answer.cancelled() else answer.result()
 
     def _late(self) -> None:
         self._is_late = True
-        self._arrived()
-
-    def _done(self, answered: "asyncio.Future[T]") -> None:
-        self._is_late = False
-        if self._limit is not None:
-            self._limit.cancel()
         self._arrived()

@@ -40,36 +40,25 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Asked:
-    """What is to be chosen among contacts: for what lasts, None where it is kept, and for pulses.
+    """What is to be chosen among contacts: for short pulses, and what lasts, None where it is kept.
 
     protected: contacts that must not notice the contents of others; before: what is felt now, by
     finger and voice; kept: what plays on beside it; triggered_at [s]: when the change arrived;
-    is_moving: whether only places have changed; is_rested: whether what plays would do, too, but
-    kept its frequencies while a finger moved.
+    takes_long: whether what lasts takes longer than the control loop may wait; is_moving: whether
+    only places have changed; is_rested: whether what plays would do, too, but kept its frequencies
+    while a finger moved.
     """
 
-    lasting: Targets | None
     short: Targets
     contacts: tuple[Contact, ...]
     protected: frozenset[ContactKey]
     before: Mapping[tuple[ContactKey, int], Content]
     kept: tuple[Selection, ...]
     triggered_at: float
+    lasting: Targets | None = None
+    takes_long: bool = False
     is_moving: bool = False
     is_rested: bool = False
-
-    @property
-    def takes_long(self) -> bool:
-        """Whether it takes longer than the control loop may wait."""
-        return self.lasting is not None and not self.is_alone(self.lasting)
-
-    def is_alone(self, targets: Targets) -> bool:
-        """Whether targets are a short pulse, or one steady content beside no protected finger."""
-        if len(targets) != 1:
-            return False
-        ((contact, target),) = targets
-        is_unbounded = self.protected <= {contact.key}
-        return target.is_short or (is_unbounded and target.modulation_hz is None)
 
 
 @dataclass(frozen=True)
@@ -93,7 +82,8 @@ class Chooser:
         """Choose what is asked for, what lasts first."""
         kept, lasting = [*asked.kept], None
         if asked.lasting is not None:
-            lasting = self._chosen(asked, asked.lasting, capabilities, ())
+            beside = None if asked.takes_long else ()
+            lasting = self._chosen(asked, asked.lasting, capabilities, beside)
             kept.append(lasting)
         short: dict[ContactKey, Selection] = {}
         for each in asked.short:
@@ -107,13 +97,16 @@ class Chooser:
         asked: Asked,
         targets: Targets,
         capabilities: PlaybackCapabilities,
-        beside: Sequence[Selection],
+        beside: Sequence[Selection] | None,
     ) -> Selection:
-        """Choose for some targets beside others; any failure is their reason for silence."""
+        """Choose for a target beside others, or several; any failure is their reason for silence.
+
+        beside: None for several together.
+        """
         keys = {contact.key for contact, _ in targets}
         quiet = tuple([each for each in asked.contacts if each.key not in keys])
         try:
-            if asked.is_alone(targets):
+            if beside is not None:
                 found = self._alone(asked, targets, quiet, capabilities, beside)
             else:
                 found = query_jointly(
@@ -145,8 +138,14 @@ class Chooser:
     ) -> Selection:
         """Choose for the only target beside others; raises InputError."""
         ((contact, target),) = targets
-        strokes, contents = self.table.strokes, [one for part in beside for one in part.contents]
-        left = _left_by(contents, capabilities, strokes)
+        strokes, left, heard = self.table.strokes, capabilities, list[float]()
+        contents = list[Content]()
+        for part in beside:
+            contents += part.contents
+            if contact.key in part.quiet_levels:
+                heard.append(part.quiet_levels[contact.key])
+        if contents:
+            left = _left_by(contents, capabilities, strokes)
         before = asked.before.get((contact.key, 0))
         answer = self._query(contact, target, quiet, left, before)
         pattern = answer.pattern
@@ -161,8 +160,7 @@ class Chooser:
         if felt < 0 and (change < 0 or (contents and not is_heard)):
             used_up = "the contents of other fingers use the whole stroke; lift a finger"
             return _silent(targets, quiet, used_up if contents else LIMITS_LEAVE_NOTHING)
-        heard = [part.quiet_levels for part in beside if contact.key in part.quiet_levels]
-        others = sum_db(each[contact.key] for each in heard) if heard else None
+        others = sum_db(heard) if heard else None
         if others is not None:
             promised = min(math.inf if promised is None else promised, felt - others)
         content = Content(targets, answer.question, pattern.scaled(change) if change else pattern)
@@ -209,6 +207,14 @@ def sum_db(levels: Iterable[float]) -> float:
     return 10 * math.log10(power) if power else -math.inf
 
 
+def is_alone(targets: Targets, protected: frozenset[ContactKey]) -> bool:
+    """Whether what lasts is one steady content that no other finger must not notice."""
+    if len(targets) != 1:
+        return False
+    ((contact, target),) = targets
+    return protected <= {contact.key} and target.modulation_hz is None
+
+
 def _is_step(new: Target, old: Target) -> bool:
     """Whether only the level of a target changes, which is not raised."""
     is_step = new != old and new == replace(old, level_db_sl=new.level_db_sl)
@@ -227,8 +233,6 @@ def _left_by(
     strokes: Mapping[str, float],
 ) -> PlaybackCapabilities:
     """Return what contents leave of the amplitudes and the power, their peaks together."""
-    if not contents:
-        return capabilities
     taken = amplitudes_of([each.pattern.excitation for each in contents])
     levels = [taken[name] / stroke for name, stroke in strokes.items()]
     return replace(

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from controller.loop.intent import Target
 from controller.sources.contacts import Contact, ContactKey
@@ -84,6 +85,20 @@ class Selection:
     is_pending: bool = False
     quiet_levels: Mapping[ContactKey, float] = field(default_factory=dict)
     protected: frozenset[ContactKey] = frozenset()
+
+    @cached_property
+    def contacts(self) -> dict[ContactKey, Contact]:
+        """All contacts as they were then."""
+        found = {each.key: each for each in self.quiet}
+        for contact, _ in self.targets:
+            found[contact.key] = contact
+        return found
+
+    @cached_property
+    def is_whole(self) -> bool:
+        """Whether every target feels its own, so that who leaves changes nothing for others."""
+        is_each_alone = all(len(content.targets) == 1 for content in self.contents)
+        return bool(self.contents) and is_each_alone and not self.not_served
 
     @property
     def predictions(self) -> tuple[Prediction, ...]:

@@ -323,8 +323,8 @@ class Decider:
         selection = self._selector.select(
             contacts, intent, self.capabilities, triggered_at=triggered_at
         )
-        self._over = tuple(each for each in self._over if each in selection.contents)
         if self._over:
+            self._over = tuple(each for each in self._over if each in selection.contents)
             selection = _held_back(selection, self._over, ENDED)
         if len(selection.contents) > self.capabilities.layers:
             selection = self._within_layers(selection)

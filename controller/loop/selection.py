@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from controller.loop.answer_thread import AnswerThread
 from controller.loop.capabilities import PlaybackCapabilities
-from controller.loop.choice import Asked, Chooser, Chosen, sum_db
+from controller.loop.choice import Asked, Chooser, Chosen, is_alone, sum_db
 from controller.loop.content import Prediction, Selection, Targets, no_layer_free, not_served
 from controller.loop.intent import HapticIntent, Target
 from controller.loop.joint_answer import Shape
@@ -48,7 +48,7 @@ class _Wanted:
         """Whether what was chosen also serves what lasts among these contacts."""
         if not self._is_part_of(chosen, lambda target: target):
             return False
-        is_whole, then = _is_whole(chosen), _contacts_of(chosen)
+        is_whole, then = chosen.is_whole, chosen.contacts
         now = {each.key: each for each in self.contacts}
         same = now.keys() <= then.keys() if is_whole else now.keys() == then.keys()
         return same and all(
@@ -66,7 +66,7 @@ class _Wanted:
 
     def is_among(self, chosen: Selection) -> bool:
         """Whether all contacts were there when it was chosen."""
-        return {each.key for each in self.contacts} <= _contacts_of(chosen).keys()
+        return {each.key for each in self.contacts} <= chosen.contacts.keys()
 
     def _is_part_of(self, chosen: Selection, of_target: Callable[[Target], Target]) -> bool:
         """Whether what lasts was chosen, and no more that would leave others more if it ended.
@@ -75,10 +75,10 @@ class _Wanted:
         """
         wanted = {of_target(target) for _, target in self.lasting}
         had = {of_target(target) for _, target in chosen.targets}
+        if not wanted <= had:
+            return False
         pulsing = {contact.key for contact, _ in self.short}
-        return wanted <= had and (
-            _is_whole(chosen) or all(target.key in pulsing for target in had - wanted)
-        )
+        return chosen.is_whole or all(target.key in pulsing for target in had - wanted)
 
 
 class Selector:
@@ -103,7 +103,7 @@ class Selector:
         self._chooser = Chooser(table, levels, shape)
         self._thread: AnswerThread[Chosen] = AnswerThread(arrived)
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
-        self._short: Mapping[ContactKey, Selection] = {}
+        self._short: dict[ContactKey, Selection] = {}
         self._current = _NOTHING
         self.triggered_at = math.inf
         """When [s] the change arrived whose answer the last selection has."""
@@ -139,38 +139,44 @@ class Selector:
         # Lists: a generator would be a call for each.
         targets = tuple([(each, by_key[each.key]) for each in contacts if each.key in by_key])
         served, skipped = _within_layers(targets, capabilities)
-        lasting = tuple([each for each in served if not each[1].is_short])
-        short = tuple([each for each in served if each[1].is_short])
-        wanted = _Wanted(tuple(contacts), lasting, short, intent.protected)
+        lasting: list[tuple[Contact, Target]] = []
+        short: list[tuple[Contact, Target]] = []
+        for each in served:
+            (short if each[1].is_short else lasting).append(each)
+        wanted = _Wanted(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
         self.triggered_at = math.inf
         arrived = self._thread.take()
         if arrived is not None:
             self._take(arrived, is_late=not self._is_wanted(arrived, wanted))
-        pulses = [self._short[contact.key] for contact, _ in short if contact.key in self._short]
-        self._short = {
-            contact.key: part
-            for contact, target in short
-            for part in pulses
-            if part.targets[0][1] == target
-        }
-        if not {each.key for each, _ in self._lasting.targets} & {each.key for each in contacts}:
+        pulses, self._short = self._short, {}
+        for contact, target in short:
+            pulse = pulses.get(contact.key)
+            if pulse is not None and pulse.targets[0][1] == target:
+                self._short[contact.key] = pulse
+        if not contacts:
             self._lasting = _NOTHING
         if self._thread.is_busy:
             self.due = triggered_at + _RESTS_AFTER if self.due <= triggered_at else self.due
         else:
             for asked in self._to_ask(wanted, pulses, triggered_at, has_waited=arrived is not None):
                 self._ask(asked, capabilities)
-        return self._together(contacts, targets, wanted, skipped, intent.reason)
+        parts = [_felt(self._lasting, wanted.lasting), *self._short.values()]
+        found = _together(contacts, targets, parts, skipped, intent.reason)
+        if self._thread.is_busy and len(found.predictions) < len(targets):
+            found = replace(found, is_pending=True)
+        if found != self._current:
+            self._current = found
+        return self._current
 
     def _to_ask(
         self,
         wanted: _Wanted,
-        pulses: Sequence[Selection],
+        pulses: Mapping[ContactKey, Selection],
         triggered_at: float,
         *,
         has_waited: bool,
     ) -> list[Asked]:
-        """Return what is to be asked now; pulses: of the fingers that had one.
+        """Return what is to be asked now; pulses: of all fingers, until now.
 
         A pulse that has waited for the thread goes before what lasts, for which it would be late.
         """
@@ -180,24 +186,33 @@ class Selector:
         is_rested = bool(lasting) and is_due and is_kept
         if is_due:
             self.due = triggered_at + _RESTS_AFTER if lasting and not is_rested else math.inf
+        new = tuple([each for each in wanted.short if each[0].key not in self._short])
+        if is_kept and not is_rested and not new:
+            return []
         felt = _felt(self._lasting, lasting)
+        before = {one.key: one for one in felt.contents}
+        for contact, _ in wanted.short:
+            before.update({each.key: each for each in pulses.get(contact.key, _NOTHING).contents})
         playing = [part for part in self._short.values() if _plays(part, triggered_at)]
-        kept = Asked(
-            None,
-            tuple([each for each in wanted.short if each[0].key not in self._short]),
-            wanted.contacts,
-            wanted.protected,
-            {one.key: one for part in (felt, *pulses) for one in part.contents},
-            (felt, *playing),
-            triggered_at,
+        asked = Asked(
+            new, wanted.contacts, wanted.protected, before, (felt, *playing), triggered_at
         )
         if is_kept and not is_rested:
-            return [kept] if kept.short else []
-        asked = replace(kept, lasting=lasting, kept=tuple(playing), is_rested=is_rested)
-        is_moving = asked.takes_long and not is_rested and wanted.is_moved_from(self._lasting)
+            return [asked]
+        takes_long = not is_alone(lasting, wanted.protected)
+        is_moving = takes_long and not is_rested and wanted.is_moved_from(self._lasting)
         self.due = triggered_at + _RESTS_AFTER if is_moving else math.inf
-        asked = replace(asked, is_moving=is_moving)
-        return [kept, replace(asked, short=())] if has_waited and kept.short else [asked]
+        first = [asked] if has_waited and new else []
+        last = replace(
+            asked,
+            short=() if first else new,
+            kept=tuple(playing),
+            lasting=lasting,
+            takes_long=takes_long,
+            is_moving=is_moving,
+            is_rested=is_rested,
+        )
+        return [*first, last]
 
     def _ask(self, asked: Asked, capabilities: PlaybackCapabilities) -> None:
         """Choose at once what does not take long, else in the thread."""
@@ -230,39 +245,34 @@ class Selector:
         if chosen.short or not is_late:
             self.triggered_at = chosen.asked.triggered_at
 
-    def _together(
-        self,
-        contacts: Sequence[Contact],
-        targets: Targets,
-        wanted: _Wanted,
-        skipped: tuple[Prediction, ...],
-        reason: str,
-    ) -> Selection:
-        """Join what lasts and the short pulses beside it, contacts as they were when chosen."""
-        parts = [_felt(self._lasting, wanted.lasting), *self._short.values()]
-        parts = [part for part in parts if part.targets]
-        then = {key: each for part in parts for key, each in _contacts_of(part).items()}
-        keys = {contact.key for contact, _ in targets}
-        quiet = [then.get(each.key, each) for each in contacts if each.key not in keys]
-        reasons = [part.reason for part in parts if part.reason is not None]
-        levels = {
-            each.key: [
-                part.quiet_levels[each.key] for part in parts if each.key in part.quiet_levels
-            ]
+
+def _together(
+    contacts: Sequence[Contact],
+    targets: Targets,
+    parts: Sequence[Selection],
+    skipped: tuple[Prediction, ...],
+    reason: str,
+) -> Selection:
+    """Join what was chosen apart, contacts as they were then; reason: why there are no targets."""
+    chosen = [part for part in parts if part.targets]
+    if len(chosen) == 1 and len(chosen[0].targets) == len(targets):
+        return chosen[0]
+    then = {key: each for part in chosen for key, each in part.contacts.items()}
+    keys = {contact.key for contact, _ in targets}
+    quiet = [then.get(each.key, each) for each in contacts if each.key not in keys]
+    reasons = [part.reason for part in chosen if part.reason is not None]
+    levels = [part.quiet_levels for part in chosen]
+    return Selection(
+        tuple([(then.get(contact.key, contact), target) for contact, target in targets]),
+        tuple(quiet),
+        tuple([content for part in chosen for content in part.contents]),
+        next(iter(reasons), None) if targets else reason,
+        (*[each for part in chosen for each in part.not_served], *skipped),
+        quiet_levels={
+            each.key: sum_db(level[each.key] for level in levels if each.key in level)
             for each in quiet
-        }
-        found = Selection(
-            tuple([(then.get(contact.key, contact), target) for contact, target in targets]),
-            tuple(quiet),
-            tuple([content for part in parts for content in part.contents]),
-            next(iter(reasons), None) if targets else reason,
-            (*[each for part in parts for each in part.not_served], *skipped),
-            is_pending=bool(targets) and self._thread.is_busy,
-            quiet_levels={key: sum_db(each) for key, each in levels.items()},
-        )
-        if found != self._current:
-            self._current = found
-        return self._current
+        },
+    )
 
 
 def _plays(pulse: Selection, now: float) -> bool:
@@ -270,21 +280,10 @@ def _plays(pulse: Selection, now: float) -> bool:
     return any(target.pulse is not None and now < target.pulse.end for _, target in pulse.targets)
 
 
-def _contacts_of(chosen: Selection) -> dict[ContactKey, Contact]:
-    """Return all contacts as they were when it was chosen."""
-    return {each.key: each for each in (*[contact for contact, _ in chosen.targets], *chosen.quiet)}
-
-
-def _is_whole(chosen: Selection) -> bool:
-    """Whether every target feels its own, so that one finger less changes nothing for others."""
-    is_each_alone = all(len(content.targets) == 1 for content in chosen.contents)
-    return bool(chosen.contents) and is_each_alone and not chosen.not_served
-
-
 def _felt(chosen: Selection, lasting: Targets) -> Selection:
     """Return what was chosen, without the contents of fingers that are to feel it no more."""
     keys = {contact.key for contact, _ in lasting}
-    if all(contact.key in keys for contact, _ in chosen.targets):
+    if keys >= chosen.contacts.keys() - {each.key for each in chosen.quiet}:
         return chosen
     return replace(
         chosen,
@@ -303,12 +302,13 @@ def _within_layers(
     targets: Targets, capabilities: PlaybackCapabilities
 ) -> tuple[Targets, tuple[Prediction, ...]]:
     """Leave out targets for which there is no layer: of the lowest priority, then the earliest."""
-    count, reason = capabilities.layers, no_layer_free(capabilities.layers)
-    if capabilities.drive_mode != UNRESTRICTED:
-        count = 1
-        reason = f"the drive mode {capabilities.drive_mode} plays 1 content at once; lift a finger"
+    mode = capabilities.drive_mode
+    count = capabilities.layers if mode == UNRESTRICTED else 1
     if len(targets) <= count:
         return targets, ()
+    reason = f"the drive mode {mode} plays 1 content at once; lift a finger"
+    if mode == UNRESTRICTED:
+        reason = no_layer_free(count)
     order = sorted(range(len(targets)), key=lambda at: (targets[at][1].priority, at), reverse=True)
     served = {*order[:count]}
     return (

@@ -234,7 +234,7 @@ def _left_by(
 ) -> PlaybackCapabilities:
     """Return what contents leave of the amplitudes and the power, their peaks together."""
     taken = amplitudes_of([each.pattern.excitation for each in contents])
-    levels = [taken[name] / stroke for name, stroke in strokes.items()]
+    levels = [amplitude / strokes[name] for name, amplitude in taken.items()]
     return replace(
         capabilities,
         max_amplitudes={

@@ -1,5 +1,6 @@
 """A table whose answers a test sets, and rigs of a few ERAs for which nothing has to be solved."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,16 +16,16 @@ from model.vibration.excitation import Excitation
 from registry.limits import GuardLimits
 
 STROKE = 100e-6  # m
-PLACES = {"SW": (0.0, 0.0), "NE": (0.3, 0.2), "SE": (0.3, 0.0)}  # m; of ERAs by name
 
 
 def make_rig(amplifiers: Sequence[str], limits: GuardLimits, *, eras: int = 3) -> Rig:
     """So many ERAs on channels 0, 1, 2 of one amplifier, or NE on another."""
-    names = [*PLACES][:eras]
+    places = {"SW": (0.0, 0.0), "NE": (0.3, 0.2), "SE": (0.3, 0.0)}
+    names = [*places][:eras]
     return Rig(
         plate=Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33)),
         mesh=Mesh(4, 4, 0.3, 0.2),
-        eras=tuple(Era(name, *PLACES[name], 17_000.0, 1.0, 0.0, STROKE) for name in names),
+        eras=tuple(Era(name, *places[name], 17_000.0, 1.0, 0.0, STROKE) for name in names),
         wiring={
             name: Channel(amplifiers[-1 if name == "NE" else 0], number)
             for number, name in enumerate(names)
@@ -46,7 +47,7 @@ class SetTable:
         self.excitation = excitation
         self.plate = plate
         self.shared = shared
-        self.strokes = dict.fromkeys(PLACES, STROKE)
+        self.strokes = defaultdict[str, float](lambda: STROKE)
         self.frequencies = np.array([90.0, 110.0, 150.0, 250.0])  # Hz
         self.prepared: list[str] = []
         self.asked: list[Question] = []

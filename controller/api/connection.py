@@ -126,15 +126,10 @@ class Connection(asyncio.BufferedProtocol):
         return self._received
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Keep the bytes received in the buffer."""
-        self.data_received(self._received[:nbytes])
-        self.reading_time += time.thread_time() - self._read_at
-
-    def data_received(self, data: bytes | memoryview) -> None:
-        """Keep it, undivided; pause reading while much waits to be served."""
+        """Keep the bytes received, undivided; pause reading while much waits to be served."""
         self.received_at = self._clock()
         before = len(self._input)
-        self._input += data
+        self._input += self._received[:nbytes]
         self._stop_at = max(self._stop_at, self._input.rfind(STOP, max(0, before - len(STOP) + 1)))
         if self._line_end < 0:
             self._line_end = self._input.find(b"\n", before)
@@ -144,6 +139,7 @@ class Connection(asyncio.BufferedProtocol):
                 self._transport.pause_reading()
         if self.has_lines:
             self._on_lines(self)
+        self.reading_time += time.thread_time() - self._read_at
 
     def eof_received(self) -> bool:
         """Finish what the client requested before it closed its side, then close."""

@@ -152,21 +152,39 @@ class ApiServer:
         return self._clock() - connection.touched_at <= CONTACT_TIMEOUT
 
     def _serve_line(self, connection: Connection) -> None:
-        """Serve the next line of a client, unless it is a touch frame that the one after replaces.
+        """Serve the next line of a client, or start to."""
+        call = self._next_call(connection)
+        if call is None:
+            return
+        try:
+            result = self._call(connection, call)
+        except Exception as error:
+            if call.method == "stop":
+                self._stop_all()
+            self._respond(connection, call, error)
+            return
+        if isinstance(result, Message):
+            self._respond(connection, call, result)
+            return
+        task = asyncio.ensure_future(self._finish(connection, call, result))
+        connection.pending.add(task)
+        task.add_done_callback(lambda task: self._finished(connection, task))
+
+    def _next_call(self, connection: Connection) -> _Call | None:
+        """Read the next line, unless it is a touch frame that the one after replaces.
 
         That one is then read, and ahead.
         """
         call: _Call | None = connection.ahead or self._read(connection)
         connection.ahead = None
         if call is not None and not connection.is_open and call.method != "stop":
-            return  # the client has left: its fingers are lifted, and its lease has ended
+            return None  # the client has left: its fingers are lifted, and its lease has ended
         if call is not None and isinstance(call.params, TouchParams):
             connection.touched_at = self._clock() if call.params.touches else -math.inf
             connection.ahead = self._read(connection)
             if call.is_superseded_by(connection.ahead):
-                return
-        if call is not None:
-            self._serve(connection, call)
+                return None
+        return call
 
     def _read(self, connection: Connection) -> _Call | None:
         """Read the next line, within the client's rate; refused requests count."""
@@ -193,22 +211,6 @@ class ApiServer:
             connection.refuse(_BUSY)
             return None
         return replace(call, params=None, error=_BUSY)
-
-    def _serve(self, connection: Connection, call: _Call) -> None:
-        """Serve one call, or start to."""
-        try:
-            result = self._call(connection, call)
-        except Exception as error:
-            if call.method == "stop":
-                self._stop_all()
-            self._respond(connection, call, error)
-            return
-        if isinstance(result, Message):
-            self._respond(connection, call, result)
-            return
-        task = asyncio.ensure_future(self._finish(connection, call, result))
-        connection.pending.add(task)
-        task.add_done_callback(lambda task: self._finished(connection, task))
 
     def _finished(self, connection: Connection, task: "asyncio.Task[None]") -> None:
         connection.pending.discard(task)

@@ -9,7 +9,6 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Callable
-from functools import partial
 
 from controller.api.connection import Connection
 from controller.api.rate_limit import RateLimiter
@@ -38,12 +37,14 @@ class Turns:
         clock: Callable[[], float],
         processor_time: Callable[[], float],
     ) -> None:
-        self._serve = serve
+        self.serve = serve
+        self.is_busy = is_busy
+        self.clock = clock
+        self.processor_time = processor_time
         self._is_first = is_first
-        self._processor_time = processor_time
-        lane = partial(_Lane, self._take, is_busy=is_busy, clock=clock)
-        self._first, self._others = lane(), lane()
-        self._urgent = lane(is_urgent=True, budget=self._others.budget)
+        first, others = (RateLimiter(SHARE, burst=BURST, clock=clock) for _ in range(2))
+        self._first, self._others = _Lane(self, first), _Lane(self, others)
+        self._urgent = _Lane(self, others, is_urgent=True)
         self._lanes = (self._urgent, self._first, self._others)
 
     def add(self, connection: Connection) -> None:
@@ -61,44 +62,17 @@ class Turns:
             lane.waiting.append(connection)
             lane.schedule()
 
-    def _take(self, waiting: deque[Connection], budget: RateLimiter) -> None:
-        """Serve a line of each connection, round and round, until the turn's time is up."""
-        began_at, end = self._processor_time(), time.perf_counter() + MAX_TURN
-        reading_time = 0.0
-        while waiting:
-            connection = waiting.popleft()
-            self._serve(connection)
-            reading_time += connection.reading_time
-            connection.reading_time = 0.0
-            if connection.has_lines:
-                self.add(connection)
-            connection.close_if_finished()
-            if time.perf_counter() >= end:
-                break
-        budget.spend(self._processor_time() - began_at + reading_time)
-
 
 class _Lane:
     """Clients that wait, and when their next turn is.
 
-    take: takes a turn; is_busy: whether turns wait; is_urgent: they wait for nothing, but count in
-    the budget, of processor time.
+    budget: of processor time; is_urgent: they wait for nothing, but count in it.
     """
 
-    def __init__(
-        self,
-        take: Callable[[deque[Connection], RateLimiter], None],
-        *,
-        is_busy: Callable[[], bool],
-        clock: Callable[[], float],
-        is_urgent: bool = False,
-        budget: RateLimiter | None = None,
-    ) -> None:
+    def __init__(self, turns: Turns, budget: RateLimiter, *, is_urgent: bool = False) -> None:
         self.waiting: deque[Connection] = deque()
-        self.budget = budget or RateLimiter(SHARE, burst=BURST, clock=clock)
-        self._take = take
-        self._is_busy = is_busy
-        self._clock = clock
+        self._turns = turns
+        self._budget = budget
         self._is_urgent = is_urgent
         self._is_turn_scheduled = False
         self._deferred_since: float | None = None
@@ -121,21 +95,33 @@ class _Lane:
             loop.call_soon(loop.call_soon, self._take_turn)
 
     def _take_turn(self) -> None:
+        """Serve a line of each client, round and round, until the turn's time is up."""
         self._is_turn_scheduled = False
-        delay = 0.0 if self._is_urgent else self._delay()
+        turns, delay = self._turns, 0.0 if self._is_urgent else self._delay()
+        began_at, end = turns.processor_time(), time.perf_counter() + MAX_TURN
+        reading_time = 0.0
         try:
-            if delay <= 0:
+            while self.waiting and delay <= 0:
                 self._deferred_since = None
-                self._take(self.waiting, self.budget)
+                connection = self.waiting.popleft()
+                turns.serve(connection)
+                reading_time += connection.reading_time
+                connection.reading_time = 0.0
+                if connection.has_lines:
+                    turns.add(connection)
+                connection.close_if_finished()
+                if time.perf_counter() >= end:
+                    break
         finally:  # whatever fails: others wait, perhaps with a stop
+            self._budget.spend(turns.processor_time() - began_at + reading_time)
             self.schedule(delay)
 
     def _delay(self) -> float:
         """Return the time [s] by which the turn that is due has to wait, 0 for none."""
-        if self._is_busy():
-            now = self._clock()
+        if self._turns.is_busy():
+            now = self._turns.clock()
             if self._deferred_since is None:
                 self._deferred_since = now
             if now - self._deferred_since < MAX_DEFERRAL:
                 return _RECHECK
-        return self.budget.pause()
+        return self._budget.pause()

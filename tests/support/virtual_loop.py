@@ -214,7 +214,7 @@ class MemoryTransport(asyncio.Transport):
 
     def _received(self, data: bytes) -> None:
         if not self._is_closed:
-            self._protocol.data_received(data)
+            feed(self._protocol, data)
 
     def _disconnect(self) -> None:
         if not self._is_closed:
@@ -227,6 +227,19 @@ class MemoryTransport(asyncio.Transport):
         soonest = self._arrives + 1e-9
         self._arrives = max(soonest, loop.time() + loop.rng.uniform(*_LATENCY))
         loop.call_at(self._arrives, callback, *args)
+
+
+def feed(protocol: Any, data: bytes) -> None:
+    """Let a protocol receive bytes, as an event loop does."""
+    if not isinstance(protocol, asyncio.BufferedProtocol):
+        protocol.data_received(data)
+        return
+    while data:
+        buffer = protocol.get_buffer(-1)
+        part = data[: len(buffer)]
+        buffer[: len(part)] = part
+        protocol.buffer_updated(len(part))
+        data = data[len(part) :]
 
 
 def run_virtual(

@@ -19,7 +19,7 @@ from controller.api.connection import MAX_REQUEST_RATE, MAX_UNREAD_BYTES, Connec
 from controller.api.schema import MAX_RATE, Message
 from controller.api.topics import ContactsEvent, Hub, LogEvent
 from drivers.garbage_collection import no_long_collections
-from served_api import ServedApi, Wire, request, serving
+from served_api import ServedApi, Wire, feed, request, serving
 
 
 async def iterate() -> None:
@@ -170,7 +170,7 @@ async def callback_times(data: bytes) -> list[float]:
     with no_long_collections(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(turns, "MAX_TURN", 0.0)
         patch.setattr(asyncio.Handle, "_run", timed)
-        asyncio.get_running_loop().call_soon(connection.data_received, data)
+        asyncio.get_running_loop().call_soon(feed, connection, data)
         for _ in range(300):
             await asyncio.sleep(0)
     connection.abort()
@@ -259,7 +259,7 @@ def test_client_in_reserve_survives_processes_that_connect_again_and_again(
         far.send(b"{")
         newcomers(2000)
         assert own in admission.admitted
-        own.data_received(near.recv(10))
+        feed(own, near.recv(10))
         newcomers(2000 if processes == 1 else 0)
         assert own in admission.admitted
 

@@ -8,7 +8,7 @@ import pytest
 from controller.api import turns
 from controller.api.jsonrpc import ErrorCode
 from controller.api.methods import TouchParams
-from served_api import ServedApi, request, serving
+from served_api import ServedApi, feed, request, serving
 
 ARM = '{"owner":"me","lease_s":5}'
 
@@ -16,7 +16,7 @@ ARM = '{"owner":"me","lease_s":5}'
 async def test_server_continues_after_invalid_lines() -> None:
     """Invalid JSON, requests, methods and parameters get an error each; the next line is served."""
     served, client, wire = serving()
-    client.data_received(b"garbage\n\n\xff\n[]\n" + request("no_such_method", id=1))
+    feed(client, b"garbage\n\n\xff\n[]\n" + request("no_such_method", id=1))
     await served.takes(client, request("disarm", '{"level": 2}', id=1) + request("disarm", id=9))
     *errors, last = wire.lines()
     codes = [each["error"]["code"] for each in errors]
@@ -114,7 +114,7 @@ async def test_stop_is_served_while_requests_are_pending() -> None:
 async def test_client_that_closed_its_side_gets_pending_responses() -> None:
     """End of input, then the responses, then the end; only arming is for those who stay."""
     served, client, wire = serving()
-    client.data_received(request("stop", id=1) + request("arm", ARM, id=2))
+    feed(client, request("stop", id=1) + request("arm", ARM, id=2))
     client.eof_received()
     assert client.is_open
     await served.settle()
@@ -188,7 +188,7 @@ async def test_stop_is_served_among_silent_and_asking_clients() -> None:
     for _ in range(160):
         served.client()
     client, wire = served.client(process=2)
-    client.data_received(request("effects", id=1) + request("hello", '{"client":"me"}', id=2))
+    feed(client, request("effects", id=1) + request("hello", '{"client":"me"}', id=2))
     await served.takes(
         client, b"".join(request(each, id=3) for each in ("status", "stop", "disarm"))
     )

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from controller.api import turns
-from served_api import ServedApi, request
+from served_api import ServedApi, feed, request
 from virtual_loop import in_virtual_time
 
 REQUEST = request("renew", '{"lease":"a"}')
@@ -43,7 +43,7 @@ async def test_turn_ends_with_the_line_after_a_tenth_of_a_millisecond(
     monkeypatch.setattr(turns.time, "perf_counter", lambda: 30e-6 * lines)
     served = serve()
     served.called = count
-    served.client()[0].data_received(REQUEST * 10)
+    feed(served.client()[0], REQUEST * 10)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
@@ -55,7 +55,7 @@ async def test_clients_take_a_burst_then_a_quarter_of_the_time() -> None:
     """Of requests of 1 ms each: 20 at once, then 250 in a second, each overdrawn by at most one."""
     served = serve(costs=0.001)
     client, _ = served.client()
-    client.data_received(TOUCH * 700)
+    feed(client, TOUCH * 700)
     await asyncio.sleep(1.0)
     times = served.times("touch")
     assert sum(time == 0 for time in times) == pytest.approx(20, abs=1)
@@ -67,12 +67,12 @@ async def test_client_that_touches_waits_for_no_other_client() -> None:
     """Beside 30 that ask without end, whose requests of 1 ms each take all of their own share."""
     served = serve(costs=0.001)
     touching, _ = served.client()
-    touching.data_received(TOUCH_DOWN)
+    feed(touching, TOUCH_DOWN)
     for _ in range(30):
-        served.client()[0].data_received(REQUEST * 100)
+        feed(served.client()[0], REQUEST * 100)
     for number in range(1, 6):
         await asyncio.sleep(0.1 * number - served.clock())
-        touching.data_received(TOUCH_DOWN)
+        feed(touching, TOUCH_DOWN)
     await asyncio.sleep(0.05)
     assert len(served.times("renew")) < 250
     assert served.times("touch") == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.5], abs=0.002)
@@ -83,10 +83,10 @@ async def test_client_whose_fingers_were_never_lifted_is_one_of_the_others() -> 
     """150 ms after its last frame, as its contacts: it and the others have one share."""
     served = serve(costs=0.001)
     silent, _ = served.client()
-    silent.data_received(TOUCH_DOWN)
-    served.client()[0].data_received(REQUEST * 400)
+    feed(silent, TOUCH_DOWN)
+    feed(served.client()[0], REQUEST * 400)
     await asyncio.sleep(0.3)
-    silent.data_received(REQUEST * 400)
+    feed(silent, REQUEST * 400)
     await asyncio.sleep(1.0 - served.clock())
     assert len(served.calls) == pytest.approx(1 + 20 + 250, abs=3)
 
@@ -97,7 +97,7 @@ async def test_requests_wait_while_a_touch_is_on_its_way_to_the_wire() -> None:
     served = serve()
     client, _ = served.client()
     served.is_busy = True
-    client.data_received(REQUEST * 4)
+    feed(client, REQUEST * 4)
     await asyncio.sleep(0.0029)
     assert served.calls == []
     await asyncio.sleep(0.0049)
@@ -112,12 +112,12 @@ async def test_stop_is_served_at_once_though_touches_come_first_and_time_is_over
     """Also behind other requests of its client, and in two parts."""
     served = serve(costs=0.001)
     client, _ = served.client()
-    client.data_received(TOUCH * 100)
+    feed(client, TOUCH * 100)
     await asyncio.sleep(0.01)
     assert len(served.times("touch")) < 30
     served.is_busy = True
-    client.data_received(STOP[:-5])
-    client.data_received(STOP[-5:])
+    feed(client, STOP[:-5])
+    feed(client, STOP[-5:])
     await asyncio.sleep(0.001)
     assert served.times("stop") == [pytest.approx(0.01)]
     assert len(served.times("touch")) == 100
@@ -131,7 +131,7 @@ async def test_lines_that_only_look_like_a_stop_are_served_in_turn() -> None:
     served.is_busy = True
     for pause in (0.0, 0.001, 0.05, 0.06):
         await asyncio.sleep(pause)
-        client.data_received(LOOKALIKE)
+        feed(client, LOOKALIKE)
         for _ in range(4):
             await asyncio.sleep(0)
     delays = [

@@ -189,7 +189,7 @@ class ExpectedAmplifier:
         cause = f"{name} {values}"
         has_expired = self.is_enabled and shown.get("fault") == FAULTS["WATCHDOG"]
         if name in ("Stop", "Disarm") and has_expired and when[1] >= self.expiry[0]:
-            self._trip(FAULTS["WATCHDOG"], (self.expiry[0], when[1]), "the watchdog")  # first
+            self._trip(FAULTS["WATCHDOG"], self._expired_by(when[1]), "the watchdog")  # first
         if name == "Arm":
             if not self.is_enabled or values["session"] != self.session:
                 self._fall_silent(ENABLED, when, FADE, cause, has_floor=False)
@@ -341,12 +341,17 @@ class ExpectedAmplifier:
                 what = f"time of the watchdog ({self.outputs.cause})"
                 must = f"from {early:.4f} to {late:.4f} s"
                 self.report("watchdog", when[1], what, must=must, seen=f"{when[1]:.4f} s")
-            first = min(max(early, self.last_status), when[1])
-            since = first, max(min(late, when[1]), first)
+            since = self._expired_by(when[1])
         elif fault == FAULTS["NONE"] or not self._may_fail:
             must, seen = "WATCHDOG" if fault else "one", name_of(FAULTS, fault)
             self.report("state", when[1], "fault of a fault reaction", must=must, seen=seen)
         self._trip(fault, since, f"fault {name_of(FAULTS, fault)}")
+
+    def _expired_by(self, time: float) -> Interval:
+        """Return between which times the watchdog tripped that has tripped by a time."""
+        early, late = self.expiry
+        first = min(max(early, self.last_status), time)
+        return first, max(min(late, time), first)
 
     def _adopt(self, shown: Values, when: Interval) -> None:
         """Go on with a status as it is."""

@@ -126,6 +126,19 @@ def test_watchdog_may_be_sooner_than_what_is_on_its_way(kind: int, latch: int) -
     assert talk.found == []
 
 
+@pytest.mark.parametrize(("kind", "latch"), [(hand.STOP, 2), (hand.DISARM, 1)])
+def test_watchdog_of_unknown_time_may_be_sooner_than_what_is_on_its_way(
+    kind: int, latch: int
+) -> None:
+    """Its Arm was not heard: half of the fade of 5 ms is left as it is told to fall silent."""
+    talk = Talk().identified(hand.ENABLED)
+    talk.exchange(hand.SILENCE, (9, 5), hand.status()).rest(0.02).playing()
+    talk.rest(0.2).sends(kind, (5,)).rest(0.0005)
+    fading: dict[str, Any] = {"fault": hand.WATCHDOG, "latch": latch, "token": 5}
+    talk.replies(kind, hand.status(hand.REACTING, levels=(2500, 0), **fading))
+    assert talk.found == []
+
+
 def test_fault_that_came_before_the_watchdog_may_show_afterwards() -> None:
     """Nothing was asked for 0.4 s, in which an arc was sooner than the watchdog of 0.25 s."""
     talk = Talk().armed().rest(0.4)

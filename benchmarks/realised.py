@@ -20,8 +20,8 @@ from benchmarks.setting import RIG, random_contacts, use_one_thread
 if TYPE_CHECKING:
     from model.arrays import FloatArray
     from model.rig.rig import Rig
-    from model.table.pattern import Pattern
     from model.table.question import Question
+    from model.vibration.excitation import Excitation
 
 PAGE = Path(__file__).parents[1] / "docs" / "measured" / "contrast-benchmark.md"
 QUIET = (1, 2, 3)
@@ -98,7 +98,7 @@ def _line(row: Row, sets: int) -> str:
             target, *others = random_contacts(rng, 1 + quiet, size, margin=MARGIN).tolist()
             asked = Question((tuple(target),), tuple(map(tuple, others)), envelopes=True)
             pattern = table.query(asked)
-            contrast, level = _realised(rig, asked, pattern, number)
+            contrast, level = realised(rig, asked, pattern.excitation, number)
             found.append([*np.percentile(contrast, [50, 10]), np.percentile(level, 10)])
             promised = pattern.robust_felt_contrast_db
             assert promised is not None
@@ -113,10 +113,10 @@ def _line(row: Row, sets: int) -> str:
     )
 
 
-def _realised(
-    rig: "Rig", asked: "Question", pattern: "Pattern", number: int
+def realised(
+    rig: "Rig", asked: "Question", excitation: "Excitation", number: int
 ) -> "tuple[FloatArray, FloatArray]":
-    """Felt contrast [dB] and level [dB SL] on drawn plates (d,)."""
+    """Felt contrast [dB] and level [dB SL] on plates (d,), drawn by the number of the set."""
     import numpy as np
 
     from model.finger.fingertip import DiscRule, fingertips_on
@@ -134,7 +134,7 @@ def _realised(
     discs, weights = fingertips_on(
         np.array(asked.contacts), length=plate.length, width=plate.width, rule=rule
     )
-    frequencies, bases = base_amplitudes(pattern.excitation, eras)
+    frequencies, bases = base_amplitudes(excitation, eras)
     unit = direct_spectral_acceleration(
         plate,
         SpectralMesh(DEGREE, DEGREE, plate.length, plate.width),

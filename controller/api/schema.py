@@ -175,7 +175,10 @@ class ContactStatus(Message):
         description="what a target feels: its own, mixed with the contents of others (promised "
         "contrast below 12 dB), the content of another finger, or none",
     )
-    frequency_hz: float | None = Field(None, description="of what it feels; null for several")
+    frequency_hz: float | None = Field(
+        None,
+        description="of what it feels, as asked for, which amplifiers may round; null for several",
+    )
     foreign_level_db_sl: float | None = Field(
         None,
         description="of the contents of others there, which nine of ten plates do not exceed; "
